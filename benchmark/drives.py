@@ -9,10 +9,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
+from pose_graph_ros.core.config import BackendConfig, GyroSource, MeasurementSource, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.gyro_config import GyroSource
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position, YawRate
 
 SECOND = 1_000_000_000

@@ -17,8 +17,8 @@ from benchmark import ours
 from benchmark.runs import Run
 from benchmark.worlds import World
 from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.solver_config import SolverConfig
 
 EXACT = SolverConfig(max_iterations=200, step_tolerance=1e-10)
 

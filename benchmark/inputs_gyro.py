@@ -21,12 +21,10 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometryNoise
+from pose_graph_ros.core.config import BackendConfig, GyroSource, MeasurementSource, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.geometry.similarity import fit_similarity
-from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.gyro_config import GyroSource
+from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.measurements import (
     Answer,
     Fix,
@@ -167,7 +165,7 @@ def husky(data: Path) -> Section:
     table.add('all: the motion alone, under its best rigid fit', *(
         f'{_rms(np.hypot(*(se2.transform(pose, path) - places).T)):.2f}'
         for path in (each.at(paths[0].stamps_ns)[:, :2] for each in paths[1:])
-        for pose in [fit_similarity(path, places).pose]))
+        for pose in [fit_motion(path, places)]))
     say('  ' + ' | '.join(table.rows[-1]))
     section.tables += [table, _courses(paths)]
     section.notes.append(

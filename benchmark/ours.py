@@ -22,16 +22,14 @@ from scipy.sparse import linalg
 
 from benchmark.runs import Plan, quiet, Run
 from benchmark.worlds import chain, laps, World
-from pose_graph_ros.core.batch import chordal_start, optimizer
-from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.batch import linear_starts, optimizer
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import UpdateResult
-from pose_graph_ros.core.solver_config import SolverConfig
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 NAME, REFINED = 'ours', 'ours, refined'
 BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)
@@ -252,8 +250,7 @@ def polished(world: World, poses: FloatArray) -> float:
 
 def start_of_batch(world: World) -> FloatArray:
     """Return the start that both tools are given in the batch comparison, shape (N, 3)."""
-    graph = world.graph(world.dead_reckoning())
-    return chordal_start.chordal(graph, symbolic.analyse(graph.memory.head).cliques)
+    return linear_starts.chordal(world.graph(world.dead_reckoning()))
 
 
 def _jacobians(

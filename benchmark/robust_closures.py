@@ -30,7 +30,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.judgement.floors import forward
+from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 

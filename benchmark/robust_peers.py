@@ -19,7 +19,7 @@ from benchmark.section import say, Section, Table
 from benchmark.worlds import integrate
 from pose_graph_ros.cli.believe import believe
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.config import Robust
+from pose_graph_ros.core.config import Robust, SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -27,8 +27,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.judgement.floors import floored, FLOORS
-from pose_graph_ros.core.solver_config import SolverConfig
+from pose_graph_ros.core.judgement.closures import floored, FLOORS
 
 PEER = 'benchmark.robust_peer'
 METHODS = 'GNC-TLS', 'GNC-GM', 'LM, Cauchy', 'LM, DCS'

@@ -13,8 +13,7 @@ import numpy as np
 from benchmark.robust_closures import Recording, Run, TRUE
 from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, INK, PURPLE, VERMILION
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.similarity import fit_similarity
-from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 
 SIZE, DPI = (13.0, 6.5), 100
 """Of the picture [inch], and dots per inch."""
@@ -71,6 +70,5 @@ def _closures(
 def _placed(path: Trajectory, truth: Trajectory) -> np.ndarray:
     """Return the poses of a path, laid over the truth."""
     inside = truth.covers(path.stamps_ns)
-    pose = fit_similarity(
-        path.poses[inside, :2], truth.at(path.stamps_ns[inside])[:, :2]).pose
+    pose = fit_motion(path.poses[inside, :2], truth.at(path.stamps_ns[inside])[:, :2])
     return np.asarray(se2.compose(pose, path.poses))

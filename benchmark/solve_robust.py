@@ -24,7 +24,7 @@ from benchmark.robust_closures import read_recording, Recording, TRUE
 from benchmark.robust_worlds import with_false
 from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.similarity import fit_similarity
+from pose_graph_ros.core.geometry.trajectory import fit_motion
 from pose_graph_ros.core.io.g2o import read_g2o
 
 SHARES = (0.1, 0.3, 0.5)
@@ -62,8 +62,7 @@ def row(name: str, method: str, recording: Recording, file: Path, folder: Path) 
     n_right = len(recording.ends) - len(wrong)
     truth = recording.truth.at(recording.stamps_ns)[:, :2]
     path = read_g2o(out).rows.poses[:, :2]
-    poses = np.pad(path, ((0, 0), (0, 1)))
-    error = np.linalg.norm(fit_similarity(path, truth).apply(poses)[:, :2] - truth, axis=1)
+    error = np.linalg.norm(se2.transform(fit_motion(path, truth), path) - truth, axis=1)
     return (f'| {name} | {method} | {len(left_out & wrong)} of {len(wrong)} '
             f'| {len(left_out - wrong)} of {n_right} '
             f'| {np.sqrt(np.mean(error**2)):.2f} | {values["certificate"]["verdict"]} '

@@ -20,7 +20,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.odometry.thinned_nodes import ThinnedNodes
+from pose_graph_ros.core.odometry.node_table import ThinnedNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.window.sparse_removal import sparse_removal
 from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning

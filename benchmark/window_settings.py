@@ -4,7 +4,7 @@
 
 from typing import Any
 
-from pose_graph_ros.core.config import Prior, ThinningConfig, WindowConfig
+from pose_graph_ros.core.config import ThinningConfig, WindowConfig, WindowPrior
 
 UNITS = {'s': 'seconds', 'm': 'metres', 'nodes': 'nodes'}
 UNLIMITED = 'unlimited'
@@ -23,4 +23,5 @@ def settings_of(window: str) -> dict[str, Any]:
     if window.startswith('thinning'):
         return {'thinning': ThinningConfig(cell=float(size))}
     return {'window': WindowConfig(
-        **{UNITS[unit]: int(size)}, prior=Prior.SPARSE if rest == ['sparse'] else Prior.DENSE)}
+        **{UNITS[unit]: int(size)}, prior=(
+            WindowPrior.SPARSE if rest == ['sparse'] else WindowPrior.DENSE))}

@@ -45,7 +45,7 @@ points = distribution('{PACKAGE}').entry_points.select(group='console_scripts')
 print(*sorted(point.name for point in points if callable(point.load())))
 """
 RENDER = f"""
-from {PACKAGE}.cli.page.render import render
+from {PACKAGE}.cli.report import render
 print(render({{}}))
 """
 

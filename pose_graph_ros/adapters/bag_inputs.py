@@ -14,17 +14,16 @@ import re
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.conversions import Message, planar_pose, stamp_ns
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, ODOMETRY_KINDS, Source
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 logger = logging.getLogger(__name__)
 
-OPTIONS = tuple(KNOWN_SOURCES)
-"""Sources with a command line option for their topic; without it their topic is guessed."""
+OPTIONS = tuple(KNOWN_SOURCES)  # have an option for their topic; without it that is guessed
+# What names of topics with the truth have in them: these are no inputs unless they are named.
 TRUTH = re.compile(r'(?:/|_|\b)(?:ground_?truth|truth|gt)(?:/|_|\b)', re.IGNORECASE)
-"""What names of topics with the truth have in them: these are no inputs unless they are named."""
 STATIC_FRAMES = '/tf_static', 'tf2_msgs/msg/TFMessage'  # topic and type of static transforms
 
 
@@ -34,8 +33,7 @@ class Inputs:
 
     topics: Mapping[str, str]  # topic in the bag by name of the source, such as `fix`
     kinds: Mapping[str, Kind] = field(default_factory=dict)  # kind by name of the source
-    hold_out: int = 0
-    """Every n-th fix (global pose, if there are no fixes) is held out; 0 holds out none."""
+    hold_out: int = 0  # every n-th fix, or global pose if there are none, is held out; 0: none
     span: Span = WHOLE  # when the messages that are read were recorded
 
     def __post_init__(self) -> None:
@@ -67,20 +65,9 @@ def choose_inputs(
     is left and no source of fixes has a topic. Fixes are not guessed if global poses are wanted,
     and topics that are named as the truth, such as `/ground_truth` or `/gt/pose`, never.
 
-    Parameters
-    ----------
-    sources : sequence of Source, all sources of the node
-    wanted : mapping, topic by name of the source; None leaves the choice open
-    hold_out : int, as in `Inputs`
-    span : Span, as in `Inputs`
-    truth : str, optional, topic that is not guessed, as it has what the result is compared with
-
-    Raises
-    ------
-    BagError
-        If there is no odometry, a wanted topic is missing or of another type, a source is not
-        among the parameters, or there are several candidates, which the message names.
-
+    Neither is the topic of the truth that the result is compared with. Raises `BagError` if there
+    is no odometry, a wanted topic is missing or of another type, a source is not among the
+    parameters, or there are several candidates, which the message names.
     """
     kinds = {source.name: source.kind for source in sources}
     chosen = {name: topic for name, topic in wanted.items() if topic is not None}
@@ -152,15 +139,7 @@ def _guess(
 
 
 def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[InputMessage]:
-    """
-    Iterate over the messages of the inputs in the order in which they were recorded.
-
-    Raises
-    ------
-    BagError
-        If a topic is not in the bag, or the bag is damaged.
-
-    """
+    """Iterate over the messages of the inputs in the order in which they were recorded."""
     sources: dict[str, list[str]] = {}
     for source, topic in inputs.topics.items():
         sources.setdefault(topic, []).append(source)
@@ -189,14 +168,7 @@ def read_static_frames(reader: Bag) -> list[BagMessage]:
 
 
 def reader_of(bag: Bag, values: Mapping[str, Any]) -> MessageReader:
-    """
-    Return a new reader for the messages of a bag, which knows its static transforms.
-
-    Parameters
-    ----------
-    values : mapping, all parameters of the node
-
-    """
+    """Return a new reader for the messages of a bag, which knows its static transforms."""
     reader = MessageReader(values)
     for message in read_static_frames(bag):
         reader.frames.receive(message.decode())
@@ -209,34 +181,18 @@ ODOMETRY, POSE, POSE_WITH_COVARIANCE = POSE_TYPES = (
 
 
 class BagPose(NamedTuple):
-    """A pose that was read from a message."""
+    """A planar pose of a message."""
 
     stamp_ns: int
     pose: FloatArray  # shape (3,) [m, m, rad]
 
 
 def poses_on(bag: Bag, topic: str, span: Span = WHOLE) -> Iterator[BagPose]:
-    """
-    Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored.
-
-    Parameters
-    ----------
-    topic : str
-    span : Span, when the messages were recorded
-
-    """
+    """Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored."""
     bare = bag.topics[topic].type == POSE
     for bag_message in bag.messages([topic], span):
         with suppress(MessageError):
             message = bag_message.decode()
-            found = _pose(message, message if bare else message.pose)
-            if found is not None:
-                yield found
-
-
-def _pose(stamped: Message, holder: Message) -> BagPose | None:
-    """Return the pose of a message with a header that is in a part with a field `pose`."""
-    pose = planar_pose(holder.pose)
-    if pose is None:
-        return None
-    return BagPose(stamp_ns(stamped), pose)
+            pose = planar_pose(message.pose if bare else message.pose.pose)
+            if pose is not None:
+                yield BagPose(stamp_ns(message), pose)

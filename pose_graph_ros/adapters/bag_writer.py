@@ -33,12 +33,10 @@ from pose_graph_ros.adapters.bags import (
 )
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
-BAG_VERSION: Final = 9
-"""Version of the metadata of ROS 2 Jazzy."""
+BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
-NO_HASH = 'RIHS01_' + 64 * '0'
-"""Of a type whose definition is unknown."""
+NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
 
 
@@ -47,23 +45,9 @@ class BagWriter:
     A new rosbag2 folder, a context manager.
 
     The bag is moved to its name when the context ends. If the context ends with an exception, no
-    bag is written, and a bag that was to be overwritten is kept.
-
-    Parameters
-    ----------
-    storage : str, `mcap` or `sqlite3`
-    overwrite : bool
-        Whether to replace an existing rosbag2 folder; other folders are never replaced.
-    latched : collection of str
-        Topics whose publisher keeps its last message for late subscribers (transient local);
-        `/tf_static` always does.
-
-    Raises
-    ------
-    BagError
-        If `folder` exists and may not be replaced, its parent cannot be written to, or the
-        storage is unknown.
-
+    bag is written, and a bag that was to be overwritten is kept; what is no rosbag2 folder is
+    never replaced. Publishers of latched topics, and of /tf_static, keep their last message for
+    late subscribers.
     """
 
     def __init__(
@@ -110,21 +94,7 @@ class BagWriter:
             shutil.rmtree(self._scratch)
 
     def write(self, topic: str, type_name: str, recorded_ns: int, message: Any) -> None:
-        """
-        Append a message.
-
-        Parameters
-        ----------
-        type_name : str, a message type of ROS 2 Jazzy, such as `nav_msgs/msg/Path`
-        recorded_ns : int, when the message was received [ns]
-        message : bytes or object, serialised CDR bytes, or an object with the fields of the type
-
-        Raises
-        ------
-        BagError
-            If the type is unknown or the message does not fit it.
-
-        """
+        """Append a message of a type of ROS 2 Jazzy: CDR bytes, or an object with its fields."""
         if (topic, type_name) not in self._connections:
             self._connections[topic, type_name] = self._connect(topic, type_name)
         if not isinstance(message, bytes):
@@ -140,13 +110,7 @@ class BagWriter:
         """
         Append a message of another bag as it is, or converted if that is of ROS 1.
 
-        Its type may be any that its bag defines.
-
-        Raises
-        ------
-        MessageError
-            If it cannot be converted.
-
+        Its type may be any that its bag defines. Raises `MessageError` if it cannot be converted.
         """
         source, data, type_name = message.connection, message.raw, message.type
         if isinstance(source.ext, ConnectionExtRosbag1):

@@ -77,10 +77,8 @@ class BagMessage:
 class Span(NamedTuple):
     """Time in which messages were recorded."""
 
-    begin_ns: int | None = None
-    """Stamp of recording from which on there are messages [ns]; None from the first one on."""
-    end_ns: int | None = None
-    """Stamp before which they were recorded [ns]; None up to the last one."""
+    begin_ns: int | None = None  # stamp of the first; None from the begin on [ns]
+    end_ns: int | None = None  # stamp before which they were recorded; None to the end [ns]
 
 
 WHOLE = Span()
@@ -99,12 +97,6 @@ class Bag(ABC):
         Iterate over the messages of some topics in the order in which they were recorded.
 
         Raises `BagError`: at the call for an unknown topic, on iteration for a damaged file.
-
-        Parameters
-        ----------
-        topics : collection of str
-        span : Span, when the messages were recorded
-
         """
         unknown = sorted(set(topics) - set(self.topics))
         if unknown:
@@ -122,20 +114,24 @@ class Bag(ABC):
         """Iterate over the messages of topics that the bag has."""
 
 
+class OpenBag(Bag):
+    """A bag that is closed as a context manager; made by `open_bag` and `open_bags`."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    @abstractmethod
+    def __exit__(self, *exception: object) -> None:
+        """Close the files; messages that were read before can still be decoded."""
+
+
 def _absolute(connection: Connection) -> str:
     """Return the topic of a connection with a slash, which recorders of ROS 1 may leave out."""
     return '/' + connection.topic.removeprefix('/')
 
 
-class BagReader(Bag):
-    """
-    An open bag, a context manager; made by `open_bag`.
-
-    Parameters
-    ----------
-    reader : Reader, opened reader of rosbags
-
-    """
+class BagReader(OpenBag):
+    """A bag whose files one reader reads."""
 
     def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | Salvaged) -> None:
         self.path = path
@@ -148,11 +144,8 @@ class BagReader(Bag):
             self.topics[name] = TopicInfo(types, sum(c.msgcount for c in connections))
         self.start_ns, self.end_ns = reader.start_time, reader.end_time
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exception: object) -> None:
-        self._reader.close()  # messages that were read before can still be decoded
+        self._reader.close()
 
     def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
         connections = [c for c in self._reader.connections if _absolute(c) in topics]
@@ -169,14 +162,13 @@ class BagReader(Bag):
             except Exception as error:  # the parsers can raise anything on a damaged file
                 text = f'damaged after {seen.total()} messages: {one_line(error)}'
                 if isinstance(self._reader, Rosbag1Reader | Salvaged) or (
-                        rest := salvage(Path(self.path), text)) is None:
+                        rest := _rest_of(Path(self.path), text)) is None:
                     raise BagError(f'{self.path}: {text}') from error
-                self._reader.close()
-                self._reader = rest
-                source = rest.messages(
-                    [each for each in rest.connections if _absolute(each) in topics],
-                    span.begin_ns if last_ns is None else last_ns + 1, span.end_ns)
-                continue
+                with rest:
+                    yield from rest.messages(
+                        [topic for topic in topics if topic in rest.topics],
+                        span if last_ns is None else Span(last_ns + 1, span.end_ns))
+                return
             seen[_absolute(connection)] += 1
             last_ns = recorded_ns
             yield BagMessage(
@@ -200,7 +192,7 @@ class BagReader(Bag):
         return self._decoders[name]
 
 
-def open_bag(path: str | Path) -> BagReader:
+def open_bag(path: str | Path) -> OpenBag:
     """
     Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
 
@@ -210,8 +202,8 @@ def open_bag(path: str | Path) -> BagReader:
     if not path.exists():
         raise BagError(f'{path}: does not exist')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
-        if (rest := salvage(path, 'the recording was not ended, it has no metadata.yaml')):
-            return BagReader(path, rest)
+        if (rest := _rest_of(path, 'the recording was not ended, it has no metadata.yaml')):
+            return rest
         inside = sorted(p.name for p in path.iterdir() if p.suffix in BAG_FILE_SUFFIXES)
         hint = f'; name a file in it: {", ".join(inside)}' if inside else ''
         raise BagError(f'{path}: no rosbag2 folder, it has no metadata.yaml{hint}')
@@ -221,19 +213,27 @@ def open_bag(path: str | Path) -> BagReader:
             f'{", ".join(BAG_FILE_SUFFIXES)}')
     files = path.iterdir() if path.is_dir() else path.parent.glob(f'{glob.escape(path.name)}-*')
     if any(each.name.endswith(JOURNALS) and each.stat().st_size > 0 for each in files) and (
-            rest := salvage(path, 'the recording was not ended, it has a journal')):
-        return BagReader(path, rest)
+            rest := _rest_of(path, 'the recording was not ended, it has a journal')):
+        return rest
     try:
         reader: Rosbag1Reader | Rosbag2Reader = (
             Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path))
         reader.open()
     except Exception as error:  # the parsers can raise anything on a damaged file
         if path.suffix != '.bag' and (
-                rest := salvage(path, f'damaged or cut short: {one_line(error)}')):
-            return BagReader(path, rest)
+                rest := _rest_of(path, f'damaged or cut short: {one_line(error)}')):
+            return rest
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
     return BagReader(path, reader)
+
+
+def _rest_of(path: Path, reason: str) -> OpenBag | None:
+    """Return what can be read of a damaged rosbag2; None if nothing can."""
+    files = [BagReader(path, each) for each in salvage(path, reason)]
+    if len(files) <= 1:
+        return files[0] if files else None
+    return BagSequence(files)
 
 
 def own_types(connection: Connection) -> Typestore | None:
@@ -264,20 +264,10 @@ def one_line(error: Exception) -> str:
     return ' '.join(str(error).split()) or type(error).__name__
 
 
-class BagSequence(Bag):
-    """
-    Open bags whose messages come in the order in which they were recorded; a context manager.
+class BagSequence(OpenBag):
+    """Several bags, merged: their messages come in the order in which they were recorded."""
 
-    Bags that were recorded at the same time are merged. Of a topic with several types, these are
-    joined with ` | `, as in a single bag.
-
-    Parameters
-    ----------
-    bags : sequence of BagReader, at least one
-
-    """
-
-    def __init__(self, bags: Sequence[BagReader]) -> None:
+    def __init__(self, bags: Sequence[OpenBag]) -> None:
         self._bags = sorted(bags, key=lambda bag: bag.start_ns)
         self.path = ', '.join(str(bag.path) for bag in self._bags)
         self.topics = {}
@@ -287,9 +277,6 @@ class BagSequence(Bag):
             self.topics[name] = TopicInfo(' | '.join(types), sum(info.count for info in found))
         self.start_ns = min(bag.start_ns for bag in self._bags)  # an empty one begins late
         self.end_ns = max(bag.end_ns for bag in self._bags)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         with ExitStack() as stack:
@@ -302,7 +289,7 @@ class BagSequence(Bag):
         return heapq.merge(*parts, key=lambda message: message.recorded_ns)
 
 
-def open_bags(paths: Sequence[str | Path]) -> BagReader | BagSequence:
+def open_bags(paths: Sequence[str | Path]) -> OpenBag:
     """Open bags that follow each other, in any order; raises `BagError` as `open_bag` does."""
     if len(paths) == 1:
         return open_bag(paths[0])

@@ -10,47 +10,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.conversions import frame, Message, stamp_ns
+from pose_graph_ros.adapters.conversions import frame, Message, stamp_ns, StaticFrames
 from pose_graph_ros.adapters.sources import Source
-from pose_graph_ros.adapters.static_frames import StaticFrames
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, Fix, rejected
 
-STATUS_NO_FIX = -1
-COVARIANCE_TYPE_UNKNOWN = 0
-LARGEST_ALTITUDE = 1e5  # largest valid distance from the ellipsoid [m]
-
 
 class Datum:
     """
     The origin of the map on the Earth: a given one, or the position of the first fix in the graph.
 
-    Parameters
-    ----------
-    given : sequence of float
-        Latitude and longitude [degrees] and, if there are three numbers, the angle of the map's x
-        axis from east [rad]; empty to use the first fix that the engine attaches to the graph.
-    wait : bool, whether to wait for a call of `renew` before a fix is used, if `given` is empty
-
-    Raises
-    ------
-    ValueError
-        If `given` is not a point on the Earth.
-
+    It is given as latitude and longitude [degrees] and, if there are three numbers, the angle of
+    the map's x axis from east [rad]. Else a fix is used at once, or after a call of `renew`.
     """
 
     def __init__(self, given: Sequence[float] = (), *, wait: bool = False) -> None:
         self.yaw = float(given[2]) if len(given) == 3 else 0.0
-        """Angle of the map's x axis from east [rad]."""
         self.is_given = len(given) > 0  # whether the datum comes from the parameter
         self.is_of_graph = False  # whether the datum comes from a loaded graph
         self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
-        """Tangent plane of the map; None without a datum."""
-        self.altitude = math.nan
-        """Altitude of the newest fix in the graph that has one [m]; NaN before that."""
+        self.altitude = math.nan  # of the newest fix in the graph that has one [m]
         self._waits = wait
         # a plane lies on the ellipsoid until an altitude is known; east and north do not change
         self._to_lift = self.is_given
@@ -76,15 +58,7 @@ class Datum:
             self.plane, self._waits, self._to_lift = None, False, False
 
     def plane_for(self, latitude: float, longitude: float, altitude: float) -> TangentPlane:
-        """
-        Return the plane for a fix that is used, which becomes the datum if there is none.
-
-        Parameters
-        ----------
-        latitude, longitude : float, of the fix [degrees]
-        altitude : float, of the fix [m]; NaN if unknown
-
-        """
+        """Return the plane for a fix that is used, which becomes the datum if there is none."""
         with self._lock:
             if math.isfinite(altitude):
                 self.altitude = altitude
@@ -100,14 +74,7 @@ class Datum:
             return self.plane
 
     def place(self, latitude: float, longitude: float, altitude: float) -> FloatArray:
-        """
-        Return the position in the map of a fix that is used, shape (2,) [m].
-
-        Parameters
-        ----------
-        latitude, longitude, altitude : float, as for `plane_for`
-
-        """
+        """Return the position in the map of a fix that is used, shape (2,) [m]."""
         plane = self.plane_for(latitude, longitude, altitude)
         return plane.to_map(
             latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
@@ -118,11 +85,6 @@ class Datum:
 
         They lie at the altitude of the newest fix; this is the inverse of `place`. Raises
         ValueError without a datum.
-
-        Parameters
-        ----------
-        position : ndarray, shape (..., 2), in the map [m]
-
         """
         if self.plane is None:
             raise ValueError('the map has no datum')
@@ -146,22 +108,12 @@ class Antenna(NamedTuple):
 
 
 class FixReader:
-    """
-    Converts the NavSatFix messages of one source to fixes.
-
-    Parameters
-    ----------
-    datum : Datum, datum of the map, shared by all sources
-    frames : StaticFrames, used if the source has no lever arm
-    base_frame : str, frame of the robot
-
-    """
+    """Converts the NavSatFix messages of one source to fixes."""
 
     def __init__(
         self, source: Source, datum: Datum, frames: StaticFrames, base_frame: str,
     ) -> None:
-        self.source = source
-        """Gives the time offset and the lever arm; may be replaced at any time."""
+        self.source = source  # may be replaced at any time
         self._datum, self._frames, self._base_frame = datum, frames, base_frame
         self.antenna: Antenna | None = None  # antenna of the newest fix; None before the first
         self.without_lever_arm = 0  # number of fixes that were read while the antenna was unknown
@@ -172,13 +124,13 @@ class FixReader:
 
         An unknown covariance is returned as zeros.
         """
-        if message.status.status == STATUS_NO_FIX:
+        if message.status.status == -1:
             return rejected('no_fix', 'the receiver reports no fix')
         latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
         if not (math.isfinite(latitude) and math.isfinite(longitude)):
             return rejected('not_finite', f'latitude {latitude}, longitude {longitude}')
         # an altitude of NaN means that it is unknown, and passes
-        if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > LARGEST_ALTITUDE:
+        if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > 1e5:
             return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
                                             f'altitude {altitude}')
         stamp = stamp_ns(message, self.source.time_offset_ns)
@@ -187,7 +139,7 @@ class FixReader:
         if self._datum.is_awaited:
             return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
         cov = np.zeros((2, 2))
-        if message.position_covariance_type != COVARIANCE_TYPE_UNKNOWN:
+        if message.position_covariance_type != 0:
             cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
         if np.all(np.isfinite(cov)):
             with np.errstate(over='ignore', invalid='ignore'):

@@ -7,12 +7,11 @@ from difflib import get_close_matches
 from pathlib import Path
 import re
 
-from pose_graph_ros.adapters.parameter_names import LIKENESS
+from pose_graph_ros.adapters.parameters import LIKENESS
 from pose_graph_ros.adapters.sources import Kind, KNOWN_SOURCES, OUTPUTS
 from pose_graph_ros.core.exceptions import ConfigError
 
-AS_IN_FILE = 'as in params_file'
-"""Default of arguments that set a parameter only if they are given."""
+AS_IN_FILE = 'as in params_file'  # default of what sets a parameter only if it is given
 SWITCHES = {'true': True, '1': True, 'false': False, '0': False}
 
 
@@ -44,19 +43,7 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
 
 
 def switch(given: Mapping[str, str], name: str) -> bool:
-    """
-    Return an argument that is true or false, as people write it.
-
-    Parameters
-    ----------
-    given : mapping, arguments by name
-
-    Raises
-    ------
-    ConfigError
-        If it is neither true, false, 1 nor 0, in any case of letters.
-
-    """
+    """Return an argument that is true or false, or 1 or 0, in any case of letters."""
     text = given[name].strip().lower()
     if text not in SWITCHES:
         raise ConfigError(f'argument {name}: expected true or false, got {given[name]!r}')
@@ -73,16 +60,10 @@ def parameter_file(given: Mapping[str, str]) -> str:
 
 def unknown(typed: Iterable[str], own: Collection[str], *, included: bool) -> list[str]:
     """
-    Return what to say of arguments that the launch file does not have, which launch ignores.
+    Return what to say of arguments `name:=value` that the launch file does not have.
 
-    Parameters
-    ----------
-    typed : iterable of str, the arguments of the command line, as `name:=value`
-    own : collection of str, names of those of this launch file
-    included : bool
-        Whether another launch file was started, which may have arguments of its own: then only
-        those that resemble one of this file are told.
-
+    Launch ignores them. If the file is included by another one, which may have arguments of its
+    own, only those that resemble one of this file are told.
     """
     said = []
     for name in (each.partition(':=')[0] for each in typed if ':=' in each):

@@ -14,6 +14,7 @@ from pose_graph_ros.adapters.conversions import (
     Message,
     planar_twist,
     stamp_ns,
+    StaticFrames,
     twist_variance,
 )
 from pose_graph_ros.adapters.fixes import datum_of, FixReader
@@ -24,31 +25,13 @@ from pose_graph_ros.adapters.sources import (
     Source,
     source_list,
 )
-from pose_graph_ros.adapters.static_frames import StaticFrames
-from pose_graph_ros.core.geometry.scalar_se2 import compose_one, exp_one, Pose
+from pose_graph_ros.core.geometry.se2 import compose_one, exp_one, Pose
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected, YawRate
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
 
-# Largest valid stamp: the seconds have 31 bits, of which one hour is left for offsets [ns].
-LARGEST_STAMP_NS = (2**31 - 3600) * NANOSECONDS
-
 
 class MessageReader:
-    """
-    Converts the messages of all sources to measurements.
-
-    Parameters
-    ----------
-    values : mapping, all checked parameters
-    frames : StaticFrames, optional, static transforms that are known already
-    keeper : TimeKeeper, optional, that knows the time already
-
-    Raises
-    ------
-    ConfigError
-        If the datum is not a point on the Earth.
-
-    """
+    """Converts the messages of all sources to measurements, by the checked parameters."""
 
     def __init__(
         self, values: Mapping[str, Any], frames: StaticFrames | None = None,
@@ -58,11 +41,9 @@ class MessageReader:
         self.keeper = keeper or TimeKeeper(
             [name for name, source in self.sources.items() if source.kind.is_odometry],
             CLOCK_JUMP_NS)
-        """The one judge of stamps."""
         self._map_frame = frame(values['map_frame'])
         base_frame = frame(values['base_link_frame'])
         self.frames = StaticFrames() if frames is None else frames
-        """Static transforms of the robot, as received on /tf_static."""
         self.datum = datum_of(values)
         self.fixes = {
             source.name: FixReader(source, self.datum, self.frames, base_frame)
@@ -96,7 +77,9 @@ class MessageReader:
     def convert(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
         """Return the same without a judgement of its stamp."""
         measurement = self._convert(self.sources[name], message)
-        if not isinstance(measurement, Answer) and measurement.stamp_ns > LARGEST_STAMP_NS:
+        if not isinstance(measurement, Answer) and (
+                # the seconds have 31 bits, of which one hour is left for offsets
+                measurement.stamp_ns > (2**31 - 3600) * NANOSECONDS):
             return rejected('stamp_out_of_range', f'{measurement.stamp_ns} ns')
         return measurement
 
@@ -118,30 +101,17 @@ class MessageReader:
                 return conversions.loop_closure(message, offset_ns)
 
 
-# First element of the covariance of the angular velocity of an Imu without one.
-NO_RATE = -1.0
-
-
 class GyroReader:
-    """
-    Converts the Imu messages of one source to yaw rates of the robot.
-
-    Parameters
-    ----------
-    frames : StaticFrames, used if the parameter `mounting` of the source says so
-    base_frame : str, frame of the robot
-
-    """
+    """Converts the Imu messages of one source to yaw rates of the robot."""
 
     def __init__(self, source: Source, frames: StaticFrames, base_frame: str) -> None:
-        self.source = source
-        """Gives the time offset and the mounting; may be replaced at any time."""
+        self.source = source  # may be replaced at any time
         self._frames, self._base_frame = frames, base_frame
 
     def read(self, message: Message) -> YawRate | Answer:
         """Return the yaw rate in a sensor_msgs/Imu, or the reason for rejecting it."""
         values = message.angular_velocity_covariance
-        if values[0] == NO_RATE:
+        if values[0] == -1.0:   # by the definition of the message
             return rejected('no_angular_velocity', 'the sensor reports no angular velocity')
         velocity, stamp = message.angular_velocity, stamp_ns(message, self.source.time_offset_ns)
         mounting, name = self.source.mounting, frame(message.header.frame_id)
@@ -168,17 +138,10 @@ class TwistReader:
 
     Its poses are twists integrated in the order of arrival. They are for outputs between two
     estimates; the engine integrates the twists anew in the order of their stamps.
-
-    Parameters
-    ----------
-    frames : StaticFrames, gives the place of the sensor, if that is not the frame of the robot
-    base_frame : str, frame of the robot
-
     """
 
     def __init__(self, source: Source, frames: StaticFrames, base_frame: str) -> None:
-        self.source = source
-        """Gives the time offset; may be replaced at any time."""
+        self.source = source  # may be replaced at any time
         self._frames, self._base_frame = frames, base_frame
         self._stamp_ns = 0
         self._pose, self._twist = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -1,13 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Write what the node publishes with each odometry message, and its path, as bytes; no rclpy.
+Write what the node publishes often, and what is long, as bytes of the middleware; no rclpy.
 
-They are the bytes of the middleware (CDR, little endian): filling in message objects would take
-ten times as long. In CDR every number is aligned to its size, counted from the end of the four
-bytes at the start of the stream.
+Filling in message objects would take ten times as long. In CDR every number is aligned to its
+size, counted from the end of the four bytes at the start of the stream.
 """
 
+from dataclasses import dataclass
 import functools
 import math
 import struct
@@ -17,18 +17,19 @@ import numpy.typing as npt
 
 from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import NANOSECONDS
+from pose_graph_ros.core.estimate import Prediction
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.prediction import Prediction
+from pose_graph_ros.core.graph.graph_view import GraphView, Lines
+from pose_graph_ros.core.quantities import StampNs
 
-# Variance of height, roll and pitch in messages for filters: they are not estimated [m^2, rad^2].
-UNKNOWN_VARIANCE = 1e6
-# The same in poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].
-PLANAR_VARIANCE = 1e-6
-
+# Variances of height, roll and pitch, which are not estimated, in messages for filters, and in
+# poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].
+UNKNOWN_VARIANCE, PLANAR_VARIANCE = 1e6, 1e-6
 PATH_CHUNK = 2048  # number of poses of a path that are written at a time
 
-CDR = b'\x00\x01\x00\x00'
+CDR = b'\x00\x01\x00\x00'  # little endian
+Colours = npt.NDArray[np.float32]
 _STAMP, _LENGTH = struct.Struct('<iI'), struct.Struct('<I')
 _POSE, _POSE_WITH_COVARIANCE = struct.Struct('<7d'), struct.Struct('<43d')
 _TWIST_WITH_COVARIANCE = struct.Struct('<42d')
@@ -49,14 +50,7 @@ def _names(at: int, frame_id: str, child_frame_id: str = '') -> bytes:
 def odometry_cdr(
     stamp_ns: int, prediction: Prediction, source: Message, map_frame: str, base_frame: str,
 ) -> bytes:
-    """
-    Return a serialised nav_msgs/Odometry: the pose in the map and the twist of the odometry.
-
-    Parameters
-    ----------
-    source : nav_msgs.msg.Odometry, its twist is replaced by an unknown one if it is not finite
-
-    """
+    """Return a serialised nav_msgs/Odometry: the pose in the map and the twist of the odometry."""
     twist = source.twist
     linear, angular = twist.twist.linear, twist.twist.angular
     numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z, *twist.covariance)
@@ -96,30 +90,18 @@ def _position_and_quaternion(pose: FloatArray) -> tuple[float, ...]:
 def transform_cdr(
     stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
 ) -> bytes:
-    """
-    Return a serialised tf2_msgs/TFMessage with the transform from map to odom.
-
-    Parameters
-    ----------
-    T_map_odom : ndarray, shape (3,)
-
-    """
+    """Return a serialised tf2_msgs/TFMessage with the transform from map to odom."""
     return b''.join((CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
                      _names(12, map_frame, odom_frame),
                      _POSE.pack(*_position_and_quaternion(T_map_odom))))
 
 
-def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
+def path_cdr(path: Trajectory, stamp_ns: StampNs, frame_id: str) -> bytes:
     """
     Return a serialised nav_msgs/Path whose poses all lie in one frame.
 
     A PoseStamped ends at a multiple of 8 bytes, so all but the first have the same layout, and
     NumPy fills many at once.
-
-    Parameters
-    ----------
-    stamp_ns : int, stamp of the path; each pose has its own [ns]
-
     """
     name = frame_id.encode() + b'\0'
     head = _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)) + _LENGTH.pack(len(name)) + name
@@ -148,9 +130,6 @@ def path_cdr(path: Trajectory, stamp_ns: int, frame_id: str) -> bytes:
     return b''.join(parts)
 
 
-_LENGTH = struct.Struct('<I')
-
-
 class CdrStream:
     """A stream of CDR: the position of each number is a multiple of its size."""
 
@@ -169,4 +148,122 @@ class CdrStream:
 
     def message(self) -> bytes:
         """Return the message, with the bytes that tell the encoding in front."""
-        return b'\x00\x01\x00\x00' + bytes(self._data)
+        return CDR + bytes(self._data)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Colours (red, green, blue, alpha) and sizes [m] of the markers of the graph."""
+
+    # of constraints by their errors [sigma], interpolated between
+    sigmas: tuple[float, ...] = (1.0, 2.0, 3.0)
+    colours: tuple[tuple[float, ...], ...] = (
+        (0.15, 0.7, 0.3, 1.0), (0.95, 0.8, 0.1, 1.0), (0.9, 0.1, 0.1, 1.0))
+    node: tuple[float, ...] = (0.4, 0.6, 0.85, 1.0)
+    waiting: tuple[float, ...] = (0.3, 0.5, 0.95, 0.9)  # loop closures; dashed, as weak ones
+    doubted: tuple[float, ...] = (0.55, 0.55, 0.55, 0.8)  # dashed loop closures, and positions
+    dashes: int = 12  # of a line; the gaps are as long
+    node_size: float = 0.2
+    observed_size: float = 0.25
+    edge_width: float = 0.06
+    closure_width: float = 0.1
+
+
+LOOK = Look()
+# Constants of visualization_msgs/Marker.
+LINE_LIST, POINTS, ADD, DELETEALL = 5, 8, 0, 3
+NAMESPACES = (
+    'hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes',
+    'weak_closures', 'waiting_closures', 'doubted', 'unused_errors', 'unused_nodes')
+"""Namespaces of the markers by id."""
+
+def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
+    """
+    Return the markers of a graph as a serialised visualization_msgs/MarkerArray.
+
+    The first marker deletes all previous ones. Kinds without points have no marker, because
+    viewers report empty markers as errors.
+    """
+    plain = np.empty((0, 4), dtype='<f4')
+    drawn = [
+        (POINTS, LOOK.node_size, view.nodes, plain),
+        (LINE_LIST, LOOK.edge_width, *_lines(view.odometry)),
+        (LINE_LIST, LOOK.closure_width, *_lines(view.loop_closures)),
+        (LINE_LIST, LOOK.edge_width, *_lines(view.observed)),
+        (POINTS, LOOK.observed_size, view.observed.ends[:, 1], colours(view.observed.sigmas)),
+        (LINE_LIST, LOOK.closure_width, *_lines(_dashed(view.weak))),
+        (LINE_LIST, LOOK.closure_width, *_plain(_dashed(view.waiting).ends, LOOK.waiting)),
+        (LINE_LIST, LOOK.closure_width, *_plain(_dashed(view.doubted).ends, LOOK.doubted)),
+        (LINE_LIST, LOOK.edge_width, *_plain(view.unused.ends, LOOK.doubted)),
+        (POINTS, LOOK.observed_size, *_plain(view.unused.ends[:, 1], LOOK.doubted))]
+    shown = [number for number, (_, _, points, _) in enumerate(drawn) if len(points) > 0]
+    header = (*divmod(stamp_ns, NANOSECONDS), frame_id)
+    stream = CdrStream()
+    stream.add('<u4', 1 + len(shown))
+    _add_marker(stream, header, '', (0, 0, DELETEALL), 0.0, np.empty((0, 2)), plain)
+    for number in shown:
+        kind, size, points, point_colours = drawn[number]
+        _add_marker(
+            stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
+    return stream.message()
+
+
+def colours(sigmas: FloatArray) -> Colours:
+    """Return the colours, shape (M, 4), of constraints with these errors, shape (M,) [sigma]."""
+    return np.column_stack([
+        np.interp(sigmas, LOOK.sigmas, channel) for channel in zip(*LOOK.colours, strict=True)
+    ]).astype(np.float32)
+
+
+def _lines(lines: Lines) -> tuple[FloatArray, Colours]:
+    """Return the ends of lines as points, shape (2 M, 2), and their colours, shape (2 M, 4)."""
+    return lines.ends.reshape(-1, 2), np.repeat(colours(lines.sigmas), 2, axis=0)
+
+
+def _dashed(lines: Lines) -> Lines:
+    """Return the dashes of lines as lines."""
+    at = np.linspace(0.0, 1.0, 2 * LOOK.dashes)[:, None]
+    begin, end = lines.ends[:, 0, None], lines.ends[:, 1, None]
+    points = begin + at * (end - begin)
+    return Lines(points.reshape(-1, 2, 2), np.repeat(lines.sigmas, LOOK.dashes))
+
+
+def _plain(
+    points: FloatArray, colour: tuple[float, ...],
+) -> tuple[FloatArray, Colours]:
+    """Return points, shape (..., 2), as one array, and the same colour for each of them."""
+    points = points.reshape(-1, 2)
+    return points, np.tile(np.array(colour, dtype=np.float32), (len(points), 1))
+
+
+def _add_marker(  # noqa: PLR0917  fields of a marker
+    stream: CdrStream, header: tuple[int, int, str], namespace: str, what: tuple[int, int, int],
+    size: float, points: FloatArray, point_colours: Colours,
+) -> None:
+    """Add a visualization_msgs/Marker field by field."""
+    def add_header() -> None:
+        stream.add('<i4', header[0])
+        stream.add('<u4', header[1])
+        stream.add_text(header[2])
+
+    add_header()
+    stream.add_text(namespace)
+    stream.add('<i4', *what)
+    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)    # pose
+    stream.add('<f8', size, size, 0.0)                      # scale: lines use the first
+    stream.add('<f4', *LOOK.node)                         # of points without their own
+    stream.add('<i4', 0, 0)                                 # lifetime: forever
+    stream.add('u1', 0)                                     # frame_locked
+    stream.add('<u4', len(points))
+    if len(points) > 0:
+        stream.add('<f8', np.pad(points, ((0, 0), (0, 1))))
+    stream.add('<u4', len(point_colours))
+    stream.add('<f4', point_colours)
+    stream.add_text('')         # texture_resource
+    add_header()                # texture
+    stream.add_text('')
+    stream.add('<u4', 0, 0)     # its data, and uv_coordinates
+    for _ in range(3):
+        stream.add_text('')     # text, mesh_resource and the name of mesh_file
+    stream.add('<u4', 0)
+    stream.add('u1', 0)         # mesh_use_embedded_materials

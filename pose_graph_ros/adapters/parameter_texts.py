@@ -4,16 +4,14 @@
 
 from collections.abc import Collection, Iterator
 
-from pose_graph_ros.adapters.parameters import (
+from pose_graph_ros.adapters.parameter_table import (
     Change,
-    listed_sources,
     Parameter,
     PARAMETERS,
     SOURCE_PARAMETERS,
-    source_parameters,
-    type_parameter,
     Value,
 )
+from pose_graph_ros.adapters.parameters import listed_sources, source_parameters, type_parameter
 from pose_graph_ros.adapters.sources import Kind
 
 # Examples for lists that are not set by default.

@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sources of measurements by the ROS parameters, and the settings of the engine for them."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 import math
 from typing import Any
 
 from pose_graph_ros.core import config
+from pose_graph_ros.core.config import GyroSource, Integrate, RateNoise
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.gyro_config import GyroSource, Integrate, RateNoise
 
 NANOSECONDS = 1_000_000_000
+# The graph is reset if the clock or the stamps of odometry jump back by more than this [ns].
 CLOCK_JUMP_NS = NANOSECONDS
-"""The graph is reset if the clock or the stamps of odometry jump back by more than this [ns]."""
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
@@ -79,11 +79,9 @@ class Source:
     kind: Kind
     topic: str  # topic to which the node subscribes
     time_offset_ns: int = 0  # added to the stamps of its messages [ns]
-    lever_arm: tuple[float, ...] = (0.0, 0.0)
-    """Antenna of fixes in the frame of the robot (x, y) [m]; zero if not given."""
+    lever_arm: tuple[float, ...] = (0.0, 0.0)  # antenna of fixes on the robot [m]; 0: not given
     yaw_offset: float = 0.0  # added to the yaw of an IMU [rad]
-    mounting: str = 'tf'
-    """How a gyroscope is mounted: `tf` (by /tf_static), or its z axis points `up` or `down`."""
+    mounting: str = 'tf'  # of a gyroscope: by /tf_static, or its z axis points `up` or `down`
     integrates_twist: bool = False  # whether the motion of odometry is that of its twists
 
 
@@ -114,8 +112,6 @@ DEFAULTS = {
     Kind.GLOBAL_POSE: config.POSITIONS, Kind.FIX: config.POSITIONS, Kind.IMU: config.HEADINGS,
     Kind.LOOP_CLOSURE: config.LOOP_CLOSURES}
 """Settings of the sources of measurements, but for those that have parameters."""
-TUKEY_THRESHOLD = 5.0
-"""Threshold of Tukey's loss, for 95 % of the accuracy of least squares [sigma]."""
 
 
 def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
@@ -144,31 +140,33 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         raise ConfigError('parameter sources: expected at least one of type odometry or '
                           f'twist, got {values["sources"]}')
     return config.BackendConfig(
-        nodes=config.NodePolicy(
-            minimum_travel_distance=values['minimum_travel_distance'],
-            minimum_travel_heading=values['minimum_travel_heading']),
+        nodes=config.NodePolicy(**_same(values, config.NodePolicy)),
         odometry=odometry, measurements=measurements, gyros=gyros,
         window=config.WindowConfig(
             seconds=values['window.seconds'], metres=values['window.metres'],
-            nodes=math.ceil(values['window.nodes']), prior=config.Prior(values['window.prior'])),
+            nodes=math.ceil(values['window.nodes']),
+            prior=config.WindowPrior(values['window.prior'])),
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
 def _odometry_source(own: Mapping[str, Any], source: Source) -> config.OdometrySource:
     return config.OdometrySource(
-        noise=config.OdometryNoise(
-            sigma_distance=own['sigma_distance'], sigma_lateral=own['sigma_lateral'],
-            sigma_heading_distance=own['sigma_heading_distance'],
-            sigma_heading_turn=own['sigma_heading_turn']),
-        noise_from=config.NoiseFrom(own['noise']), covariance_scale=own['covariance_scale'],
+        noise=config.OdometryNoise(**_same(own, config.OdometryNoise)),
+        noise_from=config.NoiseFrom(own['noise']),
         integrate=Integrate.TWIST if source.integrates_twist else Integrate.POSE,
-        sigma_scale=own['sigma_scale'], maximum_speed=own['maximum_speed'])
+        **_same(own, config.OdometrySource, but=('noise', 'integrate')))
 
 
 def _gyro_source(own: Mapping[str, Any]) -> GyroSource:
-    same = ('sigma_rate', 'sigma_bias', 'sigma_bias_walk', 'sigma_turn', 'bias_period',
-            'maximum_gap', 'covariance_scale')
-    return GyroSource(RateNoise(own['noise']), **{name: own[name] for name in same})
+    return GyroSource(RateNoise(own['noise']), **_same(own, GyroSource))
+
+
+def _same(
+    own: Mapping[str, Any], settings: type, but: Collection[str] = (),
+) -> dict[str, Any]:
+    """Return the parameters that are named as the settings that they are."""
+    return {field.name: own[field.name] for field in fields(settings)
+            if field.name in own and field.name not in but}
 
 
 def _measurement_source(
@@ -182,6 +180,6 @@ def _measurement_source(
             position_floor=floors[0], heading_floor=floors[1],
             heading=config.Heading(own.get('heading', 'auto'))),
         robust=config.Robust(own['robust']), loss=loss,
-        rejection_threshold=(TUKEY_THRESHOLD if loss is config.Loss.TUKEY
-                             else default.rejection_threshold),
+        # for Tukey's loss that for 95 % of the accuracy of least squares [sigma]
+        rejection_threshold=(5.0 if loss is config.Loss.TUKEY else default.rejection_threshold),
         correlation_time=own.get('correlation_time', 0.0))

@@ -13,16 +13,13 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
+from pose_graph_ros.core.config import CLOSURE_FLOORS
 
-ON_EARTH = ('geojson', 'kml', 'gpx')
-"""Formats of a path whose positions are latitudes and longitudes."""
-FORMATS = ('kitti', 'csv', *ON_EARTH)
-"""Formats of a path by name, which is also the ending of the file."""
+ON_EARTH = ('geojson', 'kml', 'gpx')  # whose positions are latitudes and longitudes
+FORMATS = ('kitti', 'csv', *ON_EARTH)  # of a path, also the endings of files
 EDGE2_ORDERS = ('toro', 'isam')
 STARTS = ('chordal', 'file', 'odometry', 'best')
-METHODS = ('selection', 'gnc', 'gnc-gm')
-"""Ways to decide which closures to believe; the first one is the default."""
+METHODS = ('selection', 'gnc', 'gnc-gm')  # to decide which closures to believe
 VIEWS = ('pose-graph', 'factor-graph', 'mrf', 'dbn')
 PICTURES = ('.svg', '.png', '.dot')
 LANDMARKS = 'landmarks'
@@ -32,8 +29,7 @@ class Exports(NamedTuple):
     """Formats that were asked for."""
 
     formats: tuple[str, ...] = ()
-    strict: bool = True
-    """Whether it is an error if one of them cannot be written."""
+    strict: bool = True  # whether it is an error if one of them cannot be written
 
     @property
     def on_earth(self) -> str:
@@ -354,15 +350,7 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
 def number(
     least: float = -math.inf, most: float = math.inf, *, whole: bool = False,
 ) -> Callable[[str], Any]:
-    """
-    Return what reads a finite number, and raises ArgumentTypeError if it cannot.
-
-    Parameters
-    ----------
-    least, most : float, smallest and largest number that is accepted
-    whole : bool, whether it must be an integer
-
-    """
+    """Return what reads a finite number, and raises ArgumentTypeError if it cannot."""
     kind = 'a whole number' if whole else 'a number'
     expected = kind if least == -math.inf else f'{kind} of at least {least:g}'
     expected += '' if most == math.inf else f' and at most {most:g}'

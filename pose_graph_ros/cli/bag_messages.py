@@ -10,8 +10,9 @@ import numpy as np
 
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.conversions import PLANAR
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariance, FloatArray, IntArray, Poses
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.quantities import Metres, StampsNs
 from pose_graph_ros.offline.simulation.sensors import velocities
 
 Message = tuple[str, str, int, Any]
@@ -26,14 +27,7 @@ _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 def write_bag(
     folder: str | Path, messages: Iterable[Message], *, overwrite: bool = False,
 ) -> None:
-    """
-    Write messages as a rosbag2, in the order of their stamps.
-
-    Parameters
-    ----------
-    overwrite : bool, whether to replace an existing bag; otherwise one raises `BagError`
-
-    """
+    """Write messages as a rosbag2, in the order of their stamps."""
     with BagWriter(folder, overwrite=overwrite) as bag:
         for topic, type_name, stamp, message in sorted(messages, key=lambda item: item[2]):
             bag.write(topic, type_name, stamp, message)
@@ -44,25 +38,18 @@ def odometry_messages(
     rates: FloatArray | None = None,
 ) -> Iterator[Message]:
     """
-    Return nav_msgs/Odometry messages.
+    Return nav_msgs/Odometry messages of poses of base_link in a frame.
 
-    Parameters
-    ----------
-    path : Trajectory, poses of base_link in the frame
-    variances : sequence of float, length 6
-        Of the pose and of the twist.
-    rates : ndarray, shape (N, 3), optional
-        Velocities in base_link [m/s, m/s, rad/s]; by default those between consecutive poses.
-
+    The six variances are those of the pose and of the twist. Rates are velocities in base_link,
+    shape (N, 3) [m/s, m/s, rad/s]; by default those between consecutive poses.
     """
     pose_with_covariance, twist_with_covariance, make_twist, vector = (
         _TYPES[f'geometry_msgs/msg/{key}']
         for key in ('PoseWithCovariance', 'TwistWithCovariance', 'Twist', 'Vector3'))
     covariance = np.diag(variances).ravel()
-    stamps, poses = path.stamps_ns, path.poses
     rates = velocities(path) if rates is None else rates
     for stamp, pose, (vx, _, yaw_rate) in zip(
-            stamps.tolist(), poses.tolist(), rates.tolist(), strict=True):
+            path.stamps_ns.tolist(), path.poses.tolist(), rates.tolist(), strict=True):
         twist = make_twist(vector(vx, 0.0, 0.0), vector(0.0, 0.0, yaw_rate))
         yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
             _header(stamp, frame), 'base_link', pose_with_covariance(_pose(pose), covariance),
@@ -70,19 +57,12 @@ def odometry_messages(
 
 
 def fix_messages(
-    topic: str, stamps_ns: IntArray, geodetic: FloatArray, sigma: float,
+    topic: str, stamps_ns: StampsNs, geodetic: FloatArray, sigma: Metres,
 ) -> Iterator[Message]:
     """
-    Return sensor_msgs/NavSatFix messages.
+    Return sensor_msgs/NavSatFix messages, of rows of latitude, longitude [deg] and height [m].
 
-    Parameters
-    ----------
-    stamps_ns : ndarray, shape (M,)
-    geodetic : ndarray, shape (M, 3)
-        Latitude, longitude and ellipsoidal height [deg, deg, m].
-    sigma : float
-        Standard deviation along each of east and north [m]; that of the height is twice as large.
-
+    Sigma is that of east and of north; that of the height is twice as large.
     """
     status = _TYPES['sensor_msgs/msg/NavSatStatus']
     covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
@@ -93,19 +73,9 @@ def fix_messages(
 
 
 def rate_messages(
-    topic: str, stamps_ns: IntArray, rates: FloatArray, sigma: float,
+    topic: str, stamps_ns: StampsNs, rates: FloatArray, sigma: float,
 ) -> Iterator[Message]:
-    """
-    Return sensor_msgs/Imu messages of a gyroscope alone, in base_link.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray, shape (M,)
-    rates : ndarray, shape (M,)
-        Yaw rates [rad/s].
-    sigma : float, standard deviation of each rate [rad/s]
-
-    """
+    """Return sensor_msgs/Imu messages of yaw rates in base_link [rad/s], and nothing else."""
     vector, quaternion = (
         _TYPES[f'geometry_msgs/msg/{key}'] for key in ('Vector3', 'Quaternion'))
     none, covariance = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
@@ -116,55 +86,34 @@ def rate_messages(
 
 
 def loop_closure_messages(
-    topic: str, stamps_ns: IntArray, poses: FloatArray, covariance: FloatArray,
+    topic: str, stamps_ns: IntArray, poses: Poses, covariance: Covariance,
 ) -> Iterator[Message]:
     """
     Return loop closures as geometry_msgs/PoseWithCovarianceStamped messages.
 
-    Parameters
-    ----------
-    stamps_ns : ndarray, shape (L, 2)
-        Stamps of the earlier and of the later pose [ns].
-    poses : ndarray, shape (L, 3)
-        Later pose of the robot in the frame of the earlier one [m, m, rad].
-    covariance : ndarray, shape (3, 3)
-        Of each of the poses.
-
+    Rows of stamps are those of the earlier and of the later pose; poses are the later ones in the
+    frames of the earlier, each with the same covariance.
     """
-    pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
-    full = _spatial(covariance)
-    for (old, new), pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
-        yield topic, _POSE, new, _TYPES[_POSE](
-            _header(new, f'@{old // 10**9}.{old % 10**9:09d}'),
-            pose_with_covariance(_pose(pose), full))
+    frames = [f'@{old // 10**9}.{old % 10**9:09d}' for old in stamps_ns[:, 0].tolist()]
+    return _poses(topic, stamps_ns[:, 1], frames, poses, covariance)
 
 
 def pose_messages(
-    topic: str, stamps_ns: IntArray, poses: FloatArray, covariance: FloatArray,
+    topic: str, stamps_ns: StampsNs, poses: Poses, covariance: Covariance,
 ) -> Iterator[Message]:
-    """
-    Return poses in the map as geometry_msgs/PoseWithCovarianceStamped messages.
+    """Return poses in the map with one covariance, as PoseWithCovarianceStamped messages."""
+    return _poses(topic, stamps_ns, ['map'] * len(poses), poses, covariance)
 
-    Parameters
-    ----------
-    stamps_ns : ndarray, shape (M,)
-    poses : ndarray, shape (M, 3) [m, m, rad]
-    covariance : ndarray, shape (3, 3)
-        Of each of the poses, in map axes.
 
-    """
+def _poses(
+    topic: str, stamps_ns: StampsNs, frames: Sequence[str], poses: Poses, covariance: Covariance,
+) -> Iterator[Message]:
     pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
-    full = _spatial(covariance)
-    for stamp, pose in zip(stamps_ns.tolist(), poses.tolist(), strict=True):
+    spatial = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
+    spatial[PLANAR] = covariance
+    for stamp, frame, pose in zip(stamps_ns.tolist(), frames, poses.tolist(), strict=True):
         yield topic, _POSE, stamp, _TYPES[_POSE](
-            _header(stamp, 'map'), pose_with_covariance(_pose(pose), full))
-
-
-def _spatial(covariance: FloatArray) -> FloatArray:
-    """Return a planar covariance, shape (3, 3), in the order of messages, shape (36,)."""
-    full = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
-    full[PLANAR] = covariance
-    return full.ravel()
+            _header(stamp, frame), pose_with_covariance(_pose(pose), spatial.ravel()))
 
 
 def _header(stamp_ns: int, frame: str) -> Any:

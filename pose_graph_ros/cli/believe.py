@@ -2,57 +2,50 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which loop closures of a graph from a file to believe; part of the tool `pose-graph solve`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import sys
+from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.cli.solve_starts import Problem
-from pose_graph_ros.core.batch import gnc
 from pose_graph_ros.core.batch.optimizer import (
     optimize,
     optimize_from_linear_start,
     SAME_MINIMUM,
     Status,
 )
-from pose_graph_ros.core.batch.truncated import Choice, CONFIG, TruncatedProblem
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.batch.truncated import Choice, CONFIG, Surrogate, TruncatedProblem
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement import selection
-from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
+from pose_graph_ros.core.judgement import final
+from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward
 from pose_graph_ros.core.judgement.residual_scale import give_scale
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import short
-from pose_graph_ros.core.solver_config import SolverConfig
 
-# Ways to decide: the lowest truncated cost of several sets, or graduated non-convexity alone.
-SURROGATES = {'gnc': gnc.Surrogate.TRUNCATED, 'gnc-gm': gnc.Surrogate.GEMAN_MCCLURE}
-# Number of sets of closures that are tried to join parts that no odometry joins.
-TRIES = 5
-N_LARGEST = 5  # number of edges that are named
+TRIES = 5  # sets of closures that are tried to join parts that no odometry joins
 
 
 @dataclass(frozen=True, slots=True)
 class BelievedEdges:
     """Which edges of a graph are believed."""
 
-    closures: IntArray
-    """Rows of all edges that may be doubted, shape (M,)."""
-    believed: BoolArray
-    """Shape (M,)."""
-    n_parts: int
-    """Number of parts that odometry does not join."""
-    poses: FloatArray
-    """Of all nodes, shape (N, 3) [m, m, rad]."""
-    scale: float
-    """Factor on the sigmas of closures that those believed show, at least 1."""
-    cost: float
-    """Truncated cost of the poses, with the sigmas of the file times `scale`."""
-    cost_of_all: float | None
-    """The same at the minimum of chi2 with all closures, if it was computed."""
+    closures: IntArray  # rows of all edges that may be doubted, (M,)
+    believed: BoolArray  # (M,)
+    n_parts: int  # that odometry does not join
+    poses: Poses  # of all nodes
+    scale: float  # on the sigmas of closures that those believed show, at least 1
+    cost: float  # truncated one of the poses, with the sigmas of the file times `scale`
+    cost_of_all: float | None  # likewise at the minimum of chi2 with all closures, if computed
 
 
 def believe(
@@ -64,14 +57,6 @@ def believe(
     Edges between neighbouring poses are odometry, which is believed. Where odometry does not join
     all poses, some closures are taken as known that do; several such sets are tried. The truncated
     cost is never above that of the minimum with all closures, or of the given poses.
-
-    Parameters
-    ----------
-    graph : Graph, it is not changed
-    sigmas : ndarray, shape (3,), least sigmas of closures for the decision [m, m, rad]
-    method : str, one of `METHODS`
-    given : bool, whether the poses of the graph mean anything
-
     """
     edges = forward(graph.edges)
     place = np.cumsum(graph.is_pose)
@@ -83,14 +68,15 @@ def believe(
     softened = replace(edges, information=np.where(
         is_closure[:, None, None], floored(edges, sigmas).information, edges.information))
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))
-    parts = _Parts(graph.n_nodes)
-    parts.join(edges.rows(is_motion & ~is_closure))
-    parts.count -= int(np.sum(~graph.is_pose))
-    n_parts, best, rows, lowered = parts.count, None, closures, 1.0
+    odometry = edges.rows(is_motion & ~is_closure)
+    n_parts, part = connected_components(coo_array(
+        (np.ones(len(odometry)), (odometry.i, odometry.j)), (graph.n_nodes, graph.n_nodes)))
+    n_parts -= int(np.sum(~graph.is_pose))
+    best, rows, lowered = None, closures, 1.0
     for k in range(TRIES if n_parts > 1 else 1):
-        known = _joining(edges, closures, parts.copy(), k)
+        known = _joining(edges, closures, part.astype(np.int64), k)
         problem = _from_odometry(graph, softened, closures[~np.isin(closures, known)])
-        choice = None if problem is None else _choice(problem, method)
+        choice = None if problem is None else SELECTIONS[method](problem)
         if problem is not None and choice is not None and (
                 best is None or choice.cost < best.cost):
             best, rows, lowered = choice, problem.rows, problem.lowered()
@@ -153,7 +139,7 @@ def _minimum_of_all(graph: Graph, edges: Edges, closures: IntArray) -> FloatArra
     """
     copy = _filled(graph, edges)
     problem = TruncatedProblem(copy, closures, graph.poses.copy())
-    if (problem.factorisation(np.ones(len(closures))) > selection.MOST_NUMBERS * graph.n_nodes
+    if (problem.factorisation(np.ones(len(closures))) > BELIEF.most_numbers * graph.n_nodes
             or optimize_from_linear_start(copy, CONFIG).status is Status.FAILED):
         return None
     return copy.poses.copy()
@@ -168,85 +154,47 @@ def _from_odometry(graph: Graph, edges: Edges, closures: IntArray) -> TruncatedP
     return TruncatedProblem(copy, closures, start=copy.poses.copy())
 
 
-def _choice(problem: TruncatedProblem, method: str) -> Choice | None:
-    if method in SURROGATES:
-        return gnc.select(problem, SURROGATES[method], patient=True)
-    return selection.best(problem)
+SELECTIONS: dict[str, Callable[[TruncatedProblem], Choice | None]] = {
+    'selection': final.best,
+    'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED, patient=True),
+    'gnc-gm': partial(
+        TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE, patient=True)}
+"""The lowest truncated cost of several sets, or graduated non-convexity alone."""
 
 
-class _Parts:
-    """The parts of a graph that edges join."""
-
-    def __init__(self, n_nodes: int) -> None:
-        self._parent = list(range(n_nodes))
-        self.count = n_nodes
-
-    def copy(self) -> '_Parts':
-        other = _Parts(0)
-        other._parent, other.count = self._parent.copy(), self.count
-        return other
-
-    def join(self, edges: Edges) -> BoolArray:
-        """Return for each edge whether it has joined two parts."""
-        joined = np.zeros(len(edges), dtype=bool)
-        for k, (i, j) in enumerate(zip(edges.i.tolist(), edges.j.tolist(), strict=True)):
-            a, b = self._root(i), self._root(j)
-            if a != b:
-                self._parent[max(a, b)] = min(a, b)
-                self.count -= 1
-                joined[k] = True
-        return joined
-
-    def _root(self, node: int) -> int:
-        parent = self._parent
-        while parent[node] != node:
-            parent[node] = node = parent[parent[node]]
-        return node
-
-
-def _joining(edges: Edges, closures: IntArray, parts: _Parts, number: int) -> IntArray:
+def _joining(edges: Edges, closures: IntArray, part: IntArray, number: int) -> IntArray:
     """Return closures that join all parts that can be joined, the most accurate ones first."""
     table = edges.rows(closures)
     order = np.lexsort((table.j, table.i, -np.linalg.det(table.information)))
     order = np.roll(order, -(number * len(order)) // TRIES)
-    return closures[order[parts.join(table.rows(order))]]
+    ends = np.sort(np.column_stack((part[table.i], part[table.j]))[order], axis=1)
+    # of several between the same parts the first
+    pairs, first = np.unique(ends, axis=0, return_index=True)
+    apart = pairs[:, 0] != pairs[:, 1]
+    size = len(part)
+    tree = minimum_spanning_tree(coo_array(
+        (first[apart] + 1.0, tuple(pairs[apart].T)), (size, size)).tocsr())
+    return closures[order[np.sort(tree.data).astype(np.int64) - 1]]
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """What was decided, and lines about it for people."""
-
-    method: str
-    doubted: IntArray
-    """Rows of the edges that are left out."""
-    n_closures: int
-    scale: float
-    """Factor on the sigmas of the closures that are believed."""
-    cost: float | None
-    """Truncated cost; None if there was no decision."""
-    cost_of_all: float | None
-    """The same with all closures, if it was computed."""
-    lines: tuple[str, ...]
-
-
-def doubt(problem: Problem, method: str, sigma: Sequence[float]) -> Doubt:
+def doubt(
+    problem: Problem, method: str, sigma: Sequence[float],
+) -> tuple[IntArray, dict[str, Any], list[str]]:
     """
-    Return which closures are not believed, after giving them the weight 0.
+    Return rows of closures that are not believed, after giving them the weight 0.
 
-    Parameters
-    ----------
-    problem : Problem
-    method : str, one of `believe.METHODS`
-    sigma : sequence of float, least sigmas of closures for the decision [m, rad]
-
+    With them come what JSON says of the decision, and lines for people. `sigma` has the least
+    sigmas of closures for the decision [m, rad]. Without a decision its truncated cost is None.
     """
     graph, ids = problem.engine, problem.ids
     beliefs = believe(graph, np.array([sigma[0], sigma[0], sigma[1]]), method,
                       given=problem.has_start)
+    decision = {'method': method, 'closures': 0, 'doubted': 0, 'scale': 1.0,
+                'truncated_cost': None, 'truncated_cost_of_all': None}
     if beliefs is None:
         print('warning: there is no set of loop closures with a solution; all are believed',
               file=sys.stderr)
-        return Doubt(method, np.empty(0, np.int64), 0, 1.0, None, None, ())
+        return np.empty(0, np.int64), decision, []
     lines = []
     if beliefs.n_parts > 1:
         lines.append(f'odometry, edges between neighbouring poses, leaves '
@@ -267,13 +215,14 @@ def doubt(problem: Problem, method: str, sigma: Sequence[float]) -> Doubt:
     edges = graph.edges_at(doubted)
     errors = graph.edge_errors(edges)
     squares = energies_of(errors, edges.information)
-    for k in np.argsort(-squares, kind='stable')[:N_LARGEST]:
+    for k in np.argsort(-squares, kind='stable')[:5]:
         x, y, theta = errors[k]
         lines.append(f'  doubted edge {ids[edges.i[k]]} -> {ids[edges.j[k]]}: '
                      f'{short(np.hypot(x, y), 3)} m and {short(abs(theta), 3)} rad off, '
                      f'{short(np.sqrt(squares[k]), 3)} sigma')
-    if len(doubted) > N_LARGEST:
-        lines.append(f'  and {len(doubted) - N_LARGEST} more; a file written with --out has them '
-                     f'all as comments')
-    return Doubt(method, doubted, len(beliefs.closures), beliefs.scale, beliefs.cost,
-                 beliefs.cost_of_all, tuple(lines))
+    if len(doubted) > 5:
+        lines.append(f'  and {len(doubted) - 5} more; a file written with --out has them all as '
+                     'comments')
+    return doubted, decision | {
+        'closures': len(beliefs.closures), 'doubted': len(doubted), 'scale': beliefs.scale,
+        'truncated_cost': beliefs.cost, 'truncated_cost_of_all': beliefs.cost_of_all}, lines

@@ -1,11 +1,19 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Play a bag to the node over DDS, and write the corrected path and a picture."""
+"""
+Play a bag to the node over DDS, and write the corrected path, a picture and what a report needs.
+
+That comes from the graph that the node saved, whose engine is restored, and from what it
+published. Times of updates are in the recorded diagnostics: each message has the number of updates
+and their mean and longest time since the start. The stamp of an update is that of the newest
+odometry that the node had published before.
+"""
 
 import argparse
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, ExitStack
+from dataclasses import replace
 import fcntl
 from importlib.util import find_spec
 import os
@@ -22,24 +30,23 @@ import numpy as np
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
-from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.adapters.verdict_messages import states_in
-from pose_graph_ros.cli import options as shared
-from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
-from pose_graph_ros.cli.run.document import document, write_document
-from pose_graph_ros.cli.run.from_node import GRAPH, node_run, RECORDED, restored
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns, states_in
+from pose_graph_ros.adapters.sources import backend_config, ODOMETRY_KINDS, source_list
+from pose_graph_ros.cli import shared
+from pose_graph_ros.cli.drive import collect_drive, Drive, with_refused, write_results
+from pose_graph_ros.cli.run.document import write_document
+from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.io.graph_files import read_graph
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
-SIMULATED_TRUTH = '/ground_truth'
-VERDICTS = '/pose_graph/verdicts'  # topic of the node in the recorded bag
-# Short periods [s]: the player reads from the diagnostics which messages the node has processed.
-DEMO_PARAMETERS = ('-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5')
-# Time for a process to end after SIGINT, and period of checking on the processes [s].
-STOP_TIMEOUT, POLL_PERIOD = 15.0, 0.1
+GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
+DIAGNOSTICS, ODOMETRY = '/diagnostics', '/odometry/filtered'
 NOT_CONVERGED = 3  # exit code of the player, whose module cannot be imported without ROS
 
 
@@ -65,28 +72,99 @@ def execute(options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
     converged = _run(bag_path, inputs, values, options)
     seconds = time.monotonic() - start
-    path = _last(options.out / RECORDED, '/path')
+    recorded = options.out / RECORDED
+    path = _last(recorded, '/path')
     poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
     corrected = Trajectory(np.array(list(poses), dtype=np.int64),
                            np.array([pose for pose in poses.values() if pose is not None]))
-    diagnostics = _last(options.out / RECORDED, '/diagnostics').status[0]
-    verdicts = _last(options.out / RECORDED, VERDICTS)
-    engine = restored(options.out, values)
+    diagnostics = _last(recorded, DIAGNOSTICS).status[0]
+    verdicts = _last(recorded, '/pose_graph/verdicts')
+    backend = PoseGraphBackend.restored(
+        backend_config(values), saved := read_graph(options.out / GRAPH))
+    backend.update()
     with open_bag(bag_path) as bag:
         drive = with_refused(collect_drive(
             bag, inputs, values, corrected, truth,
-            states={} if verdicts is None else states_in(verdicts)), engine[0])
+            states={} if verdicts is None else states_in(verdicts)), backend)
     table = write_results(drive, options.out, title, {
         'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
         'seconds': seconds, 'node': {item.key: item.value for item in diagnostics.values}})
-    run = node_run(title, drive, options.out, (inputs, values), engine, converged=converged,
-                   seconds=seconds)
-    write_document(document(run), options.out)
+    estimate = backend.estimate()
+    assert estimate is not None, 'a saved graph has a hidden node'
+    # chi2 of the node has robust costs, that of an update does not
+    estimate = replace(estimate, chi2=saved.chi2)
+    recorder = _arrivals(drive, inputs)
+    counts = _counts(_updates(recorded, recorder, estimate.stamp_ns), inputs)
+    write_document(Run(
+        title, 'the node over DDS', replace(drive, corrected=estimate.path), backend, estimate,
+        backend.verdicts(), recorder, values, inputs.kinds, counts,
+        None if converged else UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, estimate.chi2),
+        saved.datum, seconds, _not_added(drive, backend)), options.out)
     print(f'\n{table}\n')
     print(f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json, '
           f'{GRAPH}, run.json')
     print(f'a page of it: pose-graph report {options.out}')
     return 0 if converged else 1
+
+
+def _arrivals(drive: Drive, inputs: Inputs) -> Recorder:
+    """Return when the measurements were made that the node has got."""
+    recorder = Recorder()
+    for source in inputs.of(*ODOMETRY_KINDS)[:1]:
+        for stamp in drive.odometry.stamps_ns.tolist():
+            recorder.add_measurement(source, stamp)
+    for source, stamp, out in zip(drive.fix_sources, drive.fix_stamps_ns.tolist(),
+                                  drive.fix_held_out.tolist(), strict=True):
+        if not out:
+            recorder.add_measurement(source, stamp)
+    return recorder
+
+
+def _not_added(drive: Drive, backend: PoseGraphBackend) -> dict[tuple[str, int, int | None], str]:
+    """Return why the graph does not have some loop closures, by source and stamps."""
+    known = {(each.source, each.stamp_ns, each.reference_ns) for each in backend.verdicts()}
+    keys = [(source, later, earlier) for source, (earlier, later) in zip(
+        drive.loop_sources, drive.loop_stamps_ns.tolist(), strict=True)]
+    return dict.fromkeys(
+        (key for key in keys if key not in known),
+        'Refused: the node has not added it; its reasons are among the counts.')
+
+
+def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, str]:
+    """Record the updates before the last stamp; return the newest values of the diagnostics."""
+    newest_ns, before, values = 0, (0, 0.0, 0.0), dict[str, str]()
+    with open_bag(recorded) as bag:
+        topics = [topic for topic in (DIAGNOSTICS, ODOMETRY) if topic in bag.topics]
+        for message in bag.messages(topics):
+            content = message.decode()
+            if message.topic == ODOMETRY:
+                newest_ns = stamp_ns(content)
+                continue
+            values = {item.key: item.value for item in content.status[0].values}
+            count = int(values.get('updates', 0))
+            total = count * float(values.get('solve_mean_ms', 0.0))
+            longest = float(values.get('solve_max_ms', 0.0))
+            # of the last one, the final optimisation has a part
+            if before[0] < count and 0 < newest_ns < last_ns and 'chi2' in values:
+                mean = (total - before[1]) / (count - before[0])
+                recorder.log.add(Update(
+                    newest_ns, int(values['hidden_nodes']),
+                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2']), -1))
+                recorder.log.count += count - before[0] - 1
+                before = count, total, longest
+    return values
+
+
+def _counts(values: Mapping[str, str], inputs: Inputs) -> dict[tuple[str, str], int]:
+    """Return the counts of messages by source and answer that the diagnostics have."""
+    others = ('believed', 'believed_weakly', 'doubted', 'waiting', 'scale', 'forgotten', 'left',
+              'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
+    counts: dict[tuple[str, str], int] = {}
+    for key, value in values.items():
+        source, _, answer = key.rpartition('.')
+        if source in inputs.topics and answer not in others and value.isdecimal():
+            counts[source, answer] = int(value)
+    return counts
 
 
 def _bag(
@@ -100,7 +178,7 @@ def _bag(
     write_drive(simulate_drive(options.seed), path, overwrite=True)
     wanted = {source: topic or SIMULATED_TOPICS.get(source)
               for source, topic in shared.wanted_topics(options).items()}
-    return path, wanted, options.truth or SIMULATED_TRUTH, 'Simulated drive'
+    return path, wanted, options.truth or '/ground_truth', 'Simulated drive'
 
 
 def _run(
@@ -108,7 +186,9 @@ def _run(
 ) -> bool:
     """Tell whether the optimisation converged after playing the bag to the node."""
     node_command = [sys.executable, '-m', 'pose_graph_ros.ros.main',
-                    *shared.ros_arguments(options), *DEMO_PARAMETERS]
+                    *shared.ros_arguments(options),
+                    # the player reads from the diagnostics which messages the node has processed
+                    '-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5']
     if find_spec('tf2_msgs') is None:  # make demo does not build it for the simulated drive
         node_command += ['-p', 'publish_tf:=false']
     player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
@@ -124,7 +204,7 @@ def _run(
             while processes[1].poll() is None:
                 if node.poll() is not None:
                     raise DemoError(f'the node ended early, with code {node.returncode}')
-                time.sleep(POLL_PERIOD)
+                time.sleep(0.1)
         finally:
             codes = [_stop(process) for process in reversed(processes)]
         if codes[-1] != 0:
@@ -181,7 +261,7 @@ def _stop(node: 'subprocess.Popen[bytes]') -> int:
     """Stop a process by SIGINT, as Ctrl-C does; return its exit code."""
     node.send_signal(signal.SIGINT)  # nothing happens if it has ended
     try:
-        return node.wait(STOP_TIMEOUT)
+        return node.wait(15.0)
     except subprocess.TimeoutExpired:
         node.kill()
         return node.wait()

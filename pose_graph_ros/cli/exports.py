@@ -1,20 +1,46 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Write the corrected path in the formats that other programs read."""
+"""
+Write a replay for other programs: path and live poses in their formats, and a corrected bag.
 
-from collections.abc import Callable, Iterator
+The bag is a copy with the path, odometry in the map, and the transform to odom.
+"""
+
+import bisect
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
+from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
+from pose_graph_ros.adapters.bags import Bag, BagMessage, MessageError, Span
+from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.fixes import Datum
+from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.output_cdr import (
+    odometry_cdr,
+    path_cdr,
+    transform_cdr,
+    UNKNOWN_VARIANCE,
+)
+from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.estimate import Estimate, predict, Prediction
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.geometry.se2 import (
+    between_one,
+    compose_one,
+    Covariances,
+    FloatArray,
+    Pose,
+)
+from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection, Trajectory
 from pose_graph_ros.core.io.path_files import (
     csv_lines,
     geojson_lines,
@@ -23,9 +49,16 @@ from pose_graph_ros.core.io.path_files import (
     kml_lines,
 )
 from pose_graph_ros.core.measurements import Measurement, OdometrySample
-from pose_graph_ros.core.prediction import predict
 
 LINES = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
+PATH, ODOMETRY, TF = '/path', '/odometry/filtered', '/tf'
+"""Topics that are written, as those of the node."""
+TYPES = {PATH: 'nav_msgs/msg/Path', ODOMETRY: 'nav_msgs/msg/Odometry',
+         TF: 'tf2_msgs/msg/TFMessage'}
+MESSAGES = message_types()
+LATCHED = (PATH,)
+UNKNOWN = UNKNOWN_VARIANCE * np.eye(3)
+MOST_POSES = 100_000  # of a path in a message; of more only every second is written, or fewer
 
 
 class ExportError(PoseGraphError, ValueError):
@@ -48,17 +81,8 @@ def write_exports(
     """
     Return the files that were written into a folder, `path.kitti` and so on.
 
-    Parameters
-    ----------
-    title : str, name of the track
-    estimate : Estimate, the present one of the back end, with the path
-    datum : Datum, optional, of the map
-
-    Raises
-    ------
-    ExportError
-        If a format needs a place on the Earth, which is unknown, after all others are written.
-
+    Raises `ExportError` if a format needs a place on the Earth, which is unknown, after all others
+    are written.
     """
     written = []
     # before the first measurement in the map, its place on the Earth is unknown
@@ -105,12 +129,7 @@ class LivePoses:
     Poses at the messages of odometry, each by the newest estimate that there was by then.
 
     As in the node, odometry goes on from the estimate of the last update, and the graph is updated
-    as often; but each update is ready at once.
-
-    Parameters
-    ----------
-    frequency : float, of updates [Hz], by the stamps of odometry
-
+    as often, by the stamps of odometry; but each update is ready at once.
     """
 
     def __init__(self, frequency: float) -> None:
@@ -122,14 +141,7 @@ class LivePoses:
         self._covariances: list[FloatArray] = []
 
     def is_due(self, sample: OdometrySample | Measurement, n_nodes: int) -> bool:
-        """
-        Return whether the graph is to be updated with a measurement.
-
-        Parameters
-        ----------
-        n_nodes : int, hidden nodes
-
-        """
+        """Return whether the graph is to be updated with a measurement."""
         return (isinstance(sample, OdometrySample) and n_nodes > 0
                 and sample.stamp_ns >= self._next_ns)
 
@@ -140,14 +152,7 @@ class LivePoses:
             self._next_ns = self._estimate.stamp_ns + self._period_ns
 
     def add(self, sample: OdometrySample | Measurement, source: str) -> None:
-        """
-        Add the pose at a sample of the primary odometry, unless it is late.
-
-        Parameters
-        ----------
-        source : str
-
-        """
+        """Add the pose at a sample of the primary odometry, unless it is late."""
         estimate = self._estimate
         if not isinstance(sample, OdometrySample) or estimate is None or (
                 estimate.primary != source or sample.stamp_ns <= self._newest_ns):
@@ -163,3 +168,129 @@ class LivePoses:
         return csv_lines(Trajectory(np.array(self._stamps, dtype=np.int64),
                                     np.array(self._poses).reshape(-1, 3)),
                          np.array(self._covariances).reshape(-1, 3, 3))
+
+
+class Copied(NamedTuple):
+    """Numbers of messages."""
+
+    original: int  # copied as they are
+    corrected: int  # poses of odometry in the map
+    left_out: int  # others on the topics that are written, or that ROS 1 has alone
+
+
+class _Corrector:
+    """Makes what is published with each message of the primary odometry."""
+
+    def __init__(
+        self, bag: Bag, inputs: Inputs, values: Mapping[str, Any], estimate: Estimate,
+        covariances: Covariances,
+    ) -> None:
+        self._source = estimate.primary
+        self.topic = inputs.topics[self._source]
+        self._has_poses = inputs.kinds[self._source] is Kind.ODOMETRY
+        self.map_frame, self.odom_frame, self._base_frame = (
+            frame(values[key]) for key in ('map_frame', 'odom_frame', 'base_link_frame'))
+        odometry = interpolated(estimate.path, self._samples(
+            bag.messages([self.topic], inputs.span), MessageReader(values)))
+        self._correction = PathCorrection(estimate.path, odometry)
+        self._stamps, self._covariances = estimate.path.stamps_ns.tolist(), covariances
+        self._newest_ns = 0
+        # from the first message on again, as it remembers the stamps before
+        self._reader = reader_of(bag, values)
+
+    def _samples(
+        self, messages: Iterable[BagMessage], reader: MessageReader,
+    ) -> Iterator[tuple[int, Pose]]:
+        """Yield stamps and poses of odometry, if that has poses."""
+        for message in messages if self._has_poses else ():
+            with suppress(MessageError):
+                sample = reader.read(self._source, message.decode())
+                if isinstance(sample, OdometrySample):
+                    yield sample.stamp_ns, _pose(sample)
+
+    def outputs(self, message: BagMessage) -> Iterator[tuple[str, bytes]]:
+        """Yield topics and serialised messages; none outside the path."""
+        try:
+            source = message.decode()
+        except MessageError:
+            return
+        sample = self._reader.read(self._source, source)
+        if not isinstance(sample, OdometrySample):
+            return
+        stamp_ns, odometry = sample.stamp_ns, _pose(sample)
+        pose = self._correction.at(stamp_ns, odometry)
+        if pose is None:
+            return
+        covariance = self._covariances[bisect.bisect_right(self._stamps, stamp_ns) - 1]
+        yield ODOMETRY, odometry_cdr(
+            stamp_ns, Prediction(np.array(pose), UNKNOWN if np.isnan(covariance[0, 0])
+                                 else covariance), source, self.map_frame, self._base_frame)
+        if (self._has_poses and stamp_ns > self._newest_ns
+                and frame(source.header.frame_id) == self.odom_frame):
+            self._newest_ns = stamp_ns
+            yield TF, transform_cdr(
+                stamp_ns, np.array(compose_one(pose, between_one(odometry, (0.0, 0.0, 0.0)))),
+                self.map_frame, self.odom_frame)
+
+
+def write_corrected(
+    writer: BagWriter, bag: Bag, inputs: Inputs, values: Mapping[str, Any], *,
+    estimate: Estimate, covariances: Covariances,
+) -> Copied:
+    """
+    Return the numbers of messages after copying those of the span of the inputs, with the result.
+
+    With each message of the primary odometry comes its pose in the map by the whole recording,
+    and the transform from map to odom if its frame is `odom_frame`. The path comes first, on a
+    `LATCHED` topic. Covariances are those of the path; NaN where unknown.
+    """
+    corrector = _Corrector(bag, inputs, values, estimate, covariances)
+    begin_ns = inputs.span.begin_ns
+    writer.write(
+        PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
+        path_cdr(_thinned(estimate.path), int(estimate.path.stamps_ns[-1]), corrector.map_frame))
+    if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
+        for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
+            writer.copy(replace(message, recorded_ns=begin_ns))
+    original = corrected = left_out = 0
+    for message in bag.messages(list(bag.topics), inputs.span):
+        if _copy(writer, message, corrector):
+            original += 1
+        else:
+            left_out += 1
+        if message.topic == corrector.topic:
+            for topic, data in corrector.outputs(message):
+                writer.write(topic, TYPES[topic], message.recorded_ns, data)
+                corrected += topic == ODOMETRY
+    return Copied(original, corrected, left_out)
+
+
+def _copy(writer: BagWriter, message: BagMessage, ours: _Corrector) -> bool:
+    """Copy a message without what is written anew; return whether anything was left."""
+    if message.topic in (PATH, ODOMETRY):
+        return False
+    try:
+        if message.topic == TF and all(
+                name.encode() in message.raw for name in (ours.map_frame, ours.odom_frame)):
+            transforms = message.decode().transforms
+            kept = [each for each in transforms if (
+                frame(each.header.frame_id), frame(each.child_frame_id)) != (
+                    ours.map_frame, ours.odom_frame)]
+            if len(kept) < len(transforms):
+                if len(kept) > 0:
+                    writer.write(TF, TYPES[TF], message.recorded_ns, MESSAGES[TYPES[TF]](kept))
+                return len(kept) > 0
+        writer.copy(message)
+    except MessageError:
+        return False
+    return True
+
+
+def _pose(sample: OdometrySample) -> Pose:
+    x, y, theta = sample.pose.tolist()
+    return x, y, theta
+
+
+def _thinned(path: Trajectory) -> Trajectory:
+    step = -(-len(path) // MOST_POSES)
+    return Trajectory(path.stamps_ns[::step], path.poses[::step])

@@ -22,13 +22,9 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph_update import GraphRows
-from pose_graph_ros.core.io.edge2_order import Guess, read_guessed
-from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
+from pose_graph_ros.core.io.g2o import GraphFile, Guess, read_g2o, read_guessed
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
-N_TAGS = 10  # number of tags that are warned of
-SAVED = b'{\n"sha256": "'
-"""Begin of the JSON file of a saved graph."""
 GRAPH_SUFFIXES = ('.g2o', '.graph')
 SECOND = 1_000_000_000
 
@@ -60,9 +56,9 @@ def read_file(path: Path, edge2_order: str | None) -> tuple[GraphFile, str | Non
     tags = sorted(file.skipped, key=lambda tag: -file.skipped[tag])
     lines = [f'{file.skipped[tag]} lines {tag!r} are skipped'
              + (': TORO may merge these nodes, which their edges connect anyway'
-                if tag == 'EQUIV' else '') for tag in tags[:N_TAGS]]
-    if len(tags) > N_TAGS:
-        lines.append(f'lines with {len(tags) - N_TAGS} other tags are skipped')
+                if tag == 'EQUIV' else '') for tag in tags[:10]]
+    if len(tags) > 10:
+        lines.append(f'lines with {len(tags) - 10} other tags are skipped')
     lines += file.notes
     if reason:
         lines.append(f'EDGE2 is read in the order of {order}, as {reason}; say which it is with '
@@ -73,8 +69,9 @@ def read_file(path: Path, edge2_order: str | None) -> tuple[GraphFile, str | Non
 
 
 def _begins_as_saved(path: Path) -> bool:
+    begin = b'{\n"sha256": "'
     with path.open('rb') as file:
-        return file.read(len(SAVED)) == SAVED
+        return file.read(len(begin)) == begin
 
 
 def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
@@ -82,13 +79,6 @@ def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
     Return the rows of the nodes that a text names, such as `3,7,20:25`, ascending.
 
     A range has both ends and need not be without gaps. Raises ConfigError that names the option.
-
-    Parameters
-    ----------
-    ids : ndarray, shape (N,), of all hidden nodes
-    text : str
-    option : str, for the message
-
     """
     chosen = np.zeros(len(ids), dtype=bool)
     for word in text.split(','):
@@ -110,14 +100,9 @@ def read_measurements(
     """
     Return the measurements in a g2o file, in the order in which they come.
 
-    The covariance of an odometry edge is that of the twist: `odom.noise: twist` uses it. Raises
-    FileFormatError if a vertex has no edge to the next one.
-
-    Parameters
-    ----------
-    stamps : Path, optional, text file with a line for each vertex that begins with its stamp [s]
-    edge2 : str, optional, format of the tag EDGE2; by default it is found out
-
+    The covariance of an odometry edge is that of the twist: `odom.noise: twist` uses it. Each line
+    of the file of stamps begins with that of a vertex [s]. Raises FileFormatError if a vertex has
+    no edge to the next one.
     """
     file, _ = read_file(path, edge2)
     edges, n = file.graph.edges, file.graph.n_nodes

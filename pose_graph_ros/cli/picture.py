@@ -6,119 +6,78 @@ Draw a drive: a map of all paths, and below it (or beside a tall one) their erro
 A simulated one is a map alone: the true path, and what was measured there.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FuncFormatter, MultipleLocator
+from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from pose_graph_ros.cli.evaluation import distances, Drive, evaluate, place_odometry
+from pose_graph_ros.cli.drive import distances, Drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.geometry.se2 import Points
 from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.simulation.graph import SimulatedGraph
 from pose_graph_ros.offline.simulation.recording import Recording
 
 # After Okabe and Ito, so that people with any kind of colour vision can distinguish them.
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
-INK, GREY, GRID, SHADE = '#222222', '#666666', '#E2E2E2', '#F0F0F0'
-WIDTH, DPI = 16.0, 100  # width of the picture [inch] and resolution [dots per inch]
-LEFT, RIGHT, TOP, BETWEEN, BOTTOM = 0.8, 0.3, 0.95, 1.05, 0.6  # margins of the panels [inch]
-LEGEND_WIDTH, ERROR_HEIGHT = 2.9, 2.5  # of the legend and of the plot of errors [inch]
-MAP_HEIGHTS = (4.5, 9.0)  # smallest and largest height of the map [inch]
-TALL, TALL_HEIGHT, TALL_WIDTHS = 1.15, 8.4, (4.5, 7.5)
-"""Smallest ratio of height to width for a map beside the errors; its height and widths [inch]."""
-OUTAGE_S = 5.0  # an outage is a time without fixes above this [s] and above 10 median periods
-MIN_FIXES = 3  # with fewer fixes no outages are shown
-SECOND = 10**9  # one second [ns]
-MOST_POINTS = 20_000
-"""Of a line or a kind of marks: more take hundreds of MB, and do not show."""
-TICK_SPACING = 1.6  # largest spacing of the grid of the map [inch]
-TWO_DIGITS = 10.0  # errors below this are shown with two digits after the point [m]
-LOG_RATIO = 4.0  # if errors of odometry exceed others by this factor, the axis is logarithmic
-SKY = '#56B4E9'  # also after Okabe and Ito; markers that wait are blue as well
-LOOPS = (
-    ('loop closures', (State.BELIEVED,), GREEN, '-', 5),
-    ('loop closures\nbelieved weakly', (State.WEAKLY_BELIEVED,), GREEN, '--', 5),
-    ('loop closures that wait,\nnot used', (State.WAITING,), SKY, '--', 2),
-    ('doubted or refused\nloop closures, not used', (State.DOUBTED,), GREY, '--', 2))
-"""Names of loop closures in the legend, states, colours, lines, and their order in depth."""
+SKY, INK, GREY, GRID, SHADE = '#56B4E9', '#222222', '#666666', '#E2E2E2', '#F0F0F0'
+LOOPS = (  # name in the legend, colour, line, and order in depth
+    (State.BELIEVED, 'loop closures', GREEN, '-', 5),
+    (State.WEAKLY_BELIEVED, 'loop closures\nbelieved weakly', GREEN, '--', 5),
+    (State.WAITING, 'loop closures that wait,\nnot used', SKY, '--', 2),
+    (State.DOUBTED, 'doubted or refused\nloop closures, not used', GREY, '--', 2))
+USED_FIXES: dict[str, Any] = {
+    'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
     'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
-LOG_FLOOR = 0.05  # lower end of a logarithmic error axis [m]
-LONG_SIDE, OTHER_SIDE = 8.0, (4.0, 8.0)  # of the map [inch]
-LEGEND = 0.9  # height of title and legend [inch]
+HELD_OUT_FIXES: dict[str, Any] = {
+    'color': 'none', 'marker': 'D', 'linestyle': 'none', 'markersize': 4.5,
+    'markeredgecolor': VERMILION, 'markeredgewidth': 0.9}
+STYLE: Any = {
+    'font.size': 12, 'text.color': INK, 'axes.labelcolor': INK, 'axes.edgecolor': GREY,
+    'xtick.color': GREY, 'ytick.color': GREY, 'grid.color': GRID, 'axes.grid': True,
+    'axes.axisbelow': True, 'axes.spines.top': False, 'axes.spines.right': False,
+    'legend.frameon': False, 'svg.fonttype': 'none',
+    # the renderer keeps all pixels that a piece of a line touches, each time it does
+    'agg.path.chunksize': 1000}
 
 
 def draw_drive(drive: Drive, file: Path, title: str) -> None:
-    """
-    Draw a drive as a picture with a width of 1600 pixels, and write it to a file.
-
-    Parameters
-    ----------
-    file : Path, its suffix (`.png`, `.svg`, `.pdf`) determines the format
-
-    """
-    odometry = place_odometry(drive)
-    low, high = _limits(drive, odometry)
-    ratio = float((high - low)[1] / (high - low)[0])
-    if ratio > TALL:
-        size = np.array([np.clip(TALL_HEIGHT / ratio, *TALL_WIDTHS), TALL_HEIGHT])
-        height = TOP + TALL_HEIGHT + BOTTOM
-        left, error_height = LEFT + size[0] + BETWEEN, 0.6 * TALL_HEIGHT
-    else:
-        width = WIDTH - LEFT - RIGHT - LEGEND_WIDTH
-        size = np.array([width, np.clip(width * ratio, *MAP_HEIGHTS)])
-        height = TOP + size[1] + BETWEEN + ERROR_HEIGHT + BOTTOM
-        left, error_height = LEFT, ERROR_HEIGHT
-    figure = Figure(figsize=(WIDTH, height), dpi=DPI, facecolor='white')
-    FigureCanvasAgg(figure)
-    plan = _add_axes(figure, (LEFT, height - TOP - size[1], *size))
-    errors = _add_axes(figure, (left, BOTTOM, WIDTH - RIGHT - left, error_height))
-    _draw_map(plan, drive, odometry)
-    metres_per_inch = float(np.max((high - low) / size))
-    middle, half = 0.5 * (low + high), 0.5 * metres_per_inch * size
-    plan.set(xlim=(middle[0] - half[0], middle[0] + half[0]),
-             ylim=(middle[1] - half[1], middle[1] + half[1]))
-    for axis in (plan.xaxis, plan.yaxis):
-        axis.set_major_locator(MultipleLocator(_nice_step(TICK_SPACING * metres_per_inch)))
-    _draw_errors(errors, drive, odometry)
-    figure.text(LEFT / WIDTH, 1.0 - 0.2 / height, title, fontsize=18, fontweight='bold',
-                color=INK, va='top', parse_math=False)
-    figure.text(
-        LEFT / WIDTH, 1.0 - 0.57 / height, _facts(drive), fontsize=12, color=GREY, va='top')
-    # the renderer keeps all pixels that a piece of a line touches, each time it does
-    with rc_context({'agg.path.chunksize': 1000}):
+    """Draw a drive as a picture with a width of 1600 pixels, and write it to a file."""
+    paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
+    low, high = _limits(np.concatenate([path.poses[:, :2] for path in paths]), np.concatenate(
+        (drive.placed_odometry.poses[:, :2], drive.fix_positions)))
+    wide, tall = (high - low).tolist()
+    with rc_context(STYLE):
+        if tall > 1.15 * wide:
+            figure = Figure(figsize=(16.0, 10.0), dpi=100, layout='constrained')
+            plan, errors = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
+        else:
+            height = float(np.clip(12.0 * tall / wide, 4.5, 9.0))
+            figure = Figure(figsize=(16.0, height + 4.5), dpi=100, layout='constrained')
+            plan, errors = figure.subplots(2, 1, height_ratios=(height, 2.5))
+        _draw_map(plan, drive)
+        plan.set_aspect('equal', anchor='NW')
+        plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        plan.set_title(_facts(drive), loc='left', fontsize=12, color=GREY)
+        figure.legend(*plan.get_legend_handles_labels(), loc='outside right upper',
+                      labelspacing=0.9, alignment='left', title=_compared(drive)[1])
+        _draw_errors(errors, drive)
+        figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold',
+                        parse_math=False)
         figure.savefig(file)
 
 
-def _add_axes(figure: Figure, box: tuple[float, float, float, float]) -> Axes:
-    """Add a panel with a box (left, bottom, width, height) in inches."""
-    width, height = figure.get_size_inches()
-    left, bottom, box_width, box_height = box
-    axes = figure.add_axes((left / width, bottom / height, box_width / width, box_height / height))
-    axes.spines[['top', 'right']].set_visible(False)
-    axes.spines[['left', 'bottom']].set_color(GREY)
-    axes.tick_params(which='both', colors=GREY, labelsize=11)
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    return axes
-
-
-def _limits(drive: Drive, odometry: Trajectory) -> tuple[FloatArray, FloatArray]:
-    """Return two corners of the map; odometry and fixes far from the other paths are cut off."""
-    paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
-    near = np.concatenate([path.poses[:, :2] for path in paths])
-    stray = np.concatenate((odometry.poses[:, :2], drive.fix_positions))
+def _limits(near: Points, stray: Points) -> tuple[Points, Points]:
+    """Return two corners of a map; what strays far from what must be in it is cut off."""
     if len(near) == 0:
         near = stray if len(stray) else np.zeros((1, 2))
     low, high = near.min(axis=0), near.max(axis=0)
@@ -127,12 +86,6 @@ def _limits(drive: Drive, odometry: Trajectory) -> tuple[FloatArray, FloatArray]
     low, high = shown.min(axis=0), shown.max(axis=0)
     pad = max(0.03 * float(np.max(high - low)), 1.0)
     return low - pad, high + pad
-
-
-def _nice_step(step: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20 and so on that is at most the step, at least 1."""
-    power = 10.0 ** np.floor(np.log10(max(step, 1.0)))
-    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= max(step, 1.0)))
 
 
 def _facts(drive: Drive) -> str:
@@ -148,23 +101,29 @@ def _facts(drive: Drive) -> str:
             f', {number} {what}' for number, what in ((doubted, 'not used'), (waiting, 'waiting'))
             if number > 0)]
     if len(path) > 1:
-        parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) / SECOND:.0f} s',
+        parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9:.0f} s',
                      f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m')
     return '   ·   '.join(parts)
 
 
-def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
+def _compared(drive: Drive) -> tuple[str, str | None]:
+    """Return what the path is compared with in the legend, and the title of that."""
+    names = {row.name for row in drive.rows}
+    for name in ('truth', 'fixes held out', 'fixes used'):
+        if f'corrected path to {name}' in names:
+            return name, f'distance to {name}'
+    return '', None
+
+
+def _draw_map(axes: Axes, drive: Drive) -> None:
     """Draw all paths and measurements, with median and rms of the errors in the legend."""
-    rows = {row.name: row for row in evaluate(drive)}
-    reference = next(
-        (name for name in ('truth', 'fixes held out', 'fixes used')
-         if f'corrected path to {name}' in rows), '')
+    rows, (reference, _) = {row.name: row for row in drive.rows}, _compared(drive)
 
     def label(name: str) -> str:
         row = rows.get(f'{name} to {reference}')
         if row is None:
             return name
-        digits = 2 if row.rms < TWO_DIGITS else 1
+        digits = 2 if row.rms < 10.0 else 1
         return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'
 
     path = drive.corrected
@@ -173,212 +132,143 @@ def _draw_map(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
     if drive.truth is not None:
         axes.plot(*thinned(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8,
                   linestyle=(0, (6, 4)), zorder=4, label='truth')
-    axes.plot(*thinned(odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3, zorder=1,
-              label=label('odometry alone'))
-    used, doubted, held_out = (
-        thinned(drive.fix_positions[chosen]) for chosen in drive.fix_kinds.values())
-    if len(used):
-        axes.plot(*used.T, 'o', color=ORANGE, markersize=4.5, markeredgewidth=0, alpha=0.55,
-                  zorder=2, label=label('fixes'))
-    if len(doubted):
-        axes.plot(*doubted.T, **DOUBTED_FIXES, zorder=2, label=label('doubted fixes').replace(
-            'doubted fixes', 'doubted fixes, not used'))
-    if len(held_out):
-        axes.plot(*held_out.T, 'D', color='none', markeredgecolor=VERMILION, markersize=4.5,
-                  markeredgewidth=0.9, zorder=2, label='fixes held out')
+    axes.plot(*thinned(drive.placed_odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3,
+              zorder=1, label=label('odometry alone'))
+    for chosen, style, name in zip(
+            drive.fix_kinds.values(), ({**USED_FIXES, 'markersize': 4.5}, DOUBTED_FIXES,
+                                       HELD_OUT_FIXES),
+            (label('fixes'), label('doubted fixes').replace(
+                'doubted fixes', 'doubted fixes, not used'), 'fixes held out'), strict=True):
+        if np.any(chosen):
+            axes.plot(*thinned(drive.fix_positions[chosen]).T, **style, zorder=2, label=name)
     inside = np.all(path.covers(drive.loop_stamps_ns), axis=1)
-    for name, states, colour, line, order in LOOPS:
-        shown = inside & drive.loops(*states)
+    for state, name, colour, line, order in LOOPS:
+        shown = inside & drive.loops(state)
         if np.any(shown):
             ends = path.at(thinned(drive.loop_stamps_ns[shown]))[..., :2]
             apart = np.full((len(ends), 1, 2), np.nan)
             axes.plot(*np.concatenate((ends, apart), axis=1).reshape(-1, 2).T, linestyle=line,
                       color=colour, linewidth=1.2, marker='o', markerfacecolor='none',
                       markersize=7, markeredgewidth=1.3, zorder=order, label=name)
-    if len(path):
-        for name, pose, marker in (('start', path.poses[0], 'o'), ('end', path.poses[-1], 's')):
-            axes.plot(*pose[:2], marker, color='white', markeredgecolor=INK, markersize=10,
-                      markeredgewidth=2.0, zorder=6)
-            axes.annotate(
-                name, pose[:2], (0, 12 if name == 'start' else -12), textcoords='offset points',
-                ha='center', va='bottom' if name == 'start' else 'top', fontsize=13,
-                fontweight='bold', color=INK, zorder=7,
-                path_effects=[withStroke(linewidth=3.5, foreground='white')])
-    axes.set_xlabel(f'{drive.map_axes[0]} [m]', fontsize=12, color=INK)
-    axes.set_ylabel(f'{drive.map_axes[1]} [m]', fontsize=12, color=INK)
-    legend = axes.legend(
-        loc='upper left', bbox_to_anchor=(1.01, 1.0), frameon=False, fontsize=12,
-        labelspacing=0.9, borderaxespad=0.0, labelcolor=INK, alignment='left',
-        title=f'distance to {reference}' if reference else None, title_fontsize=12)
-    legend.get_title().set_color(GREY)
+    for name, pose, marker, side in zip(('start', 'end'), path.poses[[0, -1]] if len(path) else (),
+                                        'os', (1, -1), strict=False):
+        axes.plot(*pose[:2], marker, color='white', markeredgecolor=INK, markersize=10,
+                  markeredgewidth=2.0, zorder=6)
+        axes.annotate(
+            name, pose[:2], (0, 12 * side), textcoords='offset points', ha='center',
+            va='bottom' if side > 0 else 'top', fontsize=13, fontweight='bold', zorder=7,
+            path_effects=[withStroke(linewidth=3.5, foreground='white')])
+    axes.set(xlabel=f'{drive.map_axes[0]} [m]', ylabel=f'{drive.map_axes[1]} [m]')
 
 
-def _draw_errors(axes: Axes, drive: Drive, odometry: Trajectory) -> None:
+def _draw_errors(axes: Axes, drive: Drive) -> None:
     """Draw distances over time to the truth, else to the fixes, else to the corrected path."""
-    paths = [path for path in (odometry, drive.corrected) if len(path)]
+    truth, result, odometry = drive.truth, drive.corrected, drive.placed_odometry
+    paths = [path for path in (odometry, result) if len(path)]
     begin = min((int(path.stamps_ns[0]) for path in paths), default=0)
-    end = max((int(path.stamps_ns[-1]) for path in paths), default=SECOND)
-    odometry_style = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
-    fixes_style = {'color': ORANGE, 'marker': 'o', 'markersize': 3, 'markeredgewidth': 0,
-                  'linestyle': 'none', 'alpha': 0.6, 'zorder': 1}
-    corrected_style = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
-    held_out_style = {'color': 'none', 'marker': 'D', 'markeredgecolor': VERMILION,
-                     'markersize': 4, 'linestyle': 'none', 'zorder': 4}
-    truth, result, held_out = drive.truth, drive.corrected, drive.fix_held_out
+    end = max((int(path.stamps_ns[-1]) for path in paths), default=10**9)
+    of_odometry = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
+    of_result = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
     stamps, positions = drive.fix_stamps_ns, drive.fix_positions
-    doubted = drive.fix_kinds['doubted']
-    lines: list[tuple[Trajectory, IntArray, FloatArray, dict[str, Any]]]
+    doubted, held_out = drive.fix_kinds['doubted'], drive.fix_held_out
     if truth is not None:
-        target = 'the truth'
-        lines = [(odometry, truth.stamps_ns, truth.poses[:, :2], odometry_style),
-                 (truth, stamps[~doubted], positions[~doubted], fixes_style),
-                 (truth, stamps[doubted], positions[doubted], {**DOUBTED_FIXES, 'zorder': 1}),
-                 (result, truth.stamps_ns, truth.poses[:, :2], corrected_style)]
+        target, true = 'the truth', (truth.stamps_ns, truth.poses[:, :2])
+        lines = [(odometry, *true, of_odometry),
+                 (truth, stamps[~doubted], positions[~doubted], {**USED_FIXES, 'markersize': 3}),
+                 (truth, stamps[doubted], positions[doubted], DOUBTED_FIXES),
+                 (result, *true, of_result)]
     elif len(stamps) == 0:
         target = 'the corrected path'
-        lines = [(odometry, result.stamps_ns, result.poses[:, :2], odometry_style)]
+        lines = [(odometry, result.stamps_ns, result.poses[:, :2], of_odometry)]
     else:
         target = 'the fixes'
-        lines = [(odometry, stamps, positions, odometry_style),
-                 (result, stamps, positions, corrected_style),
-                 (result, stamps[held_out], positions[held_out], held_out_style)]
-
+        lines = [(odometry, stamps, positions, of_odometry),
+                 (result, stamps, positions, of_result),
+                 (result, stamps[held_out], positions[held_out], HELD_OUT_FIXES)]
     highest = []
     for path, line_stamps, line_positions, style in lines:
         covered, errors = distances(path, line_stamps, line_positions)
         axes.plot((thinned(covered) - begin) * 1e-9, thinned(errors), **style)
         highest.append(float(np.percentile(errors, 99.0)) if len(errors) else 0.0)
     axes.set_xlim(0.0, max((end - begin) * 1e-9, 1.0))
-    if highest[0] > LOG_RATIO * max(highest[1:], default=0.0) > 0.0:
+    if highest[0] > 4.0 * max(highest[1:], default=0.0) > 0.0:
         axes.set_yscale('log')
-        axes.set_ylim(LOG_FLOOR, 1.5 * highest[0])
+        axes.set_ylim(0.05, 1.5 * highest[0])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     else:
         axes.set_ylim(0.0, max(1.15 * max(highest), 0.1))
-    axes.set_xlabel('time [s]', fontsize=12, color=INK)
-    axes.set_ylabel('distance [m]', fontsize=12, color=INK)
-    axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold', color=INK)
+    axes.set(xlabel='time [s]', ylabel='distance [m]')
+    axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold')
     for outage in _outages(drive, begin, end):
         axes.axvspan(*outage, color=SHADE, zorder=0)
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
 
 
 def thinned(points: np.ndarray) -> np.ndarray:
-    """Return every n-th point, from the first on, so that there are not too many to draw."""
-    return points[::max(-(-len(points) // MOST_POINTS), 1)]
+    """Return every n-th point, at most 20 000: more take hundreds of MB, and do not show."""
+    return points[::max(-(-len(points) // 20_000), 1)]
 
 
-def _outages(drive: Drive, begin: int, end: int) -> list[tuple[float, float]]:
-    """Return begin and end of the outages of the fixes in the pose graph [s]."""
+def _outages(drive: Drive, begin: StampNs, end: StampNs) -> list[tuple[float, float]]:
+    """Return when no fixes were used for 5 s and 10 median periods: begin and end [s]."""
     used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
     used = used[(used > begin) & (used < end)]
-    if len(used) < MIN_FIXES:
+    if len(used) < 3:
         return []
     edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
     pauses = np.diff(edges)
-    long = pauses > max(OUTAGE_S, 10.0 * float(np.median(pauses)))
+    long = pauses > max(5.0, 10.0 * float(np.median(pauses)))
     return list(zip(edges[:-1][long].tolist(), edges[1:][long].tolist(), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """What is drawn, in the map."""
-
-    truth: FloatArray
-    """True positions, shape (N, 2)."""
-    odometry: FloatArray
-    """Positions by odometry from the true start, shape (M, 2)."""
-    ends: FloatArray
-    """True positions of both ends of closures, shape (L, 2, 2)."""
-    group: IntArray
-    """Number of the group of false ones, -1: true, shape (L,)."""
-    absolute: FloatArray
-    """Fixes and global poses, shape (P, 2)."""
-    wrong: BoolArray
-    """Which of them are moved by a jump, shape (P,)."""
-
-
-def scene_of_recording(drive: Recording) -> Scene:
-    """Return what is to be drawn of a recording."""
-    truth, odometry = drive.truth, drive.odometry
-    begin = max(truth.stamps_ns[0], odometry.stamps_ns[0])
-    moved = se2.compose(truth.at(begin), se2.inverse(odometry.at(begin)))
-    ends = truth.at(np.clip(drive.loop_stamps_ns, truth.stamps_ns[0], truth.stamps_ns[-1]))
-    fixes = np.empty((0, 2))
-    if len(drive.fixes) > 0:
-        fixes = TangentPlane(*drive.fixes[0].tolist()).to_map(*drive.fixes.T)
-    return Scene(truth.poses[:, :2], se2.compose(moved, odometry.poses)[:, :2], ends[..., :2],
-                 drive.loop_group, np.concatenate((fixes, drive.poses[:, :2])),
-                 np.append(drive.fix_is_wrong, drive.pose_is_wrong))
-
-
-def scene_of_graph(graph: SimulatedGraph) -> Scene:
-    """Return what is to be drawn of a graph."""
-    loops = graph.loops
-    wrong = np.zeros(len(graph.observed), dtype=bool)
-    wrong[graph.wrong] = True
-    positions = graph.truth.poses[:, :2]
-    return Scene(positions, graph.start[:, :2], positions[np.column_stack((loops.i, loops.j))],
-                 graph.group, graph.observed.mean[:, :2], wrong)
-
-
-def draw(scene: Scene, file: Path, title: str) -> None:
-    """
-    Write a picture of what was simulated.
-
-    Parameters
-    ----------
-    file : Path, of a kind that matplotlib writes
-
-    """
-    near = scene.truth
-    low, high = near.min(axis=0), near.max(axis=0)
-    # odometry and fixes that are far away are cut off
-    stray = np.concatenate((scene.odometry, scene.absolute, near))
-    reach = 0.25 * float(np.max(high - low))
-    low = np.maximum(stray.min(axis=0), low - reach)
-    high = np.minimum(stray.max(axis=0), high + reach)
-    pad = 0.03 * float(np.max(high - low)) + 1.0
-    low, high = low - pad, high + pad
-    size = LONG_SIDE * (high - low) / np.max(high - low)
-    size = np.clip(size, *OTHER_SIDE)
-    with rc_context({'font.size': 11, 'axes.edgecolor': GREY, 'axes.labelcolor': INK,
-                     'xtick.color': GREY, 'ytick.color': GREY, 'svg.fonttype': 'none'}):
-        figure = Figure(figsize=(size[0], size[1] + LEGEND), dpi=DPI, layout='constrained')
-        FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
-        axes.grid(color=GRID)
-        axes.set_axisbelow(True)
-        axes.spines[['top', 'right']].set_visible(False)
-        _draw_scene(axes, scene)
-        axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal', xlim=(low[0], high[0]),
-                 ylim=(low[1], high[1]))
-        figure.suptitle(title, x=0.02, ha='left', color=INK, fontweight='bold')
+def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:
+    """Write a map of what was simulated: odometry starts at the true pose."""
+    truth = simulated.truth
+    if isinstance(simulated, SimulatedGraph):
+        group, odometry = simulated.group, simulated.start
+        ends = truth.poses[np.column_stack((simulated.loops.i, simulated.loops.j)), :2]
+        measured = simulated.observed.mean[:, :2]
+        wrong = np.zeros(len(measured), dtype=bool)
+        wrong[simulated.wrong] = True
+    else:
+        begin = max(truth.stamps_ns[0], simulated.odometry.stamps_ns[0])
+        moved = se2.compose(truth.at(begin), se2.inverse(simulated.odometry.at(begin)))
+        group, odometry = simulated.loop_group, se2.compose(moved, simulated.odometry.poses)
+        ends = truth.at(np.clip(simulated.loop_stamps_ns, *truth.stamps_ns[[0, -1]]))[..., :2]
+        fixes = simulated.fixes
+        measured = simulated.poses[:, :2]
+        if len(fixes) > 0:
+            plane = TangentPlane(*fixes[0].tolist())
+            measured = np.concatenate((plane.to_map(*fixes.T), measured))
+        wrong = np.append(simulated.fix_is_wrong, simulated.pose_is_wrong)
+    true, odometry = truth.poses[:, :2], odometry[:, :2]
+    low, high = _limits(true, np.concatenate((odometry, measured)))
+    width, height = np.clip(8.0 * (high - low) / np.max(high - low), 4.0, 8.0)
+    with rc_context(STYLE | {'font.size': 11}):
+        figure = Figure(figsize=(width, height + 0.9), dpi=100, layout='constrained')
+        axes = figure.add_subplot(xlabel='x [m]', ylabel='y [m]', aspect='equal',
+                                  xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        is_false = group >= 0
+        for points, line, name in (
+                (odometry, {'color': ORANGE, 'linewidth': 1.0}, 'odometry'),
+                (measured[~wrong], {'color': GREY, 'marker': '.', 'markersize': 3,
+                                    'linestyle': 'none', 'alpha': 0.6}, 'fixes, global poses'),
+                (measured[wrong], {'color': GREY, 'marker': 'x', 'markersize': 5,
+                                   'linestyle': 'none'}, 'those moved by a jump'),
+                (true, {'color': BLUE, 'linewidth': 1.6}, 'truth'),
+                (ends[~is_false, 1], {'color': GREEN, 'marker': '.', 'linestyle': 'none'},
+                 'true closures')):
+            if len(points) > 0:
+                axes.plot(*thinned(points).T, zorder=3, label=name, **line)
+        numbers, sizes = np.unique(group[is_false], return_counts=True)
+        in_group = np.isin(group, numbers[sizes > 1])
+        for chosen, style, name in ((is_false & ~in_group, '--', 'false closures'),
+                                    (in_group, '-', 'false closures in groups')):
+            if np.any(chosen):
+                axes.add_collection(LineCollection(
+                    list(ends[chosen]), colors=INK, linestyles=style, linewidths=0.9, zorder=6,
+                    label=name))
+        figure.suptitle(title, x=0.02, ha='left', fontweight='bold')
         figure.legend(*axes.get_legend_handles_labels(), loc='outside lower left', ncols=3,
-                      frameon=False, labelcolor=INK, fontsize=10)
+                      fontsize=10)
         figure.savefig(file)
-
-
-def _draw_scene(axes: Axes, scene: Scene) -> None:
-    axes.plot(*thinned(scene.odometry).T, color=ORANGE, linewidth=1.0, zorder=2,
-              label='odometry')
-    right, wrong = scene.absolute[~scene.wrong], scene.absolute[scene.wrong]
-    if len(right) > 0:
-        axes.plot(*thinned(right).T, '.', color=GREY, markersize=3, zorder=3, alpha=0.6,
-                  label='fixes, global poses')
-    if len(wrong) > 0:
-        axes.plot(*thinned(wrong).T, 'x', color=GREY, markersize=5, zorder=3,
-                  label='those moved by a jump')
-    axes.plot(*thinned(scene.truth).T, color=BLUE, linewidth=1.6, zorder=4, label='truth')
-    true = scene.group < 0
-    if np.any(true):
-        axes.plot(*thinned(scene.ends[true, 1]).T, '.', color=GREEN, markersize=6, zorder=5,
-                  label='true closures')
-    numbers, sizes = np.unique(scene.group[~true], return_counts=True)
-    in_group = np.isin(scene.group, numbers[sizes > 1])
-    for chosen, style, name in ((~true & ~in_group, '--', 'false closures'),
-                                (in_group, '-', 'false closures in groups')):
-        if np.any(chosen):
-            axes.add_collection(LineCollection(
-                list(scene.ends[chosen]), colors=INK, linestyles=style, linewidths=0.9,
-                zorder=6, label=name))

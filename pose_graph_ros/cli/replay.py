@@ -6,22 +6,15 @@ import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
 import math
 import time
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import (
-    choose_inputs,
-    Inputs,
-    read_inputs,
-    reader_of,
-)
+from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
-from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, open_bags, Span
+from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, open_bags
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import (
@@ -31,24 +24,30 @@ from pose_graph_ros.adapters.sources import (
     ODOMETRY_KINDS,
     source_list,
 )
-from pose_graph_ros.cli import options as shared
-from pose_graph_ros.cli.corrected_bag import LATCHED, write_corrected
-from pose_graph_ros.cli.evaluation import consistency, consistency_lines, Drive, evaluate
+from pose_graph_ros.cli import shared
+from pose_graph_ros.cli.drive import (
+    collect_drive,
+    consistency,
+    consistency_lines,
+    Drive,
+    with_refused,
+    write_results,
+)
 from pose_graph_ros.cli.exports import (
     covariances,
+    LATCHED,
     LivePoses,
     require_datum,
+    write_corrected,
     write_exports,
     write_lines,
 )
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
-from pose_graph_ros.cli.progress import WatchedBag
-from pose_graph_ros.cli.results import collect_drive, with_refused, write_results
-from pose_graph_ros.cli.run.document import document, write_document
+from pose_graph_ros.cli.run.document import write_document
 from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o_writing import write_g2o
@@ -62,29 +61,22 @@ from pose_graph_ros.core.judgement.texts import (
     states_by_stamps,
     totals_text,
 )
-from pose_graph_ros.core.judgement.verdicts import (
-    Judged,
-    SourceVerdicts,
-    State,
-    Verdict,
-)
+from pose_graph_ros.core.judgement.verdicts import Judged, SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, OdometrySample
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
-NAMED = 10  # number of constraints of a source that the text names
+NAMED = 10  # constraints of a source that the text names
 
 
 class Replayed(NamedTuple):
     """Result of running a bag through the engine."""
 
     backend: PoseGraphBackend
-    report: UpdateReport  # report of the final optimisation
-    refused: Counter[tuple[str, str]]  # messages without a valid measurement, by source and reason
+    report: UpdateReport  # of the final optimisation
+    counts: Counter[tuple[str, str]]  # messages by source and answer
+    recorder: Recorder
     datum: Datum | None = None  # of the map; None for a g2o file
-    recorder: Recorder | None = None  # what was recorded on the way
-    values: Mapping[str, Any] = MappingProxyType({})  # all parameters of the node
-    kinds: Mapping[str, Kind] = MappingProxyType({})  # of the sources that have a topic
 
     @property
     def origin(self) -> MapOrigin | None:
@@ -92,50 +84,42 @@ class Replayed(NamedTuple):
         plane = None if self.datum is None else self.datum.plane
         return None if plane is None else plane.origin
 
-    def reasons(self) -> dict[Key, str]:
-        """Return why loop closures were refused."""
-        unknown = dict.fromkeys(
-            self.backend.refused_closures, 'Refused: it could not be attached to the path.')
-        return unknown | ({} if self.recorder is None else self.recorder.refused)
-
     def states(self, verdicts: Sequence[Verdict]) -> dict[Key, State]:
         """Return what is believed, by source and stamps; refused loop closures are not."""
         refused = dict.fromkeys(self.backend.refused_closures, State.DOUBTED)
         return states_by_stamps(verdicts) | refused
 
+    def run(
+        self, options: argparse.Namespace, drive: Drive, values: Mapping[str, Any],
+        kinds: Mapping[str, Kind], seconds: float,
+    ) -> Run:
+        """Return what run.json is made from."""
+        estimate = self.backend.estimate()
+        assert estimate is not None
+        refused = dict.fromkeys(
+            self.backend.refused_closures, 'Refused: it could not be attached to the path.')
+        return Run(
+            options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}',
+            drive, self.backend, estimate, self.backend.verdicts(), self.recorder, values, kinds,
+            self.counts, self.report, self.origin, seconds,
+            refused | self.recorder.refused)
+
 
 def run(
     bag: Bag, inputs: Inputs, values: Mapping[str, Any], live: LivePoses | None = None,
 ) -> Replayed:
-    """
-    Return a new engine after adding all messages of a bag and a full optimisation.
-
-    Parameters
-    ----------
-    values : mapping, all parameters of the node
-    live : LivePoses, optional, as in `run_measurements`
-
-    """
-    reader = reader_of(bag, values)
+    """Return a new engine after adding all messages of a bag and a full optimisation."""
+    reader, recorder = reader_of(bag, values), Recorder()
     refused: Counter[tuple[str, str]] = Counter()
-    recorder = Recorder()
     backend, report = run_measurements(
         measurements_of(bag, inputs, reader, refused), values, recorder, live)
-    return Replayed(
-        backend, report, refused, reader.datum, recorder, values, inputs.kinds)
+    return Replayed(backend, report, backend.counts + refused, recorder, reader.datum)
 
 
 def measurements_of(
     bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
 ) -> Iterator[tuple[str, OdometrySample | Measurement]]:
-    """
-    Yield the valid measurements of a bag that are not held out, and their sources.
-
-    Parameters
-    ----------
-    refused : Counter, receives the number of others by source and reason
-
-    """
+    """Yield the valid measurements of a bag that are not held out, and their sources."""
     for source, message, held_out in read_inputs(bag, inputs):
         if held_out:
             continue
@@ -154,17 +138,7 @@ def run_measurements(
     measurements: Iterable[tuple[str, OdometrySample | Measurement]], values: Mapping[str, Any],
     recorder: Recorder | None = None, live: LivePoses | None = None,
 ) -> tuple[PoseGraphBackend, UpdateReport]:
-    """
-    Return a new engine after adding measurements, and the report of the full optimisation.
-
-    Parameters
-    ----------
-    measurements : iterable, sources and measurements, in the order of their arrival
-    values : mapping, all parameters of the node
-    recorder : Recorder, optional, what is told of the run as it goes on
-    live : LivePoses, optional, receives the poses as of each moment; updates are as it wants them
-
-    """
+    """Return a new engine after adding measurements, and the report of the full optimisation."""
     backend = PoseGraphBackend(backend_config(values))
     recorder = Recorder() if recorder is None else recorder
     next_update = UPDATE_EVERY
@@ -194,12 +168,11 @@ def execute(options: argparse.Namespace) -> int:
     if any(path.suffix in GRAPH_SUFFIXES for path in options.bags):
         return _execute_g2o(options)
     values = shared.parameter_values(options)
-    wanted = shared.wanted_topics(options)
     with ExitStack() as stack:
         bag = stack.enter_context(open_bags(options.bags))
         inputs = choose_inputs(
-            bag, source_list(values), wanted, options.hold_out, span_of(bag, options),
-            truth=options.truth)
+            bag, source_list(values), shared.wanted_topics(options), options.hold_out,
+            shared.span_of(bag, options), truth=options.truth)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.of(Kind.FIX)) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
@@ -208,38 +181,27 @@ def execute(options: argparse.Namespace) -> int:
             print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         start = time.monotonic()
         live = LivePoses(values['frequency']) if options.live else None
-        result = run(WatchedBag(bag, 'optimising'), inputs, values, live)
+        result = run(shared.WatchedBag(bag, 'optimising'), inputs, values, live)
         seconds = time.monotonic() - start
         estimate = result.backend.estimate()
         if estimate is None:
-            topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
-            names = set(inputs.of(*ODOMETRY_KINDS))
-            why = ', '.join(f'{answer} {count}' for (source, answer), count in sorted(
-                (result.backend.counts + result.refused).items()) if source in names)
+            names = inputs.of(*ODOMETRY_KINDS)
+            topics = ' or '.join(inputs.topics[name] for name in names)
+            why = ', '.join(f'{answer} {count}' for (source, answer), count
+                            in sorted(result.counts.items()) if source in names)
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
-        verdicts = result.backend.verdicts()
         drive = with_refused(collect_drive(
-            WatchedBag(bag, 'comparing'), inputs, values, estimate.path, options.truth,
-            origin=result.origin, states=result.states(verdicts)),
+            shared.WatchedBag(bag, 'comparing'), inputs, values, estimate.path, options.truth,
+            origin=result.origin, states=result.states(result.backend.verdicts())),
             result.backend)
         facts: dict[str, Any] = {'bags': [str(path) for path in options.bags]}
         if writer is not None:
             copied = write_corrected(
-                writer, WatchedBag(bag, 'writing the bag'), inputs, values, estimate=estimate,
-                covariances=covariances(result.backend, estimate))
+                writer, shared.WatchedBag(bag, 'writing the bag'), inputs, values,
+                estimate=estimate, covariances=covariances(result.backend, estimate))
             facts['new_bag'] = copied._asdict()
-    return _report(options, drive, result, verdicts, facts | {'seconds': seconds}, live=live)
-
-
-def span_of(bag: Bag, options: argparse.Namespace) -> Span:
-    """Return the time of recording that the options ask for; raises `BagError` if it is empty."""
-    limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
-              for seconds in (options.begin, options.until)]
-    span, length = Span(*limits), (bag.end_ns - bag.start_ns) * 1e-9
-    if (options.begin or 0.0) >= min(length, np.inf if options.until is None else options.until):
-        raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
-                       f'recording is {max(length, 0.0):.3f} s long')
-    return span
+    return _report(options, result.run(options, drive, values, inputs.kinds, seconds), facts,
+                   result.datum, live)
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
@@ -248,23 +210,18 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         raise BagError(f'{options.bags[0]}: expected one .g2o file alone, without --bag, --live, '
                        '--from and --until')
     require_datum(options.export, known=False)
-    path, = options.bags
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
-    measurements = read_measurements(path, options.stamps, options.edge2)
-    odometry_source = next(
-        source.name for source in source_list(values) if source.kind.is_odometry)
-    start = time.monotonic()
-    recorder = Recorder()
+    measurements = read_measurements(options.bags[0], options.stamps, options.edge2)
+    odometry = next(source.name for source in source_list(values) if source.kind.is_odometry)
+    start, recorder = time.monotonic(), Recorder()
     backend, report = run_measurements((
-        (odometry_source if isinstance(each, OdometrySample) else CLOSURES, each)
+        (odometry if isinstance(each, OdometrySample) else CLOSURES, each)
         for each in measurements), values, recorder)
-    result = Replayed(backend, report, Counter(), None, recorder, values, {
-        odometry_source: Kind.ODOMETRY, CLOSURES: Kind.LOOP_CLOSURE})
+    result = Replayed(backend, report, backend.counts, recorder)
     seconds = time.monotonic() - start
     estimate = backend.estimate()
     assert estimate is not None, 'a graph has vertices'
-    verdicts = backend.verdicts()
-    states = result.states(verdicts)
+    states = result.states(backend.verdicts())
     samples = [each for each in measurements if isinstance(each, OdometrySample)]
     loops = [(each.reference_ns or 0, each.stamp_ns) for each in measurements
              if isinstance(each, LoopClosure)]
@@ -275,47 +232,40 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         None, np.array(loops, dtype=np.int64).reshape(-1, 2),
         loop_states=[states.get((CLOSURES, stamp, reference), State.BELIEVED)
                      for reference, stamp in loops])
-    return _report(options, drive, result, verdicts, {'seconds': seconds})
+    kinds = {odometry: Kind.ODOMETRY, CLOSURES: Kind.LOOP_CLOSURE}
+    return _report(options, result.run(options, drive, values, kinds, seconds), {})
 
 
 def _report(
-    options: argparse.Namespace, drive: Drive, result: Replayed, verdicts: Sequence[Verdict],
-    facts: Mapping[str, Any], *, live: LivePoses | None = None,
+    options: argparse.Namespace, run: Run, facts: Mapping[str, Any], datum: Datum | None = None,
+    live: LivePoses | None = None,
 ) -> int:
     """Write the results and print a summary; return the exit code."""
-    backend, report = result.backend, result.report
-    estimate, totals = backend.estimate(), backend.verdict_totals()
-    assert estimate is not None
-    counts = {f'{source}.{answer}': count for (source, answer), count
-              in sorted((backend.counts + result.refused).items())}
-    title = options.bags[0].stem
-    nees = {} if drive.truth is None or report.status is Status.FAILED else consistency(
-        drive, covariances(backend, estimate))
-    table = write_results(drive, options.out, title, {
-        **facts, **{f'nees_{name}': each and asdict(each) for name, each in nees.items()},
+    backend, estimate, report = run.backend, run.estimate, run.report
+    assert report is not None
+    counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
+    nees = {} if run.drive.truth is None or report.status is Status.FAILED else consistency(
+        run.drive, covariances(backend, estimate))
+    table = write_results(run.drive, options.out, run.title, {
+        **facts, 'seconds': run.seconds, **{f'nees_{name}': each for name, each in nees.items()},
         'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
         'chi2': estimate.chi2, 'odometry_errors': estimate.odometry_errors._asdict(),
         'status': report.status.value, 'counts': counts,
-        'judged': judgement(totals, verdicts)})
+        'judged': judgement(backend.verdict_totals(), run.verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
-    write_document(document(Run(
-        title, f'replay of {", ".join(path.name for path in options.bags)}', drive, backend,
-        estimate, verdicts, result.recorder or Recorder(), result.values, result.kinds,
-        backend.counts + result.refused, evaluate(drive), report, result.origin,
-        facts['seconds'], result.reasons())), options.out)
-    exported = write_exports(options.export, options.out, title, backend=backend,
-                             estimate=estimate, datum=result.datum)
+    write_document(run, options.out)
+    exported = write_exports(options.export, options.out, run.title, backend=backend,
+                             estimate=estimate, datum=datum)
     if live is not None:
         exported.append(options.out / 'live.csv')
         write_lines(exported[-1], live.lines())
     if options.json:
         print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
     else:
-        for line in _lines(result, estimate, verdicts, facts):
-            print(line)
+        print('\n'.join(_lines(run, facts)))
         print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
         names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
                  *(path.name for path in exported)]
@@ -324,20 +274,19 @@ def _report(
     return 0 if report.status is Status.CONVERGED else 1
 
 
-def _lines(
-    result: Replayed, estimate: Estimate, verdicts: Sequence[Verdict], facts: Mapping[str, Any],
-) -> Iterator[str]:
+def _lines(run: Run, facts: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is told of a run."""
-    backend, report = result.backend, result.report
+    estimate, report = run.estimate, run.report
+    assert report is not None
     yield (f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
-           f'observed nodes in {facts["seconds"]:.2f} s; {report.status.value}, chi2 '
+           f'observed nodes in {run.seconds:.2f} s; {report.status.value}, chi2 '
            f'{report.chi2:.6g}; {estimate.alignment.value}')
     errors = estimate.odometry_errors
     if errors != AS_CLAIMED:
         yield (f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
                f'turns {short(math.sqrt(errors.turn), 3)} times what it claims; corrected by '
                f'{short(errors.rate, 3)} rad/s and {short(100.0 * errors.scale, 3)} % of the way')
-    for source, fit in sorted(backend.reports().items()):
+    for source, fit in sorted(run.backend.reports().items()):
         text = f'{source}: squared residual {short(fit.energy, 3)} sigma^2'
         if fit.errors.significant:
             text += (f'; errors of {short(fit.errors.sigma_correlated, 3)} m with a time constant '
@@ -347,7 +296,7 @@ def _lines(
         if fit.wrongly_white:
             text += f', but are treated as white: see {source}.correlation_time'
         yield text
-    yield from judgement_lines(backend.verdict_totals(), verdicts)
+    yield from judgement_lines(run.backend.verdict_totals(), run.verdicts)
     if 'new_bag' in facts:
         yield ('new bag: {original} messages copied, {left_out} left out, {corrected} poses of '
                'odometry corrected'.format(**facts['new_bag']))
@@ -356,14 +305,7 @@ def _lines(
 def judgement(
     totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
 ) -> dict[str, object]:
-    """
-    Return counts and scale of each source, and all closures and all that is not believed.
-
-    Parameters
-    ----------
-    totals : mapping, what is believed of each source
-
-    """
+    """Return counts and scale of each source, and all closures and all that is not believed."""
     return {
         'sources': {source: {
             'states': {state.value: each.counts.get(state, 0) for state in ORDER},
@@ -376,14 +318,7 @@ def judgement(
 def judgement_lines(
     totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
 ) -> Iterator[str]:
-    """
-    Yield a line for each source, and for the first of its constraints that are doubted.
-
-    Parameters
-    ----------
-    totals : mapping, what is believed of each source
-
-    """
+    """Yield a line for each source, and for the first of its constraints that are doubted."""
     for source, each in totals.items():
         yield f'{source}: {totals_text(each)}'
         doubted = [verdict for verdict in verdicts

@@ -4,7 +4,7 @@
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 import heapq
 import json
 from operator import itemgetter
@@ -22,13 +22,14 @@ from pose_graph_ros.cli.bag_messages import (
     pose_messages,
     rate_messages,
 )
-from pose_graph_ros.cli.progress import watched
+from pose_graph_ros.cli.shared import watched
 from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what_graphs_lack
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o_writing import g2o_text
 from pose_graph_ros.core.io.path_files import tum_text
+from pose_graph_ros.core.quantities import Seconds
 from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
 from pose_graph_ros.offline.simulation.motion import PERIOD_S
 from pose_graph_ros.offline.simulation.recording import Course, course, record, Recording
@@ -55,18 +56,17 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     if options.plot is not None and options.plot.suffix not in PICTURES:
         raise ConfigError(f'--plot {options.plot}: the name must end in {", ".join(PICTURES)}')
-    beside = {kind: options.out.with_name(f'{options.out.stem}_truth.{kind}'
-                                          if options.out.suffix == GRAPH_SUFFIX else
-                                          f'{options.out.name}_truth.{kind}')
-              for kind in ('json', 'tum', 'g2o')}
     is_graph = options.out.suffix == GRAPH_SUFFIX
     if is_graph:
         refuse_what_graphs_lack(options)
     elif options.node_distance is not None:
         raise ConfigError(f'--node-distance: only a graph has nodes, but {options.out} is a bag; '
                           f'expected a name that ends in {GRAPH_SUFFIX}')
-    written = [options.out, beside['json'], *([beside['tum']] if options.tum else []),
-               *([beside['g2o']] if is_graph else [])]
+    name = options.out.stem if is_graph else options.out.name
+    beside = {kind: options.out.with_name(f'{name}_truth.{kind}')
+              for kind in ('json', *(['tum'] if options.tum else []),
+                           *(['g2o'] if is_graph else []))}
+    written = [options.out, *beside.values()]
     for path in written:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
@@ -79,19 +79,23 @@ def execute(options: argparse.Namespace) -> int:
     simulated: SimulatedGraph | Recording
     if is_graph:
         simulated = graph_of(way, options.node_distance or NODE_DISTANCES[options.world])
-        about |= about_graph(way, simulated)
-        files = {path: text.encode() for path, text in zip(
-            (options.out, beside['g2o']), graph_texts(simulated), strict=True)}
+        about |= _about_graph(way, simulated)
+        for path, poses in ((options.out, simulated.start),
+                            (beside['g2o'], simulated.truth.poses)):
+            files[path] = g2o_text(simulated.graph(poses).rows()).encode()
     else:
         simulated = record(way)
-        about |= write_recording(simulated, options.out)
+        about |= write_drive(simulated, options.out)
     text = json.dumps(about, indent=2)
     files[beside['json']] = f'{text}\n'.encode()
     if options.tum:
         files[beside['tum']] = tum_text(simulated.truth).encode()
     write_files(files)
     if options.plot is not None:
-        _draw(simulated, options.plot, next(_lines(about)))
+        # matplotlib takes half a second to load
+        from pose_graph_ros.cli.picture import draw_simulated  # noqa: PLC0415
+
+        draw_simulated(simulated, options.plot, next(_lines(about)))
         written.append(options.plot)
     if options.json:
         print(text)
@@ -100,15 +104,6 @@ def execute(options: argparse.Namespace) -> int:
         print(line)
     print('written: ' + ', '.join(map(str, written)))
     return 0
-
-
-def _draw(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:
-    # matplotlib takes half a second to load
-    from pose_graph_ros.cli import picture  # noqa: PLC0415
-
-    scene = (picture.scene_of_graph(simulated) if isinstance(simulated, SimulatedGraph)
-             else picture.scene_of_recording(simulated))
-    picture.draw(scene, file, title)
 
 
 def _lines(about: Mapping[str, Any]) -> Iterator[str]:
@@ -129,20 +124,13 @@ def _lines(about: Mapping[str, Any]) -> Iterator[str]:
 
 
 def simulate_drive(
-    seed: int = 1, duration_s: float = 440.0, *, gyro: bool = False, heading_drift: float = 0.0,
+    seed: int = 1, duration_s: Seconds = 440.0, *, gyro: bool = False, heading_drift: float = 0.0,
 ) -> Recording:
     """
-    Return a simulated drive; equal arguments give equal drives.
+    Return a simulated drive, whose second lap begins after about 310 s; equal arguments are equal.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of the sensor errors, the position within the lane and the waits at traffic lights.
-    duration_s : float
-        Length of the recording, 10 s or more [s]; the second lap begins after about 310 s.
-    gyro : bool, whether with a gyroscope; all else is the same without
-    heading_drift : float, what the heading by the wheels drifts by, per distance [rad/m]
-
+    All but the gyroscope is the same without. The heading by the wheels drifts per distance
+    [rad/m].
     """
     def change(usual: Setup) -> Setup:
         return replace(usual, gyro=Gyro() if gyro else None,
@@ -150,43 +138,31 @@ def simulate_drive(
     return record(course(WORLDS['drive'], seed, duration_s, change))
 
 
-def write_drive(drive: Recording, folder: str | Path, *, overwrite: bool = False) -> None:
+def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """
-    Write a drive as a rosbag2 with `/odom`, `/gps/fix`, `/loop_closure` and `/ground_truth`.
+    Write a recording as a rosbag2, message by message; return what there is to say of it.
 
-    With a gyroscope it has `/imu/data` as well.
-
-    Parameters
-    ----------
-    overwrite : bool, whether to replace an existing bag; otherwise one raises `BagError`
-
-    """
-    write_recording(drive, Path(folder), overwrite=overwrite)
-
-
-def write_recording(
-    drive: Recording, folder: Path, *, overwrite: bool = False,
-) -> dict[str, Any]:
-    """
-    Write a recording as a rosbag2, message by message.
-
-    Parameters
-    ----------
-    overwrite : bool, whether to replace an existing bag; otherwise one raises `BagError`
-
-    Returns
-    -------
-    about : dict, what there is to say of it
-
+    An existing bag raises `BagError`, unless it is to be replaced.
     """
     total = sum(len(recorded) for _, recorded in drive.arrivals.values())
     messages = heapq.merge(*(
         _delivered(each, *drive.arrivals[topic]) for topic, each in _messages(drive).items()),
         key=itemgetter(2))
     with BagWriter(folder, overwrite=overwrite) as bag:
-        for topic, type_name, recorded_ns, message in watched(messages, 'writing', total):
+        for topic, type_name, recorded_ns, message in watched(
+                messages, desc='writing', total=total):
             bag.write(topic, type_name, recorded_ns, message)
-    return _about_recording(drive)
+    about = {
+        'distance_m': drive.distance,
+        'topics': {topic: len(recorded) for topic, (_, recorded) in drive.arrivals.items()
+                   if len(recorded) > 0},
+        **_closures(drive.loop_group, drive.missing_groups, 'stamps_ns', drive.loop_stamps_ns),
+        'wrong_fixes_ns': drive.fix_stamps_ns[drive.fix_is_wrong].tolist(),
+        'wrong_global_poses_ns': drive.pose_stamps_ns[drive.pose_is_wrong].tolist(),
+        **_disturbances(drive.setup, drive.start_ns)}
+    for each, silenced in zip(about['outages'], drive.silenced, strict=True):
+        each['left_out'] = silenced
+    return about
 
 
 def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
@@ -231,48 +207,20 @@ def _delivered(
         yield topic, type_name, recorded, message
 
 
-def graph_texts(simulated: SimulatedGraph) -> tuple[str, str]:
-    """Return the texts of g2o files of a graph: at the poses by odometry, and at the true ones."""
-    start, truth = (g2o_text(simulated.graph(poses).rows())
-                    for poses in (simulated.start, simulated.truth.poses))
-    return start, truth
-
-
-def about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
+def _about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
     """Return what there is to say of a graph."""
-    true = simulated.graph(simulated.truth.poses)
-    n, closures = len(simulated.truth), len(simulated.group)
-    loops = simulated.loops
+    n, loops, observed = len(simulated.truth), simulated.loops, simulated.observed
+    measured = np.diagonal(observed.information, 0, 1, 2) > 0.0
     return {
         'distance_m': float(way.motion.distance[-1]), 'nodes': n,
-        'edges': n - 1 + closures, 'observed_nodes': len(simulated.observed),
-        'measured_numbers': _measured_numbers(simulated),
-        'chi2_of_the_truth': true.energies().chi2,
+        'edges': n - 1 + len(loops), 'observed_nodes': len(observed),
+        # the degrees of freedom of chi2 at the truth
+        'measured_numbers': 3 * len(simulated.edges) + int(np.sum(measured)),
+        'chi2_of_the_truth': simulated.graph(simulated.truth.poses).energies().chi2,
         **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
             (loops.i, loops.j))),
-        'wrong_observed_nodes': simulated.observed.node[simulated.wrong].tolist(),
+        'wrong_observed_nodes': observed.node[simulated.wrong].tolist(),
         **_disturbances(way.setup, int(way.truth.stamps_ns[0]))}
-
-
-def _measured_numbers(simulated: SimulatedGraph) -> int:
-    """Return how many numbers were measured, the degrees of freedom of chi2 at the truth."""
-    information = simulated.observed.information
-    return 3 * len(simulated.edges) + int(np.sum(np.diagonal(information, 0, 1, 2) > 0.0))
-
-
-def _about_recording(drive: Recording) -> dict[str, Any]:
-    setup = drive.setup
-    about = {
-        'distance_m': drive.distance,
-        'topics': {topic: len(recorded) for topic, (_, recorded) in drive.arrivals.items()
-                   if len(recorded) > 0},
-        **_closures(drive.loop_group, drive.missing_groups, 'stamps_ns', drive.loop_stamps_ns),
-        'wrong_fixes_ns': drive.fix_stamps_ns[drive.fix_is_wrong].tolist(),
-        'wrong_global_poses_ns': drive.pose_stamps_ns[drive.pose_is_wrong].tolist(),
-        **_disturbances(setup, drive.start_ns)}
-    for each, silenced in zip(about['outages'], drive.silenced, strict=True):
-        each['left_out'] = silenced
-    return about
 
 
 def _closures(
@@ -299,10 +247,6 @@ def _disturbances(setup: Setup, start_ns: int) -> dict[str, Any]:
                      'end_ns': stamp(each.end_s)} for each in setup.outages],
         'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s), 'end_ns': end(each),
                    'step': each.step} for each in setup.jumps],
-        'delays': [{'topic': each.topic, 'seconds': each.seconds, 'jitter_s': each.jitter_s}
-                   for each in setup.delays],
-        'clock_offsets': [{'topic': each.topic, 'seconds': each.seconds}
-                          for each in setup.offsets],
-        'duplicates': [{'topic': each.topic, 'share': each.share} for each in setup.duplicates],
-        'claimed_sigmas': [{'topic': each.topic, 'factor': each.factor}
-                           for each in setup.claims]}
+        **{name: [asdict(each) for each in found] for name, found in (
+            ('delays', setup.delays), ('clock_offsets', setup.offsets),
+            ('duplicates', setup.duplicates), ('claimed_sigmas', setup.claims))}}

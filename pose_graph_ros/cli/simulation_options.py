@@ -36,12 +36,9 @@ from pose_graph_ros.offline.simulation.settings import (
     Outage,
     POSES,
     Setup,
-    Wheels,
 )
 
-LONGEST_S = 100_000.0  # of a simulation, which takes 100 MB an hour
 PICTURES = ('.png', '.pdf', '.svg')
-NONE, RESET = 'none', 'reset'
 FALSE_SIZE = 4  # closures of a group of false ones
 # Options of what a graph does not have, by their names among the parsed ones.
 ONLY_IN_BAGS = ('odometry', 'wheel_scale', 'slip', 'heading_drift', 'gyro', 'gyro_noise', 'delay',
@@ -78,7 +75,7 @@ exit code: 0 written, 2 wrong input
                         help='folder of the rosbag2, or a graph if the name ends in .g2o')
     parser.add_argument('--world', choices=DURATIONS_S, default='drive',
                         help='(default: %(default)s)')
-    parser.add_argument('--duration', metavar='S', type=number(10.0, LONGEST_S),
+    parser.add_argument('--duration', metavar='S', type=number(10.0, 100_000.0),
                         help=f'length [s] (default: {_by_world(DURATIONS_S)})')
     parser.add_argument('--seed', metavar='N', type=number(0, whole=True), default=1,
                         help='(default: %(default)s)')
@@ -153,29 +150,35 @@ def _add_disturbances(parser: argparse.ArgumentParser) -> None:
         'disturbances', 'each may be repeated; times are seconds since the start. The drive has '
         'an outage and a jump\nof /gps/fix, which yours replace; "/gps/fix:none" removes them')
     for name, grammar, kind, text in (
-            ('--outage', 'TOPIC:FROM:TO', _outage, 'nothing is measured in between'),
-            ('--jump', 'TOPIC:AT:DX,DY[,RAD][:FOR]', _jump,
+            ('--outage', 'TOPIC:FROM:TO', Outage, 'nothing is measured in between'),
+            ('--jump', 'TOPIC:AT:DX,DY[,RAD][:FOR]', Jump,
              'step of odometry in the frame of the robot; or step of fixes or global poses, east '
              'and north, for so many seconds; /odom:AT:reset: odometry begins again at its '
              'origin'),
-            ('--delay', 'TOPIC:S[:JITTER]', _delay,
+            ('--delay', 'TOPIC:S[:JITTER]', Delay,
              'recorded so long after the stamp, plus 0 to JITTER at random, which shuffles '
              'messages'),
-            ('--duplicate', 'TOPIC:SHARE', _valued(Duplicates),
+            ('--duplicate', 'TOPIC:SHARE', Duplicates,
              'share of the messages that come again within a second'),
-            ('--clock-offset', 'TOPIC:S', _valued(ClockOffset),
+            ('--clock-offset', 'TOPIC:S', ClockOffset,
              'the clock of this sensor is ahead'),
-            ('--claimed-sigma', 'TOPIC:FACTOR', _valued(ClaimedSigma),
+            ('--claimed-sigma', 'TOPIC:FACTOR', ClaimedSigma,
              'ratio of the sigmas in the messages to the true ones (default: 1, honest)')):
-        group.add_argument(name, metavar=grammar, type=_spoken(grammar, kind), action='append',
-                           default=[], help=text)
+        group.add_argument(name, metavar=grammar, type=_disturbance(grammar, kind),
+                           action='append', default=[], help=text)
 
 
 def changed(usual: Setup, options: argparse.Namespace) -> Setup:
     """Return what is simulated, by the usual of the world and the options; raises ConfigError."""
+    wheels = _present({
+        'errors': options.odometry and OdometryErrors(options.odometry),
+        'scale': options.wheel_scale, 'heading_drift': options.heading_drift,
+        'slip_events_per_s': None if options.slip is None else options.slip / 60.0})
+    poses = _present({'period_s': options.global_pose, 'sigmas': options.global_pose_sigma})
     setup = replace(
-        usual, wheels=_wheels(usual.wheels, options), gyro=_gyro(options),
-        fixes=_fixes(usual.fixes, options), poses=_poses(options),
+        usual, wheels=replace(usual.wheels, **wheels), fixes=_fixes(usual.fixes, options),
+        gyro=Gyro(*options.gyro_noise or ()) if options.gyro or options.gyro_noise else None,
+        poses=GlobalPoses(**poses) if poses else None,
         closures=_closures(usual.closures or Closures(), options))
     present = [ODOMETRY, *(topic for topic, sensor in (
         (GYRO, setup.gyro), (FIXES, setup.fixes), (POSES, setup.poses), (CLOSURES, setup.closures))
@@ -209,35 +212,15 @@ def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
             raise ConfigError(f'--outage {ODOMETRY}: a graph cannot do without odometry')
 
 
-def _wheels(usual: Wheels, options: argparse.Namespace) -> Wheels:
-    given = {'errors': options.odometry and OdometryErrors(options.odometry),
-             'scale': options.wheel_scale, 'heading_drift': options.heading_drift,
-             'slip_events_per_s': None if options.slip is None else options.slip / 60.0}
-    return replace(usual, **_present(given))
-
-
-def _gyro(options: argparse.Namespace) -> Gyro | None:
-    if options.gyro_noise is not None:
-        return Gyro(*options.gyro_noise)
-    return Gyro() if options.gyro else None
-
-
 def _fixes(usual: Fixes | None, options: argparse.Namespace) -> Fixes | None:
     correlated, correlation = options.fix_correlated or (None, None)
     given = _present({'period_s': options.fix_period, 'white': options.fix_sigma,
                       'correlated': correlated, 'correlation_s': correlation})
-    if options.fix is False:
-        if given:
-            raise ConfigError('--no-fix: expected no other option on fixes, but there is one')
-        return None
-    if usual is None and options.fix is None and not given:
+    if options.fix is False and given:
+        raise ConfigError('--no-fix: expected no other option on fixes, but there is one')
+    if options.fix is False or (usual is None and options.fix is None and not given):
         return None
     return replace(usual or Fixes(), **given)
-
-
-def _poses(options: argparse.Namespace) -> GlobalPoses | None:
-    given = _present({'period_s': options.global_pose, 'sigmas': options.global_pose_sigma})
-    return GlobalPoses(**given) if given else None
 
 
 def _closures(usual: Closures, options: argparse.Namespace) -> Closures:
@@ -279,47 +262,25 @@ def _groups(text: str) -> tuple[int, int]:
     return groups, size
 
 
-def _spoken(
-    grammar: str, kind: Callable[[str, list[str]], Any],
-) -> Callable[[str], Change]:
+def _disturbance(grammar: str, kind: Callable[..., Any]) -> Callable[[str], Change]:
     """Return what reads a disturbance, and says what was expected if it cannot."""
     def read(text: str) -> Change:
         topic, *words = text.split(':')
-        if words == [NONE]:
+        if words == ['none']:
             return topic, None
         try:
-            return topic, kind(topic, words)
+            return topic, (_jump(topic, *words) if kind is Jump
+                           else kind(topic, *map(float, words)))
         except ConfigError as error:
             raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
-        except ValueError:
+        except (TypeError, ValueError):
             raise argparse.ArgumentTypeError(f'expected {grammar}, got {text!r}') from None
     return read
 
 
-def _outage(topic: str, words: list[str]) -> Outage:
-    begin, end = map(float, words)
-    return Outage(topic, begin, end)
-
-
-def _jump(topic: str, words: list[str]) -> Jump:
-    at, step, *duration = words
-    seconds, = map(float, duration or ['inf'])
-    if step == RESET:
-        return Jump(topic, float(at), None, seconds)
+def _jump(topic: str, at: str, step: str, seconds: str = 'inf') -> Jump:
+    if step == 'reset':
+        return Jump(topic, float(at), None, float(seconds))
     dx, dy, *turn = map(float, step.split(','))
     heading, = turn or [0.0]
-    return Jump(topic, float(at), (dx, dy, heading), seconds)
-
-
-def _delay(topic: str, words: list[str]) -> Delay:
-    seconds, *rest = map(float, words)
-    jitter, = rest or [0.0]
-    return Delay(topic, seconds, jitter)
-
-
-def _valued(kind: Callable[[str, float], Any]) -> Callable[[str, list[str]], Any]:
-    """Return what reads a topic and a number."""
-    def read(topic: str, words: list[str]) -> Any:
-        value, = map(float, words)
-        return kind(topic, value)
-    return read
+    return Jump(topic, float(at), (dx, dy, heading), float(seconds))

@@ -1,6 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Optimise a g2o, TORO or iSAM file, and print the constraints with the largest energies."""
+"""
+Optimise a g2o, TORO or iSAM file, and print the constraints with the largest energies.
+
+What takes long to load, such as compiled kernels, is imported where it is used.
+"""
+# ruff: noqa: PLC0415
 
 import argparse
 import json
@@ -8,26 +13,26 @@ import math
 from pathlib import Path
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.cli.graph_input import read_file
-from pose_graph_ros.cli.solve_starts import Problem, Solution, solve
-from pose_graph_ros.core.batch.outcome import Status
+from pose_graph_ros.cli.solve_starts import CONFIG, Problem, Solution, solve, with_certificate
+from pose_graph_ros.core.batch.levenberg_marquardt import Status
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
 
 if TYPE_CHECKING:
-    from pose_graph_ros.cli.believe import Doubt
-    from pose_graph_ros.cli.marginals import Marginals
+    from pose_graph_ros.core.graph.graph import Graph
 
-TOLD = 1e-6  # relative error of covariances from which on it is told
-N_LARGEST = 5  # number of edges, of observed nodes, and of names, that are printed
+N_LARGEST = 5  # edges, observed nodes, and names, that are printed
+COLUMNS = ('id', 'x', 'y', 'theta', 'cov_xx', 'cov_xy', 'cov_xtheta', 'cov_yy', 'cov_ytheta',
+           'cov_thetatheta')
 
 
-def _arguments(options: argparse.Namespace) -> None:
+def _complete(options: argparse.Namespace) -> None:
     """Complete the arguments: in `--robust FILE`, what follows the option is the file."""
     if options.robust not in (None, *METHODS):
         if options.graph is not None:
@@ -43,52 +48,57 @@ def _arguments(options: argparse.Namespace) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    _arguments(options)
+    _complete(options)
+
+    def say(line: str) -> None:
+        if not options.json:
+            print(line)
+
     file, order = read_file(options.graph, options.edge2)
     tables = [path for path in options.out if path.suffix == '.csv']
     which = options.marginals or ('all' if len(tables) > 0 else None)
     problem = Problem(file, plain=(
         options.robust is None and which is None and options.start == 'chordal'))
-    rows = None if which is None else _chosen_rows(problem, which)
-    text = _Text(options.json)
+    rows = None if which is None else _chosen(problem, which)
     held = problem.hold_parts()
     graph = problem.graph
     before = graph.energies().chi2
-    text.add(f'{graph.n_nodes} hidden nodes, {len(graph.edges)} edges, '
-             f'{len(graph.observed)} observed nodes; chi2 {before:.9g} as read')
+    say(f'{graph.n_nodes} hidden nodes, {len(graph.edges)} edges, '
+        f'{len(graph.observed)} observed nodes; chi2 {before:.9g} as read')
     if not file.has_start:
-        text.add('nodes without a pose in the file start at poses composed from the edges')
+        say('nodes without a pose in the file start at poses composed from the edges')
     if len(held) > 0:
-        text.add(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
-                 f'fixed: {_listed(file.ids[held])}')
-    begin = time.monotonic()
-    doubt = None if options.robust is None else _doubt(problem, options)
-    for line in () if doubt is None else doubt.lines:
-        text.add(line)
-    decided = doubt is not None and doubt.cost is not None
-    solution = solve(problem, 'present' if decided else options.start)
-    seconds = time.monotonic() - begin
-    certificate = None
-    if options.certificate:
-        from pose_graph_ros.cli.solve_certificate import with_certificate  # noqa: PLC0415
+        names = ', '.join(map(str, file.ids[held[:N_LARGEST]].tolist()))
+        say(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
+            f'fixed: {names}{", ..." if len(held) > N_LARGEST else ""}')
+    begin, start = time.monotonic(), options.start
+    doubted, decision, certificate = np.empty(0, np.int64), None, None
+    if options.robust is not None:
+        from pose_graph_ros.cli.believe import doubt
 
+        doubted, decision, lines = doubt(problem, options.robust, options.closure_sigma)
+        for line in lines:
+            say(line)
+        start = start if decision['truncated_cost'] is None else 'present'
+    solution = solve(problem, start)
+    seconds = time.monotonic() - begin
+    if options.certificate:
         solution, certificate = with_certificate(problem, solution, eigenvalue=options.json)
-    doubted = np.empty(0, np.int64) if doubt is None else doubt.doubted
-    _tell(problem, solution, seconds, doubted, text)
-    if certificate is not None:
-        for line in certificate.lines():
-            text.add(line)
+    say('\n'.join([*_lines(problem, solution, seconds, doubted),
+                   *([] if certificate is None else certificate.lines())]))
     table = None if rows is None else _marginals(problem, solution, rows)
     for path in options.out:
         if path in tables:
-            path.write_text('\n'.join(table.lines() if table else ()) + '\n', encoding='ascii')
+            assert table is not None
+            path.write_text('\n'.join(table.lines()) + '\n', encoding='ascii')
         else:
-            _write_graph(problem, path)
+            from pose_graph_ros.core.io.g2o_writing import write_g2o
+
+            write_g2o(problem.graph, path, problem.ids)
     if options.json:
-        values = _values(problem, solution, doubted, file.ids[held])
-        values |= {'chi2_start': before, 'seconds': seconds, 'edge2': order,
-                   'robust': _decision(doubt),
-                   'certificate': None if certificate is None else certificate.values()}
+        values = _values(problem, solution, doubted, file.ids[held]) | {
+            'chi2_start': before, 'seconds': seconds, 'edge2': order, 'robust': decision,
+            'certificate': None if certificate is None else certificate.values()}
         if table is not None:
             values |= {'marginals_relative_error': table.relative_error,
                        **({} if len(tables) > 0 else {'marginals': table.rows})}
@@ -98,35 +108,23 @@ def execute(options: argparse.Namespace) -> int:
     return 0 if solution.result.status is Status.CONVERGED else 1
 
 
-class _Text:
-    """Prints lines for people; with JSON there are none."""
-
-    def __init__(self, silent: bool) -> None:
-        self._silent = silent
-
-    def add(self, line: str) -> None:
-        if not self._silent:
-            print(line)
-
-
-def _tell(
-    problem: Problem, solution: Solution, seconds: float, doubted: IntArray, text: _Text,
-) -> None:
-    """Print chi2 with how it was reached, and the largest energies."""
+def _lines(
+    problem: Problem, solution: Solution, seconds: float, doubted: IntArray,
+) -> list[str]:
+    """Return chi2 with how it was reached, and the largest energies."""
     graph, ids, result = problem.graph, problem.ids, solution.result
-    for name, each in solution.tried:
-        text.add(f'  from the {name}: chi2 {each.chi2:.9g}, {each.status.value} after '
-                 f'{each.iterations} iterations')
-    text.add(f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
-             f'from the {solution.start}, {seconds:.3f} s'
-             f'{": " if result.reason else ""}{result.reason}')
-    energies = graph.energies()
-    for k in _largest(energies.edges, doubted):
-        text.add(f'  edge {ids[graph.edges.i[k]]} -> {ids[graph.edges.j[k]]}: '
-                 f'energy {energies.edges[k]:.4g}')
-    for k in np.argsort(energies.observed)[::-1][:N_LARGEST]:
-        text.add(f'  observed node on {ids[graph.observed.node[k]]}: '
-                 f'energy {energies.observed[k]:.4g}')
+    energies, edges = graph.energies(), graph.edges
+    order = np.argsort(energies.edges)[::-1]
+    return [
+        *(f'  from the {name}: chi2 {each.chi2:.9g}, {each.status.value} after '
+          f'{each.iterations} iterations' for name, each in solution.tried),
+        f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
+        f'from the {solution.start}, {seconds:.3f} s'
+        f'{": " if result.reason else ""}{result.reason}',
+        *(f'  edge {ids[edges.i[k]]} -> {ids[edges.j[k]]}: energy {energies.edges[k]:.4g}'
+          for k in order[~np.isin(order, doubted)][:N_LARGEST]),
+        *(f'  observed node on {ids[graph.observed.node[k]]}: energy {energies.observed[k]:.4g}'
+          for k in np.argsort(energies.observed)[::-1][:N_LARGEST])]
 
 
 def _values(
@@ -155,54 +153,75 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _chosen_rows(problem: Problem, which: str) -> IntArray:
-    """Return the rows of nodes; what knows of covariances is loaded only if asked for."""
-    from pose_graph_ros.cli.marginals import chosen_rows  # noqa: PLC0415
-
-    return chosen_rows(problem, which)
-
-
-def _decision(doubt: 'Doubt | None') -> dict[str, Any] | None:
-    """Return the key `robust` of the JSON output."""
-    if doubt is None:
-        return None
-    return {'method': doubt.method, 'closures': doubt.n_closures,
-            'doubted': len(doubt.doubted), 'scale': doubt.scale,
-            'truncated_cost': doubt.cost, 'truncated_cost_of_all': doubt.cost_of_all}
-
-
-def _doubt(problem: Problem, options: argparse.Namespace) -> 'Doubt':
-    """Decide about closures; what does so takes longer to load than all else here."""
-    from pose_graph_ros.cli.believe import doubt  # noqa: PLC0415
-
-    return doubt(problem, options.robust, options.closure_sigma)
+def _chosen(problem: Problem, which: str) -> IntArray:
+    """Return the rows of the nodes whose marginals are asked for."""
+    if which == 'all':
+        return np.arange(len(problem.ids))
+    if which == 'newest':
+        return np.array([problem.engine.newest_pose])
+    try:
+        names = [int(word) for word in which.split(',')]
+    except ValueError:
+        raise PoseGraphError(f'--marginals: expected all, newest or ids separated by commas, '
+                             f'got {which!r}') from None
+    for name in names:
+        if name not in problem.ids:
+            raise PoseGraphError(f'--marginals: the file has no vertex {name}')
+    return np.searchsorted(problem.ids, names)
 
 
-def _write_graph(problem: Problem, path: Path) -> None:
-    from pose_graph_ros.core.io.g2o_writing import write_g2o  # noqa: PLC0415
+class _Marginals(NamedTuple):
+    """Poses and covariances in map axes of some nodes."""
 
-    write_g2o(problem.graph, path, problem.ids)
+    rows: list[dict[str, float | None]]  # by `COLUMNS`; None for the heading of a point
+    relative_error: float  # that rounding may make: the condition number times epsilon
+
+    def lines(self) -> list[str]:
+        """Return lines of CSV."""
+        return [','.join(COLUMNS), *(','.join(
+            '' if value is None else repr(value) for value in row.values())
+            for row in self.rows)]
 
 
-def _marginals(problem: Problem, solution: Solution, rows: IntArray) -> 'Marginals':
-    from pose_graph_ros.cli.marginals import marginals  # noqa: PLC0415
+def _marginals(problem: Problem, solution: Solution, rows: IntArray) -> _Marginals:
+    """Return the covariances of nodes of a graph that the batch optimiser has solved."""
+    from pose_graph_ros.core.batch.optimizer import optimize
+    from pose_graph_ros.core.graph.constraints import upper
+    from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
     if solution.result.status is Status.FAILED or not solution.determined:
         raise PoseGraphError(f'--marginals: {solution.result.reason}')
-    table = marginals(problem, rows)
-    if table.relative_error > TOLD:
-        print(f'warning: by rounding, covariances may be off by {table.relative_error:.1g} of '
-              f'themselves', file=sys.stderr)
-    return table
+    graph = problem.engine
+    # H at the optimum; the last step before it was linearised one step away
+    optimize(graph, CONFIG)
+    covariances = IncrementalSmoother(graph=graph).covariances()
+    table = []
+    for row, pose, numbers in zip(rows.tolist(), graph.poses[rows].tolist(),
+                                  upper(covariances[rows]).tolist(), strict=True):
+        values: list[float | None] = [*pose, *numbers]
+        if not graph.is_pose[row]:
+            values = [None if k in {2, 5, 7, 8} else value for k, value in enumerate(values)]
+        table.append(dict(zip(COLUMNS, [int(problem.ids[row]), *values], strict=True)))
+    error = float(np.finfo(float).eps) * _condition(graph, covariances)
+    if error > 1e-6:
+        print(f'warning: by rounding, covariances may be off by {error:.1g} of themselves',
+              file=sys.stderr)
+    return _Marginals(table, error)
 
 
-def _largest(energies: FloatArray, left_out: IntArray) -> IntArray:
-    """Return the rows with the largest energies, without some of them."""
-    order = np.argsort(energies)[::-1]
-    return np.asarray(order[~np.isin(order, left_out)][:N_LARGEST])
+def _condition(graph: 'Graph', covariances: Covariances) -> float:
+    """
+    Return a bound of the condition number of H with a diagonal of ones.
 
-
-def _listed(names: IntArray) -> str:
-    """Return names separated by commas, at most five."""
-    return ', '.join(map(str, names[:N_LARGEST].tolist())) + (
-        ', ...' if len(names) > N_LARGEST else '')
+    The trace of its inverse, each variance times what constraints add to H there.
+    """
+    added = np.zeros((graph.n_nodes, 3))
+    edges, observed = graph.edges_by_row, graph.observed_by_row
+    for table, ends in ((edges, (edges.i, edges.j)), (observed, (observed.node,))):
+        information = table.weighted_information
+        position = information[:, 0, 0] + information[:, 1, 1]
+        arm = np.sum(table.mean[:, :2]**2, axis=1) if table is edges else 0.0
+        heading = information[:, 2, 2] + arm * position
+        for end in ends:
+            np.add.at(added, end, np.column_stack((position, position, heading)))
+    return max(float(np.sum(added * np.einsum('mii->mi', covariances))), 1.0)

@@ -1,32 +1,41 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Optimisation of a graph from a file from one or several starts; part of `pose-graph solve`."""
+"""
+Optimise a graph from a file from one or several starts, and certify the minimum.
+
+This is a part of `pose-graph solve`. The certificate may lead to a better minimum.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import re
-from typing import TYPE_CHECKING
+import time
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from pose_graph_ros.cli.arguments import STARTS
-from pose_graph_ros.core.batch.outcome import BatchResult, Start, Status
-from pose_graph_ros.core.batch.plain_graph import PlainGraph
-from pose_graph_ros.core.batch.plain_optimizer import PlainOptimizer
-from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import ObservedNodes
+from pose_graph_ros.core.batch.levenberg_marquardt import (
+    BatchResult,
+    SAME_MINIMUM,
+    Start,
+    Status,
+)
+from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, PlainOptimizer
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
+from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph_update import GraphUpdate
-from pose_graph_ros.core.graph.kinds import ObservedKind
 from pose_graph_ros.core.io.g2o import compose_missing, GraphFile
-from pose_graph_ros.core.solver_config import SolverConfig
+from pose_graph_ros.offline.certificate.certify import Certificate, certify, NearHessian, Verdict
+from pose_graph_ros.offline.certificate.objective import formulate, NotCoveredError
 
 if TYPE_CHECKING:
     from pose_graph_ros.core.graph.graph import Graph
 
-WEAK = 1e-7  # information of a weak prior, as a fraction of that of the median constraint
 CONFIG = SolverConfig(max_iterations=200)
-# Nodes up to which a graph is solved without compiled kernels, if possible.
-MOST_PLAIN_NODES = 20_000
+MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,34 +43,24 @@ class Solution:
     """A graph at the lowest minimum that was found."""
 
     result: BatchResult
-    start: str
-    """Poses from which it was reached."""
-    determined: bool
-    """Whether the constraints determine all poses."""
-    tried: tuple[tuple[str, BatchResult], ...] = ()
-    """All starts with their results, if there were several."""
-    optimizer: PlainOptimizer | None = None
-    """What found it, if no compiled kernels were used."""
+    start: str  # poses from which it was reached
+    determined: bool  # whether the constraints determine all poses
+    tried: tuple[tuple[str, BatchResult], ...] = ()  # all starts, if there were several
+    optimizer: PlainOptimizer | None = None  # what found it, if no compiled kernels were used
 
 
 class Problem:
     """
     A graph from a file that is to be optimised.
 
-    Parameters
-    ----------
-    file : GraphFile
-    plain : bool
-        Whether to do without compiled kernels if the graph is simple and not large. Loading them
-        takes longer than to solve such a graph.
-
+    With `plain` compiled kernels are not used if the graph is simple and not large: loading them
+    takes longer than to solve such a graph.
     """
 
     def __init__(self, file: GraphFile, *, plain: bool) -> None:
         self.ids, self.has_start, self._file = file.ids, file.has_start, file
         self._held: list[int] = []
-        self.plain: PlainGraph | None = None
-        """The graph, if no kernels are used."""
+        self.plain: PlainGraph | None = None  # the graph, if no kernels are used
         rows = file.rows
         if (plain and len(rows.poses) <= MOST_PLAIN_NODES and not np.all(rows.fixed)
                 and PlainGraph.is_covered(rows)):
@@ -97,14 +96,7 @@ class Problem:
 
 
 def solve(problem: Problem, start: str) -> Solution:
-    """
-    Return the result of optimising a graph in place.
-
-    Parameters
-    ----------
-    start : str, one of `STARTS`, or 'present' for the poses of the graph
-
-    """
+    """Return the result of optimising a graph in place."""
     if start != 'best':
         return _solve_from(problem, start, problem.graph.poses.copy())
     present = problem.graph.poses.copy()
@@ -121,14 +113,9 @@ def solve(problem: Problem, start: str) -> Solution:
     return replace(best, tried=tuple((each.start, each.result) for each, _ in found))
 
 
-def resumed(problem: Problem, solution: Solution, poses: FloatArray) -> Solution:
+def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
     """
     Return a solution after optimising from its poses again, so that the graph is factorised there.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), at the minimum [m, m, rad]
-
     """
     again = _solve_from(problem, 'present', poses)
     if again.result.status is not Status.CONVERGED:
@@ -140,7 +127,7 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
     if problem.plain is not None and start in {'chordal', 'present'}:
         problem.plain.set_poses(poses)
         plain = PlainOptimizer(problem.plain, CONFIG)
-        found = plain.from_chordal_start() if start == 'chordal' else plain.from_present_poses()
+        found = plain.optimize(Start.CHORDAL if start == 'chordal' else Start.PRESENT)
         if found is not None:
             return Solution(found, found.start.value, True, (), plain)
     # loads the compiled kernels
@@ -187,7 +174,7 @@ def _held_weakly(
     copy.fill(graph.rows())
     typical = np.concatenate([np.einsum('mii->mi', table.weighted_information).ravel()
                               for table in (graph.edges, graph.observed)])
-    weak = WEAK * np.median(typical[typical > 0.0]) * (
+    weak = 1e-7 * np.median(typical[typical > 0.0]) * (
         np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
     copy.apply(GraphUpdate(observed=ObservedNodes(
         np.arange(n), None, graph.poses.copy(), weak,
@@ -198,3 +185,101 @@ def _held_weakly(
     graph.set_poses(copy.poses)
     return replace(other, chi2=graph.energies().chi2,
                    reason=f'{result.reason}; it is held near its start'), False
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What the certificate says of a solution."""
+
+    certificate: Certificate | None
+    reason: str  # why there is none; else empty
+    seconds: float
+    chi2: float  # of the solution, with the error (3.48)
+    bounds_chi2: bool = False  # whether the lower bound is one of chi2 as well
+    chi2_from_it: float | None = None  # reached from the minimum that it found, if tried
+
+    @property
+    def bound(self) -> float | None:
+        """Lower bound of chi2, if one was proved."""
+        if self.certificate is None or not self.bounds_chi2:
+            return None
+        return max(self.certificate.bound, 0.0)
+
+    def values(self) -> dict[str, Any]:
+        """Return the keys of `certificate` in the JSON output, as in docs/tools.md."""
+        made = self.certificate
+        verdict = Verdict.NOT_ATTEMPTED if made is None else made.verdict
+        return {
+            'verdict': verdict.value, 'reason': self.reason, 'seconds': self.seconds,
+            'chi2': None if made is None else made.chi2,
+            'gap': None if made is None else made.gap,
+            'relative_gap': None if made is None else made.relative_gap,
+            'lambda_min': None if made is None else made.smallest,
+            'rank': None if made is None else made.rank,
+            'lower_minimum': made is not None and made.is_lower,
+            'chi2_from_it': self.chi2_from_it,
+            'chi2_bound': self.bound,
+            'chi2_gap': None if self.bound is None else max(self.chi2 - self.bound, 0.0)}
+
+    def lines(self) -> list[str]:
+        """Return what is printed."""
+        made = self.certificate
+        if made is None:
+            return [f'certificate: not attempted, because {self.reason}']
+        took = f'{self.seconds:.3f} s'
+        if made.verdict is Verdict.CERTIFIED:
+            lines = [f'certificate: certified, {took}: the chordal objective, {made.chi2:.9g} at '
+                     f'its minimum, is nowhere lower by more than {made.gap:.2g}']
+        else:
+            lines = [f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
+                     f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum '
+                     f'found']
+        if made.is_lower:
+            lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
+        if self.chi2_from_it is not None:
+            lines.append(f'  from there, chi2 becomes {self.chi2_from_it:.9g}')
+        if self.bound is None:
+            lines.append('  this bounds no chi2, whose information depends on the direction; it '
+                         'only speaks for the headings')
+        else:
+            above = max(self.chi2 - self.bound, 0.0)
+            lines.append(f'  so no poses have a chi2 below {self.bound:.9g}; that found is '
+                         f'{above:.2g} above this')
+        return lines
+
+
+def with_certificate(
+    problem: Problem, solution: Solution, *, eigenvalue: bool,
+) -> tuple[Solution, Report]:
+    """Return the certificate of a solution, and a better solution if it leads to one."""
+    begin, graph = time.monotonic(), problem.graph
+
+    def none(reason: str) -> tuple[Solution, Report]:
+        return solution, Report(
+            None, reason, time.monotonic() - begin, solution.result.chi2)
+
+    if not solution.determined:
+        return none('the constraints do not determine the poses')
+    if solution.result.status is Status.FAILED:
+        return none(f'the optimisation failed: {solution.result.reason}')
+    try:
+        formulation = formulate(graph)
+        by = solution.optimizer
+        made = certify(formulation, graph.poses, eigenvalue=eigenvalue, hessian=(
+            None if by is None else NearHessian(by.places, by.heading_steps)))
+    except (NotCoveredError, LinearSolveError) as error:
+        return none(str(error))
+    found = None
+    if made.is_lower:
+        poses = graph.poses.copy()
+        graph.set_poses(made.poses)
+        other = solve(problem, 'present')
+        found = other.result.chi2
+        if (other.result.status is not Status.FAILED
+                and found < solution.result.chi2 * (1.0 - SAME_MINIMUM)):
+            solution = Solution(other.result, 'minimum of the chordal objective',
+                                other.determined, solution.tried)
+        else:
+            solution = resumed(problem, solution, poses)
+    return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2,
+                            formulation.below_chi2, found)

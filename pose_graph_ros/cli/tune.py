@@ -14,15 +14,12 @@ from typing import Any
 from pose_graph_ros.adapters.bag_inputs import choose_inputs
 from pose_graph_ros.adapters.bags import BagError, open_bags
 from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.cli import options as shared
-from pose_graph_ros.cli.progress import WatchedBag
-from pose_graph_ros.cli.replay import span_of
-from pose_graph_ros.cli.results import read_truth
+from pose_graph_ros.cli import shared
+from pose_graph_ros.cli.drive import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
 from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
 from pose_graph_ros.cli.tuning_drive import TuningDrive
 from pose_graph_ros.offline.tuning.fit import CONTRADICTION
-from pose_graph_ros.offline.tuning.held_out import Summary
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -38,14 +35,16 @@ def execute(options: argparse.Namespace) -> int:
         raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bags(options.bags) as bag:
         inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options), span=span_of(bag, options),
-            truth=options.truth)
+            bag, source_list(values), shared.wanted_topics(options),
+            span=shared.span_of(bag, options), truth=options.truth)
         truth = None if options.truth is None else read_truth(bag, options.truth)
-        drive = TuningDrive(WatchedBag(bag, 'reading'), inputs, values)
+        drive = TuningDrive(shared.WatchedBag(bag, 'reading'), inputs, values)
         path = str(bag.path)
-    with _Status() as status:
-        tuning = Tuning(drive, inputs, values, path, status.show)
+    try:
+        tuning = Tuning(drive, inputs, values, path, _show)
         outcome = tuning.tune(options.folds, start + options.budget, truth)
+    finally:
+        _show('')
     names = ' '.join(each.name for each in options.bags)
     headline = [f'Noise by `pose-graph tune {names}`', *_notes(outcome, drive)]
     is_better = outcome.verdict is Verdict.BETTER
@@ -60,23 +59,10 @@ def execute(options: argparse.Namespace) -> int:
     return 0 if is_better else 1
 
 
-class _Status:
-    """A line on standard error that says what is being done, on a terminal only."""
-
-    def __enter__(self) -> '_Status':
-        self._shown = ''
-        return self
-
-    def show(self, text: str) -> None:
-        """Show a text instead of the one before."""
-        if sys.stderr.isatty() and text != self._shown:
-            print(f'\r{text:<{len(self._shown)}}', end='', file=sys.stderr, flush=True)
-            self._shown = text
-
-    def __exit__(self, *_: object) -> None:
-        self.show('')
-        if self._shown == '' and sys.stderr.isatty():
-            print('\r', end='', file=sys.stderr, flush=True)
+def _show(text: str) -> None:
+    """Say on a terminal what is being done, in place of what was said before."""
+    if sys.stderr.isatty():
+        print(f'\r\x1b[K{text}', end='', file=sys.stderr, flush=True)
 
 
 def _notes(outcome: Outcome, drive: TuningDrive) -> list[str]:
@@ -131,16 +117,12 @@ def _facts(
         'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
         'parameters': [_plain(asdict(each)) | {'changed': each.changes}
                        for each in outcome.tuned],
-        'before': _summary(outcome.before), 'after': _summary(outcome.after),
+        'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
         'to_truth': _plain(dict(zip(
             ('before', 'after'), outcome.to_truth, strict=False))) or None,
         'folds': outcome.folds, 'folds_done': outcome.folds_done, 'stretch_s': outcome.stretch,
         'doubted': outcome.n_doubted, 'contradiction': outcome.contradiction,
         'is_cut': drive.is_cut, 'seconds': seconds}
-
-
-def _summary(of: Summary) -> dict[str, Any]:
-    return _plain(of._asdict())
 
 
 def _plain(facts: Mapping[str, Any]) -> dict[str, Any]:

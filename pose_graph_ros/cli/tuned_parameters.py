@@ -14,10 +14,6 @@ from pose_graph_ros.offline.tuning.likelihood import Role
 
 ODOMETRY = ('sigma_distance', 'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn')
 LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters
-APART = 1.3  # ratio of the factors of positions and headings that both need a number
-DIGITS = 3  # that numbers have in the file
-UNDECIDED = 'kept: the data do not tell'
-AGREES = 'kept: as good as any'
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +23,7 @@ class Tuned:
     name: str
     before: Any
     after: Any
-    low: float = math.nan
-    """Ends of its interval of 95 %, in its unit; NaN if it has none."""
+    low: float = math.nan  # end of its interval of 95 %, in its unit; NaN if it has none
     high: float = math.nan
     note: str = ''
 
@@ -42,22 +37,9 @@ class Tuned:
         """Name of the source."""
         return self.name.partition('.')[0]
 
-    def kept(self, note: str) -> 'Tuned':
-        """Return the parameter with the value before."""
-        return replace(self, after=self.before, note=note)
-
 
 def odometry_parameters(source: str, found: Fit, values: Mapping[str, Any]) -> Iterator[Tuned]:
-    """
-    Yield the parameters of a source of odometry by a fit.
-
-    Parameters
-    ----------
-    source : str
-    found : Fit
-    values : mapping, all parameters before
-
-    """
+    """Yield the parameters of a source of odometry by a fit."""
     own = [each for each in found.found if each.parameter.role is Role.ODOMETRY]
     scale = math.sqrt(values[f'{source}.covariance_scale'])
     before, changed = values[f'{source}.sigma_scale'], any(not each.kept for each in own)
@@ -80,17 +62,7 @@ def odometry_parameters(source: str, found: Fit, values: Mapping[str, Any]) -> I
 def closure_parameters(
     odometry: str, closures: Sequence[str], found: Fit, values: Mapping[str, Any],
 ) -> Iterator[Tuned]:
-    """
-    Yield the parameters of odometry and of loop closures by factors on their sigmas.
-
-    Parameters
-    ----------
-    odometry : str, the primary source
-    closures : sequence of str, sources of loop closures
-    found : Fit
-    values : mapping, all parameters before
-
-    """
+    """Yield the parameters of odometry and of loop closures by factors on their sigmas."""
     by_role = {each.parameter.role: each for each in found.found}
     own, of_closures = by_role[Role.ODOMETRY], by_role[Role.CLOSURE]
     scale = values[f'{odometry}.sigma_scale'] or 1.0
@@ -115,17 +87,7 @@ def closure_parameters(
 def source_parameters(
     source: SourceOfPoses, index: int, found: Fit, values: Mapping[str, Any],
 ) -> Iterator[Tuned]:
-    """
-    Yield the parameters of a source of measurements in the map by a fit.
-
-    Parameters
-    ----------
-    source : SourceOfPoses
-    index : int, of the source in the fit
-    found : Fit
-    values : mapping, all parameters before
-
-    """
+    """Yield the parameters of a source of measurements in the map by a fit."""
     of = {each.parameter.role: each for each in found.found
           if each.parameter.index == index and each.parameter.role is not Role.ODOMETRY}
     size, heading = of.get(Role.CORRELATED) or of.get(Role.WHITE), of.get(Role.HEADING)
@@ -152,8 +114,9 @@ def _sizes(
     if leading is None:
         return
     scale, override = f'{source.name}.covariance_scale', f'{source.name}.covariance_override'
+    # factors of positions and headings that both need a number
     apart = size is not None and heading is not None and source.is_constant and (
-        max(heading.value, size.value) > APART * min(heading.value, size.value))
+        max(heading.value, size.value) > 1.3 * min(heading.value, size.value))
     if source.is_scalable and not apart:
         at_scale = values[scale]
         one = _one(scale, leading, values, lambda ratio: at_scale * ratio)
@@ -195,7 +158,7 @@ def _one(name: str, found: Found, values: Mapping[str, Any], value: Any) -> Tune
 
 
 def _kept_note(found: Found) -> str:
-    return UNDECIDED if found.is_wide else AGREES
+    return 'kept: the data do not tell' if found.is_wide else 'kept: as good as any'
 
 
 def changed(tuned: Iterable[Tuned]) -> dict[str, Any]:
@@ -204,15 +167,7 @@ def changed(tuned: Iterable[Tuned]) -> dict[str, Any]:
 
 
 def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
-    """
-    Return a parameter file with what changes, and comments.
-
-    Parameters
-    ----------
-    tuned : sequence of Tuned
-    headline : sequence of str, the first lines, without marks of comments
-
-    """
+    """Return a parameter file with what changes, and comments."""
     lines = [*(f'# {line}'.rstrip() for line in headline), '/**:', '  ros__parameters:']
     for source in dict.fromkeys(each.source for each in tuned):
         own = [each for each in tuned if each.source == source]
@@ -244,11 +199,11 @@ def _why(tuned: Tuned) -> str:
 
 def _rounded(value: float) -> float:
     """Return a value with some digits."""
-    return float(f'{value:.{DIGITS}g}')
+    return float(f'{value:.3g}')
 
 
 def _number(value: float) -> str:
-    return 'no bound' if math.isinf(value) else f'{value:.{DIGITS}g}'
+    return 'no bound' if math.isinf(value) else f'{value:.3g}'
 
 
 def _text(value: Any) -> str:

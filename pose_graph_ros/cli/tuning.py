@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,9 +29,10 @@ from pose_graph_ros.cli.tuned_parameters import (
     source_parameters,
     Tuned,
 )
-from pose_graph_ros.cli.tuning_drive import Key, LEAST, Run, SourceOfPoses, TuningDrive
+from pose_graph_ros.cli.tuning_drive import Key, LEAST, TuningDrive
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import LoopClosure
+from pose_graph_ros.core.quantities import Metres, Seconds
 from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
 from pose_graph_ros.offline.tuning.drive_rows import drive_rows, timeline
 from pose_graph_ros.offline.tuning.fit import estimate, Fit
@@ -67,39 +68,24 @@ class Outcome:
     verdict: Verdict
     before: Summary
     after: Summary
-    to_truth: Sequence[float]
-    """Rms error of the paths before and after to the truth [m]; empty if it is not known."""
+    to_truth: Sequence[Metres]  # rms of the paths before and after; empty if it is not known
     folds: int
     folds_done: int
-    stretch: float
-    """Length of the stretches that were held out [s]."""
-    measured: str
-    """How much was measured."""
+    stretch: Seconds  # length of those that were held out
+    measured: str  # how much was
     n_doubted: int
     contradiction: float
 
 
-@dataclass(slots=True)
-class _Fold:
-    """One part of the drive that is held out."""
+class _Tried(NamedTuple):
+    """What a path with some settings shows of what was held out."""
 
-    held_out: frozenset[Key]
-    tuned: list[Tuned]
-    before: list[Errors]
-    to_truth: float
+    errors: list[Errors]
+    to_truth: Metres
 
 
 class Tuning:
-    """
-    Tunes with the measurements of a drive.
-
-    Parameters
-    ----------
-    values : mapping, all parameters before
-    path : str, of the bag, for errors
-    show : callable, receives what is being done
-
-    """
+    """Tunes with the measurements of a drive."""
 
     def __init__(
         self, drive: TuningDrive, inputs: Inputs, values: Mapping[str, Any], path: str,
@@ -124,21 +110,14 @@ class Tuning:
         if not any(each.measured.has_positions for each in self._sources):
             self._sources, self._closures = [], drive.closures()
             if len(self._closures) < LEAST:
+                topics = ', '.join(f'{topic} ({source})'
+                                   for source, topic in inputs.topics.items())
                 raise BagError(
                     f'{path}: nothing to tune by: at least {LEAST} valid fixes, global poses or '
-                    f'loop closures are needed; used are {_topics(inputs)}')
+                    f'loop closures are needed; used are {topics}')
 
-    def tune(self, folds: int, deadline: float, truth: Trajectory | None) -> Outcome:
-        """
-        Return the parameters that are the most likely, and how well these do.
-
-        Parameters
-        ----------
-        folds : int
-        deadline : float, by `time.monotonic` [s]
-        truth : Trajectory, optional, only for comparison
-
-        """
+    def tune(self, folds: int, deadline: Seconds, truth: Trajectory | None) -> Outcome:
+        """Return the parameters that are the most likely, and how well these do."""
         self._steps = 2 + 3 * folds
         tuned, fits = self._estimate(frozenset(), 'estimating noise')
         start = time.monotonic()
@@ -158,19 +137,15 @@ class Tuning:
         n_done = int(np.clip((deadline - time.monotonic()) / per_fold, 1, folds))
         changes = len(changed(tuned)) > 0
         self._steps -= 3 * folds - (3 if changes else 1) * n_done
-        parts = [self._fold(k, folds, stretch, doubted, truth, is_tuned=changes)
+        tried = [self._fold(k, folds, stretch, doubted, truth, is_tuned=changes)
                  for k in range(n_done)]
-        after = self._after(parts, truth) if changes else [
-            (part.before, part.to_truth) for part in parts]
-        one, other = self._common([part.before for part in parts], [each for each, _ in after],
-                                  doubted)
+        one, other = self._common(tried, doubted)
         verdict = Verdict.SAME
         if changes:
             verdict = Verdict.BETTER if is_better(
                 one, other, self._start_ns, stretch) else Verdict.WORSE
-        errors = [float(np.sqrt(np.mean(np.square(each)))) for each in (
-            [part.to_truth for part in parts],
-            [each for _, each in after])] if truth is not None else []
+        errors = [] if truth is None else np.sqrt(np.mean(np.square(
+            [[each.to_truth for each in pair] for pair in tried]), axis=0)).tolist()
         return Outcome(tuned, verdict, summary(one), summary(other), errors, folds, n_done,
                        stretch, self._measured(), len(doubted),
                        max(each.contradiction for each in fits.values()))
@@ -199,7 +174,8 @@ class Tuning:
                 self._show(f'{text}: {count} evaluations')
         if len(self._closures) > 0:
             return self._estimate_by_closures(without, tick)
-        sources = [self._without(each, without) for each in self._sources]
+        sources = [each._replace(measured=each.measured.rows(~each.is_among(without)))
+                   for each in self._sources]
         measured = {each.name: each.measured for each in sources}
         fits = estimate(self._odometry, measured, self._config, tick)
         if len(fits) == 0:
@@ -231,77 +207,56 @@ class Tuning:
         sources = list(dict.fromkeys(name for name, _ in self._closures))
         return list(closure_parameters(primary, sources, found, self._values)), {primary: found}
 
-    def _without(self, source: SourceOfPoses, without: Collection[Key]) -> SourceOfPoses:
-        """Return a source without some measurements."""
-        if len(without) == 0:
-            return source
-        kept = np.array([(source.name, stamp) not in without
-                         for stamp in source.measured.stamps_ns.tolist()], dtype=bool)
-        return SourceOfPoses(
-            source.name, source.measured.rows(kept), is_constant=source.is_constant,
-            is_scalable=source.is_scalable, sigma=source.sigma,
-            sigma_heading=source.sigma_heading)
-
     def _period(self) -> float:
         """Return the longest median time between measurements of a source of positions [s]."""
         return max((float(np.median(np.diff(each.measured.stamps_ns))) * 1e-9
                     for each in self._sources if each.measured.has_positions), default=1.0)
 
     def _fold(
-        self, k: int, folds: int, stretch: float, doubted: Collection[Key],
+        self, k: int, folds: int, stretch: Seconds, doubted: Collection[Key],
         truth: Trajectory | None, *, is_tuned: bool,
-    ) -> _Fold:
-        """Return a fold, with the estimate of the noise if it is asked for, and its errors."""
+    ) -> tuple[_Tried, _Tried]:
+        """Return what a part that is held out shows of the settings before and after."""
+        every = [(source.name, source.measured.stamps_ns) for source in self._sources
+                 if source.measured.has_positions]
+        every += [(name, np.array([each.stamp_ns], dtype=np.int64))
+                  for name, each in self._closures]
         held_out = frozenset(
-            (source.name, stamp) for source in self._sources if source.measured.has_positions
-            for stamp in source.measured.stamps_ns[fold_of(
-                source.measured.stamps_ns, self._start_ns, stretch, folds) == k].tolist())
-        if len(self._closures) > 0:
-            stamps = np.array([each.stamp_ns for _, each in self._closures], dtype=np.int64)
-            folded = fold_of(stamps, self._start_ns, stretch, folds) == k
-            held_out = frozenset((name, each.stamp_ns) for (name, each), out in zip(
-                self._closures, folded.tolist(), strict=True) if out)
+            (name, stamp) for name, stamps in every
+            for stamp in stamps[fold_of(stamps, self._start_ns, stretch, folds) == k].tolist())
         text = f'part {k + 1} of {folds} held out'
-        tuned, _ = self._estimate(held_out | frozenset(doubted), text) if is_tuned else ([], {})
+        tuned = self._estimate(held_out | frozenset(doubted), text)[0] if is_tuned else []
         self._begin(f'{text}: running with the settings before')
-        run = self._drive.run(self._values, held_out)
-        return _Fold(held_out, tuned, self._errors(run, self._values, held_out),
-                     _to_truth(run, truth))
+        before = after = self._try(self._values, held_out, truth)
+        if is_tuned:
+            self._begin(f'{text}: running with the settings after')
+            after = self._try(self._with(tuned), held_out, truth)
+        return before, after
 
-    def _after(
-        self, parts: Sequence[_Fold], truth: Trajectory | None,
-    ) -> list[tuple[list[Errors], float]]:
-        """Return the errors of all folds after tuning, and those to the truth."""
-        after = []
-        for k, part in enumerate(parts):
-            self._begin(f'part {k + 1} held out: running with the settings after')
-            values = self._with(part.tuned)
-            run = self._drive.run(values, part.held_out)
-            after.append((self._errors(run, values, part.held_out), _to_truth(run, truth)))
-        return after
-
-    def _errors(
-        self, run: Run | None, values: Mapping[str, Any], held_out: Collection[Key],
-    ) -> list[Errors]:
+    def _try(
+        self, values: Mapping[str, Any], held_out: Collection[Key], truth: Trajectory | None,
+    ) -> _Tried:
+        run = self._drive.run(values, held_out)
         if run is None:
-            return []
-        if len(self._closures) > 0:
-            return [self._drive.closure_errors(run, held_out)]
-        return self._drive.errors(run, values, self._inputs, held_out)
+            return _Tried([], np.nan)
+        errors = ([self._drive.closure_errors(run, held_out)] if len(self._closures) > 0
+                  else self._drive.errors(run, values, self._inputs, held_out))
+        if truth is None or not np.any(inside := run.path.covers(truth.stamps_ns)):
+            return _Tried(errors, np.nan)
+        apart = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
+        return _Tried(errors, float(np.sqrt(np.mean(np.sum(apart**2, axis=1)))))
 
     def _common(
-        self, before: Sequence[Sequence[Errors]], after: Sequence[Sequence[Errors]],
-        doubted: Collection[Key],
+        self, tried: Sequence[tuple[_Tried, _Tried]], doubted: Collection[Key],
     ) -> tuple[Errors, Errors]:
         """Return the errors before and after at the same positions, which are not wrong."""
         stamps = np.array([stamp for _, stamp in doubted], dtype=np.int64)
         ones, others = [NO_ERRORS], [NO_ERRORS]
-        for part, same in zip(before, after, strict=True):
-            for one, other in zip(part, same, strict=True):
+        for before, after in tried:
+            for one, other in zip(before.errors, after.errors, strict=True):
                 common = np.isin(one.stamps_ns, other.stamps_ns) & ~np.isin(one.stamps_ns, stamps)
-                kept = np.isin(other.stamps_ns, one.stamps_ns[common])
                 ones.append(one.rows(common))
-                others.append(other.rows(kept))
+                others.append(other.rows(np.isin(other.stamps_ns, one.stamps_ns[common])))
         first, second = joined(ones), joined(others)
         right = ~wrong([first, second])
         return first.rows(right), second.rows(right)
@@ -311,18 +266,3 @@ class Tuning:
         counts = ', '.join([f'{len(each.measured.stamps_ns)} of {each.name}'
                             for each in self._sources] or [f'{len(self._closures)} closures'])
         return f'{self._duration:.0f} s of odometry, {counts}'
-
-
-def _to_truth(run: Run | None, truth: Trajectory | None) -> float:
-    """Return the rms error of a path [m]."""
-    if run is None or truth is None:
-        return float('nan')
-    inside = run.path.covers(truth.stamps_ns)
-    if not np.any(inside):
-        return float('nan')
-    errors = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
-
-
-def _topics(inputs: Inputs) -> str:
-    return ', '.join(f'{topic} ({source})' for source, topic in inputs.topics.items())

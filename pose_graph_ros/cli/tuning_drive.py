@@ -4,7 +4,6 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from pose_graph_ros.adapters.sources import backend_config, Kind
 from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.core.config import MeasurementSource
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.texts import states_by_stamps
@@ -30,68 +29,51 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
+from pose_graph_ros.core.quantities import Metres, Radians, StampNs
 from pose_graph_ros.core.sources.validation import validate, Validated
 from pose_graph_ros.offline.tuning import likelihood as lk
 from pose_graph_ros.offline.tuning.drive_rows import Measured, measured
 from pose_graph_ros.offline.tuning.held_out import Errors, errors_at
 
-# Measurements that are kept in memory, of about 700 bytes each.
-MOST_MEASUREMENTS = 1_000_000
-# Least number of measurements of a source whose noise is estimated.
-LEAST = 20
-# Claimed variances with a smaller ratio are the same.
-SAME = 1.05
+LEAST = 20  # measurements of a source whose noise is estimated
 
-Key = tuple[str, int]
-"""Source and stamp [ns] of a measurement."""
+Key = tuple[str, StampNs]
+"""Source and stamp of a measurement."""
 
 
-@dataclass(frozen=True, slots=True)
-class SourceOfPoses:
+class SourceOfPoses(NamedTuple):
     """What a source has measured in the map, by the settings of its covariances."""
 
     name: str
     measured: Measured
-    is_constant: bool
-    """Whether it always claims the same covariance."""
-    is_scalable: bool
-    """Whether a factor on what it claims makes sense: that is valid and not at a bound."""
-    sigma: float
-    """Median sigma of a coordinate [m]; 0 without positions."""
-    sigma_heading: float
-    """The same of a heading [rad]."""
+    is_constant: bool  # whether it always claims the same covariance
+    is_scalable: bool  # whether what it claims is valid and not at a bound, so that a factor helps
+    sigma: Metres  # median of a coordinate; 0 without positions
+    sigma_heading: Radians  # median; 0 without headings
+
+    def is_among(self, keys: Collection[Key]) -> BoolArray:
+        """Return which of its measurements are among some."""
+        return np.array([(self.name, stamp) in keys
+                         for stamp in self.measured.stamps_ns.tolist()], dtype=bool)
 
 
 class Run(NamedTuple):
     """Result of a run of the engine."""
 
     path: Trajectory
-    covariances: FloatArray
-    """Of the path, shape (P, 3, 3), in map axes."""
-    factors: Mapping[str, float]
-    """By which the engine multiplies the variances that a source claims."""
-    doubted: frozenset[Key]
-    """Measurements that contradict the others."""
+    covariances: Covariances  # of the path, in map axes
+    factors: Mapping[str, float]  # of the engine on the variances that a source claims
+    doubted: frozenset[Key]  # measurements that contradict the others
     graph: Graph
 
 
 class TuningDrive:
-    """
-    The measurements of a bag, all fixes in the same map.
-
-    Parameters
-    ----------
-    values : mapping, all parameters of the node
-
-    """
+    """The measurements of a bag, the first million, all fixes in the same map."""
 
     def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
-        reader = reader_of(bag, values)
-        self.refused: Counter[tuple[str, str]] = Counter()
-        stream = measurements_of(bag, inputs, reader, self.refused)
-        measurements = list(islice(stream, MOST_MEASUREMENTS))
-        self.is_cut = next(stream, None) is not None
-        """Whether the bag has more."""
+        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
+        measurements = list(islice(stream, 1_000_000))  # of about 700 bytes each
+        self.is_cut = next(stream, None) is not None  # whether the bag has more
         self.measurements = _in_the_map(measurements)
 
     def odometry(self, source: str) -> list[OdometrySample]:
@@ -107,14 +89,7 @@ class TuningDrive:
     def sources_of_poses(
         self, inputs: Inputs, values: Mapping[str, Any],
     ) -> list[SourceOfPoses]:
-        """
-        Return the sources with enough valid measurements in the map.
-
-        Parameters
-        ----------
-        values : mapping, all parameters of the node, which say what is valid
-
-        """
+        """Return the sources with enough valid measurements in the map."""
         config, found = backend_config(values), []
         for name in inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
             kept = [each for of, each in self.measurements if of == name
@@ -126,15 +101,7 @@ class TuningDrive:
         return found
 
     def run(self, values: Mapping[str, Any], without: Collection[Key] = ()) -> Run | None:
-        """
-        Return the result of the engine without some measurements; None if it has no path.
-
-        Parameters
-        ----------
-        values : mapping, all parameters of the node
-        without : collection, sources and stamps [ns] of measurements
-
-        """
+        """Return the result of the engine without some measurements; None if it has no path."""
         backend, _ = run_measurements((
             (name, each) for name, each in self.measurements
             if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
@@ -153,22 +120,11 @@ class TuningDrive:
     def errors(
         self, run: Run, values: Mapping[str, Any], inputs: Inputs, held_out: Collection[Key],
     ) -> list[Errors]:
-        """
-        Return the errors of a path at positions that were held out, for each source.
-
-        Parameters
-        ----------
-        values : mapping, all parameters, by which the covariances of positions are those of run
-        held_out : collection, sources and stamps [ns]
-
-        """
-        parts = []
-        for source in self.sources_of_poses(inputs, values):
-            chosen = np.array([(source.name, stamp) in held_out
-                               for stamp in source.measured.stamps_ns.tolist()], dtype=bool)
-            parts.append(errors_at(run.path, run.covariances, source.measured.rows(chosen),
-                                   run.factors.get(source.name, 1.0)))
-        return parts
+        """Return the errors of a path at positions that were held out, for each source."""
+        return [errors_at(run.path, run.covariances,
+                          source.measured.rows(source.is_among(held_out)),
+                          run.factors.get(source.name, 1.0))
+                for source in self.sources_of_poses(inputs, values)]
 
     def closure_errors(self, run: Run, held_out: Collection[Key]) -> Errors:
         """Return the errors of a path at closures, in the frames of their references."""
@@ -229,7 +185,7 @@ def _in_the_map(
 
 
 def _is_same(variances: FloatArray) -> bool:
-    return len(variances) == 0 or bool(np.max(variances) < SAME * np.min(variances))
+    return len(variances) == 0 or bool(np.max(variances) < 1.05 * np.min(variances))
 
 
 def _median_sigma(variances: FloatArray) -> float:

@@ -11,7 +11,7 @@ Public names; import each from its own module, as importing all of them costs st
 - `measurements.OdometrySample`, `GlobalPose`, `Position`, `HeadingOnly`, `LoopClosure`: inputs.
 - `measurements.Answer`: whether an input was accepted, waits, or was rejected, and why.
 - `estimate.Estimate`, `estimate.UpdateReport`: immutable outputs.
-- `prediction.predict`: propagate an estimate to newer odometry, without the back end.
+- `estimate.predict`: propagate an estimate to newer odometry, without the back end.
 - `warm_up.warm_up`: compile or load all kernels before the first measurement.
 - `geometry.geodesy.TangentPlane`: convert latitude and longitude to map coordinates and back.
 - `geometry.trajectory.Trajectory`: stamped poses with interpolation.

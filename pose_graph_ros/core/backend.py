@@ -2,19 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The facade of the engine, for the node, the offline tools and the tests."""
 
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Self
 
 import numpy as np
 
-from pose_graph_ros.core import isolation, newest_estimate
+from pose_graph_ros.core import disagreement, newest_estimate
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Solve, Status
-from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.config import BackendConfig, CovariancePolicy
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.forgetting import Forgetting
@@ -22,9 +20,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import graph_view
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.io.capture import capture, Parts, restore
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judge import Judge
@@ -37,19 +34,17 @@ from pose_graph_ros.core.measurements import (
     rejected,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.parts import capture, Parts, restore
 from pose_graph_ros.core.refiner import Refiner
-from pose_graph_ros.core.relocation import relocate
-from pose_graph_ros.core.residuals import components, disagreement
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import DIVERGED, Refinement
+from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names as cn
-from pose_graph_ros.core.sources.constraint_queue import Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.measurement_constraints import attach
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
+from pose_graph_ros.core.sources.source_constraints import Queue, QueuedEdge
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.core.transaction import Transaction
-
-MOST_IN_UPDATE = 1000  # edges of a graph in which an update may change all weights of odometry
+from pose_graph_ros.core.sources.validation import validate
+from pose_graph_ros.core.transaction import Transaction, update_isolated, update_with_all
 
 
 class PoseGraphBackend:
@@ -76,11 +71,14 @@ class PoseGraphBackend:
     ) -> None:
         self._config, self._solve = config or BackendConfig(), solve
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
+        self.graph = self._smoother.graph  # which only this object may change
         self._nodes = HiddenNodes(self._config, self._make_node)
         self.odometry = self._nodes.streams  # by source, to be read only
         self._newest_node_covariance = np.zeros((3, 3))  # in map axes
         self._reweighting = Reweighting()
         self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
+        self.verdicts, self.verdict_totals = self._judge.verdicts, self._judge.totals
+        self.verdict_changes = self._judge.changes
         self._factors = FactorBuilder(self._config, self._reweighting)
         self.gyro_biases = self._factors.gyros.values
         self.disagreement = lambda: disagreement.find(self._smoother, self._nodes, self._factors)
@@ -89,10 +87,12 @@ class PoseGraphBackend:
         self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self.gyro_differences = self._pipeline.gyros.differences
+        self.counts = self._pipeline.counts  # of answers by source and 'accepted' or the reason
+        self.refusals = self._pipeline.refusals  # details of the newest ones by source and reason
         self._quarantine, self._alignment = Queue(), AlignmentMonitor(self._config)
-        self._forgetting = Forgetting(self._smoother, self._tuner, self._parts())
+        self._forgetting = Forgetting(self._smoother, self._tuner, self.parts())
         self._settled, self._chi2 = True, 0.0
-        self._waits = False     # whether the queue waits until the graph is solved
+        self._waits = False  # whether the queue waits until the graph is solved
 
     def configure(self, config: BackendConfig) -> None:
         """Change the settings for later input; raises as `BackendConfig.changed_to` does."""
@@ -102,21 +102,6 @@ class PoseGraphBackend:
         self._factors.config = config
         self._judge.configure(config)
         self._alignment.configure(config)
-
-    @property
-    def graph(self) -> Graph:
-        """The pose graph, which only this object may change."""
-        return self._smoother.graph
-
-    @property
-    def counts(self) -> Counter[tuple[str, str]]:
-        """Number of answers by (source, 'accepted' or the reason)."""
-        return self._pipeline.counts
-
-    @property
-    def refusals(self) -> dict[tuple[str, str], str]:
-        """Detail of the newest refusal by (source, reason)."""
-        return self._pipeline.refusals
 
     @property
     def refused_closures(self) -> list[tuple[str, int, int | None]]:
@@ -156,11 +141,6 @@ class PoseGraphBackend:
         """Return a copy of the graph for display; None before the first odometry."""
         return graph_view.view(self.graph, self._judge.drawn_rows())
 
-    def residuals(self) -> components.Analysis:
-        """Return the residuals of each source with what they show; linear in the graph."""
-        return components.analyse(self._smoother, self._nodes, self._factors, self._reweighting,
-                                  self._judge.closures())
-
     def measured(self) -> dict[str, IntArray]:
         """Return the stamps of all measurements in the map in the graph [ns], by source."""
         return {source: stamps for source, (stamps, _) in self._factors.held().items()}
@@ -168,18 +148,6 @@ class PoseGraphBackend:
     def largest_energies(self, n: int) -> list[cn.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""
         return cn.largest(self.graph, self._nodes, self._factors, n)
-
-    def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
-        """Return all verdicts, but of those that are believed only the newest of each source."""
-        return self._judge.verdicts(most_believed)
-
-    def verdict_changes(self) -> list[vd.Change]:
-        """Return the changes of verdicts since the last call."""
-        return self._judge.changes()
-
-    def verdict_totals(self) -> Mapping[str, vd.SourceVerdicts]:
-        """Return what is believed of each source, as a whole."""
-        return self._judge.totals()
 
     def decide(self, name: str, decision: vd.Decision) -> Answer:
         """Return the answer to a decision on a `Verdict.id`; the next update applies it."""
@@ -227,12 +195,6 @@ class PoseGraphBackend:
 
         The graph does not depend on the order. The answer is pending if odometry has not reached
         the stamp; `counts` contains the later answer.
-
-        Parameters
-        ----------
-        measurement : Measurement
-        source : str
-
         """
         return self._pipeline.add(measurement, source)
 
@@ -242,29 +204,43 @@ class PoseGraphBackend:
 
         Before the graph is aligned, this adds a global pose. Afterwards it means that the robot
         was moved without odometry: a new node at the pose follows the last one by a loose edge.
-
-        Parameters
-        ----------
-        pose : GlobalPose, a stamp outside the odometry is replaced by the nearest one inside
-        source : str, key of the counts and of the settings for its covariance
-
+        A stamp outside the odometry is replaced by the nearest one inside.
         """
         self.finish()
         if self.graph.n_nodes == 0:
             return self._pipeline.count(source, rejected('before_odometry', 'no odometry yet'))
         first_ns = max(int(self.node_stamps_ns[0]), self._nodes.last_frozen_ns)
-        last_ns = self._nodes.covered_ns
-        pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), last_ns))
+        pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), self._nodes.covered_ns))
         if not self._alignment.is_aligned:
             return self.add_measurement(pose, source)
-        moved = relocate(pose, self._config.measurement_source(source, GlobalPose).covariance,
-                         self.graph, self._nodes)
+        moved = self._relocate(
+            pose, self._config.measurement_source(source, GlobalPose).covariance)
         if isinstance(moved, Answer):
             return self._pipeline.count(source, moved)
         self._collect()
         self._alignment.stop_rechecking()
         self._pipeline.attach_to_node(moved, source, int(self._nodes.ids[-1]))
         return self._pipeline.count(source, ACCEPTED)
+
+    def _relocate(self, pose: GlobalPose, policy: CovariancePolicy) -> GlobalPose | Answer:
+        """Return the pose of a new hidden node after the newest odometry; or why there is none."""
+        validated, last_ns = validate(pose, policy), self._nodes.covered_ns
+        if isinstance(validated, Answer):
+            return validated
+        measurement = validated.measurement
+        begin, end = attach(self._nodes, pose.stamp_ns), attach(self._nodes, last_ns)
+        if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
+                measurement, GlobalPose):
+            return rejected('no_odometry', 'none at that time')
+        first, last, newest = self.graph.poses_of([
+            begin.node, end.node, int(self._nodes.ids[-1])])
+        moved = se2.between(se2.compose(first, begin.motion), se2.compose(last, end.motion))
+        now = se2.compose(measurement.pose, moved)
+        # the motion to the new node is unknown [m, m, rad]
+        noise = np.diag((1000.0, 1000.0, 3.0)) ** 2
+        if self._nodes.relocate(se2.between(newest, now), noise) < 0:
+            return rejected('failed', 'the solver failed')
+        return replace(measurement, stamp_ns=last_ns + 1, pose=now)
 
     def update(self) -> UpdateReport:
         """
@@ -280,7 +256,7 @@ class PoseGraphBackend:
 
     def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, Queue]:
         """Return the report of an update, and the constraints for which it had no time."""
-        return isolation.update(
+        return update_isolated(
             partial(self._add_queue, at_once=at_once), self._settle, self._pipeline,
             self._quarantine, lambda one: cn.queued(one, self._nodes)[0])
 
@@ -295,16 +271,17 @@ class PoseGraphBackend:
     def _add_queue(self, *, at_once: bool) -> tuple[UpdateReport, Queue]:
         """Add the constraints in the queue and solve; return those that it could not add."""
         if self.graph.n_nodes == 0:
-            return UpdateReport(Status.CONVERGED, '', 0, 0, 0.0), Queue()
+            return UpdateReport(Status.CONVERGED), Queue()
         if self._waits and self._judge.solves_later and not at_once:
             self._judge.work()
-            return UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, self._chi2), Queue()
+            return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), Queue()
         with self._transaction() as transaction:
             T_map_graph = self._alignment.find(
                 self.graph, self._pipeline.queue.observed, self._nodes)
-            queue = transaction.add(self._pipeline.take_ready(aligned=self._alignment.is_aligned))
+            queue = transaction.queue = self._pipeline.take_ready(
+                aligned=self._alignment.is_aligned)
             if len(queue) == 0 and self._settled:
-                return UpdateReport(Status.CONVERGED, '', 0, 0, self._chi2), Queue()
+                return UpdateReport(Status.CONVERGED, chi2=self._chi2), Queue()
             if T_map_graph is not None:
                 transaction.move_graph(T_map_graph)
             # once aligned, measurements fix the gauge, and the first node is no longer fixed
@@ -317,17 +294,18 @@ class PoseGraphBackend:
         self._waits = transaction.failure == DIVERGED and not at_once
         if self._waits:
             self._refiner.restart()
-            return UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, self._chi2), transaction.queue
+            return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), transaction.queue
         if transaction.failure != '':
             self._settled = self._settled and not transaction.moved_back
-            return (UpdateReport(Status.FAILED, transaction.failure, 0, 0, self._chi2),
+            return (UpdateReport(Status.FAILED, transaction.failure, chi2=self._chi2),
                     transaction.queue)
         self._factors.commit()
         self._judge.commit()
         self._alignment.add(queue.observed)
         self._refiner.restart()
         result, self._settled = self._refiner.reweight(transaction.result, self._transaction)
-        self._tuner.step(MOST_IN_UPDATE)
+        # in a larger graph an update does not change all weights of odometry
+        self._tuner.step(1000)
         self._recheck_alignment()
         self._evaluate()
         return UpdateReport(
@@ -368,7 +346,7 @@ class PoseGraphBackend:
         if self._optimize_whole().status is not Status.FAILED:
             self.counts['alignment', 'done_over'] += 1
             # the frozen part of the path stays in front of the rest
-            self._nodes.table.move_frozen(se2.compose(graph.poses_of(oldest), se2.inverse(left)))
+            self._nodes.move_frozen(se2.compose(graph.poses_of(oldest), se2.inverse(left)))
             return
         self.graph.set_poses(before)
         with self._transaction():
@@ -382,7 +360,7 @@ class PoseGraphBackend:
     def optimize(self) -> UpdateReport:
         """Optimise the whole graph with all quarantined constraints; for the end of a stream."""
         self.finish()
-        report = isolation.update_with_all(
+        report = update_with_all(
             partial(self._update, at_once=True), self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
@@ -408,7 +386,7 @@ class PoseGraphBackend:
         if result.status is Status.FAILED:
             self._settled = False
             self.counts['solver', 'failed'] += 1
-            return UpdateReport(Status.FAILED, result.reason, 0, 0, self._chi2)
+            return UpdateReport(Status.FAILED, result.reason, chi2=self._chi2)
         self._settled = self._refiner.finished = result.status is not Status.MAX_ITERATIONS
         self._chi2 = result.chi2
         self._newest_node_covariance = self._smoother.newest_covariance()
@@ -419,24 +397,24 @@ class PoseGraphBackend:
         if self.graph.n_nodes == 0:
             return None
         return newest_estimate.estimate(
-            self._parts(), self._smoother, self._config.odometry_source(self._nodes.primary),
+            self.parts(), self._smoother, self._config.odometry_source(self._nodes.primary),
             self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
         """Return those at the path of the present estimate; see `newest_estimate`."""
         return newest_estimate.path_covariances(
-            self._parts(), self._smoother.covariances(), estimate)
+            self.parts(), self._smoother.covariances(), estimate)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
-        """Return the graph with its state since the last update; see `io.capture.capture`."""
+        """Return the graph with its state since the last update; see `parts.capture`."""
         self._tuner.finish_change()
-        return capture(self._parts(), self._newest_node_covariance, self._chi2, datum)
+        return capture(self.parts(), self._newest_node_covariance, self._chi2, datum)
 
     @classmethod
     def restored(cls, config: BackendConfig | None, saved: SavedGraph) -> Self:
-        """Return a back end that continues a saved graph; see `io.capture.restore`."""
+        """Return a back end that continues a saved graph; see `parts.restore`."""
         backend = cls(config)
-        restore(backend._parts(), saved)
+        restore(backend.parts(), saved)
         backend._tuner.restored(knows_errors=len(saved.nodes.errors) > 0)
         backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
@@ -444,6 +422,7 @@ class PoseGraphBackend:
         backend._settled, backend._chi2 = False, saved.chi2
         return backend
 
-    def _parts(self) -> Parts:
+    def parts(self) -> Parts:
+        """Return what it is made of, for tools."""
         return Parts(self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
-                     self._pipeline, self._quarantine, self._judge)
+                     self._pipeline, self._quarantine, self._judge, self._smoother)

@@ -11,26 +11,65 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 import math
+from typing import Any
 
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.gyro_config import GyroSource, Integrate
 from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
-from pose_graph_ros.core.setting_checks import require, require_member, require_same
-from pose_graph_ros.core.solver_config import SolverConfig
 
-# Motion since the last hidden node below which the robot stands still [m], [rad].
-REST_DISTANCE = 0.05
-REST_HEADING = 0.05
 # Sigma of a heading that is uniform on the circle [rad].
 FLAT_GUESS = math.pi / math.sqrt(3.0)
-
+# Least sigmas of loop closures to decide by whether to believe them, as claimed covariances are
+# mostly too small [m, m, rad].
+CLOSURE_FLOORS = (0.3, 0.3, 0.05)
 # Correlation time of a source whose errors tell whether they are correlated, and for how long.
 FOUND = -1.0
 
 
+def require(settings: object, *names: str, positive: bool = False) -> None:
+    """Raise ConfigError unless the named settings are finite and not negative."""
+    for name in names:
+        value = getattr(settings, name)
+        if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
+            expected = 'a positive number' if positive else 'a number that is not negative'
+            raise ConfigError(
+                f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
+
+
+def require_member(settings: object, name: str, kind: type[Enum]) -> None:
+    """Raise ConfigError unless the named setting is a member of an enumeration."""
+    value = getattr(settings, name)
+    if not isinstance(value, kind):
+        raise ConfigError(f'{type(settings).__name__}.{name}: expected one of '
+                          f'{", ".join(map(str, kind))}, got {value!r}')
+
+
+def require_same(what: str, present: object, wanted: object, *names: str) -> None:
+    """
+    Raise ConfigError if one of the named settings differs, as it cannot change while it runs.
+    """
+    for name in names:
+        old, new = getattr(present, name), getattr(wanted, name)
+        if old != new:
+            raise ConfigError(
+                f'{what}.{name}: cannot change while it runs, expected {old!r}, got {new!r}')
+
+
+def check(settings: Any, *positive: str, but: str = '') -> None:
+    """
+    Raise ConfigError unless numbers are valid and choices are members of their enumerations.
+
+    Those of the given names are positive, and all but one are finite and not negative.
+    """
+    for name, default in ((each.name, each.default) for each in fields(settings)):
+        if isinstance(default, Enum):
+            require_member(settings, name, type(default))
+        elif isinstance(default, float | int) and name != but:
+            require(settings, name, positive=name in positive)
+
+
 class Loss(Enum):
     """
-    Loss of a constraint as a function of its energy; see `graph.losses`.
+    Loss of a constraint as a function of its energy; see `graph.reweighting`.
 
     A threshold of 3 sigma keeps 96 % (Cauchy), 89 % (truncated, Geman-McClure), 99 % (Huber, DCS)
     of the accuracy of least squares where no measurement is wrong; Tukey needs 5 sigma for 95 %.
@@ -48,31 +87,32 @@ class Loss(Enum):
 class Robust(Enum):
     """How a source is protected from its wrong measurements."""
 
+    # the back end decides which ones to believe (`core.judgement`); a loss applies to these
     JUDGED = 'judged'
-    """The back end decides which ones to believe (`core.judgement`); a loss applies to these."""
-    LOSS = 'loss'
-    """All are used, with the robust loss of the source."""
-    NONE = 'none'
-    """All are used, as if the source had no robust loss."""
+    LOSS = 'loss'  # all are used, with the robust loss of the source
+    NONE = 'none'  # all are used, as if the source had no robust loss
 
 
 class Heading(Enum):
     """Whether the heading of a global pose is used."""
 
-    AUTO = 'auto'
-    """If its variance is positive and smaller than that of a uniform distribution."""
-    ALWAYS = 'always'
-    """The default replaces an unknown variance."""
+    AUTO = 'auto'  # if its variance is positive and smaller than that of a uniform distribution
+    ALWAYS = 'always'  # the default replaces an unknown variance
     NEVER = 'never'
 
 
 class NoiseFrom(Enum):
     """Source of the noise of odometry."""
 
-    MODEL = 'model'
-    """`OdometryNoise`, from the length of the path and the turns."""
-    TWIST = 'twist'
-    """Covariance of the twist in each message, times the time to the next message."""
+    MODEL = 'model'  # `OdometryNoise`, from the length of the path and the turns
+    TWIST = 'twist'  # covariance of the twist in each message, times the time to the next message
+
+
+class Integrate(Enum):
+    """What the motion by odometry is taken from."""
+
+    POSE = 'pose'  # the pose in each message
+    TWIST = 'twist'  # the twist in each message, integrated over the time between messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,23 +124,17 @@ class OdometryNoise:
     the spacing of the hidden nodes therefore does not change the covariance of the estimate.
     """
 
-    sigma_distance: float = 0.05
-    """Sigma along the direction of travel [m per sqrt(m) travelled]."""
-    sigma_lateral: float = 0.03
-    """Sigma across the direction of travel [m per sqrt(m) travelled]."""
+    sigma_distance: float = 0.05  # sigma along the direction of travel [m per sqrt(m) travelled]
+    sigma_lateral: float = 0.03  # sigma across the direction of travel [m per sqrt(m) travelled]
+    # sigma of the heading by distance [rad per sqrt(m) travelled]
     sigma_heading_distance: float = 0.01
-    """Sigma of the heading by distance [rad per sqrt(m) travelled]."""
-    sigma_heading_turn: float = 0.05
-    """Sigma of the heading by turns [rad per sqrt(rad) turned]."""
+    sigma_heading_turn: float = 0.05  # sigma of the heading by turns [rad per sqrt(rad) turned]
+    # sigma of the position added per increment [m]; keeps the information finite at rest
     sigma_floor_position: float = 0.002
-    """Sigma of the position added per increment [m]; keeps the information finite at rest."""
-    sigma_floor_heading: float = 0.0005
-    """Sigma of the heading added per increment [rad]."""
+    sigma_floor_heading: float = 0.0005  # sigma of the heading added per increment [rad]
 
     def __post_init__(self) -> None:
-        require(self, 'sigma_distance', 'sigma_lateral', 'sigma_heading_distance',
-                 'sigma_heading_turn')
-        require(self, 'sigma_floor_position', 'sigma_floor_heading', positive=True)
+        check(self, 'sigma_floor_position', 'sigma_floor_heading')
 
     def scaled(self, factor: float) -> 'OdometryNoise':
         """Return the noise with all sigmas times a factor."""
@@ -114,52 +148,73 @@ class OdometrySource:
     noise: OdometryNoise = field(default_factory=OdometryNoise)
     noise_from: NoiseFrom = NoiseFrom.MODEL
     integrate: Integrate = Integrate.POSE
-    covariance_scale: float = 1.0
-    """Factor on the covariance of every increment."""
+    covariance_scale: float = 1.0  # factor on the covariance of every increment
+    # factor on the sigmas of the primary odometry; 0 for one that fixes and poses show
     sigma_scale: float = 0.0
-    """Factor on the sigmas of the primary odometry; 0 for one that fixes and poses show."""
+    # a sample that is older by stamp than the newest one by up to this is still used [s]
     reorder_window: float = 0.25
-    """A sample that is older by stamp than the newest one by up to this is still used [s]."""
-    maximum_speed: float = 60.0
-    """A faster motion counts as a jump of the odometry [m/s]."""
+    maximum_speed: float = 60.0  # a faster motion counts as a jump of the odometry [m/s]
     loss: Loss = Loss.NONE
-    rejection_threshold: float = 3.0
-    """Threshold k of the loss [sigma]."""
+    rejection_threshold: float = 3.0  # threshold k of the loss [sigma]
 
     def __post_init__(self) -> None:
-        require(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold', positive=True)
-        require(self, 'reorder_window', 'sigma_scale')
-        require_member(self, 'noise_from', NoiseFrom)
-        require_member(self, 'integrate', Integrate)
-        require_member(self, 'loss', Loss)
+        check(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold')
+
+
+class RateNoise(Enum):
+    """Source of the noise of a gyroscope."""
+
+    # variance of the rate in each message, if it is positive, else `sigma_rate`
+    MESSAGE = 'message'
+    MODEL = 'model'  # `sigma_rate`
+
+
+@dataclass(frozen=True, slots=True)
+class GyroSource:
+    """
+    Settings of a gyroscope, whose yaw rate is integrated between hidden nodes.
+
+    Its error is white noise and a bias, which is a random walk.
+    """
+
+    noise_from: RateNoise = RateNoise.MESSAGE
+    # white noise of the rate, as the angle random walk that it integrates to [rad/sqrt(s)]
+    sigma_rate: float = 1e-3
+    sigma_bias: float = 0.02  # sigma of the bias when the sensor is switched on [rad/s]
+    sigma_bias_walk: float = 3e-5  # random walk of the bias [rad/s/sqrt(s)]
+    sigma_turn: float = 2e-3  # error of the scale, as a random walk by turns [rad/sqrt(rad)]
+    bias_period: float = 10.0  # the bias has a new state this often [s]
+    # longest time between two samples over which the rate is integrated [s]
+    maximum_gap: float = 0.25
+    covariance_scale: float = 1.0  # factor on the variance of every integrated angle
+    # a sample that is older by stamp than the newest one by up to this is still used [s]
+    reorder_window: float = 0.25
+
+    def __post_init__(self) -> None:
+        check(self, 'sigma_rate', 'sigma_bias', 'sigma_bias_walk', 'bias_period', 'maximum_gap',
+              'covariance_scale')
 
 
 @dataclass(frozen=True, slots=True)
 class CovariancePolicy:
     """How the covariances of a source are validated; see `sources.validation`."""
 
+    # whether invalid covariances are repaired; otherwise the measurement is rejected
     repair: bool = True
-    """Whether invalid covariances are repaired; otherwise the measurement is rejected."""
+    # sigmas that replace every covariance: position [m], heading [rad]; empty for none
     override: tuple[float, ...] = ()
-    """Sigmas that replace every covariance: position [m], heading [rad]; empty for none."""
-    scale: float = 1.0
-    """Factor on the covariance."""
-    position_floor: float = 0.01
-    """Lower bound of the sigma of a position [m]."""
-    heading_floor: float = 0.001
-    """Lower bound of the sigma of a heading [rad]."""
+    scale: float = 1.0  # factor on the covariance
+    position_floor: float = 0.01  # lower bound of the sigma of a position [m]
+    heading_floor: float = 0.001  # lower bound of the sigma of a heading [rad]
+    # upper bound of the sigma of a position [m]; replaces infinite ones
     position_ceiling: float = 1000.0
-    """Upper bound of the sigma of a position [m]; replaces infinite ones."""
-    default_position: float = 5.0
-    """Sigma of a position if it is unknown [m]."""
-    default_heading: float = 0.3
-    """Sigma of a heading if it is unknown [rad]."""
+    default_position: float = 5.0  # sigma of a position if it is unknown [m]
+    default_heading: float = 0.3  # sigma of a heading if it is unknown [rad]
     heading: Heading = Heading.AUTO
 
     def __post_init__(self) -> None:
-        require(self, 'scale', 'position_floor', 'heading_floor', 'position_ceiling',
-                'default_position', 'default_heading', positive=True)
-        require_member(self, 'heading', Heading)
+        check(self, 'scale', 'position_floor', 'heading_floor', 'position_ceiling',
+              'default_position', 'default_heading')
         if len(self.override) not in (0, 1, 2) or not all(
                 0.0 < sigma < math.inf for sigma in self.override):
             raise ConfigError('CovariancePolicy.override: expected no, one or two positive '
@@ -179,22 +234,16 @@ class MeasurementSource:
 
     covariance: CovariancePolicy = field(default_factory=CovariancePolicy)
     robust: Robust = Robust.LOSS
-    loss: Loss = Loss.NONE
-    """Of what is believed; see `applied_loss`."""
-    rejection_threshold: float = 3.0
-    """Threshold k of the loss [sigma]."""
+    loss: Loss = Loss.NONE  # of what is believed; see `applied_loss`
+    rejection_threshold: float = 3.0  # threshold k of the loss [sigma]
+    # of measurements with stamps closer than this only the first to arrive is used [s]
     minimum_period: float = 0.0
-    """Of measurements with stamps closer than this only the first to arrive is used [s]."""
+    # time constant of the errors [s]; 0 for white noise, `FOUND` for one that they show
     correlation_time: float = 0.0
-    """Time constant of the errors [s]; 0 for white noise, `FOUND` for one that they show."""
 
     def __post_init__(self) -> None:
-        require(self, 'rejection_threshold', positive=True)
-        require(self, 'minimum_period')
-        if not self.finds_correlation:
-            require(self, 'correlation_time')
-        require_member(self, 'robust', Robust)
-        require_member(self, 'loss', Loss)
+        check(self, 'rejection_threshold',
+              but='correlation_time' if self.finds_correlation else '')
 
     @property
     def finds_correlation(self) -> bool:
@@ -207,48 +256,38 @@ class MeasurementSource:
         return Loss.NONE if self.robust is Robust.NONE else self.loss
 
 
+# defaults of a source of global poses or positions
 POSITIONS = MeasurementSource(
     robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
-"""Defaults of a source of global poses or positions."""
+# defaults of a source of headings; thinned, as an IMU sends many redundant ones
 HEADINGS = MeasurementSource(minimum_period=0.5)
-"""Defaults of a source of headings; thinned, as an IMU sends many redundant ones."""
+# settings of poses that a user sets: neither judged nor with a loss, as the user is believed
 SET_POSES = MeasurementSource(robust=Robust.NONE)
-"""Settings of poses that a user sets: neither judged nor with a loss, as the user is believed."""
+# defaults of a source of loop closures; those with an invalid covariance are rejected
 LOOP_CLOSURES = MeasurementSource(
     covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
-"""Defaults of a source of loop closures; those with an invalid covariance are rejected."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodePolicy:
     """Conditions for a new hidden node: enough motion, or a maximum time."""
 
+    # distance from the last hidden node at which the next one is created [m]
     minimum_travel_distance: float = 1.0
-    """Distance from the last hidden node at which the next one is created [m]."""
+    # turn since the last hidden node at which the next one is created [rad]
     minimum_travel_heading: float = 0.3
-    """Turn since the last hidden node at which the next one is created [rad]."""
+    # minimum time between hidden nodes [s]; limits the size of the graph at high speed
     minimum_interval: float = 0.2
-    """Minimum time between hidden nodes [s]; limits the size of the graph at high speed."""
-    moving_interval: float = 1.0
-    """Maximum time between hidden nodes while the robot moves [s]."""
-    heartbeat: float = 10.0
-    """Maximum time between hidden nodes at standstill [s]."""
+    moving_interval: float = 1.0  # maximum time between hidden nodes while the robot moves [s]
+    heartbeat: float = 10.0  # maximum time between hidden nodes at standstill [s]
 
     def __post_init__(self) -> None:
-        require(self, 'minimum_travel_distance', 'minimum_travel_heading', 'minimum_interval')
-        require(self, 'moving_interval', 'heartbeat', positive=True)
+        check(self, 'moving_interval', 'heartbeat')
 
     def due(self, distance: float, turned: float, elapsed: float) -> bool:
-        """
-        Tell whether a new hidden node is due.
-
-        Parameters
-        ----------
-        distance, turned, elapsed : float, since the last node: straight [m], turn [rad], time [s]
-
-        """
+        """Tell whether a node is due this far [m, rad] and long [s] after the last one."""
         far = distance >= self.minimum_travel_distance or turned >= self.minimum_travel_heading
-        moved = distance >= REST_DISTANCE or turned >= REST_HEADING
+        moved = distance >= 0.05 or turned >= 0.05  # beyond the jitter of odometry at rest
         return ((far and elapsed >= self.minimum_interval)
                 or (moved and elapsed >= self.moving_interval) or elapsed >= self.heartbeat)
 
@@ -257,61 +296,60 @@ class NodePolicy:
 class AlignmentPolicy:
     """When the angle between odometry and map, computed from positions, counts as known."""
 
-    sigma_heading: float = 0.15
-    """Maximum sigma of the angle [rad]."""
-    minimum_baseline: float = 1.0
-    """Minimum extent of the positions [m]."""
-    baseline_in_sigmas: float = 5.0
-    """Minimum extent of the positions, in sigmas of a position."""
+    sigma_heading: float = 0.15  # maximum sigma of the angle [rad]
+    minimum_baseline: float = 1.0  # minimum extent of the positions [m]
+    baseline_in_sigmas: float = 5.0  # minimum extent of the positions, in sigmas of a position
 
     def __post_init__(self) -> None:
-        require(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas', positive=True)
+        check(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas')
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig:
+    """Settings of Gauss-Newton with Levenberg-Marquardt damping, for a whole graph."""
+
+    max_iterations: int = 50
+    # converged if no coordinate of the next step is larger than this [m, rad]
+    step_tolerance: float = 1e-8
+
+    def __post_init__(self) -> None:
+        check(self, 'max_iterations', 'step_tolerance')
 
 
 @dataclass(frozen=True, slots=True)
 class SmootherConfig:
     """Accuracy of the incremental smoother, and the work per update."""
 
-    alpha: float = 0.02
-    """Back-substitution stops at nodes that move by less than this [sigma]."""
+    alpha: float = 0.02  # back-substitution stops at nodes that move by less than this [sigma]
+    # upper limit of the squared linearisation error that a step may leave [sigma^2]
     budget: float = 0.001
-    """Upper limit of the squared linearisation error that a step may leave [sigma^2]."""
+    # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
     budget_share: float = 6e-6
-    """The same limit per node that the step has moved; the smaller limit applies [sigma^2]."""
-    max_iterations: int = 5
-    """Maximum number of iterations per update; the next update continues."""
+    max_iterations: int = 5  # maximum number of iterations per update; the next update continues
 
     def __post_init__(self) -> None:
-        require(self, 'alpha', 'budget', 'budget_share')
-        if self.max_iterations < 1:
-            raise ConfigError(f'SmootherConfig.max_iterations: expected >= 1, '
-                              f'got {self.max_iterations!r}')
+        check(self, 'max_iterations')
 
 
-class Prior(Enum):
+class WindowPrior(Enum):
     """What becomes of constraints whose hidden nodes leave the graph."""
 
-    DENSE = 'dense'
-    """One constraint of all their neighbours: exact but for the linearization."""
+    DENSE = 'dense'  # one constraint of all their neighbours: exact but for the linearization
+    # a few constraints of pairs of neighbours, with covariances that are no smaller
     SPARSE = 'sparse'
-    """A few constraints of pairs of neighbours, with covariances that are no smaller."""
 
 
 @dataclass(frozen=True, slots=True)
 class WindowConfig:
     """How much of the past the graph keeps: the smallest limit that is not 0; see `window`."""
 
-    seconds: float = 0.0
-    """Time before the newest hidden node [s]; 0 for no limit."""
-    metres: float = 0.0
-    """Path length before it [m]; 0 for no limit."""
-    nodes: int = 0
-    """Number of hidden nodes; 0 for no limit."""
-    prior: Prior = Prior.DENSE
+    seconds: float = 0.0  # time before the newest hidden node [s]; 0 for no limit
+    metres: float = 0.0  # path length before it [m]; 0 for no limit
+    nodes: int = 0  # number of hidden nodes; 0 for no limit
+    prior: WindowPrior = WindowPrior.DENSE
 
     def __post_init__(self) -> None:
-        require(self, 'seconds', 'metres', 'nodes')
-        require_member(self, 'prior', Prior)
+        check(self)
 
     @property
     def is_limited(self) -> bool:
@@ -323,18 +361,13 @@ class WindowConfig:
 class ThinningConfig:
     """Which hidden nodes leave where a place is driven often; see `window.thinning`."""
 
-    cell: float = 0.0
-    """Distance within which a node stands for others [m]; 0 for no thinning."""
-    angle: float = math.pi / 2.0
-    """Difference of headings below which it does [rad]."""
-    poses: int = 1
-    """So many must stay near one that leaves."""
-    newest: int = 50
-    """Number of newest hidden nodes that stay in any case."""
+    cell: float = 0.0  # distance within which a node stands for others [m]; 0 for no thinning
+    angle: float = math.pi / 2.0  # difference of headings below which it does [rad]
+    poses: int = 1  # so many must stay near one that leaves
+    newest: int = 50  # number of newest hidden nodes that stay in any case
 
     def __post_init__(self) -> None:
-        require(self, 'cell')
-        require(self, 'angle', 'poses', 'newest', positive=True)
+        check(self, 'angle', 'poses', 'newest')
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,26 +376,26 @@ class BackendConfig:
 
     nodes: NodePolicy = field(default_factory=NodePolicy)
     alignment: AlignmentPolicy = field(default_factory=AlignmentPolicy)
+    # of the update at each tick of the timer
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
-    """Of the update at each tick of the timer."""
+    # of the full optimisation at the end of a stream; after outages it can converge slowly
     final_optimization: SolverConfig = field(
         default_factory=lambda: SolverConfig(max_iterations=400, step_tolerance=1e-10))
-    """Of the full optimisation at the end of a stream; after outages it can converge slowly."""
+    # sources of odometry by name, the preferred one first; others have the defaults
     odometry: Mapping[str, OdometrySource] = field(default_factory=dict)
-    """Sources of odometry by name, the preferred one first; others have the defaults."""
+    # sources of measurements by name; others have the defaults of their kind
     measurements: Mapping[str, MeasurementSource] = field(default_factory=dict)
-    """Sources of measurements by name; others have the defaults of their kind."""
+    # gyroscopes by name; others have the defaults
     gyros: Mapping[str, GyroSource] = field(default_factory=dict)
-    """Gyroscopes by name; others have the defaults."""
+    # silence of the primary odometry source after which another one replaces it [s]
     odometry_patience: float = 2.0
-    """Silence of the primary odometry source after which another one replaces it [s]."""
+    # what the graph keeps; the rest leaves it, and what it told stays as a prior
     window: WindowConfig = field(default_factory=WindowConfig)
-    """What the graph keeps; the rest leaves it, and what it told stays as a prior."""
+    # which hidden nodes leave where a place is driven often
     thinning: ThinningConfig = field(default_factory=ThinningConfig)
-    """Which hidden nodes leave where a place is driven often."""
 
     def __post_init__(self) -> None:
-        require(self, 'odometry_patience', positive=True)
+        check(self, 'odometry_patience')
 
     def odometry_source(self, name: str) -> OdometrySource:
         """Return the settings of a source of odometry."""
@@ -378,15 +411,7 @@ class BackendConfig:
         return next((source.sigma_scale for source in self.odometry.values()), 0.0)
 
     def measurement_source(self, name: str, kind: type[Measurement]) -> MeasurementSource:
-        """
-        Return the settings of a source of measurements.
-
-        Parameters
-        ----------
-        name : str
-        kind : type, of the measurement; selects the defaults of a source without settings
-
-        """
+        """Return the settings of a source, by default those of its kind of measurement."""
         defaults = {LoopClosure: LOOP_CLOSURES, HeadingOnly: HEADINGS}
         return self.measurements.get(name, defaults.get(kind, POSITIONS))
 

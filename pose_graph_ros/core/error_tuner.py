@@ -22,34 +22,29 @@ from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Measured
-from pose_graph_ros.core.graph.incidence import constraints_on
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.odometry_errors import (
+from pose_graph_ros.core.odometry.motion import (
     AS_CLAIMED,
     changed,
     OdometryErrors,
 )
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources import error_estimate
+from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.gauss_markov import (
     Additions,
     CorrelatedErrors,
     GaussMarkovBias,
 )
-from pose_graph_ros.core.sources.past_path import PastPath
 from pose_graph_ros.core.sources.source_constraints import Held, SourceConstraints
 
-# Factor on the number of measurements from one estimate to the next.
-MORE = 1.3
 # Number of measurements that a step moves, online and at the end of a stream.
 PART, WHOLE = 100, 5000
 # Estimates that differ by less than this factor from what is in use change nothing online.
 SIMILAR = 1.9
-# The same of the factors on the noise of odometry.
-FACTOR_STEP = 1.5
 
 
 @dataclass(slots=True)
@@ -57,15 +52,11 @@ class _Change:
     """A change of the error model of a source that is under way."""
 
     source: str
-    model: GaussMarkovBias | None
-    """The new model; None for white errors."""
-    left: IntArray
-    """Numbers of the measurements to be moved, the next ones last."""
-    before: IntArray
-    """Id of the edge that held each measurement at the beginning, or -1."""
+    model: GaussMarkovBias | None  # the new model; None for white errors
+    remaining: IntArray  # numbers of the measurements to be moved, the next ones last
+    before: IntArray  # id of the edge that held each measurement at the beginning, or -1
     undoing: bool = False
-    failed: GaussMarkovBias | None = None
-    """The model that it was, if it is undone."""
+    failed: GaussMarkovBias | None = None  # the model that it was, if it is undone
 
 
 @dataclass(slots=True)
@@ -74,23 +65,11 @@ class _Search:
 
     source: str
     steps: error_estimate.Search
-    next_estimate: int
-    """Number of measurements at which the next one is due."""
+    next_estimate: int  # number of measurements at which the next one is due
 
 
 class ErrorTuner:
-    """
-    Finds out whether the errors of sources are correlated, and has the graph treat them so.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother
-    nodes : HiddenNodes
-    factors : FactorBuilder
-    reweighting : Reweighting
-    judge : Judge
-
-    """
+    """Finds out whether the errors of sources are correlated, and has the graph treat them so."""
 
     def __init__(
         self, smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
@@ -100,13 +79,11 @@ class ErrorTuner:
         self._nodes, self._judge = nodes, judge
         self._search: _Search | None = None
         self._change: _Change | None = None
-        self.n_failures = 0
-        """Number of changes that were undone because the solver failed."""
+        self.n_failures = 0  # number of changes that were undone because the solver failed
         self._failed: OdometryErrors | None = None  # of odometry, with which the solver failed
+        # of each source, its positions that will have left the graph
         self._past: dict[str, PastPath] = {}
-        """Of each source, its positions that will have left the graph."""
-        self._n_bias_edges = 0
-        """Number of edges to biases that are about to leave."""
+        self._n_bias_edges = 0  # number of edges to biases that are about to leave
 
     def step(self, most_edges: float = math.inf) -> float:
         """
@@ -184,12 +161,6 @@ class ErrorTuner:
 
         What the measurements among these show of the errors of their sources is kept, once
         `forget` says that they have left. At least the newest bias of a source stays.
-
-        Parameters
-        ----------
-        edges, observed : ndarray of int, ids of the constraints
-        first : int, id of the first pose whose measurements stay
-
         """
         graph = self._smoother.graph
         self._past = {}
@@ -205,7 +176,7 @@ class ErrorTuner:
         model = None if change is None else change.model or change.failed
         others = {} if change is None or model is None else {change.source: model}
         biases = self._factors.leaving_biases(edges, observed, others)
-        left = np.union1d(edges, constraints_on(graph, np.array(biases, dtype=np.int64))[0])
+        left = np.union1d(edges, graph.constraints_on(np.array(biases, dtype=np.int64))[0])
         self._n_bias_edges = int(np.count_nonzero(
             graph.memory['edge_i'][graph.edge_rows(left), tb.EDGE_KIND] == EdgeKind.BIAS))
         return biases
@@ -234,7 +205,7 @@ class ErrorTuner:
                 model.forget({*nodes.tolist()})
         numbers = kept[change.source]
         numbers = numbers[numbers < len(change.before)]
-        change.left = np.flatnonzero(np.isin(numbers, change.left))
+        change.remaining = np.flatnonzero(np.isin(numbers, change.remaining))
         change.before = change.before[numbers]
 
     def restored(self, *, knows_errors: bool) -> None:
@@ -290,12 +261,7 @@ class ErrorTuner:
         measured = Measured(ids, *changed(
             edges.mean, edges.information,
             np.asarray((end_ns - begin_ns) * 1e-9, dtype=np.float64), before, wanted))
-        try:
-            failed = self._smoother.update(
-                GraphUpdate(measure_edges=[measured])).status is Status.FAILED
-        except Exception:
-            failed = True   # the smoother has rolled it back
-        if failed:
+        if not self._succeeds(GraphUpdate(measure_edges=[measured])):
             self.n_failures += 1
             self._failed = wanted
             return
@@ -362,12 +328,12 @@ class ErrorTuner:
         constraints = self._factors.constraints(change.source)
         if not change.undoing:  # those that came meanwhile
             known = len(change.before)
-            change.left = np.append(change.left, np.arange(known, len(constraints)))
+            change.remaining = np.append(change.remaining, np.arange(known, len(constraints)))
             change.before = np.append(change.before, constraints.edges.values[known:])
-        some = change.left[-most:]
+        some = change.remaining[-most:]
         if self._apply(change, constraints, some):
-            change.left = change.left[:len(change.left) - len(some)]
-            if len(change.left) == 0:
+            change.remaining = change.remaining[:len(change.remaining) - len(some)]
+            if len(change.remaining) == 0:
                 if not change.undoing:
                     self._factors.set_error_model(change.source, change.model)
                 elif change.failed is not None:
@@ -378,7 +344,8 @@ class ErrorTuner:
             return False    # tried again at the next step
         self.n_failures += 1
         moved = np.flatnonzero(constraints.edges.values[:len(change.before)] != change.before)
-        change.undoing, change.left, change.failed, change.model = True, moved, change.model, None
+        change.undoing, change.remaining = True, moved
+        change.failed, change.model = change.model, None
         return True
 
     def _apply(self, change: _Change, constraints: SourceConstraints, some: IntArray) -> bool:
@@ -407,11 +374,7 @@ class ErrorTuner:
                     weigh_observed[first] = weight
         update = additions.update()._replace(
             weigh_edges=weigh_edges, weigh_observed=weigh_observed)
-        try:
-            failed = self._smoother.update(update).status is Status.FAILED
-        except Exception:
-            failed = True   # whatever it is, the smoother has rolled its part back
-        if failed:
+        if not self._succeeds(update):
             if model is not None:
                 model.rollback()
             return False
@@ -425,16 +388,23 @@ class ErrorTuner:
             self._reweighting.move(one, to, edge=is_edge, to_edge=to_edge)
         return True
 
+    def _succeeds(self, update: GraphUpdate) -> bool:
+        """Tell whether the graph was updated."""
+        try:
+            return self._smoother.update(update).status is not Status.FAILED
+        except Exception:
+            return False    # whatever it is, the smoother has rolled its part back
+
 
 def _next_estimate(constraints: SourceConstraints) -> int:
     """Return at how many measurements of a source the estimate after the next one is due."""
-    return constraints.n_gone + math.ceil(MORE * len(constraints))
+    return constraints.n_gone + math.ceil(1.3 * len(constraints))
 
 
 def _far(known: OdometryErrors, found: error_estimate.Estimate) -> bool:
     """Tell whether errors of odometry differ by more than what is known of them."""
     new = found.odometry
-    return (any(max(one, other) > FACTOR_STEP * min(one, other)
+    return (any(max(one, other) > 1.5 * min(one, other)
                 for one, other in zip(known[:2], new[:2], strict=True))
             or abs(new.rate - known.rate) > found.rate_sigma
             or abs(new.scale - known.scale) > found.scale_sigma)

@@ -33,7 +33,3 @@ class NothingToSaveError(PoseGraphError):
 
 class FileWriteError(PoseGraphError):
     """Files cannot be written; existing files are unchanged."""
-
-
-class TrajectoryError(PoseGraphError, ValueError):
-    """Trajectories cannot be compared."""

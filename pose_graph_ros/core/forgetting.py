@@ -1,58 +1,229 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The oldest hidden nodes leave the graph, and all parts of the engine forget what was on them.
+Hidden nodes leave the graph, and all parts of the engine forget what was on them.
 
-`window.policy` decides which. Their poses are frozen where they are, and what their constraints
-told stays in the graph as a prior on its oldest nodes. A fixed node, the gauge of a graph that is
-not aligned with the map, is frozen with the others but stays in the graph until it is freed: a
-prior of poses relative to it says nothing about where they are in the map.
+By the window the oldest ones leave. Their poses are frozen where they are, and what their
+constraints told stays in the graph as a prior on its oldest nodes. A fixed node, the gauge of a
+graph that is not aligned with the map, is frozen with the others but stays in the graph until it
+is freed: a prior of poses relative to it says nothing about where they are in the map.
+
+By thinning, nodes leave where a place is driven often, as `window.thinning` decides.
 """
+
+from collections.abc import Iterator
+import math
 
 import numpy as np
 
-from pose_graph_ros.core.config import BackendConfig, Prior, WindowConfig
+from pose_graph_ros.core.config import BackendConfig, ThinningConfig, WindowConfig, WindowPrior
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.graph_update import Left
-from pose_graph_ros.core.graph.incidence import constraints_on
-from pose_graph_ros.core.io.capture import Parts
+from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
+from pose_graph_ros.core.judgement.judge import Leaving
 from pose_graph_ros.core.measurements import rejected
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import Forgotten
-from pose_graph_ros.core.thinner import forget, Thinner
-from pose_graph_ros.core.window.policy import n_leaving
-from pose_graph_ros.core.window.sparse_removal import sparse_marginalization
-from pose_graph_ros.core.window.thinning import Places, relative_noise, removed
+from pose_graph_ros.core.odometry.node_table import NodeTable
+from pose_graph_ros.core.parts import Parts
+from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
+from pose_graph_ros.core.window.sparse_removal import (
+    cut_chains,
+    LIMITS,
+    NONE,
+    old_closures,
+    sparse_marginalization,
+    sparse_removal,
+)
+from pose_graph_ros.core.window.thinning import (
+    carriers,
+    certain,
+    Crowd,
+    first_of,
+    groups,
+    next_segment,
+    Places,
+    relative_noise,
+    removed,
+    Segment,
+    simplify,
+    Thinning,
+)
 
-# After a failure of the solver no node leaves before so many new ones have come.
-REST = 20
+
+def n_leaving(config: WindowConfig, table: NodeTable, needed_ns: int | None = None) -> int:
+    """
+    Return how many of the nodes in the graph leave it: the oldest ones.
+
+    Where a group ends depends on the nodes alone, not on when it is asked for, so the same drive
+    gives the same groups, however often the graph is updated. The last node up to `needed_ns`
+    stays until it is twice as old as the window.
+    """
+    n_kept = len(table) - table.n_frozen
+    leaving = min(_beyond(config, table, 1.0), n_kept - LIMITS.newest)
+    if leaving > 0 and needed_ns is not None:
+        at = int(np.searchsorted(table.stamps_ns, needed_ns, side='right')) - 1 - table.n_frozen
+        if 0 <= at < leaving:
+            leaving = max(at, min(_beyond(config, table, LIMITS.longest_hold), leaving))
+    return max(leaving, 0)
+
+
+def _beyond(config: WindowConfig, table: NodeTable, factor: float) -> int:
+    """Return how many nodes lie beyond the window times a factor, in whole groups."""
+    first, stamps, travelled = table.n_frozen, table.stamps_ns, table.travelled
+    most = 0
+    if config.nodes > 0:
+        group = max(math.floor(LIMITS.group * config.nodes), 1)
+        begin = len(table) - math.ceil(factor * config.nodes)
+        most = begin // group * group - first
+    if config.seconds > 0.0:
+        limit_ns, group_ns = (
+            round(share * config.seconds * 1e9) for share in (factor, LIMITS.group))
+        # stamps are compared as integers: as floats they would be rounded to 0.2 us
+        begin_ns = int(stamps[-1]) - limit_ns - int(stamps[0])
+        begin_ns = begin_ns // max(group_ns, 1) * max(group_ns, 1) + int(stamps[0])
+        if stamps[first] < begin_ns:
+            most = max(most, int(np.searchsorted(stamps[first:], begin_ns)))
+    if config.metres > 0.0:
+        most = max(most, _before(travelled, factor * config.metres, LIMITS.group * config.metres))
+    return most
+
+
+def _before(travelled: FloatArray, limit: float, group: float) -> int:
+    """Return how many path lengths, which increase, are farther than a limit from the last."""
+    begin = math.floor((travelled[-1] - limit) / group) * group
+    return int(np.searchsorted(travelled, begin)) if travelled[0] < begin else 0
+
+
+class Thinner:
+    """Keeps the graph at the size of the area."""
+
+    def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
+        self._smoother, self._tuner, self._parts = smoother, tuner, parts
+        self._thinning = Thinning()
+        self._work: Iterator[None] = iter(())
+        self._n_made = 0
+
+    def step(self, config: ThinningConfig) -> None:
+        """Let groups of nodes leave, or of old measurements in the map, if some are due."""
+        if config.cell == 0.0:
+            self._work = iter(())
+            return
+        # a bag is replayed with many new nodes from step to step
+        n_made = len(self._parts.nodes)
+        new, self._n_made = max(n_made - self._n_made, 1), n_made
+        for _ in range(min(new, LIMITS.pieces)):
+            if next(self._work, self) is self:
+                self._work = self._steps(config)
+                if next(self._work, self) is self:
+                    return
+
+    def _steps(self, config: ThinningConfig) -> Iterator[None]:
+        """Yield after each change of the graph; others may have changed it before the next."""
+        parts, smoother = self._parts, self._smoother
+        # a fixed node that is frozen stays in the graph, but stands for no others
+        first = int(parts.nodes.ids[parts.nodes.n_frozen])
+        places = self._thinning.places(
+            smoother, config, len(parts.nodes), self._held(), first)
+        if places is None:
+            return
+        older = parts.graph.node_ids[parts.graph.is_pose][:-config.newest]
+        while self._thinning.measurements_are_due(parts.graph):
+            older = older[parts.graph.node_rows(older) >= 0]
+            segment = next_segment(parts.graph, older, places.nodes)
+            if segment is None:
+                break
+            inside = np.isin(places.nodes, segment.poses)
+            group = self._present(places.rows(inside), config)
+            if not self._measurements_leave(segment, group):
+                break
+            places, older = places.rows(~inside), older[older >= segment.after]
+            yield
+        # others leave with their measurements
+        before = places.nodes < first_of(*carriers(parts.graph))
+        places = self._present(places.rows(before), config)
+        for chosen in groups(parts.graph, places):
+            group = self._present(chosen, config)
+            if len(group.nodes) == 0:
+                continue
+            decided = parts.judge.decide_leaving(*parts.graph.constraints_on(group.nodes))
+            self._leave(group, sparse_removal(parts.graph, group.nodes), decided)
+            yield
+        nobody = places.rows(np.zeros(len(places.nodes), dtype=bool))
+        while len(closures := old_closures(parts.graph, config.newest, LIMITS.old_closures)) > 0:
+            decided = parts.judge.decide_leaving(closures, NONE)
+            if not self._leave(
+                    nobody, sparse_removal(parts.graph, NONE, closures), decided):
+                break
+            yield
+        for gone in simplify(smoother):
+            forget(gone, parts, self._tuner, None)
+            yield
+        parts.nodes.drop_samples(config.newest)
+        parts.pipeline.seen.forget(parts.nodes.newest_ns - LIMITS.repeated_ns)
+
+    def _present(self, places: Places, config: ThinningConfig) -> Places:
+        """Return the places, as they are now, of those nodes that may still leave."""
+        graph = self._parts.graph
+        there = (graph.node_rows(places.nodes) >= 0) & (graph.node_rows(places.anchors) >= 0)
+        free = there & ~np.isin(places.nodes, list(self._held()))
+        return certain(self._smoother, Crowd(places.nodes[free], places.anchors[free]), config)
+
+    def _measurements_leave(self, segment: Segment, group: Places) -> bool:
+        """
+        Let the measurements of a stretch leave, and a group of its nodes; tell whether they did.
+        """
+        graph = self._parts.graph
+        edges, observed = graph.constraints_on(group.nodes)
+        edges = np.union1d(edges, segment.edges)
+        observed = np.union1d(observed, segment.observed)
+        # what is decided may have another weight
+        decided = self._parts.judge.decide_leaving(edges, observed)
+        biases = np.array(self._tuner.leave(edges, observed, segment.after), dtype=np.int64)
+        cuts = cut_chains(graph, biases)
+        update = None if cuts is None else sparse_removal(
+            graph, np.sort(np.concatenate((group.nodes, biases))), segment.edges,
+            segment.observed, cuts)
+        return self._leave(group, update, decided)
+
+    def _leave(self, group: Places, update: GraphUpdate | None, decided: Leaving) -> bool:
+        """Let nodes leave with an update; tell whether they did."""
+        gone = removed(self._smoother, update)
+        if gone is None:
+            self._tuner.stay()
+            return False
+        forget(gone, self._parts, self._tuner, decided)
+        self._parts.nodes.thin(*group)
+        return True
+
+    def _held(self) -> set[int]:
+        """Return the ids of nodes that do not leave, as something is to be added to them."""
+        parts, found = self._parts, set(self._tuner.needed)
+        for queue in (parts.pipeline.queue, parts.quarantine):
+            found.update(int(end[0]) for each in queue.edges for end in (each.edge.i, each.edge.j))
+            found.update(each.attachment.node for each in queue.observed)
+        return found
+
+
+def forget(
+    gone: Left | Forgotten, parts: Parts, tuner: ErrorTuner, decided: Leaving | None,
+) -> None:
+    """Let judge, reweighting, tuner and factors forget what has left the graph."""
+    parts.judge.forget(gone.nodes, gone.edges, gone.observed, decided)
+    parts.reweighting.forget(gone.edges, gone.observed)
+    tuner.forget(gone.nodes, gone.edges, gone.observed)
 
 
 class Forgetting:
-    """
-    Keeps the graph within its window.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother
-    tuner : ErrorTuner
-    parts : Parts, all others that forget
-
-    """
+    """Keeps the graph within its window."""
 
     def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
         self._smoother, self._tuner, self._parts = smoother, tuner, parts
         self._thinner = Thinner(smoother, tuner, parts)
+        # pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
+        # was frozen before the graph was aligned with the map; else None
         self._joint: FloatArray | None = None
-        """
-        Pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
-        was frozen before the graph was aligned with the map; else None.
-        """
-        self._rest = 0
-        """Number of hidden nodes from which on more of them may leave."""
+        self._rest = 0  # number of hidden nodes from which on more of them may leave
 
     def step(self, config: BackendConfig) -> None:
         """Let the nodes leave that are due, by the window and by thinning."""
@@ -72,15 +243,15 @@ class Forgetting:
     def _step_of_window(self, window: WindowConfig) -> None:
         """Let the nodes beyond the window leave, if a group is due."""
         nodes = self._parts.nodes
-        n = n_leaving(window, nodes.table)
+        n = n_leaving(window, nodes)
         if n > 0:
             parts = self._parts
-            n = n_leaving(window, nodes.table, parts.pipeline.needed_ns(
+            n = n_leaving(window, nodes, parts.pipeline.needed_ns(
                 aligned=parts.alignment.is_aligned))
         if n > 0 and len(nodes) >= self._rest:
             self._forget(n, window.prior)
 
-    def _forget(self, n: int, prior: Prior) -> None:
+    def _forget(self, n: int, prior: WindowPrior) -> None:
         """Let the n oldest nodes leave, with a dense or a sparse prior instead."""
         parts, graph, nodes = self._parts, self._parts.graph, self._parts.nodes
         first = nodes.n_frozen + n
@@ -92,10 +263,10 @@ class Forgetting:
         self._follow_alignment()
         stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
         biases = np.array(self._tuner.leave(
-            *constraints_on(graph, leaving), int(graph.node_ids[np.argmax(stays)])),
+            *graph.constraints_on(leaving), int(graph.node_ids[np.argmax(stays)])),
             dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
-        decided = parts.judge.decide_leaving(*constraints_on(graph, leaving))
+        decided = parts.judge.decide_leaving(*graph.constraints_on(leaving))
         self._smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         anchors = self._other_anchors(first)
@@ -105,7 +276,7 @@ class Forgetting:
             return
         forget(gone, parts, self._tuner, decided)
         if anchors is not None:
-            nodes.table.thin(*anchors)
+            nodes.thin(*anchors)
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[n - 1], poses[n])
@@ -113,9 +284,9 @@ class Forgetting:
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         self._refuse(leaving)
 
-    def _gone(self, leaving: IntArray, prior: Prior) -> Left | Forgotten | None:
+    def _gone(self, leaving: IntArray, prior: WindowPrior) -> Left | Forgotten | None:
         """Return what has left with nodes; None, and they all stay, if the solver has failed."""
-        gone = None if prior is Prior.DENSE else removed(
+        gone = None if prior is WindowPrior.DENSE else removed(
             self._smoother, sparse_marginalization(self._parts.graph, leaving))
         if gone is not None:
             return gone
@@ -123,7 +294,7 @@ class Forgetting:
             return self._smoother.forget(leaving)
         except GraphUpdateError:
             self._parts.pipeline.counts['solver', 'failed'] += 1
-            self._rest = len(self._parts.nodes) + REST
+            self._rest = len(self._parts.nodes) + LIMITS.rest
             return None
 
     def _other_anchors(self, first: int) -> Places | None:
@@ -132,7 +303,7 @@ class Forgetting:
 
         None if there are none.
         """
-        table, graph = self._parts.nodes.table, self._parts.graph
+        table, graph = self._parts.nodes, self._parts.graph
         thinned = table.thinned.places()
         leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
         if len(leave) == 0:
@@ -157,7 +328,7 @@ class Forgetting:
         self._joint = None
         oldest = nodes.recent_poses(self._parts.graph)[0]
         last = se2.compose(oldest, se2.inverse(joint))
-        nodes.table.move_frozen(se2.compose(last, se2.inverse(nodes.table.frozen[-1])))
+        nodes.move_frozen(se2.compose(last, se2.inverse(nodes.frozen[-1])))
 
     def _refuse(self, nodes: IntArray) -> None:
         """Count constraints that were to be added to nodes that have left."""

@@ -13,8 +13,7 @@ from enum import Enum
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.scalar_se2 import Pose
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, Pose
 
 # Largest valid coordinate in a map or in odometry [m, rad]; a larger one is a faulty number.
 LARGEST_COORDINATE = 1e9
@@ -27,17 +26,13 @@ class OdometrySample:
     """Pose of the robot in the odometry frame."""
 
     stamp_ns: int
-    pose: FloatArray
-    """`T_odom_base`, shape (3,) [m, m, rad]."""
-    speed: float = 0.0
-    """Of the twist in the same message [m/s]; 0 if it has none."""
+    pose: FloatArray  # `T_odom_base`, shape (3,) [m, m, rad]
+    speed: float = 0.0  # of the twist in the same message [m/s]; 0 if it has none
+    # of (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown
     twist_variance: FloatArray | None = None
-    """Of (v_x, v_y, yaw rate) in the robot's frame, shape (3,); None if unknown."""
+    # (v_x, v_y, yaw rate) in the robot's frame [m/s, m/s, rad/s]; used, and then needed, if the
+    # motion of the source is integrated from twists
     twist: Pose | None = None
-    """
-    (v_x, v_y, yaw rate) in the robot's frame [m/s, m/s, rad/s]; used, and then needed, if the
-    motion of the source is integrated from twists.
-    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +40,8 @@ class YawRate:
     """Yaw rate of the robot by a gyroscope, with its bias."""
 
     stamp_ns: int
-    rate: float
-    """About the vertical axis of the robot, counterclockwise [rad/s]."""
-    variance: float = 0.0
-    """Of the rate [rad^2/s^2]; 0 if unknown."""
+    rate: float  # about the vertical axis of the robot, counterclockwise [rad/s]
+    variance: float = 0.0  # of the rate [rad^2/s^2]; 0 if unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +49,8 @@ class GlobalPose:
     """Pose of the robot in the map."""
 
     stamp_ns: int
-    pose: FloatArray
-    """`T_map_base`, shape (3,) [m, m, rad]."""
-    covariance: FloatArray
-    """Of (x, y, theta) in map axes, shape (3, 3)."""
+    pose: FloatArray  # `T_map_base`, shape (3,) [m, m, rad]
+    covariance: FloatArray  # of (x, y, theta) in map axes, shape (3, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +58,9 @@ class Position:
     """Position in the map of a point of the robot, such as an antenna."""
 
     stamp_ns: int
-    position: FloatArray
-    """In the map, shape (2,) [m]."""
-    covariance: FloatArray
-    """In map axes, shape (2, 2)."""
-    lever_arm: FloatArray
-    """The point in the robot's frame, shape (2,) [m]."""
+    position: FloatArray  # in the map, shape (2,) [m]
+    covariance: FloatArray  # in map axes, shape (2, 2)
+    lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +73,9 @@ class Fix:
     """
 
     stamp_ns: int
-    place: Callable[[], FloatArray]
-    """Returns the position in the map, shape (2,) [m]."""
-    covariance: FloatArray
-    """In map axes, shape (2, 2)."""
-    lever_arm: FloatArray
-    """The point in the robot's frame, shape (2,) [m]."""
+    place: Callable[[], FloatArray]  # returns the position in the map, shape (2,) [m]
+    covariance: FloatArray  # in map axes, shape (2, 2)
+    lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
 
     def placed(self) -> Position:
         """Return the position in the map."""
@@ -102,10 +87,8 @@ class HeadingOnly:
     """Heading of the robot in the map."""
 
     stamp_ns: int
-    heading: float
-    """[rad]"""
-    variance: float
-    """[rad^2]"""
+    heading: float  # [rad]
+    variance: float  # [rad^2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,23 +96,19 @@ class LoopClosure:
     """Pose of the robot relative to its pose at another stamp, or to a hidden node."""
 
     stamp_ns: int
-    pose: FloatArray
-    """`T_reference_base`, shape (3,) [m, m, rad]."""
+    pose: FloatArray  # `T_reference_base`, shape (3,) [m, m, rad]
+    # Of (x, y, theta) in the axes of the reference pose, shape (3, 3). With infinite variances of
+    # x and y only the difference of the headings is used.
     covariance: FloatArray
-    """
-    Of (x, y, theta) in the axes of the reference pose, shape (3, 3). With infinite variances of x
-    and y only the difference of the headings is used.
-    """
+    # stamp of the reference pose [ns]; None if `reference_node` is given
     reference_ns: int | None = None
-    """Stamp of the reference pose [ns]; None if `reference_node` is given."""
+    # index of the reference's hidden node; None if `reference_ns` is given
     reference_node: int | None = None
-    """Index of the reference's hidden node; None if `reference_ns` is given."""
 
 
-Absolute = GlobalPose | Position | HeadingOnly
-"""Measurements relative to the map."""
+Absolute = GlobalPose | Position | HeadingOnly  # measurements relative to the map
+# measurements that are attached to hidden nodes by their stamps
 PoseMeasurement = Absolute | LoopClosure | Fix
-"""Measurements that are attached to hidden nodes by their stamps."""
 Measurement = PoseMeasurement | YawRate
 
 
@@ -146,17 +125,15 @@ class Answer:
     """Whether an input is used, and why it is not."""
 
     status: AnswerStatus
-    reason: str = ''
-    """Key for counting, such as `not_finite`; empty if accepted."""
-    detail: str = ''
-    """Explanation with numbers, for users."""
+    reason: str = ''  # key for counting, such as `not_finite`; empty if accepted
+    detail: str = ''  # explanation with numbers, for users
 
 
 ACCEPTED = Answer(AnswerStatus.ACCEPTED)
 
 
 def value_defect(value: FloatArray) -> str | None:
-    """Return why numbers are not a valid pose or position, as a reason; None if they are valid."""
+    """Return why numbers are not a valid pose or position; None if they are."""
     if not np.all(np.isfinite(value)):
         return 'not_finite'
     if np.any(np.abs(value) > LARGEST_COORDINATE):
@@ -165,12 +142,5 @@ def value_defect(value: FloatArray) -> str | None:
 
 
 def rejected(reason: str, detail: str = '') -> Answer:
-    """
-    Return the answer that rejects an input.
-
-    Parameters
-    ----------
-    reason, detail : str, as in `Answer`
-
-    """
+    """Return the answer that rejects an input."""
     return Answer(AnswerStatus.REJECTED, reason, detail)

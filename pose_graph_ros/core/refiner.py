@@ -9,34 +9,22 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.graph.reweighting import PART, Reweighting
+from pose_graph_ros.core.graph.reweighting import Reweighting, TUNING
 from pose_graph_ros.core.judgement.judge import Judge
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import DIVERGED, Refinement, UpdateResult
+from pose_graph_ros.core.smoother.incremental import (
+    DIVERGED,
+    IncrementalSmoother,
+    Refinement,
+    UpdateResult,
+)
 from pose_graph_ros.core.transaction import Transaction
 
-# Maximum number of reweightings in an update.
-IN_UPDATE = 3
-# Limits after an update: of how often weights are changed, and of how many constraints with a loss
-# are looked at in turn without a change.
-REWEIGHTINGS = 100
-LOOKED_AT = 2 * PART
+# Constraints with a loss that are looked at in turn without a change after an update.
+LOOKED_AT = 2 * TUNING.part
 
 
 class Refiner:
-    """
-    Takes the estimate from that of an update to the minimum, one bounded part at each call.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother
-    reweighting : Reweighting
-        Constraints of its graph that have a robust loss.
-    judge : Judge
-        Decides which constraints of the graph are believed.
-    tuner : ErrorTuner
-
-    """
+    """Takes the estimate from that of an update to the minimum, one bounded part at each call."""
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, judge: Judge,
@@ -44,10 +32,8 @@ class Refiner:
     ) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._judge, self._tuner = judge, tuner
-        self.finished = True
-        """Whether there is nothing to refine until the next update."""
-        self._tests = False
-        """Whether closures may wait for a test since the last update."""
+        self.finished = True  # whether there is nothing to refine until the next update
+        self._tests = False  # whether closures may wait for a test since the last update
         self._cursor = self._unchanged = self._reweightings = 0
 
     def restart(self) -> None:
@@ -60,18 +46,13 @@ class Refiner:
     ) -> tuple[UpdateResult, bool]:
         """
         Return the last result after judging again and some reweightings, and if none was needed.
-
-        Parameters
-        ----------
-        result : UpdateResult, of the update
-        begin : callable, returns a transaction for one reweighting
-
         """
         self._judge.after()
         if self._judge.solves_later:
             self._judge.work()  # a part of it also where nobody refines, as in a replay
         settled = result.status is Status.CONVERGED
-        for _ in range(IN_UPDATE if self._may_reweight else 0):
+        # the rest is done by `refine`
+        for _ in range(3 if self._may_reweight else 0):
             edges, observed = self._reweighting.changes(self._smoother.graph)
             if len(edges) + len(observed) == 0:
                 break
@@ -133,7 +114,7 @@ class Refiner:
     def _reweight(self, moved: float) -> Refinement:
         graph, size = self._smoother.graph, len(self._reweighting)
         while (self._may_reweight and self._unchanged < min(size, LOOKED_AT)
-               and self._reweightings < REWEIGHTINGS):
+               and self._reweightings < 100):
             edges, observed = self._reweighting.changes_of_part(graph, self._cursor)
             if len(edges) + len(observed) > 0:
                 self._unchanged, self._reweightings = 0, self._reweightings + 1
@@ -142,6 +123,7 @@ class Refiner:
                 self.finished = result.status is Status.FAILED and result.reason != DIVERGED
                 by_weights = np.max(np.abs(graph.poses - before)[graph.is_pose, :2], initial=0.0)
                 return Refinement(finished=self.finished, moved=max(moved, float(by_weights)))
-            self._unchanged, self._cursor = self._unchanged + PART, (self._cursor + PART) % size
+            self._unchanged += TUNING.part
+            self._cursor = (self._cursor + TUNING.part) % size
         self.finished = True
         return Refinement(finished=True, moved=moved)

@@ -10,8 +10,7 @@ annotated with the types of this module, which `io` uses to read, check and writ
 from enum import Enum, IntEnum
 from typing import Annotated, NamedTuple
 
-from pose_graph_ros.core.geometry.scalar_se2 import Pose
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Pose
 
 
 class Column(NamedTuple):

@@ -1,21 +1,31 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One update of the back end, which is applied completely or rolled back."""
+"""
+Updates of the back end, each of which is applied completely or rolled back.
 
+Only those constraints that make an update fail are set aside. The search halves a queue that
+fails: if its first half can be added, a bad one is in the second. Each bad one of n constraints
+takes about log2 n attempts, and all halves that pass are added on the way.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.results import UpdateResult
-from pose_graph_ros.core.sources.constraint_queue import Queue
+from pose_graph_ros.core.smoother.incremental import UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
+from pose_graph_ros.core.sources.source_constraints import Queue
 
 
 class Transaction:
@@ -26,15 +36,6 @@ class Transaction:
     the state of the alignment, and the records of factor builder and judge. It suppresses the
     exception and stores its message in `failure`. The smoother rolls back its own changes, bit for
     bit.
-
-    Parameters
-    ----------
-    graph : Graph
-    nodes : HiddenNodes
-    alignment : AlignmentMonitor
-    factors : FactorBuilder
-    judge : Judge
-
     """
 
     def __init__(
@@ -45,24 +46,16 @@ class Transaction:
         self._factors, self._judge = factors, judge
         self._before = alignment.copy()
         self._poses: tuple[FloatArray, FloatArray] | None = None
-        self.queue = Queue()
-        """The new constraints."""
-        self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)
-        """Result of the solver."""
-        self.failure = ''
-        """Why the update was rolled back; empty if it succeeded."""
-
-    def add(self, queue: Queue) -> Queue:
-        """Return the new constraints after storing them."""
-        self.queue = queue
-        return queue
+        self.queue = Queue()  # the new constraints
+        self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)  # result of the solver
+        self.failure = ''  # why the update was rolled back; empty if it succeeded
 
     def move_graph(self, T_map_graph: FloatArray) -> None:
         """Move all nodes, frozen ones too, by a rigid motion, shape (3,) [m, m, rad]."""
         poses = self._graph.poses.copy()
-        self._poses = poses, self._nodes.table.frozen.copy()
+        self._poses = poses, self._nodes.frozen.copy()
         self._graph.set_poses(se2.compose(T_map_graph, poses))
-        self._nodes.table.move_frozen(T_map_graph)
+        self._nodes.move_frozen(T_map_graph)
 
     @property
     def moved_back(self) -> bool:
@@ -89,9 +82,112 @@ class Transaction:
         if self._poses is not None:
             poses, frozen = self._poses
             self._graph.set_poses(poses)
-            self._nodes.table.set_frozen(frozen)
+            self._nodes.set_frozen(frozen)
         self._alignment.restore(self._before)
         self.failure = str(error)
         if not isinstance(error, LinearSolveError):
             self.failure = f'{type(error).__name__}: {error}'
         return isinstance(error, Exception)
+
+
+# Maximum number of attempts in one search, which bounds the time of an update.
+MOST_ATTEMPTS = 32
+
+
+# adds what is in the queue of the pipeline; returns the report, and the constraints left over
+Update = Callable[[], tuple[UpdateReport, Queue]]
+
+
+class Isolated(NamedTuple):
+    """Result of a search."""
+
+    bad: list[tuple[Queue, str]]  # single constraints that cannot be added, and why
+    untried: Queue  # constraints that were not added, as there were no attempts left
+
+
+def update_isolated(
+    add_queue: Update, can_solve: Callable[[], bool], pipeline: MeasurementPipeline,
+    quarantine: Queue, name: Callable[[Queue], str],
+) -> tuple[UpdateReport, Queue]:
+    """
+    Return the report of an update, and the constraints that were not tried in it.
+
+    If it sets constraints aside, it has the status FAILED, and the reason names them.
+    """
+    report, failed = add_queue()
+    if report.status is not Status.FAILED:
+        return report, failed
+    pipeline.counts['solver', 'failed'] += 1
+    if len(failed) == 0 or (len(failed) > 1 and not can_solve()):
+        quarantine.extend(failed)
+        return report, Queue()
+    added = [report]
+
+    def attempt(part: Queue) -> str:
+        waiting = pipeline.queue
+        pipeline.queue = part.joined(waiting)
+        again, _ = add_queue()
+        if again.status is Status.FAILED:
+            pipeline.queue = waiting
+            return again.reason
+        added.append(again)
+        return ''
+
+    bad, untried = isolate(failed, report.reason, attempt)
+    for one, _ in bad:
+        quarantine.extend(one)
+    reasons = [f'{name(one)}: {reason}' for one, reason in bad[:5]] or [report.reason]
+    if len(bad) > 5:
+        reasons.append(f'and {len(bad) - 5} more')
+    return replace(
+        added[-1], status=Status.FAILED, reason='; '.join(reasons),
+        new_constraints=sum(each.new_constraints for each in added)), untried
+
+
+def update_with_all(
+    update: Update, pipeline: MeasurementPipeline, quarantine: Queue,
+) -> UpdateReport:
+    """
+    Return one report of updates with all constraints in the queue, then with those set aside.
+    """
+    report, untried = update()
+    while len(untried) > 0:     # each update sets at least one aside
+        pipeline.queue = untried.joined(pipeline.queue)
+        again, untried = update()
+        report = report.before(again)
+    if len(quarantine) > 0:
+        pipeline.queue.extend(quarantine)
+        quarantine.replace_by(Queue())
+        again, untried = update()
+        # they are the first ones the next time
+        quarantine.replace_by(untried.joined(quarantine))
+        report = report.before(again)
+    return report
+
+
+def isolate(failed: Queue, reason: str, attempt: Callable[[Queue], str]) -> Isolated:
+    """
+    Return the bad constraints of a queue that cannot be added whole, after adding the rest.
+
+    `attempt` adds all constraints of a queue, or none; it returns why it cannot, or ''.
+    """
+    bad: list[tuple[Queue, str]] = []
+    suspects, untried, attempts = failed, Queue(), 0
+    while True:
+        while len(suspects) > 1:
+            if attempts >= MOST_ATTEMPTS:
+                return Isolated(bad, suspects.joined(untried))
+            half, rest = suspects.halves()
+            attempts, reason = attempts + 1, attempt(half)
+            suspects, untried = (
+                (rest, untried) if reason == '' else (half, rest.joined(untried)))
+        if reason == '':    # suspected because all others were added
+            attempts, reason = attempts + 1, attempt(suspects)
+        if reason != '':
+            bad.append((suspects, reason))
+        if len(untried) == 0 or attempts >= MOST_ATTEMPTS:
+            return Isolated(bad, untried)
+        attempts, reason = attempts + 1, attempt(untried)
+        if reason == '':
+            return Isolated(bad, Queue())
+        suspects, untried = untried, Queue()

@@ -8,25 +8,61 @@ the kernels that Python calls, each of which declares its signature (`compiled.j
 
 Compiling takes half a minute or more, and Numba's compiler holds the GIL for most of it. So other
 processes compile, and this one only loads the result: meanwhile it receives messages and can be
-ended at any moment.
+ended at any moment. It may be a node with threads and handlers of signals, so the others are
+started afresh and not forked, and get nothing but the path of imports and the environment.
 """
 
 from collections.abc import Callable, Iterator
 import contextlib
 import gc
 import os
+import subprocess
+import sys
+import threading
 import time
 
 from pose_graph_ros.core import backend  # noqa: F401  imports all modules with kernels
 from pose_graph_ros.core.compiled import jit
-from pose_graph_ros.core.helper_process import end_with_parent, HelperProcess
+
+# The path is set before anything of ours is imported: where there are two installations, or none
+# that a bare interpreter would find, it must be this one.
+BEGIN = ('import importlib, sys; _, module, name, *sys.path = sys.argv; '
+         'getattr(importlib.import_module(module), name)()')
+
+
+@contextlib.contextmanager
+def helper(module: str, name: str) -> Iterator[Callable[[], bool]]:
+    """Run a function of a module in an interpreter of its own; yield whether it goes on."""
+    try:
+        # no interpreter is known where Python is embedded; none can be started without memory
+        process = subprocess.Popen(
+            [sys.executable, '-c', BEGIN, module, name, *map(os.fspath, sys.path)],
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    except (OSError, ValueError, TypeError):
+        yield lambda: False
+        return
+    try:
+        yield lambda: process.poll() is None
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def end_with_parent() -> None:
+    """End this process as soon as the one that has started it is gone."""
+    threading.Thread(target=_wait_for_parent, name='parent', daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    # the end of the pipe that the parent holds is closed in whichever way it ends
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)
+
 
 # Functions that the helper processes call: one begins with the first kernel, one with the last.
 HELPERS = ((__name__, 'compile_forwards'), (__name__, 'compile_backwards'))
 # Time after which a helper counts as stuck [s].
 PATIENCE = 600.0
-# Threshold of the garbage collector while kernels are compiled [objects].
-MANY_OBJECTS = 200_000
 
 
 def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
@@ -43,10 +79,11 @@ def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
     start = time.perf_counter()
     if jit.can_be_kept() and not jit.is_cached():
         with contextlib.ExitStack() as stack:
-            helpers = [stack.enter_context(HelperProcess(*function))
+            running = [stack.enter_context(helper(*function))
                        for function in HELPERS[:len(os.sched_getaffinity(0))]]
-            for helper in helpers:
-                helper.wait(PATIENCE, stopped)
+            while (any(goes_on() for goes_on in running) and not stopped()
+                   and time.perf_counter() < start + PATIENCE):
+                time.sleep(0.05)
     with _rare_collections():
         for name in jit.declared():
             if stopped():
@@ -77,7 +114,7 @@ def _compile_missing(names: list[str]) -> None:
 def _rare_collections() -> Iterator[None]:
     """Collect garbage rarely, as the compiler creates many objects and keeps most of them."""
     thresholds = gc.get_threshold()
-    gc.set_threshold(MANY_OBJECTS)
+    gc.set_threshold(200_000)
     try:
         yield
     finally:

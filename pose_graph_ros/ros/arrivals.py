@@ -8,51 +8,53 @@ from dataclasses import dataclass, field
 import math
 
 from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS
+from pose_graph_ros.core.quantities import Seconds
 
-# A source is silent after the longest of this time [s], this many of its median gaps between two
-# messages, and this many times the second longest of its gaps and of its pauses.
-LEAST_SILENCE, MEDIANS, LONGEST = 2.0, 5.0, 3.0
-GAPS, ENOUGH = 50, 5  # number of gaps that are kept, and that make a rhythm
-# A pause, which is a much longer gap, is remembered for this many times its length. One may be a
-# failure of the driver; two show a source that comes and goes.
-MEMORY = 20.0
-QUIET = 10.0  # longest time without a message from any source that is not said [s]
+
+@dataclass(frozen=True, slots=True)
+class Expectations:
+    """When sources are missed [s], and from when on it is said that they are refused."""
+
+    # A source is silent after the longest of this time, this many of its median gaps between two
+    # messages, and this many times the second longest: one long gap may be a failure of the
+    # driver, two show a source that comes and goes.
+    least_silence: float = 2.0
+    medians: float = 5.0
+    longest: float = 3.0
+    gaps: int = 1000            # number of gaps that are kept,
+    rhythm: int = 5             # that make a rhythm,
+    present: int = 50           # and that tell the present rate
+    quiet: float = 10.0         # longest time without a message from any source that is not said
+    refusals: int = 3           # number of refused messages from which a source is reported
+    refused_for: float = 5.0    # time since its last accepted message from which it is
+
+
+EXPECTED = Expectations()
 
 
 @dataclass(slots=True)
 class _Arrivals:
     at: float  # time of the newest message [s]
     since: float  # the same, or later if the node was inactive meanwhile [s]
-    gaps: deque[float] = field(default_factory=lambda: deque(maxlen=GAPS))
-    pauses: list[tuple[float, float]] = field(default_factory=list)  # ends and lengths [s]
+    gaps: deque[float] = field(default_factory=lambda: deque(maxlen=EXPECTED.gaps))
 
     @property
-    def usual(self) -> float:
-        """Longest gap that is no pause [s]; infinite before there is a rhythm."""
-        if len(self.gaps) < ENOUGH:
+    def patience(self) -> float:
+        """Longest gap that is no silence [s]; infinite before there is a rhythm."""
+        if len(self.gaps) < EXPECTED.rhythm:
             return math.inf
         gaps = sorted(self.gaps)
-        return max(LEAST_SILENCE, MEDIANS * gaps[len(gaps) // 2], LONGEST * gaps[-2])
-
-    def patience(self, now: float) -> float:
-        """Return the longest gap that is no silence [s]."""
-        self.pauses = [pause for pause in self.pauses if now - pause[0] < MEMORY * pause[1]]
-        second = sorted((0.0, 0.0, *(length for _, length in self.pauses)))[-2]
-        return max(self.usual, LONGEST * second)
+        return max(EXPECTED.least_silence, EXPECTED.medians * gaps[len(gaps) // 2],
+                   EXPECTED.longest * gaps[-2])
 
     def receive(self, now: float) -> None:
-        gap = now - self.at
         if self.since == self.at:
-            # the least is compared first, as this is called at the rate of the messages
-            if gap > LEAST_SILENCE and gap > self.usual:
-                self.pauses.append((now, gap))
-            else:
-                self.gaps.append(gap)
+            self.gaps.append(now - self.at)
         self.at = self.since = now
 
     def is_active(self, now: float) -> bool:
-        patience = self.patience(now)
-        return now - self.since <= (patience if math.isfinite(patience) else QUIET)
+        return now - self.since <= (
+            self.patience if math.isfinite(self.patience) else EXPECTED.quiet)
 
 
 class Liveness:
@@ -62,15 +64,8 @@ class Liveness:
         self._rare = frozenset(rare)
         self._arrivals: dict[str, _Arrivals] = {}
 
-    def receive(self, source: str, now: float) -> None:
-        """
-        Record that a message came.
-
-        Parameters
-        ----------
-        now : float, by a monotonic clock, here and below [s]
-
-        """
+    def receive(self, source: str, now: Seconds) -> None:
+        """Record that a message came."""
         arrivals = self._arrivals.get(source)
         if arrivals is None:
             self._arrivals[source] = _Arrivals(now, now)
@@ -83,22 +78,15 @@ class Liveness:
             arrivals.since = now
 
     def silence(self, source: str, now: float) -> float | None:
-        """
-        Return the time since the last message of a source [s]; None before the first.
-
-        Parameters
-        ----------
-        now : float
-
-        """
+        """Return the time since the last message of a source [s]; None before the first."""
         arrivals = self._arrivals.get(source)
         return None if arrivals is None else now - arrivals.at
 
     def rate(self, source: str) -> float:
         """Return the present rate of a source [Hz]; 0 before its second message."""
-        arrivals = self._arrivals.get(source)
-        total = 0.0 if arrivals is None else sum(arrivals.gaps)
-        return 0.0 if arrivals is None or total <= 0.0 else len(arrivals.gaps) / total
+        gaps = [*self._arrivals[source].gaps][-EXPECTED.present:] if (
+            source in self._arrivals) else []
+        return len(gaps) / sum(gaps) if sum(gaps) > 0.0 else 0.0
 
     def silent(self, now: float) -> list[str]:
         """Return the sources that are silent at a time [s] at which another one is not."""
@@ -106,7 +94,7 @@ class Liveness:
                       if arrivals.is_active(now)), default=-math.inf)
         return sorted(name for name, arrivals in self._arrivals.items()
                       if name not in self._rare
-                      and newest - arrivals.since > arrivals.patience(now))
+                      and newest - arrivals.since > arrivals.patience)
 
     def quiet(self, now: float) -> float:
         """Return for how long no source has sent anything [s]; 0 if that is not long, or never."""
@@ -114,7 +102,7 @@ class Liveness:
                 arrivals.is_active(now) for arrivals in self._arrivals.values()):
             return 0.0
         silence = now - max(arrivals.since for arrivals in self._arrivals.values())
-        return silence if silence > QUIET else 0.0
+        return silence if silence > EXPECTED.quiet else 0.0
 
 
 @dataclass(slots=True)
@@ -129,8 +117,7 @@ class Delays:
 
     def __init__(self) -> None:
         self._delays: dict[str, _Delay] = {}
-        self.wrong: dict[str, str] = {}
-        """What is to be said of sources whose stamps are wrong, in sentences."""
+        self.wrong: dict[str, str] = {}  # sentences on sources whose stamps are wrong
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -140,15 +127,7 @@ class Delays:
     def receive(
         self, source: str, stamp_ns: int, clock: tuple[str, int], *, may_be_late: bool,
     ) -> None:
-        """
-        Compare a stamp.
-
-        Parameters
-        ----------
-        clock : tuple, the odometry that is compared with, and its newest stamp [ns]
-        may_be_late : bool, whether the source may take any time to measure
-
-        """
+        """Compare a stamp with the newest one of an odometry [ns]."""
         odometry, clock_ns = clock
         if odometry in ('', source):
             return
@@ -171,8 +150,6 @@ class Delays:
                 f'{source}.time_offset')
 
 
-LEAST_REFUSALS = 3  # number of refused messages from which a source is reported
-REFUSED_FOR = 5.0  # time since its last accepted message from which it is, if there was one [s]
 INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
 
 
@@ -193,19 +170,9 @@ class Refusals:
 
     def update(
         self, received: Mapping[str, int], counts: Counter[tuple[str, str]],
-        details: Mapping[tuple[str, str], str], now: float,
+        details: Mapping[tuple[str, str], str], now: Seconds,
     ) -> dict[str, str]:
-        """
-        Return what to say of the sources of which the newest messages were all refused.
-
-        Parameters
-        ----------
-        received : mapping, number of messages by source
-        counts : Counter, number of messages by source and 'accepted' or a reason
-        details : mapping, of the newest refusal by source and reason
-        now : float, by a monotonic clock [s]
-
-        """
+        """Return what to say of the sources of which the newest messages were all refused."""
         said = {}
         for source, total in received.items():
             refused = {reason: counts[name, reason] for name, reason in details
@@ -216,7 +183,8 @@ class Refusals:
             newest = Counter({reason: count - before.refused.get(reason, 0)
                               for reason, count in refused.items()})
             count = newest.total()
-            if count >= LEAST_REFUSALS and (accepted == 0 or now - before.at > REFUSED_FOR):
+            if count >= EXPECTED.refusals and (
+                    accepted == 0 or now - before.at > EXPECTED.refused_for):
                 begin = f'{count} of {total}' if accepted == 0 else f'the newest {count}'
                 said[source] = (f'{begin} messages of {source} were refused: '
                                 f'{_reasons(source, newest, details)}')

@@ -2,34 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values and summary of the node's status in /diagnostics; imports only messages of ROS."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 import math
 import os
 from pathlib import Path
 import time
-from typing import TYPE_CHECKING
+from typing import Generic, TYPE_CHECKING, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
-from pose_graph_ros.core.odometry.agreement import CONTRADICTORY
-from pose_graph_ros.core.odometry.turns import MOST_BIAS
-from pose_graph_ros.core.residuals.disagreement import Disagreement
+from pose_graph_ros.core.odometry.turns import CONTRADICTORY, MOST_BIAS
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
-from pose_graph_ros.core.sources.source_report import LEAST_ENERGY
+from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
 
-# Number of yaw rates and of hidden nodes after which a gyroscope must have been of use.
-MANY = 20
-# Period of the search for the constraints with the largest energies [s], and their number.
-ENERGY_PERIOD, N_ENERGIES = 5.0, 3
+Answer = TypeVar('Answer')
 
 
 def values(session: 'Session') -> dict[str, object]:
@@ -71,56 +68,54 @@ def _state(session: 'Session') -> dict[str, object]:
             'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
             'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
             'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
-    for rank, largest in enumerate(session.energies.found, 1):
+    for rank, largest in enumerate(session.searches.energies.found, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (
             '' if largest.unweighted == largest.energy else
             f', without its loss {short(largest.unweighted, 4)}')
     return found
 
 
-class LargestEnergies:
-    """The constraints with the largest energies, for which the worker is asked now and then."""
+class Asked(Generic[Answer]):
+    """What the worker is asked for now and then, with its newest answer."""
 
-    def __init__(self) -> None:
-        self.found: Sequence[ConstraintEnergy] = []
-        self._asked: Future[list[ConstraintEnergy]] | None = None
-        self._asked_at = -math.inf
+    def __init__(
+        self, found: Answer, what: str, ask: Callable[[PoseGraphBackend], Answer],
+    ) -> None:
+        self.found = found
+        self._what, self._ask = what, ask
+        self._asked: Future[Answer] | None = None
+        self.due = 0.0  # time [s], or number of measurements, from which on it is asked again
 
-    def update(self, worker: Worker) -> None:
-        """Take the newest answer of the worker, and ask again after a while."""
-        now, asked = time.monotonic(), self._asked
+    def update(self, worker: Worker, now: float, following: float) -> None:
+        """Take the newest answer of the worker, and ask again if that is due."""
+        asked = self._asked
         if asked is not None and asked.done():
             self._asked = None
             if not asked.cancelled() and asked.exception() is None:
                 self.found = asked.result()
-        if self._asked is None and worker.prepared and now - self._asked_at > ENERGY_PERIOD:
-            self._asked_at = now
-            self._asked = worker.call(
-                lambda backend: backend.largest_energies(N_ENERGIES), 'the largest energies')
+        if self._asked is None and worker.prepared and now >= self.due:
+            self.due = following
+            self._asked = worker.call(self._ask, self._what)
 
 
-class Contradiction:
-    """The source that contradicts the others, searched for while measurements fit badly."""
+class Searches:
+    """The constraints with the largest energies, and a source that contradicts the others."""
 
     def __init__(self) -> None:
-        self.found: Disagreement | None = None
-        self._asked: Future[Disagreement | None] | None = None
-        self._next = 0  # number of measurements from which on it is searched for again
+        self.energies: Asked[Sequence[ConstraintEnergy]] = Asked(
+            (), 'the largest energies', lambda backend: backend.largest_energies(3))
+        self.contradiction: Asked[Disagreement | None] = Asked(
+            None, 'the source that contradicts the others', lambda backend: backend.disagreement())
 
     def update(self, worker: Worker) -> None:
-        """Take the newest answer of the worker, and ask again when there is twice as much."""
-        reports, asked = worker.status.sources.values(), self._asked
-        if asked is not None and asked.done():
-            self._asked = None
-            if not asked.cancelled() and asked.exception() is None:
-                self.found = asked.result()
-        n = sum(report.n for report in reports)
-        if not any(report.fits_badly for report in reports):
-            self.found, self._next = None, 0
-        elif self._asked is None and n >= self._next:
-            self._next = 2 * n
-            self._asked = worker.call(
-                lambda backend: backend.disagreement(), 'the source that contradicts the others')
+        """Search every 5 s; while measurements fit badly, when there are twice as many."""
+        now, reports = time.monotonic(), worker.status.sources.values()
+        self.energies.update(worker, now, now + 5.0)
+        if any(report.fits_badly for report in reports):
+            n = sum(report.n for report in reports)
+            self.contradiction.update(worker, n, 2 * n)
+        else:
+            self.contradiction.found, self.contradiction.due = None, 0
 
 
 def memory() -> int:
@@ -165,7 +160,7 @@ def _fits(session: 'Session') -> dict[str, object]:
             found[f'{name}.errors_live'] = (
                 f'{short(in_use.tau)} s, with {short(math.sqrt(in_use.correlated))} times the '
                 f'sigma of the messages; found by {name}.correlation_time of -1, and treated so')
-        elif errors.significant and report.energy >= LEAST_ENERGY:
+        elif errors.significant and report.energy >= SOURCES.least_energy:
             found[f'{name}.errors_live'] = (
                 f'{short(errors.tau)} s, with a sigma of {short(errors.sigma_correlated)} m'
                 + (f'; treated as white: set {name}.correlation_time'
@@ -270,7 +265,7 @@ def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
 def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
     """Yield who disagrees with others, by a key, and what is probably wrong with them."""
     status, estimate = session.worker.status, session.worker.estimate
-    found = session.contradiction.found
+    found = session.searches.contradiction.found
     if found is not None:
         yield f'{found.source}.contradiction', f'{found.text[0].upper()}{found.text[1:]}.'
     for name, source in session.input.reader.sources.items():
@@ -278,7 +273,7 @@ def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
             continue
         counts, bias = status.counts, status.biases.get(name, 0.0)
         used, most = counts[name, 'rotations'], MOST_BIAS * session.values[f'{name}.sigma_bias']
-        if used == 0 and counts[name, 'accepted'] >= MANY <= estimate.n_hidden:
+        if used == 0 and counts[name, 'accepted'] >= 20 <= estimate.n_hidden:
             yield f'{name}.rotations', (
                 f'No message of {name} could be used: either their stamps are not in the time of '
                 f'odometry, or they are farther apart than {name}.maximum_gap.')

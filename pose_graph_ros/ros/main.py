@@ -16,19 +16,9 @@ import signal
 import sys
 from threading import enumerate as all_threads, Thread
 
-# Longest waits at the end, for a callback and for files of the graph that are written [s].
-CALLBACK_TIMEOUT, FILES_TIMEOUT = 0.5, 1.0
-
 
 def main(args: list[str] | None = None) -> int:
-    """
-    Run the node until SIGINT or SIGTERM; return the exit code.
-
-    Parameters
-    ----------
-    args : list of str, optional, by default those of the command line
-
-    """
+    """Run the node until SIGINT or SIGTERM; return the exit code."""
     ends, end = os.pipe()   # a byte for each signal, and one if the callbacks end by themselves
     os.set_blocking(end, False)
     signal.set_wakeup_fd(end)
@@ -74,11 +64,11 @@ def main(args: list[str] | None = None) -> int:
     thread.start()
     os.read(ends, 1)
     spinner.stop()
-    thread.join(CALLBACK_TIMEOUT)
+    thread.join(0.5)    # for a callback [s]
     node.close()
     for each in all_threads():
         if each.name == SERVICE_THREAD:
-            each.join(FILES_TIMEOUT)
+            each.join(1.0)  # for files of the graph that are written [s]
     spinner.close()
     node.destroy_node()
     rclpy.try_shutdown()

@@ -8,35 +8,29 @@ import traceback
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 
-from pose_graph_ros.adapters.parameter_changes import (
-    changed,
-    is_same,
-    NOTHING,
-    plain,
-    require_together,
-)
-from pose_graph_ros.adapters.parameter_files import without_effect
-from pose_graph_ros.adapters.parameter_names import is_own
+from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
 from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
-    Change,
+    changed,
     checked,
+    is_own,
+    is_same,
     listed_sources,
-    OF_SOURCES,
-    Parameter,
-    PARAMETERS,
+    NOTHING,
+    plain,
+    require_together,
     source_parameters,
     type_parameter,
     unknown,
+    without_effect,
 )
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros.log import FLUSH_PERIOD, NodeLog
+from pose_graph_ros.ros.log import NodeLog
 from pose_graph_ros.ros.services import Services
 from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.topics import check_topics, OVERRIDES
@@ -58,8 +52,6 @@ class PoseGraphNode(LifecycleNode):
         super().__init__(
             'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
         self._log = NodeLog(self.get_logger())
-        self.create_timer(
-            FLUSH_PERIOD, self._log.flush, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.failure = ''  # why the last transition or change of parameters failed
         self._session: Session | None = None
         self._offered: Services | None = None
@@ -191,7 +183,7 @@ class PoseGraphNode(LifecycleNode):
         for name, value in sorted(self._overrides.items()):
             # those of rclpy are declared, or will be with the publishers and subscriptions
             if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
-                    is_own(name, self._own, OF_SOURCES)) and (
+                    is_own(name, self._own)) and (
                     name not in usual or not is_same(plain(value), usual[name])):
                 self.get_logger().warning(str(unknown(name, self._own)))
 

@@ -10,21 +10,25 @@ not processed yet, by its own count. At the end it is asked for the final optimi
 import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 import sys
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path as PathMessage
 from rcl_interfaces.srv import SetParameters
 import rclpy
+from rclpy.client import Client
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
+from tqdm import tqdm
 
 from pose_graph_ros.adapters.bag_inputs import (
     Inputs,
@@ -40,18 +44,27 @@ from pose_graph_ros.ros.transforms import TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
 VERDICTS = f'{NODE_NAME}/verdicts'
+DIAGNOSTICS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 # Profiles are reliable if they do not say otherwise.
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-WINDOW = 400  # greatest number of unprocessed messages, well below the depth of the node's queues
-# Longest waits for the node: to appear, to compile at its first start, to process another message,
-# and to answer [s].
-APPEAR_TIMEOUT, PREPARE_TIMEOUT, STALL_TIMEOUT, ANSWER_TIMEOUT = 30.0, 600.0, 20.0, 90.0
 NOT_CONVERGED = 3  # exit code if all was played and recorded, without convergence at the end
-# Time without a path after which the last one has come; longer than the node's `path_period` [s].
-PATH_SILENCE = 1.0
-MOST_DIAGNOSTICS = 2000  # largest number of diagnostics that are recorded
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """Longest waits for the node [s], and how far it may fall behind."""
+
+    appear: float = 30.0
+    prepare: float = 600.0      # compile, as at its first start
+    stall: float = 20.0         # process another message
+    answer: float = 90.0
+    path_silence: float = 1.0   # after which the last path has come; longer than `path_period`
+    unprocessed: int = 400      # messages; well below the depth of the node's queues
+
+
+PATIENCE = Patience()
 
 
 class PlayError(Exception):
@@ -59,14 +72,7 @@ class PlayError(Exception):
 
 
 class Player(Node):
-    """
-    Publishes a bag and records the node's outputs.
-
-    Parameters
-    ----------
-    topics : mapping, of the node, by source
-
-    """
+    """Publishes a bag and records the node's outputs."""
 
     def __init__(self, inputs: Inputs, topics: Mapping[str, str]) -> None:
         super().__init__('pose_graph_player')
@@ -83,9 +89,6 @@ class Player(Node):
         self.path = b''  # the newest path
         self._path_at = -float('inf')
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        self._diagnostics: list[tuple[int, bytes]] = []   # with their times of arrival [ns]
-        self._newest_diagnostics = 0, b''
-        self._n_diagnostics, self._stride = 0, 1
         self._verdicts = b''
         self._record('pose', PoseWithCovarianceStamped, Kind.GLOBAL_POSE.message_type)
         self._record('odometry/filtered', Odometry, Kind.ODOMETRY.message_type)
@@ -115,17 +118,8 @@ class Player(Node):
         for status in deserialize_message(raw, DiagnosticArray).status:
             if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME:
                 self.diagnostics = {value.key: value.value for value in status.values}
-                self._keep_diagnostics(raw)
-
-    def _keep_diagnostics(self, raw: bytes) -> None:
-        """Keep the newest message, and of the others every second one, or fewer of very many."""
-        self._newest_diagnostics = time.time_ns(), raw
-        if self._n_diagnostics % self._stride == 0:
-            self._diagnostics.append(self._newest_diagnostics)
-        self._n_diagnostics += 1
-        if len(self._diagnostics) > MOST_DIAGNOSTICS:
-            del self._diagnostics[1::2]
-            self._stride *= 2
+                self.recorded.append(
+                    ('/diagnostics', DIAGNOSTICS_TYPE, time.time_ns(), raw))
 
     @property
     def processed(self) -> int:
@@ -142,24 +136,17 @@ class Player(Node):
 
     def play(self, bag: Path, rate: float) -> Counter[str]:
         """
-        Publish the inputs of a bag, and wait until the node has processed them.
+        Return the numbers of messages by input, after publishing those of a bag.
 
-        Parameters
-        ----------
-        rate : float, speed relative to the recorded one; 0 for as fast as the node can process
-
-        Returns
-        -------
-        published : Counter
-            Number of published messages by input, of those held out under `held_out`, and of those
-            that cannot be decoded under `malformed`.
-
+        They are all processed then. The rate is relative to the recorded one; 0 is as fast as the
+        node can process. Messages that are held out are counted under `held_out`, and those that
+        cannot be decoded under `malformed`.
         """
         self._spin_until(
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
-            and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), APPEAR_TIMEOUT,
+            and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), PATIENCE.appear,
             'the node does not subscribe')
-        self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PREPARE_TIMEOUT,
+        self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PATIENCE.prepare,
                         'the node is still compiling')
         if self._static is not None:
             with open_bag(bag) as reader:
@@ -173,7 +160,7 @@ class Player(Node):
         with open_bag(bag) as reader:
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
             start = first_ns = None
-            progress = Progress(total)
+            progress = tqdm(total=total, disable=None, unit=' messages')     # on a terminal
             for source, message, held_out in read_inputs(reader, self._inputs):
                 if held_out:
                     published['held_out'] += 1
@@ -193,10 +180,11 @@ class Player(Node):
                 self._writers[source].publish(message.raw)
                 published[source] += 1
                 sent += 1
-                if sent - self.processed > WINDOW:
-                    self._wait_for(sent - WINDOW // 2)
+                if sent - self.processed > PATIENCE.unprocessed:
+                    self._wait_for(sent - PATIENCE.unprocessed // 2)
                 self._executor.spin_once(timeout_sec=0.0)
-                progress.show(published.total())
+                progress.update()
+        progress.close()
         self._wait_for(sent)
         return published
 
@@ -204,21 +192,19 @@ class Player(Node):
         """Wait until the node has processed a number of messages, as long as it makes progress."""
         while (before := self.processed) < count:
             self._spin_until(
-                lambda before=before: self.processed > before, STALL_TIMEOUT,  # type: ignore[misc]
+                lambda before=before: self.processed > before, PATIENCE.stall,  # type: ignore[misc]
                 f'the node has processed {before} of {count} messages and makes no progress')
 
     def request_final_optimization(self) -> tuple[bool, str]:
         """Call ~/optimize, and wait for the path after it; return success and message."""
-        answer = self._optimize.call_async(Trigger.Request())
         asked_at = time.monotonic()
-        self._spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/optimize')
+        response = self._call(self._optimize, Trigger.Request(), 'the optimisation')
         answered_at = time.monotonic()
-        response = answer.result()
         # an earlier path may still come first: wait until no other one comes
         self._spin_until(
             lambda: asked_at < self._path_at
-            and max(answered_at, self._path_at) < time.monotonic() - PATH_SILENCE,
-            ANSWER_TIMEOUT, 'no path came after the optimisation')
+            and max(answered_at, self._path_at) < time.monotonic() - PATIENCE.path_silence,
+            PATIENCE.answer, 'no path came after the optimisation')
         return bool(response.success), str(response.message)
 
     def save_graph(self, path: Path) -> None:
@@ -226,14 +212,17 @@ class Player(Node):
         parameters = self.create_client(SetParameters, f'{NODE_NAME}/set_parameters')
         save = self.create_client(Trigger, f'{NODE_NAME}/save_graph')
         self._spin_until(lambda: parameters.service_is_ready() and save.service_is_ready(),
-                         APPEAR_TIMEOUT, 'the node does not offer to save its graph')
-        asked = parameters.call_async(SetParameters.Request(parameters=[
-            Parameter('graph_file', value=str(path)).to_parameter_msg()]))
-        self._spin_until(asked.done, ANSWER_TIMEOUT, 'no answer to setting graph_file')
-        answer = save.call_async(Trigger.Request())
-        self._spin_until(answer.done, ANSWER_TIMEOUT, 'no answer from ~/save_graph')
-        if not answer.result().success:
-            raise PlayError(f'~/save_graph: {answer.result().message}')
+                         PATIENCE.appear, 'the node does not offer to save its graph')
+        self._call(parameters, SetParameters.Request(parameters=[
+            Parameter('graph_file', value=str(path)).to_parameter_msg()]), 'setting graph_file')
+        answer = self._call(save, Trigger.Request(), 'saving the graph')
+        if not answer.success:
+            raise PlayError(f'~/save_graph: {answer.message}')
+
+    def _call(self, service: Client, request: Any, what: str) -> Any:
+        asked = service.call_async(request)
+        self._spin_until(asked.done, PATIENCE.answer, f'no answer to {what}')
+        return asked.result()
 
     def write(self, folder: Path) -> None:
         """Write a rosbag2 of all; of path and verdicts the last message."""
@@ -242,47 +231,8 @@ class Player(Node):
             for topic, type_name, arrived_ns, raw in self.recorded:
                 writer.write(topic, type_name, arrived_ns, raw)
             writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
-            verdicts = [] if self._verdicts == b'' else [(time.time_ns(), self._verdicts)]
-            diagnostics = self._diagnostics + [self._newest_diagnostics] * (
-                self._n_diagnostics > 0 and self._diagnostics[-1] != self._newest_diagnostics)
-            for topic, messages in ((verdicts_topic, verdicts), ('/diagnostics', diagnostics)):
-                for arrived_ns, raw in messages:
-                    writer.write(
-                        topic, 'diagnostic_msgs/msg/DiagnosticArray', arrived_ns, raw)
-
-
-class Progress:
-    """
-    Shows how many messages were played: on one line of a terminal, every ten percent elsewhere.
-
-    Parameters
-    ----------
-    total : int, number of messages
-
-    """
-
-    def __init__(self, total: int) -> None:
-        self._total, self._is_terminal = max(total, 1), sys.stderr.isatty()
-        self._shown, self._shown_at = 0, 0.0
-
-    def show(self, done: int) -> None:
-        """
-        Show a number of messages.
-
-        Parameters
-        ----------
-        done : int
-
-        """
-        percent = 100 * done // self._total
-        if self._is_terminal:
-            is_due = percent >= 100 or time.monotonic() - self._shown_at > 1.0
-        else:
-            is_due = percent // 10 > self._shown // 10
-        if is_due:
-            self._shown, self._shown_at = percent, time.monotonic()
-            print(f'  played {done} of {self._total} messages ({percent} %)', file=sys.stderr,
-                  end='\r' if self._is_terminal and percent < 100 else '\n', flush=True)
+            if self._verdicts != b'':
+                writer.write(verdicts_topic, DIAGNOSTICS_TYPE, time.time_ns(), self._verdicts)
 
 
 def main(args: list[str] | None = None) -> int:

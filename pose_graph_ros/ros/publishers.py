@@ -28,27 +28,32 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.fixes import Datum
-from pose_graph_ros.adapters.markers import markers_cdr
+from pose_graph_ros.adapters.output_cdr import (
+    markers_cdr,
+    odometry_cdr,
+    path_cdr,
+    stamped_pose_cdr,
+    UNKNOWN_VARIANCE,
+)
 from pose_graph_ros.adapters.sources import (
     IN_MAP,
     NANOSECONDS,
     OUTPUTS as OUTPUT_TOPICS,
     source_list,
 )
-from pose_graph_ros.adapters.verdict_messages import verdicts_cdr
 from pose_graph_ros.core.alignment.monitor import AlignmentState
-from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.estimate import Estimate, predict, Prediction
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView
-from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, Verdict
+from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
+from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.prediction import predict, Prediction
+from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
 from pose_graph_ros.ros.transforms import Slew, TF_QOS, TFMessage, TOPIC, TransformPublisher
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
@@ -64,25 +69,43 @@ OUTPUTS = {
     '~/verdicts': (DiagnosticArray, LATCHED_QOS),
     '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
 """Messages and quality of service by default topic, but for /tf."""
-LEAST_GRAPH_PERIOD = 0.1
-"""Least time between two sets of markers, and between two lists of verdicts [s]."""
-UNPLACED = np.diag((
-    output_cdr.UNKNOWN_VARIANCE, output_cdr.UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
-"""Covariance of a pose of which only the motion since the start is known."""
-MOST_FROZEN = 20_000
-"""Poses that have left the graph in a message; a day at 1 m/s has four times as many."""
+# Covariance of a pose of which only the motion since the start is known.
+UNPLACED = np.diag((UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
+LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
+          State.DOUBTED: DiagnosticStatus.WARN, State.WAITING: DiagnosticStatus.STALE}
+
+
+class View:
+    """A latched output that the thread of the engine makes now and then."""
+
+    def __init__(self, publisher: Publisher) -> None:
+        self.publisher = publisher
+        self.forget()
+
+    def forget(self) -> None:
+        """Let the next message have any stamp, at once."""
+        self.stamp_ns = 0
+        self._at = -math.inf
+        self.shown: object = None
+
+    def is_due(self, state: object, period: Seconds) -> bool:
+        """Tell whether to publish what is new, if a state is given, wanted, and not too soon."""
+        return ((state is None or state != self.shown)
+                and time.monotonic() - self._at >= period
+                and bool(self.publisher.get_subscription_count() > 0))
+
+    def publish(
+        self, state: object, stamp_ns: StampNs, message_at: Callable[[StampNs], object],
+    ) -> None:
+        """Publish a message, with a stamp that is newer than that of the one before."""
+        self.shown, self._at = state, time.monotonic()
+        # with the same newest odometry: 1 ns keeps the stamps increasing
+        self.stamp_ns = max(stamp_ns, self.stamp_ns + 1)
+        self.publisher.publish(message_at(self.stamp_ns))
 
 
 class Publishers:
-    """
-    The outputs of the node.
-
-    Parameters
-    ----------
-    values : mapping, all checked parameters
-    on_other : callable, called with a sentence if another node publishes the same transform
-
-    """
+    """The outputs of the node."""
 
     def __init__(
         self, node: Node, values: Mapping[str, Any], on_other: Callable[[str], None],
@@ -92,12 +115,15 @@ class Publishers:
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
         given = {topic: values[f'outputs.{name}'] for name, (topic, *_) in OUTPUT_TOPICS.items()}
-        self._publishers = [self._publisher(message_type, given[topic], qos)
-                            for topic, (message_type, qos) in OUTPUTS.items()]
-        (self._pose, self._odometry, self._fix, self._path, self._graph, self._verdicts,
-         self._diagnostics) = self._publishers
+        self._publishers = {
+            topic: self._publisher(message_type, given[topic], qos)
+            for topic, (message_type, qos) in OUTPUTS.items()}
+        self._pose, self._odometry, self._fix = (
+            self._publishers[topic] for topic in ('pose', 'odometry/filtered', 'gps/filtered'))
+        self.path, self.markers, self.verdicts = (
+            View(self._publishers[topic]) for topic in ('path', 'graph', '~/verdicts'))
+        # None if `publish_tf` is false or tf2_msgs is not installed
         self.transforms: TransformPublisher | None = None
-        """None if `publish_tf` is false or tf2_msgs is not installed."""
         self._on_other = on_other
         self._map_topics = [node.resolve_topic_name(source.topic)
                             for source in source_list(values) if source.kind in IN_MAP]
@@ -108,14 +134,7 @@ class Publishers:
         self.graph = 0  # number of the present graph: how many were started after the first
         # shared by the two threads
         self._lock = threading.Lock()
-        self._forget_views()
         self.configure(values)
-
-    def _forget_views(self) -> None:
-        self._path_shown: Estimate | None = None
-        self._path_stamp_ns = self._graph_stamp_ns = self._verdicts_stamp_ns = 0
-        self._path_at = self._graph_at = self._verdicts_at = -float('inf')
-        self._verdicts_shown: object = None
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
@@ -140,20 +159,13 @@ class Publishers:
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = tuple(values['transform_slew'])
         self._path_period = values['path_period']
-        self._graph_period = max(2.0 * self._path_period, LEAST_GRAPH_PERIOD)
+        self.graph_period = max(2.0 * self._path_period, 0.1)   # of markers and verdicts [s]
 
     def publish_pose(
         self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,
     ) -> None:
         """
         Publish pose, odometry, fix and transform at an odometry message, if they are not held.
-
-        Parameters
-        ----------
-        estimate : Estimate, the newest estimate, with the same primary odometry
-        odometry : Message, with the fields of nav_msgs/Odometry
-        sample : OdometrySample, the same message, as it was read
-
         """
         stamp, plane = sample.stamp_ns, datum.plane
         if stamp <= self._newest_ns or self._holds(estimate):
@@ -175,10 +187,10 @@ class Publishers:
         if self._is_unplaced(estimate):
             prediction = prediction._replace(covariance=UNPLACED)
         if self._odometry in wanted:
-            self._odometry.publish(output_cdr.odometry_cdr(
+            self._odometry.publish(odometry_cdr(
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
-            self._pose.publish(output_cdr.stamped_pose_cdr(stamp, prediction, self.map_frame))
+            self._pose.publish(stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before the first measurement in the map, its place on the Earth is unknown
         if (self._fix in wanted and plane is not None
                 and estimate.alignment is not AlignmentState.LOCAL):
@@ -203,90 +215,36 @@ class Publishers:
         self._slew.forget()
 
     def path_is_due(self, estimate: Estimate) -> bool:
-        """Tell whether to publish the path of an estimate: new, wanted, and not too soon."""
-        return (estimate is not self._path_shown and not self._holds(estimate)
-                and time.monotonic() - self._path_at >= self._path_period
-                and self._path.get_subscription_count() > 0)
+        """Tell whether to publish the path of an estimate."""
+        return (estimate is not self.path.shown and not self._holds(estimate)
+                and self.path.is_due(None, self._path_period))
 
     def publish_path(
         self, estimate: Estimate, path: Trajectory, graph: int, n_frozen: int = 0,
     ) -> None:
-        """
-        Publish the path of an estimate, if it is of the present graph.
-
-        Parameters
-        ----------
-        graph : int, number of its graph
-        n_frozen : int
-            Number of its first poses that have left the graph: of more than `MOST_FROZEN` only
-            every second one is published, or every third, and so on.
-
-        """
+        """Publish a path, the first poses of which may have left the graph, if it is present."""
         shown = thinned(path, n_frozen)
         with self._lock:
-            if graph != self.graph or self._holds(estimate):
-                return
-            self._path_shown, self._path_at = estimate, time.monotonic()
-            # a better path with the same newest odometry: 1 ns keeps the stamps increasing
-            self._path_stamp_ns = max(estimate.stamp_ns, self._path_stamp_ns + 1)
-            self._path.publish(output_cdr.path_cdr(shown, self._path_stamp_ns, self.map_frame))
+            if graph == self.graph and not self._holds(estimate):
+                self.path.publish(estimate, estimate.stamp_ns, lambda stamp_ns: path_cdr(
+                    shown, stamp_ns, self.map_frame))
 
-    def graph_is_due(self) -> bool:
-        """Tell whether to publish the markers of the graph: wanted, and not too soon."""
-        return (self._graph.get_subscription_count() > 0
-                and time.monotonic() - self._graph_at >= self._graph_period)
-
-    def publish_graph(self, view: GraphView, stamp_ns: int, graph: int) -> None:
-        """
-        Publish the markers of a graph, if it is the present one.
-
-        Parameters
-        ----------
-        stamp_ns, graph : int, stamp of the newest odometry in it [ns], and number of the graph
-
-        """
+    def publish_graph(self, view: GraphView, stamp_ns: StampNs, graph: int) -> None:
+        """Publish the markers of a graph, if it is the present one."""
         with self._lock:
-            if graph != self.graph:
-                return
-            self._graph_at = time.monotonic()
-            self._graph_stamp_ns = max(stamp_ns, self._graph_stamp_ns + 1)
-            self._graph.publish(markers_cdr(view, self._graph_stamp_ns, self.map_frame))
-
-    def verdicts_are_due(self, state: object, *, at_once: bool = False) -> bool:
-        """
-        Tell whether to publish the verdicts: changed, wanted, and not too soon.
-
-        Parameters
-        ----------
-        state : object, equal to that of the verdicts published last if they have not changed
-        at_once : bool, whether it cannot be too soon
-
-        """
-        return (state != self._verdicts_shown
-                and (at_once or time.monotonic() - self._verdicts_at >= self._graph_period)
-                and self._verdicts.get_subscription_count() > 0)
+            if graph == self.graph:
+                self.markers.publish(None, stamp_ns, lambda stamp_ns: markers_cdr(
+                    view, stamp_ns, self.map_frame))
 
     def publish_verdicts(
-        self, verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], stamp_ns: int,
+        self, verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], stamp_ns: StampNs,
         graph: int, *, state: object,
     ) -> None:
-        """
-        Publish the verdicts on the constraints of a graph, if it is the present one.
-
-        Parameters
-        ----------
-        totals : mapping, what is believed of each source
-        stamp_ns, graph : int, stamp of the newest odometry in it [ns], and number of the graph
-        state : object, what `verdicts_are_due` was asked for
-
-        """
+        """Publish the verdicts on the constraints of a graph, if it is the present one."""
         with self._lock:
-            if graph != self.graph:
-                return
-            self._verdicts_at, self._verdicts_shown = time.monotonic(), state
-            self._verdicts_stamp_ns = max(stamp_ns, self._verdicts_stamp_ns + 1)
-            self._verdicts.publish(verdicts_cdr(
-                verdicts, totals, self._verdicts_stamp_ns, self.map_frame))
+            if graph == self.graph:
+                self.verdicts.publish(state, stamp_ns, lambda stamp_ns: verdicts_message(
+                    verdicts, totals, self._header(stamp_ns)))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""
@@ -296,34 +254,24 @@ class Publishers:
             self.transforms.forget()
         with self._lock:
             self.graph += 1
-            path_ns, graph_ns = self._path_stamp_ns, self._graph_stamp_ns
-            verdicts_ns = self._verdicts_stamp_ns
-            self._forget_views()
-            if path_ns > 0:
-                self._path.publish(Path(header=self._after(path_ns)))
-            if graph_ns > 0:
-                self._graph.publish(MarkerArray(
-                    markers=[Marker(header=self._after(graph_ns), action=Marker.DELETEALL)]))
-            if verdicts_ns > 0:
-                self._verdicts.publish(verdicts_cdr([], {}, verdicts_ns + 1, self.map_frame))
+            for view, empty in (
+                    (self.path, lambda header: Path(header=header)),
+                    (self.markers, lambda header: MarkerArray(
+                        markers=[Marker(header=header, action=Marker.DELETEALL)])),
+                    (self.verdicts, lambda header: verdicts_message([], {}, header))):
+                if view.stamp_ns > 0:
+                    view.publisher.publish(empty(self._header(view.stamp_ns + 1)))
+                view.forget()
 
-    def _after(self, stamp_ns: int) -> Header:
-        return Header(stamp=time_message(stamp_ns + 1), frame_id=self.map_frame)
+    def _header(self, stamp_ns: StampNs) -> Header:
+        return Header(stamp=time_message(stamp_ns), frame_id=self.map_frame)
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
-        """
-        Publish the state of the node; the only output that is stamped by the node's clock.
-
-        Parameters
-        ----------
-        level : bytes, as in DiagnosticStatus
-
-        """
+        """Publish the state of the node; the only output that is stamped by the node's clock."""
         status = DiagnosticStatus(
             level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph', message=text,
-            hardware_id='pose_graph',
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
-        self._diagnostics.publish(DiagnosticArray(
+            hardware_id='pose_graph', values=_key_values(values))
+        self._publishers['/diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
     def close(self) -> None:
@@ -332,23 +280,38 @@ class Publishers:
             self.transforms.close()
         with self._lock:
             self.graph += 1     # nothing more is published of the graph so far
-            for publisher in self._publishers:
+            for publisher in self._publishers.values():
                 self._node.destroy_publisher(publisher)
+
+
+def verdicts_message(
+    verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], header: Header,
+) -> DiagnosticArray:
+    """Return a status for each constraint, after one that also counts those not listed."""
+    n_all = sum(sum(each.counts.values()) for each in totals.values())
+    of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
+    doubting = any(each.doubting for each in totals.values())
+    summary = DiagnosticStatus(
+        level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK, name='summary',
+        message=f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}',
+        values=_key_values(total_values(totals)))
+    return DiagnosticArray(header=header, status=[summary, *(DiagnosticStatus(
+        level=LEVELS[each.state], name=each.id, message=sentence(each), hardware_id=each.source,
+        values=_key_values(details(each))) for each in verdicts)])
+
+
+def _key_values(values: Mapping[str, object]) -> list[KeyValue]:
+    return [KeyValue(key=key, value=str(value)) for key, value in values.items()]
 
 
 def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
     """
-    Return a path with at most `MOST_FROZEN` of its frozen poses.
+    Return a path with every n-th of its poses that have left the graph, from the first on.
 
-    Every n-th of them is kept, from the first on, with the smallest n that is enough: poses that
-    are published stay the same, until n grows.
-
-    Parameters
-    ----------
-    n_frozen : int, how many of its first poses are frozen
-
+    n is the smallest with at most 20 000 of them, a quarter of a day at 1 m/s: so poses that are
+    published stay the same until it grows.
     """
-    step = -(-n_frozen // MOST_FROZEN)
+    step = -(-n_frozen // 20_000)
     if step <= 1:
         return path
     kept = np.concatenate((np.arange(0, n_frozen, step), np.arange(n_frozen, len(path))))
@@ -362,19 +325,12 @@ def time_message(stamp_ns: int) -> Time:
 
 
 def fix_message(
-    stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: float, base_frame: str,
+    stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: Metres, base_frame: str,
 ) -> NavSatFix:
-    """
-    Return the robot's position on the Earth, its covariance in east and north.
-
-    Parameters
-    ----------
-    altitude : float, above the ellipsoid [m]; NaN if unknown
-
-    """
+    """Return the robot's position on the Earth, its covariance in east and north."""
     latitude, longitude, _ = plane.to_geodetic(
         prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
-    covariance = np.diag((0.0, 0.0, output_cdr.UNKNOWN_VARIANCE))
+    covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
     turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
     covariance[:2, :2] = 0.5 * (turned + turned.T)
     return NavSatFix(

@@ -1,17 +1,31 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a person asks for by messages: poses that are set, decisions on constraints; no rclpy."""
+"""
+What a person asks for: poses that are set, decisions on constraints, files of the graph.
 
-from functools import partial
+Imports no rclpy.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 import logging
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, Message, PLANAR, planar_pose, stamp_ns
-from pose_graph_ros.adapters.verdict_messages import JUDGE, read_decision
+from pose_graph_ros.adapters.fixes import datum_of
+from pose_graph_ros.adapters.sources import SET_POSE
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph
+from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
+from pose_graph_ros.core.judgement.verdicts import Decision
 from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,
@@ -22,22 +36,16 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.ros.log import ANSWER
 from pose_graph_ros.ros.worker import Worker
 
-# Used if a message has no valid covariance: what RViz sends [m, m, rad].
-DEFAULT_SIGMA = (0.5, 0.5, 0.26)
+logger = logging.getLogger(__name__)
+
+JUDGE = 'judge'  # name under which decisions are counted
 # Stamps that stand for the newest odometry (if the message has no stamp), and for the first
 # odometry (if the message came before it) [ns].
 NEWEST, FIRST = 2**62, 1
 
 
 class SetPoseInput:
-    """
-    Keeps the newest pose that was set until there is odometry that it can be applied to.
-
-    Parameters
-    ----------
-    map_frame, odom_frame, base_frame : str, those in which a pose may be given
-
-    """
+    """Keeps the newest pose that was set until there is odometry that it can be applied to."""
 
     def __init__(self, map_frame: str, odom_frame: str, base_frame: str) -> None:
         self._frames = (map_frame, odom_frame, base_frame)
@@ -45,15 +53,7 @@ class SetPoseInput:
         self._early = False
 
     def receive(self, message: Message, *, early: bool = False) -> Answer | None:
-        """
-        Return why a message cannot be used; None if it can and is kept for `pop`.
-
-        Parameters
-        ----------
-        message : geometry_msgs/PoseWithCovarianceStamped
-        early : bool, whether there is no odometry yet: the pose then applies to the first odometry
-
-        """
+        """Return why a message cannot be used; None if it can and is kept for `pop`."""
         named = frame(message.header.frame_id)
         if named not in ('', *self._frames):
             return rejected('wrong_frame', f'expected {", ".join(self._frames)}, got {named!r}')
@@ -76,7 +76,7 @@ class SetPoseInput:
         variance = np.diagonal(cov)
         if not (np.all(np.isfinite(cov)) and np.all(variance > 0.0)
                 and np.all(variance <= covariance.LARGEST_VARIANCE)):
-            cov = np.diag(DEFAULT_SIGMA) ** 2
+            cov = np.diag((0.5, 0.5, 0.26)) ** 2    # what RViz sends [m, m, rad]
         _, odom_frame, base_frame = self._frames
         T_map_frame = {odom_frame: estimate.T_map_odom, base_frame: estimate.T_map_base}.get(
             frame(message.header.frame_id))
@@ -93,31 +93,107 @@ class SetPoseInput:
         self._waiting = None
 
 
-logger = logging.getLogger(__name__)
+def read_decision(message: Message) -> tuple[str, Decision] | Answer:
+    """Return the id of a constraint and what is decided on it; else why it cannot be read."""
+    name, text = str(message.key).strip(), str(message.value).strip().lower()
+    try:
+        return name, Decision(text)
+    except ValueError:
+        choices = ', '.join(decision.value for decision in Decision)
+        return rejected('unknown_decision', f'expected one of {choices} as the value for the key '
+                                            f'{name!r}, got {text!r}')
 
 
 def decide(message: Message, worker: Worker) -> None:
-    """
-    Hand a decision to the engine, which answers in the log; an update follows at once.
+    """Hand a decision to the engine, which answers in the log; an update follows at once."""
+    def act(backend: PoseGraphBackend) -> None:
+        read = read_decision(message)
+        answer = read if isinstance(read, Answer) else backend.decide(*read)
+        refused = answer.status is AnswerStatus.REJECTED
+        backend.counts[JUDGE, answer.reason if refused else 'accepted'] += 1
+        _tell(answer, 'nothing is decided', answer.detail or f'{message.key}: {message.value}')
+        worker.request_update()     # here, as jobs are done after one that was asked for before
+    worker.call(act, 'a decision')
 
-    Parameters
-    ----------
-    message : diagnostic_msgs/KeyValue, the id of a constraint, and `in`, `out` or `auto`
 
-    """
-    worker.call(partial(_hand_over, message, worker), 'a decision')
+def set_pose(pose: GlobalPose, map_frame: str, worker: Worker) -> None:
+    """Hand a pose to the engine, which answers in the log; an update follows at once."""
+    def act(backend: PoseGraphBackend) -> None:
+        x, y, yaw = pose.pose
+        where = f'to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {map_frame}'
+        _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
+              f'the pose is set {where}')
+        worker.request_update()
+    worker.call(act, 'a pose that is set')
 
 
-def _hand_over(message: Message, worker: Worker, backend: PoseGraphBackend) -> None:
-    """Decide in the engine, count and log its answer; for the worker's thread."""
-    read = read_decision(message)
-    answer = read if isinstance(read, Answer) else backend.decide(*read)
+def _tell(answer: Answer, refused: str, done: str) -> None:
+    """Log an answer to a person."""
     if answer.status is AnswerStatus.REJECTED:
-        backend.counts[JUDGE, answer.reason] += 1
-        logger.warning(
-            'nothing is decided: %s: %s', answer.reason, answer.detail, extra=ANSWER)
+        logger.warning('%s: %s: %s', refused, answer.reason, answer.detail, extra=ANSWER)
     else:
-        backend.counts[JUDGE, 'accepted'] += 1
-        logger.info('%s', answer.detail or f'{message.key}: {message.value}')
-    # asked for here, as jobs are done after an update that was asked for before
-    worker.request_update()
+        logger.info('%s', done)
+
+
+# --- the file of the graph
+
+@dataclass(frozen=True, slots=True)
+class InitialGraph:
+    """A saved graph that was found to be whole, and to be of the site of the robot."""
+
+    path: Path
+    datum: MapOrigin | None
+
+    def read(self, config: BackendConfig) -> PoseGraphBackend | None:
+        """Return an engine that continues it; None, which is logged, if that fails after all."""
+        try:
+            saved, backend = restored(self.path, config)
+        except Exception:
+            logger.exception('%s could not be loaded: a new graph is started', self.path)
+            return None
+        logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), self.path)
+        return backend
+
+
+def graph_path(values: Mapping[str, Any]) -> Path:
+    """Return the file that graph_file names; raises `ConfigError` if it names none."""
+    name = values['graph_file']
+    if name == '':
+        raise ConfigError('parameter graph_file: expected the name of a file, such as '
+                          "~/map.g2o, got ''")
+    try:
+        return Path(name).expanduser().absolute()
+    except RuntimeError as error:
+        raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
+
+
+def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
+    """
+    Return the graph that a node starts with; None before one was saved, which is said.
+
+    Only the checksums and the datum are read, as whoever configures the node waits for it.
+    """
+    if not values['load_graph_on_start']:
+        return None
+    path, plane = graph_path(values), datum_of(values).plane
+    try:
+        if not path.is_dir() and not any(map(Path.exists, graph_paths(path))):
+            logger.warning('there is no graph in %s yet: starting with an empty one, which '
+                           '~/save_graph writes there', path)
+            return None
+        datum = read_datum(path)
+    except (FileFormatError, OSError) as error:
+        raise ConfigError(f'parameter load_graph_on_start: {error}') from error
+    if datum is not None and plane is not None:
+        refusal = datum_refusal(datum, plane.origin)
+        if refusal is not None:
+            raise ConfigError(f'parameter load_graph_on_start: {path}: {refusal}')
+    return InitialGraph(path, datum)
+
+
+def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
+    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
+    saved = read_graph(path)
+    backend = PoseGraphBackend.restored(config, saved)
+    backend.update()
+    return saved, backend

@@ -35,22 +35,26 @@ from pose_graph_ros.adapters.sources import (
     SET_POSE,
     Source,
 )
-from pose_graph_ros.adapters.verdict_messages import JUDGE, MOST_BELIEVED
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample
+from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.ros import diagnostics
-from pose_graph_ros.ros.graph_file import initial_graph, InitialGraph
-from pose_graph_ros.ros.input import Input, PAUSED
-from pose_graph_ros.ros.jumps import PoseContinuity, ReceivedMessage
+from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER
 from pose_graph_ros.ros.publishers import Publishers
-from pose_graph_ros.ros.requests import decide, SetPoseInput
+from pose_graph_ros.ros.requests import (
+    decide,
+    initial_graph,
+    InitialGraph,
+    JUDGE,
+    set_pose,
+    SetPoseInput,
+)
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.surroundings import doubts
 from pose_graph_ros.ros.topics import (
     CLASSES,
+    doubts,
     JUDGE_QOS,
     JUDGE_TOPIC,
     LOOP_CLOSURE_QOS,
@@ -66,18 +70,10 @@ logger = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
 IN_FRAMES = (Kind.FIX, Kind.GYRO, Kind.TWIST)  # sources that need /tf_static
-SILENCE_PERIOD = 0.2  # period of the check whether all sources are silent [s]
 
 
 class Session:
-    """
-    Inputs, graph and outputs of the node, from its configuration to its clean-up.
-
-    Parameters
-    ----------
-    values : mapping, all checked parameters; raises `ConfigError` if they contradict each other
-
-    """
+    """Inputs, graph and outputs of the node, from its configuration to its clean-up."""
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
@@ -112,8 +108,7 @@ class Session:
         self.is_loaded = resumes  # whether the graph began as one that was loaded
         self.final: Future[UpdateReport] | None = None  # optimisation at the end of the stream
         # of this graph, so that the answer of an earlier worker is nobody's
-        self.energies = diagnostics.LargestEnergies()
-        self.contradiction = diagnostics.Contradiction()
+        self.searches = diagnostics.Searches()
 
     def _start_worker(
         self, backend: PoseGraphBackend, *, prepared: bool = False,
@@ -160,7 +155,8 @@ class Session:
             self._subscribe(STATIC_TOPIC, TFMessage, self.input.reader.frames.receive, STATIC_QOS)
         for topic in SET_POSE_TOPICS:
             self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
-        self._subscribe(JUDGE_TOPIC, KeyValue, self._on_judge, JUDGE_QOS)
+        self._subscribe(JUDGE_TOPIC, KeyValue, lambda message: decide(message, self.worker),
+                        JUDGE_QOS)
         for source in sources:
             qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS
             self._subscribe(
@@ -272,24 +268,7 @@ class Session:
         if estimate is None or (pose := self._set_pose_input.pop(estimate)) is None:
             return
         self.out.jump()
-        self.worker.call(partial(self._hand_over, pose, self.worker), 'a pose that is set')
-
-    def _hand_over(self, pose: GlobalPose, worker: Worker, backend: PoseGraphBackend) -> None:
-        """Set the pose in the engine and log what it answers; for the thread of the worker."""
-        answer = backend.set_pose(pose, SET_POSE)
-        x, y, yaw = pose.pose
-        what = f'({x:.3f}, {y:.3f}, {yaw:.3f}) in {self.out.map_frame}'
-        if answer.status is AnswerStatus.REJECTED:
-            logger.warning('the pose is not set to %s: %s: %s', what, answer.reason, answer.detail,
-                           extra=ANSWER)
-        else:
-            logger.info('the pose is set to %s', what)
-        # asked for here, as jobs are done after an update that was asked for before
-        worker.request_update()
-
-    def _on_judge(self, message: Message) -> None:
-        """Receive what a person decides on a constraint."""
-        decide(message, self.worker)
+        set_pose(pose, self.out.map_frame, self.worker)
 
     # ---- time
 
@@ -297,7 +276,7 @@ class Session:
         """Start the timers, and register the callback for jumps of the clock back in time."""
         values = self.values
         self._set_timer('update', 1.0 / values['frequency'], self._on_update_timer)
-        self._set_timer('silence', SILENCE_PERIOD, self._on_silence_timer)
+        self._set_timer('silence', 0.2, self._on_silence_timer)
         self._set_timer('views', max(min(values['path_period'], 0.5), 0.1), self._on_views_timer)
         if self._jump_handle is None:
             self._jump_handle = self.node.get_clock().create_jump_callback(
@@ -327,15 +306,7 @@ class Session:
                 self._use(ReceivedMessage(source, message, measurement))
 
     def load(self, saved: SavedGraph, backend: PoseGraphBackend, name: str) -> None:
-        """
-        Replace the graph by one that was loaded.
-
-        Parameters
-        ----------
-        backend : PoseGraphBackend, restored from it
-        name : str, for the log
-
-        """
+        """Replace the graph by one that was loaded."""
         self.input.time_jumps.forget()
         self._replace(backend, f'the graph in {name} was loaded', resumes=True)
         if saved.datum is not None:
@@ -391,12 +362,14 @@ class Session:
             newest = backend.estimate()
             assert newest is not None
             self.out.publish_path(estimate, newest.path, graph, newest.n_frozen)
-        if self.out.graph_is_due() and (view := backend.view()) is not None:
+        if self.out.markers.is_due(None, self.out.graph_period) and (
+                view := backend.view()) is not None:
             self.out.publish_graph(view, estimate.stamp_ns, graph)
         status = worker.status
         state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
-        if self.out.verdicts_are_due(state, at_once=at_once):
-            self.out.publish_verdicts(backend.verdicts(MOST_BELIEVED), status.verdicts,
+        if self.out.verdicts.is_due(state, 0.0 if at_once else self.out.graph_period):
+            # of those that are believed, the newest of each source
+            self.out.publish_verdicts(backend.verdicts(50), status.verdicts,
                                       estimate.stamp_ns, graph, state=state)
 
     def optimize(self) -> 'Future[UpdateReport]':
@@ -426,8 +399,7 @@ class Session:
         for about, what, sentence in found:
             self.input.warn_once(about, what, sentence)
         self.doubts = [sentence for *_, sentence in found]
-        self.energies.update(self.worker)
-        self.contradiction.update(self.worker)
+        self.searches.update(self.worker)
         for key, text in diagnostics.disagreements(self):
             self.input.warn_once(key, 'disagreement', text)
         # in this order: the sentence is then at least as new as the values beside it

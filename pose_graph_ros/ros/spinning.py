@@ -19,9 +19,6 @@ logger = logging.getLogger(__name__)
 # Without a limit the EventsExecutor waits to the last instant of the steady clock; where rclpy was
 # built for an old C library, as on PyPI, that overflows and hangs [s].
 LONGEST_WAIT = 3600.0
-# Of the SingleThreadedExecutor, which begins each wait with all that has changed [s].
-SHORT_WAIT = 0.1
-CLOSE_TIMEOUT = 1.0  # longest wait for a callback at the end [s]
 
 
 class Spinner:
@@ -39,7 +36,8 @@ class Spinner:
         while not self._stopped.done() and self._node.context.ok():
             try:
                 if EventsExecutor is None:
-                    self._executor.spin_once(timeout_sec=SHORT_WAIT)
+                    # it begins each wait with all that has changed
+                    self._executor.spin_once(timeout_sec=0.1)
                 else:
                     self._executor.spin_until_future_complete(
                         self._stopped, timeout_sec=LONGEST_WAIT)
@@ -55,7 +53,7 @@ class Spinner:
 
     def close(self) -> None:
         """Release the node, before it is destroyed."""
-        self._executor.shutdown(timeout_sec=CLOSE_TIMEOUT)
+        self._executor.shutdown(timeout_sec=1.0)
 
 
 def guarded(callback: Callable[..., None], is_due: Callable[[], bool]) -> Callable[..., None]:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The transform from map to odom: its speed, its stamps, and others that publish it."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 import math
 import time
@@ -19,7 +19,6 @@ from pose_graph_ros.adapters.conversions import frame, stamp_ns
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.surroundings import other_publishers
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -29,21 +28,22 @@ except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
 # The profile of tf2_ros, which is reliable.
 TF_QOS = QoSProfile(depth=100)
 TOPIC, STATIC_TOPIC = '/tf', '/tf_static'
-LISTENING = 2.0  # reading all of /tf costs as much as odometry, so it is read for this time [s]
-PAUSE = 30.0  # period of the listening; a new publisher on /tf starts it at once [s]
-OWN = 2000  # number of the newest transforms of this node that are kept, to recognise them on /tf
+# Reading all of /tf costs as much as odometry: how long it is read, and the period of that [s].
+LISTENING, PAUSE = 2.0, 30.0
+
+
+def other_publishers(node: Node, topic: str) -> list[str]:
+    """Return the full names of the other nodes that publish a topic, which may be like its own."""
+    names = Counter(
+        f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+        for info in node.get_publishers_info_by_topic(topic)
+        if info.node_name != '_NODE_NAME_UNKNOWN_')   # until rmw has found out
+    names -= Counter([node.get_fully_qualified_name()])
+    return sorted(names)
 
 
 class TransformPublisher:
-    """
-    Publishes the transform from map to odom, each with a newer stamp than the one before.
-
-    Parameters
-    ----------
-    publisher : rclpy.publisher.Publisher
-    on_other : callable, called once with a sentence if another node publishes the same transform
-
-    """
+    """Publishes the transform from map to odom, each with a newer stamp than the one before."""
 
     def __init__(
         self, node: Node, publisher: Publisher, map_frame: str, odom_frame: str,
@@ -52,21 +52,14 @@ class TransformPublisher:
         self._node, self._publisher, self._on_other = node, publisher, on_other
         self._map_frame, self._odom_frame = map_frame, odom_frame
         self._newest_ns = 0
-        self._own: deque[tuple[int, float, float]] = deque(maxlen=OWN)
+        # its newest, to recognise them
+        self._own: deque[tuple[int, float, float]] = deque(maxlen=2000)
         self._subscription: Subscription | None = None
-        self._known: set[bytes] = set()
         self._since = -float('inf')
         self.other = ''  # warning about another publisher of the transform; empty if there is none
 
     def publish(self, at_ns: int, T_map_odom: FloatArray) -> None:
-        """
-        Publish the transform, unless its stamp is not newer than the last one.
-
-        Parameters
-        ----------
-        T_map_odom : ndarray, shape (3,)
-
-        """
+        """Publish the transform, unless its stamp is not newer than the last one."""
         if at_ns <= self._newest_ns:
             return
         self._newest_ns = at_ns
@@ -80,18 +73,13 @@ class TransformPublisher:
 
     def check_for_others(self) -> None:
         """Listen to /tf for a while if other nodes publish there; to be called periodically."""
-        if self.other != '':
-            return
-        now = time.monotonic()
+        silence = time.monotonic() - self._since
         if self._subscription is not None:
-            if now - self._since > LISTENING:
+            if silence > LISTENING:
                 self._stop_listening()
-            return
         # by endpoint: a second instance of this node, started by mistake, has the same name
-        everyone = {bytes(info.endpoint_gid)
-                    for info in self._node.get_publishers_info_by_topic(TOPIC)}
-        if len(everyone) > 1 and (not everyone <= self._known or now - self._since > PAUSE):
-            self._known, self._since = everyone, now
+        elif self.other == '' and silence > PAUSE and self._node.count_publishers(TOPIC) > 1:
+            self._since = time.monotonic()
             self._subscription = self._node.create_subscription(
                 TFMessage, TOPIC, guarded(self._on_transforms, lambda: True), TF_QOS, raw=True)
 
@@ -149,18 +137,9 @@ class Slew:
         angular: float,
     ) -> FloatArray:
         """
-        Return the transform from map to odom to publish, shape (3,).
+        Return the transform from map to odom to publish, given the estimate and odometry now.
 
-        Parameters
-        ----------
-        stamp_ns : int, newer than in the call before [ns]
-        T_map_odom : ndarray, shape (3,)
-            The estimate.
-        T_odom_base : ndarray, shape (3,)
-            Odometry at the stamp.
-        linear, angular : float
-            Greatest speeds of corrections at the robot [m/s, rad/s]; 0: no limit.
-
+        The limits are the greatest speeds of corrections at the robot [m/s, rad/s]; 0: no limit.
         """
         if self._last is not None and (linear > 0.0 or angular > 0.0):
             elapsed = (stamp_ns - self._stamp_ns) * 1e-9

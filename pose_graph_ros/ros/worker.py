@@ -22,20 +22,16 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
 from pose_graph_ros.core.measurements import AnswerStatus, Measurement, OdometrySample
-from pose_graph_ros.core.odometry.agreement import Difference
+from pose_graph_ros.core.odometry.turns import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.ros.announcements import Announcer
 from pose_graph_ros.ros.arrivals import INTENDED
+from pose_graph_ros.ros.log import Announcer
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar('Result')
 Job = Callable[[PoseGraphBackend], Result]
-"""A function that is called in the worker's thread with the engine."""
 
-N_SET_ASIDE = 3  # number of constraints in the quarantine that the status names
-VISIBLE = 1e-3  # distance that nodes must have moved for an estimate between two updates [m]
-INBOX_LIMIT = 100_000  # measurements that wait for the thread; further ones are rejected
 # The thread takes what has come in this time together, as it costs as much to wake it as to add a
 # measurement: only an update makes a new estimate of them, and for that it takes all [s].
 GATHERING = 0.05
@@ -46,10 +42,10 @@ class WorkerStatus:
     """A snapshot for the diagnostics."""
 
     processed: int = 0  # number of measurements that the engine has accepted or rejected
+    # of measurements, by source and 'accepted' or a reason
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
-    """Number of measurements by source and 'accepted' or a reason."""
+    # detail of the newest one, by source and reason
     refusals: Mapping[tuple[str, str], str] = field(default_factory=dict)
-    """Detail of the newest refusal by source and reason."""
     pending: int = 0
     quarantined: int = 0
     set_aside: Sequence[str] = ()  # names of the newest of these
@@ -57,14 +53,12 @@ class WorkerStatus:
     solve_mean: float = 0.0  # mean duration of such an update [s]
     solve_max: float = 0.0  # longest such duration [s]
     report: UpdateReport | None = None  # of the newest update
-    sources: Mapping[str, SourceReport] = field(default_factory=dict)
-    """How well the measurements of each source fit."""
+    sources: Mapping[str, SourceReport] = field(default_factory=dict)  # how well each fits
+    # what is believed of each
     verdicts: Mapping[str, SourceVerdicts] = field(default_factory=dict)
-    """How many constraints of each source are believed."""
-    biases: Mapping[str, float] = field(default_factory=dict)
-    """Newest estimate of the bias of each gyroscope [rad/s]."""
+    biases: Mapping[str, float] = field(default_factory=dict)  # of gyroscopes [rad/s]
+    # of the rotations of each gyroscope from those of odometry
     differences: Mapping[str, Difference] = field(default_factory=dict)
-    """Of the rotations of each gyroscope from those of odometry."""
     n_changes: int = 0  # number of changes of verdicts
 
 
@@ -72,12 +66,8 @@ class Worker:
     """
     Runs a backend in a thread of its own; a new graph gets a new worker.
 
-    Parameters
-    ----------
-    on_estimate : callable, called in the thread after each new estimate, with the backend
-    prepare : callable
-        Called in the thread before its first work, with a function that returns whether to end.
-
+    The thread calls `prepare` before its first work, with a function that tells whether to end,
+    and `on_estimate` after each new estimate.
     """
 
     def __init__(
@@ -124,16 +114,9 @@ class Worker:
         return not self._thread.is_alive()
 
     def post(self, source: str, measurement: OdometrySample | Measurement) -> bool:
-        """
-        Return whether a measurement was handed over: not if the inbox is full.
-
-        Parameters
-        ----------
-        measurement : OdometrySample or Measurement
-
-        """
+        """Return whether a measurement was handed over: not if the inbox is full."""
         with self._condition:
-            if len(self._inbox) >= INBOX_LIMIT:
+            if len(self._inbox) >= 100_000:
                 return False
             self._inbox.append((source, measurement))
             if len(self._inbox) == 1:
@@ -156,11 +139,6 @@ class Worker:
         Return the future answer of a job, done in the thread after all posted measurements.
 
         If it fails, that is logged and counted whether or not anybody reads the answer.
-
-        Parameters
-        ----------
-        what : str, for the log
-
         """
         future: Future[Result] = Future()
         with self._condition:
@@ -234,7 +212,7 @@ class Worker:
         self._refined += result.moved
         # it judges again, too
         has_judged = result.finished and self._report(None, 0) > 0
-        if has_judged or self._refined > VISIBLE:
+        if has_judged or self._refined > 1e-3:  # that can be seen [m]
             self._publish()
 
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
@@ -329,7 +307,7 @@ class Worker:
             processed=status.processed + processed, counts=Counter(backend.counts),
             refusals=dict(backend.refusals),
             pending=backend.n_waiting, quarantined=backend.n_quarantined,
-            set_aside=backend.set_aside(N_SET_ASIDE), updates=self._solves,
+            set_aside=backend.set_aside(3), updates=self._solves,
             solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),

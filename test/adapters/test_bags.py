@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.interfaces import ConnectionExtRosbag2, QosDurability
-from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from ruamel.yaml import YAML
 
@@ -56,25 +55,6 @@ def test_what_is_written_is_read_back(tmp_path: Path, storage: str) -> None:
     assert files_below(tmp_path / 'deep') == [folder, *files_below(folder)]  # no scratch left
 
 
-def test_order_is_that_of_recording_not_of_writing(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / 'bag') as bag:
-        for stamp in (30, 10, 20):
-            bag.write('/a', POINT, stamp, point(stamp))
-    with open_bag(tmp_path / 'bag') as reader:
-        assert [m.recorded_ns for m in reader.messages(['/a'])] == [10, 20, 30]
-
-
-def test_raw_messages_pass_through_unchanged(tmp_path: Path) -> None:
-    write_points(tmp_path / 'one')
-    with open_bag(tmp_path / 'one') as source, BagWriter(tmp_path / 'two') as copy:
-        raws = []
-        for message in source.messages(['/a']):
-            copy.write(message.topic, message.type, message.recorded_ns, message.raw)
-            raws.append(message.raw)
-    with open_bag(tmp_path / 'two') as reader:
-        assert [m.raw for m in reader.messages(['/a'])] == raws
-
-
 @pytest.mark.parametrize(('storage', 'suffix'), [('mcap', '.mcap'), ('sqlite3', '.db3')])
 def test_a_lone_file_is_a_bag_with_and_without_its_folder(
     tmp_path: Path, storage: str, suffix: str,
@@ -84,37 +64,6 @@ def test_a_lone_file_is_a_bag_with_and_without_its_folder(
     for path in (inside, alone):
         with open_bag(str(path)) as bag:
             assert [m.decode().x for m in bag.messages({'/a'})] == [0.0, 1.0, 2.0, 3.0, 4.0]
-
-
-@pytest.mark.parametrize(('plugin', 'mode'), [
-    (StoragePlugin.SQLITE3, CompressionMode.FILE),
-    (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-    (StoragePlugin.MCAP, CompressionMode.FILE),
-    (StoragePlugin.MCAP, CompressionMode.MESSAGE),
-    (StoragePlugin.MCAP, CompressionMode.STORAGE),
-])
-def test_compressed_bags_are_read(
-    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode,
-) -> None:
-    types = get_typestore(Stores.ROS2_JAZZY)
-    writer = Writer(tmp_path / 'bag', version=9, storage_plugin=plugin)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connection = writer.add_connection('/a', POINT, typestore=types)
-        writer.write(connection, 7, types.serialize_cdr(point(1.5), POINT))
-    with open_bag(tmp_path / 'bag') as bag:
-        assert [m.decode().x for m in bag.messages(['/a'])] == [1.5]
-
-
-def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:
-    types = get_typestore(Stores.ROS1_NOETIC)
-    with Rosbag1Writer(tmp_path / 'old.bag') as writer:
-        connection = writer.add_connection('/a', POINT, typestore=types)
-        message = types.types[POINT](1.5, 2.0, 3.0)
-        writer.write(connection, 7, types.serialize_ros1(message, POINT))
-    with open_bag(tmp_path / 'old.bag') as bag:
-        assert bag.topics['/a'].type == POINT
-        assert [m.decode().x for m in bag.messages(['/a'])] == [1.5]
 
 
 def test_metadata_is_what_jazzy_expects(tmp_path: Path) -> None:
@@ -138,17 +87,6 @@ def test_metadata_is_what_jazzy_expects(tmp_path: Path) -> None:
         '/path': QosDurability.TRANSIENT_LOCAL,
         '/tf_static': QosDurability.TRANSIENT_LOCAL,
     }
-
-
-def test_an_empty_bag_and_an_empty_choice_have_no_messages(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / 'empty'):
-        pass
-    with open_bag(tmp_path / 'empty') as bag:
-        assert bag.topics == {}
-        assert list(bag.messages([])) == []
-        assert bag.describe() == 'no topics'
-    with open_bag(write_points(tmp_path / 'bag')) as bag:
-        assert list(bag.messages([])) == []
 
 
 def test_a_bad_message_does_not_end_the_iteration(tmp_path: Path) -> None:
@@ -193,17 +131,6 @@ def test_without_a_usable_definition_that_of_jazzy_serves(
     assert len(caplog.records) == warnings
 
 
-def test_a_type_that_nobody_knows_fails_when_decoded(tmp_path: Path) -> None:
-    with Writer(tmp_path / 'bag', version=9) as writer:
-        connection = writer.add_connection(
-            '/a', 'my_msgs/msg/Thing', msgdef='other_msgs/Part x', rihs01='RIHS01_0')
-        writer.write(connection, 7, b'\0\1\0\0')
-    with open_bag(tmp_path / 'bag') as bag:
-        message = next(bag.messages(['/a']))
-        with pytest.raises(MessageError, match='my_msgs/msg/Thing'):
-            message.decode()
-
-
 def test_unknown_topics_are_refused_at_once_with_those_that_exist(tmp_path: Path) -> None:
     with open_bag(write_points(tmp_path / 'bag')) as bag, pytest.raises(
         BagError, match=r'no topic /c; the bag has /a \(geometry_msgs/msg/Point\), /b',
@@ -216,21 +143,6 @@ def assert_clear(path: Path, words: str) -> None:
         open_bag(path)
     assert str(caught.value).startswith(str(path))
     assert '\n' not in str(caught.value)
-
-
-def test_what_is_no_bag_is_said_so(tmp_path: Path) -> None:
-    assert_clear(tmp_path / 'nothing', 'does not exist')
-    assert_clear(tmp_path, 'no metadata.yaml$')
-    (tmp_path / 'notes.txt').write_text('no bag')
-    assert_clear(tmp_path / 'notes.txt', 'no bag, expected')
-    for name in ('a.mcap', 'a.db3', 'a.bag'):
-        for content in (b'', b'something else ' * 20):
-            (tmp_path / name).write_bytes(content)
-            assert_clear(tmp_path / name, 'damaged, cut short or not supported')
-    assert_clear(tmp_path, 'name a file in it: a.bag, a.db3, a.mcap')
-    for text in ('', '[1, 2]', '{ no yaml', 'rosbag2_bagfile_information: {version: 99}'):
-        (tmp_path / 'metadata.yaml').write_text(text)
-        assert_clear(tmp_path, 'damaged, cut short or not supported')
 
 
 @pytest.mark.parametrize(('storage', 'suffix'), [('mcap', '.mcap'), ('sqlite3', '.db3')])
@@ -302,16 +214,6 @@ def test_the_journal_beside_an_sqlite3_bag_is_applied(tmp_path: Path, mode: str)
     assert {each.name for each in killed.iterdir()} >= {'bag.db3', 'metadata.yaml'}
 
 
-def test_missing_messages_are_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture,
-) -> None:
-    metadata = write_points(tmp_path / 'bag') / 'metadata.yaml'
-    metadata.write_text(metadata.read_text().replace('message_count: 5', 'message_count: 9'))
-    with open_bag(tmp_path / 'bag') as bag, caplog.at_level(logging.WARNING):
-        assert len(list(bag.messages(['/a']))) == 5
-    assert '/a should have 9 messages, 5 were found' in caplog.text
-
-
 def test_nothing_is_overwritten_unless_asked_and_a_bag(tmp_path: Path) -> None:
     folder = write_points(tmp_path / 'bag')
     with pytest.raises(BagError, match='exists already'):
@@ -354,3 +256,28 @@ def test_the_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
             bag.write('/a', 'my_msgs/msg/Thing', 1, b'')
         with pytest.raises(BagError, match=f'/a: no valid {POINT}'):
             bag.write('/a', POINT, 1, TYPES[STRING]('hello'))
+
+
+def test_missing_messages_are_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture,
+) -> None:
+    metadata = write_points(tmp_path / 'bag') / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 5', 'message_count: 9'))
+    with open_bag(tmp_path / 'bag') as bag, caplog.at_level(logging.WARNING):
+        assert len(list(bag.messages(['/a']))) == 5
+    assert '/a should have 9 messages, 5 were found' in caplog.text
+
+
+def test_what_is_no_bag_is_said_so(tmp_path: Path) -> None:
+    assert_clear(tmp_path / 'nothing', 'does not exist')
+    assert_clear(tmp_path, 'no metadata.yaml$')
+    (tmp_path / 'notes.txt').write_text('no bag')
+    assert_clear(tmp_path / 'notes.txt', 'no bag, expected')
+    for name in ('a.mcap', 'a.db3', 'a.bag'):
+        for content in (b'', b'something else ' * 20):
+            (tmp_path / name).write_bytes(content)
+            assert_clear(tmp_path / name, 'damaged, cut short or not supported')
+    assert_clear(tmp_path, 'name a file in it: a.bag, a.db3, a.mcap')
+    for text in ('', '[1, 2]', '{ no yaml', 'rosbag2_bagfile_information: {version: 99}'):
+        (tmp_path / 'metadata.yaml').write_text(text)
+        assert_clear(tmp_path, 'damaged, cut short or not supported')

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 import pytest
 import yaml
 
-from pose_graph_ros.adapters.parameter_changes import changed, require_together
+from pose_graph_ros.adapters.parameter_table import Change, Parameter
 from pose_graph_ros.adapters.parameter_texts import (
     as_markdown,
     as_yaml,
@@ -23,16 +23,15 @@ from pose_graph_ros.adapters.parameter_texts import (
 )
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
-    Change,
+    changed,
     checked,
-    Parameter,
-    PARAMETERS,
-    SOURCE_PARAMETERS,
+    explanation,
+    is_own,
+    require_together,
 )
 from pose_graph_ros.adapters.sources import (
     backend_config,
     Kind,
-    OUTPUTS,
     SET_POSE,
     Source,
     source_list,
@@ -88,21 +87,6 @@ def test_the_short_yaml_file_changes_nothing_whatever_in_it_is_put_to_use() -> N
     require_together(checked(more))
 
 
-def test_every_parameter_says_when_it_changes() -> None:
-    changes = {parameter.name: parameter.change for parameter in all_parameters(
-        {'sources': ['odom', 'global_pose', 'fix', 'imu', 'gyro']})}
-    taken = {name.rpartition('.')[2] if '.' in name else name
-             for name, change in changes.items() if change is Change.UNCONFIGURED
-             and not name.startswith('outputs.')}
-    assert {changes[f'outputs.{name}'] for name in OUTPUTS} == {Change.UNCONFIGURED}
-    assert taken == {'map_frame', 'odom_frame', 'base_link_frame', 'datum', 'wait_for_datum',
-                     'topic', 'noise', 'correlation_time', 'load_graph_on_start',
-                     'integrate', 'sigma_bias', 'sigma_bias_walk', 'bias_period'}
-    assert {name for name, change in changes.items() if change is Change.START} == {
-        'sources', 'autostart', 'odom.type', 'global_pose.type', 'fix.type', 'imu.type',
-        'loop_closure.type', 'gyro.type'}
-
-
 def test_the_yaml_file_holds_every_default() -> None:
     tree = yaml.safe_load(as_yaml())['/**']['ros__parameters']
     for parameter in all_parameters({}):
@@ -145,11 +129,6 @@ def test_a_source_has_the_same_defaults_in_the_node_and_in_the_core(
     assert config.odometry['odom'] == BackendConfig().odometry_source('odom')
 
 
-def test_a_pose_that_is_set_has_no_robust_loss() -> None:
-    config = backend_config(checked({}))
-    assert config.measurement_source(SET_POSE, GlobalPose).loss is Loss.NONE
-
-
 NUMBERS = [p for p in (*all_parameters({}), *all_parameters({'sources': ['imu']}))
            if p.smallest is not None]
 
@@ -186,15 +165,6 @@ def test_a_wrong_name_or_type_is_refused(values: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match=next(iter(values))) as caught:
         checked(values)
     assert '\n' not in str(caught.value)
-
-
-def test_a_name_that_is_not_known_has_to_have_a_type() -> None:
-    with pytest.raises(ConfigError, match=r'wheels\.type: expected one of odometry, global_pose'):
-        checked({'sources': ['wheels']})
-    with pytest.raises(ConfigError, match=r'wheels\.topic is not known: wheels is not in'):
-        checked({'wheels.topic': 'wheels'})
-    with pytest.raises(ConfigError, match='a source of the type of wheels has none'):
-        checked({'sources': ['wheels'], 'wheels.type': 'odometry', 'wheels.lever_arm': [0.0, 0.0]})
 
 
 @pytest.mark.parametrize(('values', 'said'), [
@@ -248,15 +218,6 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
         Source('loop_closure', Kind.LOOP_CLOSURE, 'loop_closure'))
 
 
-def test_every_parameter_says_what_it_does() -> None:
-    for parameter in (*PARAMETERS, *SOURCE_PARAMETERS):
-        assert re.fullmatch(r'[A-Z`].+[^.,]\.', parameter.description), parameter.name
-        assert len(parameter.description) > 10, parameter.name
-    names = [parameter.name for parameter in all_parameters({})]
-    assert len(set(names)) == len(names)
-    assert all(len(parameter.kinds) > 0 for parameter in SOURCE_PARAMETERS)
-
-
 @pytest.mark.parametrize(('name', 'text'), [
     ('fix.robust_loss', 'one of: none, huber, cauchy, geman_mcclure, dcs, tukey, truncated'),
     ('datum', '2 or 3 numbers, or unset; unit: deg, deg, rad; only while the node is not '
@@ -264,6 +225,32 @@ def test_every_parameter_says_what_it_does() -> None:
     ('fix.sigma_floor', '2 numbers; unit: m, rad'), ('frequency', 'unit: Hz'), ('publish_tf', '')])
 def test_a_parameter_says_which_values_it_can_have(name: str, text: str) -> None:
     assert constraints(next(each for each in all_parameters({}) if each.name == name)) == text
+
+
+# --- Names that are not known
+
+KNOWN = {parameter.name for parameter in all_parameters({})}
+
+
+@pytest.mark.parametrize(('name', 'said'), [
+    ('frequncy', 'did you mean frequency?'), ('Frequency', 'did you mean frequency?'),
+    ('odom.sigma_distnce', 'did you mean odom.sigma_distance?'),
+    ('window.second', 'did you mean window.seconds?'),
+    ('odm.sigma_distance', 'odm is not in sources; did you mean odom.sigma_distance?'),
+    ('imu.topic', 'imu is not in sources'), ('wheels.type', 'wheels is not in sources'),
+    ('odom.lever_arm', 'a source of the type of odom has none'),
+    ('robust_loss', 'did you mean fix.robust_loss?'),
+    ('gain', ''), ('odom.gain', ''), ('', ''), ('.', '')])
+def test_the_nearest_name_is_offered(name: str, said: str) -> None:
+    assert explanation(name, KNOWN) == said
+
+
+@pytest.mark.parametrize(('name', 'own'), [
+    ('gain', True), ('odom.gain', True), ('odm.topic', True), ('planner.gain', False),
+    ('local_costmap.robot.radius', False), ('window.gain', True),
+    ('alignment.sigma_heading', True), ('alignment.gain', False)])
+def test_groups_that_the_node_does_not_have_are_for_other_nodes(name: str, own: bool) -> None:
+    assert is_own(name, KNOWN) is own
 
 
 # --- Changes while the node runs -----------------------------------------------------------------
@@ -298,18 +285,6 @@ def test_what_can_be_unset_is_unset(nothing: object) -> None:
 
 
 @pytest.mark.parametrize(('wanted', 'said'), [
-    ({'frequency': 0.0}, r'frequency: expected a number in \[0\.01, 100\], got 0\.0'),
-    ({'frequency': math.nan}, r'frequency: expected .* got nan'),
-    ({'frequency': math.inf}, r'frequency: expected .* got inf'),
-    ({'frequency': True}, r'frequency: expected a number, got True'),
-    ({'frequency': None}, r'frequency: expected a number, got None'),
-    ({'frequency': '5'}, r"frequency: expected a number, got '5'"),
-    ({'publish_tf': 1}, r'publish_tf: expected bool, got 1'),
-    ({'fix.lever_arm': array('d', [math.nan, 0.0])}, r'fix\.lever_arm: .* got nan'),
-    ({'fix.lever_arm': b'ab'}, r'fix\.lever_arm: expected a list of numbers'),
-    ({'fix.robust_loss': 'l1'}, r'fix\.robust_loss: expected one of none, huber, cauchy'),
-    ({'no_such': 1.0}, 'no_such is not known'),
-    ({'frequncy': 1.0}, r'frequncy is not known: did you mean frequency\?'),
     ({'sources': ['odom']}, r'sources is read at the start: .*start the node again'),
     ({'fix.type': 'imu'}, r'fix\.type is read at the start'),
     ({'fix.sigma_floor': [0.1, 3.0]}, r'fix\.sigma_floor: expected less than'),
@@ -334,34 +309,13 @@ def test_what_is_taken_at_configuration_can_be_changed_before() -> None:
         changed(PRESENT, {'autostart': False}, configured=False)
 
 
-def test_what_goes_together_only_with_its_like_is_changed_together() -> None:
-    wanted = {'map_frame': 'odom', 'odom_frame': 'wheels'}
-    with pytest.raises(ConfigError, match='expected three different names'):
-        changed(PRESENT, {'map_frame': 'odom'}, configured=False)
-    new = changed(PRESENT, wanted, configured=False)
-    assert (new['map_frame'], new['odom_frame']) == ('odom', 'wheels')
-
-
-@pytest.mark.parametrize(('name', 'said'), [
-    ('node_heartbeat', r'node_heartbeat no longer exists: it is 10 s now, remove it'),
-    ('transform_slew_linear', r'no longer exists: set transform_slew'),
-    ('fix.correlation_model', r'fix\.correlation_model no longer exists: .*bias'),
-    ('odom.robust_loss', r'odom\.robust_loss no longer exists: odometry has none'),
-    ('loop_closure.sigma_scale', r'loop_closure\.sigma_scale no longer exists: .*covariance_')])
-def test_what_has_become_of_a_parameter_is_said(name: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+@pytest.mark.parametrize('name', [
+    'node_heartbeat', 'fix.correlation_model', 'odom.robust_loss', 'loop_closure.sigma_scale'])
+def test_what_has_become_of_a_parameter_is_said(name: str) -> None:
+    with pytest.raises(ConfigError, match=f'parameter {name} no longer exists: .*CHANGELOG'):
         checked({name: 1.0})
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match='no longer exists'):
         changed(PRESENT, {name: 1.0}, configured=True)
-
-
-def test_all_that_a_file_has_too_much_is_said_in_one_line() -> None:
-    with pytest.raises(ConfigError, match=r'node_heartbeat no longer .*; parameter white_shar is'):
-        checked({'node_heartbeat': 10.0, 'white_shar': 0.1, 'frequency': 5.0})
-
-
-def test_setting_everything_as_it_is_changes_nothing_even_while_configured() -> None:
-    assert changed(PRESENT, PRESENT, configured=True) == PRESENT
 
 
 def test_what_is_missing_has_its_default_and_what_was_wrong_can_be_mended() -> None:

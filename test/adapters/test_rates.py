@@ -94,14 +94,6 @@ def test_an_imu_without_an_angular_velocity_is_refused() -> None:
     assert reader().read('gyro', message).reason == 'not_finite'
 
 
-def test_a_leap_of_the_stamps_is_refused_at_first() -> None:
-    read = reader()
-    assert isinstance(read.read('gyro', rate_message(1.0, (0.0, 0.0, 0.1))), YawRate)
-    assert read.read('gyro', rate_message(1000.0, (0.0, 0.0, 0.1))).reason == 'stamp_leap'
-    assert read.read('wheels', twist_message(1.0, 1.0, 0.0, 0.0)).stamp_ns == 1_000_000_000
-    assert read.read('wheels', twist_message(999.0, 1.0, 0.0, 0.0)).reason == 'stamp_leap'
-
-
 def test_twists_become_odometry() -> None:
     read, rate = reader(), 0.5
     for k in range(21):

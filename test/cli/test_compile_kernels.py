@@ -15,7 +15,7 @@ from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.compiled import jit
 
 
-def test_it_says_what_it_does_and_where_the_code_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_says_what_it_does_and_where_the_code_is(capsys) -> None:
     assert main(['compile-kernels']) == 0
     assert jit.is_cached()
     first, second = capsys.readouterr().out.splitlines()
@@ -25,9 +25,7 @@ def test_it_says_what_it_does_and_where_the_code_is(capsys: pytest.CaptureFixtur
     assert second.split(' s; kept in ')[1].startswith(folder)
 
 
-def test_code_that_could_not_be_kept_is_a_failure(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_code_that_could_not_be_kept_is_a_failure(monkeypatch, capsys) -> None:
     monkeypatch.setattr(jit, 'is_cached', lambda *_: False)
     monkeypatch.setattr(module, 'warm_up', lambda: 0.0)
     assert main(['compile-kernels']) == 1
@@ -49,9 +47,7 @@ def test_without_a_compiler_it_does_not_claim_to_have_compiled() -> None:
     ({'/home/u/.cache/pose_graph_ros/a', '/home/u/.cache/pose_graph_ros/b'},
      'in /home/u/.cache/pose_graph_ros, where only this user finds it; set NUMBA_CACHE_DIR for '
      'others')])
-def test_it_says_who_finds_the_code(
-    folders: set[str], said: str, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_it_says_who_finds_the_code(folders, said, monkeypatch) -> None:
     monkeypatch.setattr(numba.config, 'CACHE_DIR', '')
     monkeypatch.setattr(jit, 'cache_folders', lambda: set(map(Path, folders)))
     assert module._place() == said

@@ -44,9 +44,7 @@ def recorded() -> list[Message]:
 
 
 @pytest.mark.parametrize('ros1', [False, True])
-def test_the_new_bag_has_all_messages_and_the_result(
-    tmp_path: Path, ros1: bool, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_new_bag_has_all_messages_and_the_result(tmp_path, ros1, capsys) -> None:
     if ros1:
         bag = write_ros1(tmp_path / 'bag.bag', recorded())
     else:
@@ -98,7 +96,7 @@ def planar_pose_of(item: Any) -> np.ndarray:
                      2.0 * np.arctan2(item.rotation.z, item.rotation.w)])
 
 
-def test_static_transforms_from_before_a_span_are_kept(tmp_path: Path) -> None:
+def test_static_transforms_from_before_a_span_are_kept(tmp_path) -> None:
     write_bag(tmp_path / 'bag', recorded())
     words = ['replay', str(tmp_path / 'bag'), '-o', str(tmp_path / 'out'), '--odom', '/odom',
              '--from', '10', '--until', '20', '--bag', str(tmp_path / 'new')]
@@ -110,7 +108,7 @@ def test_static_transforms_from_before_a_span_are_kept(tmp_path: Path) -> None:
     assert main(words) == 2     # nothing is overwritten
 
 
-def test_evo_reads_the_corrected_odometry(tmp_path: Path) -> None:
+def test_evo_reads_the_corrected_odometry(tmp_path) -> None:
     evo = pytest.importorskip('evo.tools.file_interface', reason='evo is not there')
     write_bag(tmp_path / 'bag', [*odometry(), *fixes(np.zeros(2))])
     assert main(['replay', str(tmp_path / 'bag'), '-o', str(tmp_path / 'out'),
@@ -121,7 +119,7 @@ def test_evo_reads_the_corrected_odometry(tmp_path: Path) -> None:
     assert len(read.timestamps) == 400
 
 
-def test_types_of_their_own_are_copied_from_ros_1_and_ros_2(tmp_path: Path) -> None:
+def test_types_of_their_own_are_copied_from_ros_1_and_ros_2(tmp_path) -> None:
     name, text = 'my_msgs/msg/Level', 'std_msgs/Header header\nfloat64 level\n'
     for store, writes in ((Stores.ROS1_NOETIC, 'one'), (Stores.ROS2_JAZZY, 'two')):
         types = get_typestore(store)
@@ -151,7 +149,7 @@ def write_own(folder: Path, types: Any, name: str, message: Any, ros1: bool) -> 
     return path
 
 
-def test_a_broken_message_of_ros_1_is_refused(tmp_path: Path) -> None:
+def test_a_broken_message_of_ros_1_is_refused(tmp_path) -> None:
     bag = write_ros1(tmp_path / 'bag.bag', odometry()[:1])
     with open_bag(bag) as source, BagWriter(tmp_path / 'copy') as copy:
         message, = source.messages(['/odom'])

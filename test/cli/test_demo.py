@@ -3,14 +3,13 @@
 """The environment of the processes of the demo, which itself runs in test_replay_is_node."""
 
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
 from pose_graph_ros.cli.demo import isolated_environment
 
 
-def test_two_at_the_same_time_have_different_domains(tmp_path: Path) -> None:
+def test_two_at_the_same_time_have_different_domains(tmp_path) -> None:
     with ExitStack() as stack:
         domains = [stack.enter_context(isolated_environment(tmp_path))['ROS_DOMAIN_ID']
                    for _ in range(40)]
@@ -18,7 +17,7 @@ def test_two_at_the_same_time_have_different_domains(tmp_path: Path) -> None:
     assert all(0 < int(domain) <= 100 for domain in domains)
 
 
-def test_domains_are_free_again_after_an_error(tmp_path: Path) -> None:
+def test_domains_are_free_again_after_an_error(tmp_path) -> None:
     """There are a hundred, and programs that share one receive each other's messages."""
     for _ in range(120):
         with pytest.raises(OSError, match='of the body'), isolated_environment(tmp_path):
@@ -27,9 +26,7 @@ def test_domains_are_free_again_after_an_error(tmp_path: Path) -> None:
         assert first['ROS_DOMAIN_ID'] != second['ROS_DOMAIN_ID']
 
 
-def test_nothing_is_heard_from_other_machines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_nothing_is_heard_from_other_machines(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv('ROS_LOCALHOST_ONLY', '0')
     with isolated_environment(tmp_path) as env:
         assert env['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'

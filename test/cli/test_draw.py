@@ -55,9 +55,7 @@ def hidden(drawn: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize('view', VIEWS)
-def test_a_picture_names_the_nodes_by_their_ids_in_the_file(
-    view: str, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_picture_names_the_nodes_by_their_ids_in_the_file(view, small, tmp_path, capsys) -> None:
     out = tmp_path / 'small.svg'
     assert main(['draw', str(small), '--as', view, '-o', str(out)]) == 0
     printed = capsys.readouterr()
@@ -70,7 +68,7 @@ def test_a_picture_names_the_nodes_by_their_ids_in_the_file(
     assert (unary in ' '.join(drawn)) == (view == 'mrf')
 
 
-def test_a_picture_is_the_same_each_time_and_transparent(small: Path, tmp_path: Path) -> None:
+def test_a_picture_is_the_same_each_time_and_transparent(small, tmp_path) -> None:
     outs = [tmp_path / name for name in ('one.svg', 'two.svg', 'one.png')]
     for out in outs:
         assert main(['draw', str(small), '--pattern', '--headings', '-o', str(out)]) == 0
@@ -83,7 +81,7 @@ def test_a_picture_is_the_same_each_time_and_transparent(small: Path, tmp_path: 
     assert colour_type == 6     # with alpha
 
 
-def test_the_example_has_five_states_with_their_patterns(tmp_path: Path) -> None:
+def test_the_example_has_five_states_with_their_patterns(tmp_path) -> None:
     out = tmp_path / 'states.svg'
     assert main(['draw', '--example', '-o', str(out)]) == 0
     drawn = texts(out)
@@ -93,7 +91,7 @@ def test_the_example_has_five_states_with_their_patterns(tmp_path: Path) -> None
     assert [drawn.count(f'x{n}') for n in range(5)] == [15, 9, 3, 3, 3]
 
 
-def test_dot_has_all_vertices_and_arcs(small: Path, tmp_path: Path) -> None:
+def test_dot_has_all_vertices_and_arcs(small, tmp_path) -> None:
     out = tmp_path / 'small.dot'
     assert main(['draw', str(small), '-o', str(out)]) == 0
     text = out.read_text(encoding='utf-8')
@@ -109,9 +107,7 @@ def test_dot_has_all_vertices_and_arcs(small: Path, tmp_path: Path) -> None:
     assert text.count('dir=none') == 1 + 1 + 4
 
 
-def test_json_has_what_is_drawn(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_json_has_what_is_drawn(small, tmp_path, capsys) -> None:
     out = tmp_path / 'small.svg'
     assert main(['draw', str(small), '--as', 'dbn', '--json', '-o', str(out)]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -128,10 +124,7 @@ def test_json_has_what_is_drawn(
     (['--nodes', '11:20'], ['x11', 'x12', 'x15', 'l20']),
     (['--nodes', '10,l20'], ['x10', 'l20']),
     (['--around', '11', '--hops', '1'], ['x10', 'x11', 'x12'])])
-def test_a_part_is_drawn(
-    words: list[str], names: list[str], small: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_part_is_drawn(words, names, small, tmp_path, capsys) -> None:
     out = tmp_path / 'part.svg'
     assert main(['draw', str(small), *words, '-o', str(out)]) == 0
     assert hidden(texts(out)) == names
@@ -139,9 +132,7 @@ def test_a_part_is_drawn(
                      capsys.readouterr().err)
 
 
-def test_a_large_graph_is_refused_with_the_way_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_large_graph_is_refused_with_the_way_out(tmp_path, capsys) -> None:
     path = tmp_path / 'large.g2o'
     path.write_text(''.join(f'EDGE_SE2 {n} {n + 1} 1 0 0 {IDENTITY}\n' for n in range(N_MOST)),
                     encoding='utf-8')
@@ -160,10 +151,7 @@ def test_a_large_graph_is_refused_with_the_way_out(
     (['--around', '7'], 'error: --around: the graph has no hidden node 7'),
     (['--example'], 'error: expected a graph or --example, and not both'),
     (['--hops', '1', '-o', 'no/such/folder.svg'], 'error: ')])
-def test_wrong_input_is_refused_in_one_line(
-    words: list[str], message: str, small: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_wrong_input_is_refused_in_one_line(words, message, small, tmp_path, capsys) -> None:
     out = [] if '-o' in words else ['-o', str(tmp_path / 'out.svg')]
     assert main(['draw', str(small), *words, *out]) == 2
     error = capsys.readouterr().err
@@ -171,7 +159,7 @@ def test_wrong_input_is_refused_in_one_line(
     assert error.count('\n') == 1
 
 
-def test_the_suffix_is_checked_first(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_suffix_is_checked_first(capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(['draw', 'no_such_file.g2o', '-o', 'graph.jpg'])
     assert ended.value.code == 2
@@ -180,7 +168,7 @@ def test_the_suffix_is_checked_first(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize('suffix', ['.g2o', '.json'])
-def test_a_saved_graph_has_its_biases(suffix: str, tmp_path: Path) -> None:
+def test_a_saved_graph_has_its_biases(suffix, tmp_path) -> None:
     out = tmp_path / 'map.svg'
     assert main(['draw', str(SAVED.with_suffix(suffix)), '-o', str(out), '--pattern']) == 0
     names = set(hidden(texts(out)))

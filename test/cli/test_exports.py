@@ -48,7 +48,7 @@ def geodetic(path: np.ndarray) -> np.ndarray:
     return np.column_stack((lat, lon))
 
 
-def test_gpx_kml_and_geojson_have_the_path_on_the_earth(results: Path) -> None:
+def test_gpx_kml_and_geojson_have_the_path_on_the_earth(results) -> None:
     path = read_tum(results / 'path.tum')
     expected = geodetic(path.poses)
     times = [str(np.datetime64(stamp, 'ns').astype('datetime64[ms]')) + 'Z'
@@ -70,7 +70,7 @@ def test_gpx_kml_and_geojson_have_the_path_on_the_earth(results: Path) -> None:
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
 
 
-def test_the_table_has_path_and_covariances(results: Path) -> None:
+def test_the_table_has_path_and_covariances(results) -> None:
     with (results / 'path.csv').open(encoding='utf-8') as file:
         rows = list(csv.DictReader(file))
     path = read_tum(results / 'path.tum')
@@ -85,7 +85,7 @@ def test_the_table_has_path_and_covariances(results: Path) -> None:
         assert 0.0 < xx < 0.1
 
 
-def test_evo_reads_tum_and_kitti(results: Path) -> None:
+def test_evo_reads_tum_and_kitti(results) -> None:
     evo = pytest.importorskip('evo.tools.file_interface', reason='evo is not there')
     path = read_tum(results / 'path.tum')
     tum = evo.read_tum_trajectory_file(results / 'path.tum')
@@ -99,9 +99,7 @@ def test_evo_reads_tum_and_kitti(results: Path) -> None:
             atol=1e-9)
 
 
-def test_without_a_datum_there_is_no_place_on_the_earth(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_without_a_datum_there_is_no_place_on_the_earth(tmp_path, capsys) -> None:
     write_bag(tmp_path / 'bag', odometry())
     words = ['replay', str(tmp_path / 'bag'), '-o', str(tmp_path / 'out'), '--export']
     assert main([*words, 'csv,gpx']) == 2
@@ -118,7 +116,7 @@ def test_without_a_datum_there_is_no_place_on_the_earth(
             'run.json'}
 
 
-def test_covariances_are_empty_where_nodes_have_left_the_graph(tmp_path: Path) -> None:
+def test_covariances_are_empty_where_nodes_have_left_the_graph(tmp_path) -> None:
     write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
     assert main(['replay', str(tmp_path / 'bag'), '-o', str(tmp_path), '--export', 'csv',
                  '-p', 'window.nodes:=8']) == 0

@@ -34,7 +34,7 @@ def square(tmp_path: Path) -> Path:
     return path
 
 
-def test_odometry_is_composed_and_closures_come_with_their_later_ends(square: Path) -> None:
+def test_odometry_is_composed_and_closures_come_with_their_later_ends(square) -> None:
     found = read_measurements(square)
     samples = [each for each in found if isinstance(each, OdometrySample)]
     assert [each.stamp_ns for each in samples] == [k * SECOND for k in range(1, 10)]
@@ -48,7 +48,7 @@ def test_odometry_is_composed_and_closures_come_with_their_later_ends(square: Pa
         assert found[k - 1].stamp_ns == max(each.stamp_ns, each.reference_ns)
 
 
-def test_covariances_are_in_the_axes_that_the_engine_wants(tmp_path: Path) -> None:
+def test_covariances_are_in_the_axes_that_the_engine_wants(tmp_path) -> None:
     path = tmp_path / 'turned.g2o'
     path.write_text(SQUARE.replace(f'0 4 {LOOP}', '0 4 0 0 0.7 100 3 0 25 1 400'))
     closure = next(each for each in read_measurements(path)
@@ -58,7 +58,7 @@ def test_covariances_are_in_the_axes_that_the_engine_wants(tmp_path: Path) -> No
         np.linalg.inv(in_edge), [[100, 3, 0], [3, 25, 1], [0, 1, 400]], atol=1e-9)
 
 
-def test_stamps_come_from_a_file(square: Path, tmp_path: Path) -> None:
+def test_stamps_come_from_a_file(square, tmp_path) -> None:
     stamps = tmp_path / 'stamps.txt'
     stamps.write_text('# of a camera\n' + '\n'.join(f'{100.5 + 2 * k} 1 2' for k in range(9)))
     found = read_measurements(square, stamps)
@@ -69,20 +69,20 @@ def test_stamps_come_from_a_file(square: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('text', ['1\n2\n', '1\n2\nx\n', '\n'.join('987654321')])
-def test_bad_stamps_are_refused(square: Path, tmp_path: Path, text: str) -> None:
+def test_bad_stamps_are_refused(square, tmp_path, text) -> None:
     (tmp_path / 'stamps.txt').write_text(text)
     with pytest.raises(FileFormatError, match='stamp'):
         read_measurements(square, tmp_path / 'stamps.txt')
 
 
-def test_a_graph_without_odometry_is_refused_by_the_vertices(tmp_path: Path) -> None:
+def test_a_graph_without_odometry_is_refused_by_the_vertices(tmp_path) -> None:
     path = tmp_path / 'lone.g2o'
     path.write_text(f'EDGE_SE2 0 1 {STEP}\nEDGE_SE2 0 7 {LOOP}\n')
     with pytest.raises(FileFormatError, match='there is none from 1 to 7'):
         read_measurements(path)
 
 
-def test_a_replay_writes_path_picture_and_summary(square: Path, tmp_path: Path) -> None:
+def test_a_replay_writes_path_picture_and_summary(square, tmp_path) -> None:
     assert main(['replay', str(square), '-o', str(tmp_path / 'out')]) == 0
     path = read_tum(tmp_path / 'out' / 'path.tum')
     assert len(path) == 9

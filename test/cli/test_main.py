@@ -22,7 +22,7 @@ RING = Path(__file__).parents[1] / 'data' / 'ring.g2o'
 HEAVY = ('rclpy', 'rosbags', 'pyproj', 'matplotlib', 'PIL', 'scipy', 'numba', 'numpy', 'yaml')
 
 
-def test_help_lists_all_tools(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_all_tools(capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(['--help'])
     assert ended.value.code == 0
@@ -31,14 +31,14 @@ def test_help_lists_all_tools(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize('tool', TOOLS)
-def test_each_tool_has_a_help(tool: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_tool_has_a_help(tool, capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main([tool, '--help'])
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith(f'usage: pose-graph {tool} ')
 
 
-def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_that_of_the_package(capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(['--version'])
     assert ended.value.code == 0
@@ -59,11 +59,11 @@ def loaded(*words: str | Path) -> set[str]:
 @pytest.mark.parametrize('words', [
     ['--help'], ['--version'], ['no_such_tool'], *([tool, '--help'] for tool in TOOLS),
     ['simulate', 'a', '--fix-sigma', 'b']], ids=' '.join)
-def test_help_and_wrong_words_load_nothing_that_takes_time(words: list[str]) -> None:
+def test_help_and_wrong_words_load_nothing_that_takes_time(words) -> None:
     assert not loaded(*words) & set(HEAVY)
 
 
-def test_solve_loads_what_it_needs(tmp_path: Path) -> None:
+def test_solve_loads_what_it_needs(tmp_path) -> None:
     # neither Numba nor, but for an extension module, SciPy: they take longer to load than all else
     names = loaded('solve', RING, '-o', tmp_path / 'ring.g2o')
     assert 'pose_graph_ros.core.batch.plain_optimizer' in names
@@ -85,25 +85,21 @@ def test_solve_loads_what_it_needs(tmp_path: Path) -> None:
 @pytest.mark.parametrize('words', [
     [], ['no_such_tool'], ['solve', 'a', '--edge2', 'b'],
     ['replay', 'bag', '--hold-out', 'some']])
-def test_wrong_words_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_words_are_refused(words, capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == 2
     assert capsys.readouterr().err.startswith('usage: pose-graph')
 
 
-def test_parameters_are_printed_as_tables_and_as_a_file(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_parameters_are_printed_as_tables_and_as_a_file(capsys) -> None:
     assert main(['parameters']) == 0
     assert capsys.readouterr().out == f'{as_markdown()}\n{sources_as_markdown()}'
     assert main(['parameters', '--yaml']) == 0
     assert capsys.readouterr().out == as_yaml()
 
 
-def test_a_drive_is_simulated_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_drive_is_simulated_once(tmp_path, capsys) -> None:
     folder = tmp_path / 'drive'
     assert main(['simulate', str(folder), '--seed', '5', '--duration', '12']) == 0
     assert capsys.readouterr().out.endswith(f'written: {folder}, {folder}_truth.json\n')

@@ -55,9 +55,7 @@ def covariance_of_poses(graph: Graph) -> np.ndarray:
     return np.linalg.inv(H[np.ix_(free, free)])[np.ix_(pose, pose)]
 
 
-def test_landmarks_leave_and_poses_and_covariances_remain(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_landmarks_leave_and_poses_and_covariances_remain(tmp_path, capsys) -> None:
     path = solved(write(tmp_path / 'seen.g2o', POSES + SEEN_TWICE))
     out = tmp_path / 'poses.g2o'
     capsys.readouterr()
@@ -73,9 +71,7 @@ def test_landmarks_leave_and_poses_and_covariances_remain(
     np.testing.assert_allclose(read_g2o(out).graph.poses, before.graph.poses[:4], atol=1e-6)
 
 
-def test_dense_priors_are_refused_or_become_conservative_edges(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_dense_priors_are_refused_or_become_conservative_edges(tmp_path, capsys) -> None:
     path = solved(write(tmp_path / 'seen.g2o', POSES + SEEN_BY_THREE))
     out, words = tmp_path / 'poses.g2o', ['--nodes', 'landmarks']
     capsys.readouterr()
@@ -96,7 +92,7 @@ def test_dense_priors_are_refused_or_become_conservative_edges(
     np.testing.assert_allclose(after.graph.poses, before.graph.poses[:4], atol=1e-12)
 
 
-def test_poses_leave_by_their_ids_in_the_file(tmp_path: Path) -> None:
+def test_poses_leave_by_their_ids_in_the_file(tmp_path) -> None:
     path = write(tmp_path / 'chain.g2o', POSES)
     out = tmp_path / 'out.g2o'
     assert main(['marginalize', str(path), '--nodes', '4:5', '-o', str(out)]) == 0
@@ -114,9 +110,7 @@ def test_poses_leave_by_their_ids_in_the_file(tmp_path: Path) -> None:
     ('3:7', 'error: --nodes: no pose would be left'),
     ('some', 'error: --nodes: expected ids such as 3,7,20:25'),
     ('landmarks', 'error: {path}: has no landmarks')])
-def test_wrong_input_is_refused_in_one_line(
-    nodes: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_wrong_input_is_refused_in_one_line(nodes, message, tmp_path, capsys) -> None:
     path = write(tmp_path / 'chain.g2o', POSES)
     out = tmp_path / 'out.g2o'
     assert main(['marginalize', str(path), '--nodes', nodes, '-o', str(out)]) == 2

@@ -3,13 +3,12 @@
 """Command line options that several tools share: topics, and the parameters of the node."""
 
 import argparse
-from pathlib import Path
 
 import pytest
 import yaml
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.cli import options as shared
+from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import demo
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -53,7 +52,7 @@ def test_without_options_all_parameters_have_their_defaults() -> None:
     assert shared.ros_arguments(parsed()) == ['--ros-args']
 
 
-def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path: Path) -> None:
+def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path) -> None:
     path = tmp_path / 'params.yaml'
     path.write_text(FILE, encoding='utf-8')
     in_file = {
@@ -70,14 +69,14 @@ def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path: Path)
         'rear.lever_arm:=[1, 2]', '-p', 'publish_tf:=false']
 
 
-def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path: Path) -> None:
+def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path) -> None:
     path = tmp_path / 'params.yaml'
     for text in ('', '- a list', 'other: {ros__parameters: {frequency: 1.0}}'):
         path.write_text(text, encoding='utf-8')
         assert shared.parameter_values(parsed('--params-file', str(path))) == checked({})
 
 
-def test_a_file_of_ros2_param_dump_is_taken(tmp_path: Path) -> None:
+def test_a_file_of_ros2_param_dump_is_taken(tmp_path) -> None:
     path = tmp_path / 'dump.yaml'
     path.write_text(yaml.safe_dump({'/pose_graph': {'ros__parameters': {
         'datum': None, 'fix': {'covariance_override': None, 'covariance_scale': 9.0},
@@ -95,7 +94,7 @@ def test_a_file_of_ros2_param_dump_is_taken(tmp_path: Path) -> None:
     ('/**: [', r'params\.yaml: cannot be read as yaml'),
     (b'\xff\xfe\xfa', r'params\.yaml: cannot be read as yaml'),
     (None, r'params\.yaml: cannot be read as yaml')])
-def test_a_wrong_file_is_refused(text: str | bytes | None, said: str, tmp_path: Path) -> None:
+def test_a_wrong_file_is_refused(text, said, tmp_path) -> None:
     path = tmp_path / 'params.yaml'
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())

@@ -19,7 +19,7 @@ from pose_graph_ros.adapters.bag_writer import message_types
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.cli import replay, results
+from pose_graph_ros.cli import drive as drives, replay
 from pose_graph_ros.cli.bag_messages import (
     fix_messages,
     loop_closure_messages,
@@ -27,8 +27,8 @@ from pose_graph_ros.cli.bag_messages import (
     odometry_messages,
     write_bag,
 )
+from pose_graph_ros.cli.drive import collect_drive, PathCollector, read_truth
 from pose_graph_ros.cli.main import guarded, main
-from pose_graph_ros.cli.results import collect_drive, PathCollector, read_truth
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -65,9 +65,7 @@ def rms(content: dict[str, Any]) -> dict[str, float]:
     return {row['name']: row['rms'] for row in content['errors']}
 
 
-def test_global_poses_correct_the_path_and_all_files_are_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_global_poses_correct_the_path_and_all_files_are_written(tmp_path, capsys) -> None:
     path = circle()
     closed = path.stamps_ns[[0, 314]]
     relative = se2.between(path.poses[[0]], path.poses[[314]])
@@ -108,7 +106,7 @@ def test_global_poses_correct_the_path_and_all_files_are_written(
     assert 'counts: global_pose.accepted 40, loop_closure.accepted 1, odom.accepted 400' in printed
 
 
-def test_distances_from_fixes_are_those_of_the_robot_not_of_the_antenna(tmp_path: Path) -> None:
+def test_distances_from_fixes_are_those_of_the_robot_not_of_the_antenna(tmp_path) -> None:
     write_bag(tmp_path / 'bag', (*odometry(), *fixes(ANTENNA)))
     assert run(tmp_path / 'bag', '--hold-out', 4, '-o', tmp_path, '-p',
                f'fix.lever_arm:={ANTENNA.tolist()}') == 0
@@ -120,7 +118,7 @@ def test_distances_from_fixes_are_those_of_the_robot_not_of_the_antenna(tmp_path
         assert errors[f'corrected path to fixes {kind}'] < 0.1
 
 
-def test_the_antenna_may_come_from_tf_static_whenever_it_was_recorded(tmp_path: Path) -> None:
+def test_the_antenna_may_come_from_tf_static_whenever_it_was_recorded(tmp_path) -> None:
     header, time = TYPES['std_msgs/msg/Header'], TYPES['builtin_interfaces/msg/Time']
     transform = TYPES['geometry_msgs/msg/TransformStamped'](
         header(time(0, 0), 'base_link'), 'gps', TYPES['geometry_msgs/msg/Transform'](
@@ -136,7 +134,7 @@ def test_the_antenna_may_come_from_tf_static_whenever_it_was_recorded(tmp_path: 
     assert rms(summary_of(tmp_path))['corrected path to fixes used'] < 0.1
 
 
-def test_messages_without_a_measurement_are_counted_and_not_compared_with(tmp_path: Path) -> None:
+def test_messages_without_a_measurement_are_counted_and_not_compared_with(tmp_path) -> None:
     bad = fixes(np.zeros(2))[:3]
     for _, _, _, message in bad:
         message.status.status = -1
@@ -153,7 +151,7 @@ def test_messages_without_a_measurement_are_counted_and_not_compared_with(tmp_pa
     assert content['fixes_used'] == 77
 
 
-def test_a_loop_closure_to_a_node_is_used_but_has_no_stamp_to_be_drawn_at(tmp_path: Path) -> None:
+def test_a_loop_closure_to_a_node_is_used_but_has_no_stamp_to_be_drawn_at(tmp_path) -> None:
     path = circle()
     closures = list(loop_closure_messages(
         '/loop_closure', path.stamps_ns[[[0, 314]]], se2.between(
@@ -166,7 +164,7 @@ def test_a_loop_closure_to_a_node_is_used_but_has_no_stamp_to_be_drawn_at(tmp_pa
     assert content['loop_closures'] == 0
 
 
-def test_with_a_window_of_a_few_nodes_the_path_is_whole_and_as_good(tmp_path: Path) -> None:
+def test_with_a_window_of_a_few_nodes_the_path_is_whole_and_as_good(tmp_path) -> None:
     write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
     assert run(tmp_path / 'bag', '-o', tmp_path / 'whole') == 0
     assert run(tmp_path / 'bag', '-o', tmp_path / 'part', '-p', 'window.nodes:=8') == 0
@@ -180,7 +178,7 @@ def test_with_a_window_of_a_few_nodes_the_path_is_whole_and_as_good(tmp_path: Pa
     assert both[1] < both[0] + 0.1
 
 
-def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path: Path) -> None:
+def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -> None:
     truth = circle()
     ends = truth.stamps_ns[[50, -50]]
     relative = se2.between(*truth.at(ends))
@@ -199,9 +197,7 @@ def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path: P
 
 @pytest.mark.parametrize(('datum', 'axes'), [
     ([], ('east', 'north')), ([50.7, 7.1], ('east', 'north')), ([50.7, 7.1, 0.5], ('x', 'y'))])
-def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(
-    datum: list[float], axes: tuple[str, str], tmp_path: Path,
-) -> None:
+def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(datum, axes, tmp_path) -> None:
     write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
     values = checked({'datum': datum})
     with open_bag(tmp_path / 'bag') as bag:
@@ -214,7 +210,7 @@ def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(
 
 @pytest.mark.parametrize('type_name', [
     'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped', POSE])
-def test_truth_is_read_from_each_type_with_a_pose(type_name: str, tmp_path: Path) -> None:
+def test_truth_is_read_from_each_type_with_a_pose(type_name, tmp_path) -> None:
     path = circle()
     messages = list(odometry_messages('/truth', 'map', path, (0.0,) * 6))[::10]
     if type_name != 'nav_msgs/msg/Odometry':
@@ -229,16 +225,14 @@ def test_truth_is_read_from_each_type_with_a_pose(type_name: str, tmp_path: Path
             read_truth(bag, '/nothing')
 
 
-def test_a_topic_without_poses_is_no_truth(tmp_path: Path) -> None:
+def test_a_topic_without_poses_is_no_truth(tmp_path) -> None:
     write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
     with open_bag(tmp_path / 'bag') as bag, pytest.raises(
             BagError, match=r'type sensor_msgs/msg/NavSatFix of /gps/fix \(--truth\); expected'):
         read_truth(bag, '/gps/fix')
 
 
-def test_a_bag_without_usable_odometry_is_one_line_of_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_bag_without_usable_odometry_is_one_line_of_error(tmp_path, capsys) -> None:
     messages = odometry()[:5]
     for _, _, _, message in messages:
         message.pose.pose.position.x = np.nan
@@ -249,9 +243,7 @@ def test_a_bag_without_usable_odometry_is_one_line_of_error(
     assert not (tmp_path / 'out').exists()
 
 
-def test_correlated_errors_are_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_correlated_errors_are_reported(tmp_path, capsys) -> None:
     # positions that wander by 2 m in half a minute, with sigmas of 0.3 m
     path = circle(600)
     wave = 2.0 * np.sin(path.stamps_ns * 1e-9 * 2.0 * np.pi / 120.0)
@@ -267,18 +259,14 @@ def test_correlated_errors_are_reported(
     assert line.endswith('but are treated as white: see fix.correlation_time')
 
 
-def test_odometry_alone_has_nothing_to_compare_with(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_odometry_alone_has_nothing_to_compare_with(tmp_path, capsys) -> None:
     write_bag(tmp_path / 'bag', odometry())
     assert main(['replay', str(tmp_path / 'bag'), '-o', str(tmp_path)]) == 0
     assert len(read_tum(tmp_path / 'path.tum')) > 20
     assert 'nothing to compare' in capsys.readouterr().out
 
 
-def test_the_exit_code_says_whether_the_optimisation_converged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_exit_code_says_whether_the_optimisation_converged(tmp_path, monkeypatch) -> None:
     write_bag(tmp_path / 'bag', odometry())
     with open_bag(tmp_path / 'bag') as bag:
         values = checked({})
@@ -294,9 +282,7 @@ def test_the_exit_code_says_whether_the_optimisation_converged(
 @pytest.mark.parametrize(('error', 'code', 'said'), [
     (PoseGraphError('what is wrong'), 2, 'error: what is wrong\n'),
     (PermissionError('no entry'), 2, 'error: no entry\n'), (KeyboardInterrupt(), 130, '')])
-def test_errors_of_the_user_are_one_line_and_an_exit_code(
-    error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_errors_of_the_user_are_one_line_and_an_exit_code(error, code, said, capsys) -> None:
     def execute() -> int:
         raise error
 
@@ -312,9 +298,7 @@ def test_an_error_of_the_program_is_not_hidden() -> None:
         guarded(execute)
 
 
-def test_a_pipe_whose_reader_has_ended_is_no_traceback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_pipe_whose_reader_has_ended_is_no_traceback(tmp_path, monkeypatch) -> None:
     def execute() -> int:
         raise BrokenPipeError
 
@@ -326,9 +310,9 @@ def test_a_pipe_whose_reader_has_ended_is_no_traceback(
 
 
 def test_of_very_many_samples_those_that_are_kept_are_bounded_and_evenly_spaced(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch,
 ) -> None:
-    monkeypatch.setattr(results, 'MOST_SAMPLES', 16)
+    monkeypatch.setattr(drives, 'MOST_SAMPLES', 16)
     few, many = PathCollector(), PathCollector()
     for k in (3, 1, 2, 1):
         few.add(k, np.array([float(k), 0.0, 0.0]))

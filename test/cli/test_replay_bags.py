@@ -19,8 +19,8 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.bag_messages import Message, write_bag
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.progress import WatchedBag
 from pose_graph_ros.cli.replay import run
+from pose_graph_ros.cli.shared import WatchedBag
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 
 START = int(circle().stamps_ns[0])
@@ -57,7 +57,7 @@ def path_of(*bags: Path) -> list[bytes]:
     return [estimate.path.stamps_ns.tobytes(), estimate.path.poses.tobytes()]
 
 
-def test_the_path_is_the_same_bit_for_bit_whatever_the_bag_is(tmp_path: Path) -> None:
+def test_the_path_is_the_same_bit_for_bit_whatever_the_bag_is(tmp_path) -> None:
     write_bag(tmp_path / 'bag', drive())
     expected = path_of(tmp_path / 'bag')
     for form in (None, Rosbag1Writer.CompressionFormat.BZ2, Rosbag1Writer.CompressionFormat.LZ4):
@@ -66,7 +66,7 @@ def test_the_path_is_the_same_bit_for_bit_whatever_the_bag_is(tmp_path: Path) ->
         assert path_of(write_compressed(tmp_path / mode.name, drive(), mode)) == expected
 
 
-def test_several_bags_are_one_recording_whatever_their_order(tmp_path: Path) -> None:
+def test_several_bags_are_one_recording_whatever_their_order(tmp_path) -> None:
     messages, middle = drive(), START + 20 * 10**9
     write_bag(tmp_path / 'whole', messages)
     expected = path_of(tmp_path / 'whole')
@@ -79,7 +79,7 @@ def test_several_bags_are_one_recording_whatever_their_order(tmp_path: Path) -> 
     assert path_of(tmp_path / 'odom', fix) == expected
 
 
-def test_only_what_was_recorded_in_a_span_is_used(tmp_path: Path) -> None:
+def test_only_what_was_recorded_in_a_span_is_used(tmp_path) -> None:
     write_bag(tmp_path / 'bag', drive())
     replayed(tmp_path / 'a', tmp_path / 'bag', '--from', 5, '--until', 15.05)
     part = read_tum(tmp_path / 'a' / 'path.tum')
@@ -90,9 +90,7 @@ def test_only_what_was_recorded_in_a_span_is_used(tmp_path: Path) -> None:
         tmp_path / 'a' / 'path.tum').read_bytes()
 
 
-def test_json_is_the_summary_and_nothing_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_json_is_the_summary_and_nothing_else(tmp_path, capsys) -> None:
     write_bag(tmp_path / 'bag', drive())
     replayed(tmp_path / 'out', tmp_path / 'bag', '--json')
     printed = capsys.readouterr()
@@ -103,9 +101,7 @@ def test_json_is_the_summary_and_nothing_else(
     assert content['status'] == 'converged'
 
 
-def test_wrong_bags_are_one_line_that_names_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_wrong_bags_are_one_line_that_names_them(tmp_path, capsys) -> None:
     good = tmp_path / 'good'
     write_bag(good, drive())
     whole = write_ros1(tmp_path / 'whole.bag', drive()).read_bytes()
@@ -129,11 +125,9 @@ def test_wrong_bags_are_one_line_that_names_them(
     assert 'expected one .g2o file alone' in error_of(capsys, good, 'graph.g2o')
 
 
-def test_a_terminal_sees_how_far_a_bag_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_terminal_sees_how_far_a_bag_is_read(tmp_path, capsys, monkeypatch) -> None:
     write_bag(tmp_path / 'bag', drive())
-    monkeypatch.setattr('pose_graph_ros.cli.progress.DELAY', 0.0)
+    monkeypatch.setattr('pose_graph_ros.cli.shared.DELAY', 0.0)
     with open_bags([tmp_path / 'bag']) as bag:
         plain = [message.raw for message in bag.messages(['/odom'])]
         assert [each.raw for each in WatchedBag(bag, 'reading').messages(['/odom'])] == plain
@@ -143,9 +137,7 @@ def test_a_terminal_sees_how_far_a_bag_is_read(
     assert 'reading:   0 % |' in capsys.readouterr().err
 
 
-def test_a_simulated_drive_needs_no_topics_and_its_second_lap_is_thinned(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_simulated_drive_needs_no_topics_and_its_second_lap_is_thinned(tmp_path, capsys) -> None:
     write_drive(simulate_drive(1), tmp_path / 'drive')
     assert main(['replay', str(tmp_path / 'drive'), '-o', str(tmp_path / 'out'), '--json',
                  '-p', 'thinning.cell:=3.0']) == 0
@@ -153,7 +145,7 @@ def test_a_simulated_drive_needs_no_topics_and_its_second_lap_is_thinned(
     assert facts['thinned_nodes'] > 0.1 * facts['hidden_nodes']
 
 
-def test_live_poses_do_not_know_what_came_later(tmp_path: Path) -> None:
+def test_live_poses_do_not_know_what_came_later(tmp_path) -> None:
     write_bag(tmp_path / 'bag', drive())
     tables = []
     for name, part in (('whole', ()), ('part', ('--until', 12))):
@@ -165,7 +157,7 @@ def test_live_poses_do_not_know_what_came_later(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('named', ['wheel/odometry', '/wheel/odometry'])
-def test_topics_of_ros_1_without_a_slash_can_be_named(named: str, tmp_path: Path) -> None:
+def test_topics_of_ros_1_without_a_slash_can_be_named(named, tmp_path) -> None:
     messages = [(topic, *rest) for topic in ('wheel/odometry', 'other')
                 for _, *rest in odometry()]
     bag = write_ros1(tmp_path / 'bag.bag', messages)

@@ -20,7 +20,7 @@ from report_data import example
 
 import pose_graph_ros
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.page.render import render
+from pose_graph_ros.cli.report import render
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')

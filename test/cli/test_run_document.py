@@ -14,7 +14,7 @@ from run_schema import problems
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.evaluation import Drive, evaluate, place_truth
+from pose_graph_ros.cli.drive import Drive, place_truth
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.document import document
@@ -54,7 +54,7 @@ def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
     # as it is read from the file
     return dict(json.loads(json.dumps(document(Run(
         'a drive', 'made up', compared, backend, estimate, backend.verdicts(), recorder, values,
-        kinds, backend.counts, evaluate(compared), report)), allow_nan=False)))
+        kinds, backend.counts, report)), allow_nan=False)))
 
 
 def texts(found: dict[str, Any], *levels: str) -> list[str]:
@@ -69,7 +69,7 @@ def source(found: dict[str, Any], name: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize('of_drive', [
     {}, {'tau': 20.0}, {'fixes': False}, {'closures': 0}, {'false_closures': 5}], ids=str)
-def test_it_has_the_form_that_is_documented(of_drive: dict[str, Any]) -> None:
+def test_it_has_the_form_that_is_documented(of_drive) -> None:
     found = run_of(**of_drive)
     assert list(problems(found)) == []
     assert len(found['springs']) == 10
@@ -105,9 +105,7 @@ def test_times_and_places_are_those_of_the_run() -> None:
             assert path['x'][node] == pytest.approx(spring['from']['x'], abs=0.02)
 
 
-def test_of_very_many_measurements_those_that_are_not_believed_stay(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_of_very_many_measurements_those_that_are_not_believed_stay(monkeypatch) -> None:
     whole = run_of(false_closures=5)
     monkeypatch.setattr(places, 'MOST_OF_SOURCE', 16)
     part = run_of(('frequency', 10.0), false_closures=5)
@@ -124,7 +122,7 @@ def test_of_very_many_measurements_those_that_are_not_believed_stay(
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_nothing_is_wrong_with_an_honest_drive(seed: int) -> None:
+def test_nothing_is_wrong_with_an_honest_drive(seed) -> None:
     for settings in ((), (WHITE,)):
         assert texts(run_of(*settings, seed=seed), 'warning', 'notice') == []
 
@@ -282,7 +280,7 @@ def test_a_silence_of_one_of_two_odometries_does_not_hide_the_motion() -> None:
 
 
 @pytest.mark.parametrize('source', ['odom', 'fix'])
-def test_a_silence_is_a_warning_from_20_s_on_as_the_docs_say(source: str) -> None:
+def test_a_silence_is_a_warning_from_20_s_on_as_the_docs_say(source) -> None:
     for length, level in ((7, 'notice'), (25, 'warning')):
         recorder = Recorder()
         for tenth in (*range(10, 110), *range(109 + 10 * length, 210 + 10 * length)):

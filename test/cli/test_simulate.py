@@ -44,7 +44,7 @@ def test_the_drive_is_the_one_of_the_first_version() -> None:
     np.testing.assert_allclose(drive.loop_poses, old['loop_poses'], rtol=0.0, atol=1e-9)
 
 
-def test_equal_seeds_give_equal_drives_and_others_do_not(drive: Recording) -> None:
+def test_equal_seeds_give_equal_drives_and_others_do_not(drive) -> None:
     again, other = simulate_drive(seed=1), simulate_drive(seed=2)
     np.testing.assert_array_equal(again.odometry.poses, drive.odometry.poses)
     np.testing.assert_array_equal(again.fixes, drive.fixes)
@@ -52,7 +52,7 @@ def test_equal_seeds_give_equal_drives_and_others_do_not(drive: Recording) -> No
     assert not np.array_equal(other.fixes[:10], drive.fixes[:10])
 
 
-def test_the_car_moves_like_a_car(drive: Recording) -> None:
+def test_the_car_moves_like_a_car(drive) -> None:
     steps = se2.between(drive.truth.poses[:-1], drive.truth.poses[1:])
     period = np.diff(drive.truth.stamps_ns) * 1e-9
     speed = steps[:, 0] / period
@@ -66,7 +66,7 @@ def test_the_car_moves_like_a_car(drive: Recording) -> None:
     assert 0.02 < np.mean(speed < 0.01) < 0.3  # it stops at lights
 
 
-def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive: Recording) -> None:
+def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive) -> None:
     stamps = drive.odometry.stamps_ns
     stamps = stamps[drive.truth.covers(stamps)]
     odometry, truth = drive.odometry.at(stamps), drive.truth.at(stamps)
@@ -78,7 +78,7 @@ def test_odometry_is_good_over_seconds_and_drifts_over_minutes(drive: Recording)
     assert abs(se2.wrap(truth[0, 2] - odometry[0, 2] - 2.0)) < 0.05
 
 
-def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive: Recording) -> None:
+def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive) -> None:
     errors = []
     for seed in range(1, 6):
         other = simulate_drive(seed)
@@ -97,13 +97,13 @@ def test_fixes_err_by_their_sigma_but_for_reflected_ones(drive: Recording) -> No
     assert np.all(np.hypot(*(off - MULTIPATH_OFFSET).T) < 10.0)    # to one side
 
 
-def test_fixes_pause_once(drive: Recording) -> None:
+def test_fixes_pause_once(drive) -> None:
     gaps = np.diff(drive.fix_stamps_ns) * 1e-9
     assert 68.0 < gaps.max() < 72.0
     assert np.sum(gaps > 1.0) == 1
 
 
-def test_loop_closures_are_true_up_to_their_noise(drive: Recording) -> None:
+def test_loop_closures_are_true_up_to_their_noise(drive) -> None:
     true = ~drive.loop_is_false
     old, new = drive.loop_stamps_ns[true].T
     assert np.sum(true) >= 24
@@ -119,7 +119,7 @@ def test_loop_closures_are_true_up_to_their_noise(drive: Recording) -> None:
     assert np.sum((new > outage[0]) & (new < outage[1])) >= 4
 
 
-def test_false_loop_closures_tie_places_that_are_far_apart(drive: Recording) -> None:
+def test_false_loop_closures_tie_places_that_are_far_apart(drive) -> None:
     ends = drive.loop_stamps_ns[drive.loop_is_false]
     assert len(ends) == FALSE_SINGLE + FALSE_GROUP
     assert np.all(np.diff(drive.loop_stamps_ns[:, 1]) >= 0)
@@ -139,7 +139,7 @@ def test_a_short_drive_needs_no_second_lap() -> None:
     assert short.truth.stamps_ns[-1] - short.truth.stamps_ns[0] > 19e9
 
 
-def test_the_bag_says_what_the_drive_says(tmp_path: Path) -> None:
+def test_the_bag_says_what_the_drive_says(tmp_path) -> None:
     drive = simulate_drive(duration_s=200.0)
     write_drive(drive, tmp_path / 'drive')
     seen: dict[str, list[tuple[int, tuple[float, ...]]]] = {}

@@ -29,7 +29,7 @@ def about(path: Path) -> dict:
 
 
 @pytest.mark.parametrize('world', ['drive', 'hall', 'grid'])
-def test_equal_options_write_equal_bytes(world: str, tmp_path: Path) -> None:
+def test_equal_options_write_equal_bytes(world, tmp_path) -> None:
     words = ('--world', world, '--duration', '60', *ALL, '--delay', '/odom:0.1:0.3',
              '--duplicate', '/gps/fix:0.3', '--tum')
     for folder, seed in (('a', '7'), ('b', '7'), ('c', '8')):
@@ -61,7 +61,7 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_bag_has_what_was_asked_for(disturbed: Path) -> None:
+def test_the_bag_has_what_was_asked_for(disturbed) -> None:
     truth = about(disturbed)
     counts, stamps, sigmas = Counter[str](), dict[str, list[int]](), dict[str, float]()
     late = dict[str, list[float]]()
@@ -108,7 +108,7 @@ def test_the_bag_has_what_was_asked_for(disturbed: Path) -> None:
     assert fixes['end_ns'] - fixes['at_ns'] == 20 * 10**9
 
 
-def test_replay_reads_all_of_it(disturbed: Path, tmp_path: Path) -> None:
+def test_replay_reads_all_of_it(disturbed, tmp_path) -> None:
     words = [word for name, topic in TOPICS.items()
              for word in (f'--{name.replace("_", "-")}', topic)]
     assert main(['replay', str(disturbed), '-o', str(tmp_path / 'run'), *words, '-p',
@@ -125,7 +125,7 @@ def read_tum(path: Path) -> np.ndarray:
     return np.column_stack((rows[:, 1:3], 2.0 * np.arctan2(rows[:, 6], rows[:, 7])))
 
 
-def test_the_truth_beside_a_bag_is_that_in_it(disturbed: Path) -> None:
+def test_the_truth_beside_a_bag_is_that_in_it(disturbed) -> None:
     written = read_tum(disturbed.with_name('bag_truth.tum'))
     with open_bag(disturbed) as bag:
         poses = [(pose.position.x, pose.position.y, 2.0 * np.arctan2(
@@ -136,7 +136,7 @@ def test_the_truth_beside_a_bag_is_that_in_it(disturbed: Path) -> None:
     np.testing.assert_allclose(difference, 0.0, atol=1e-12)
 
 
-def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path: Path) -> None:
+def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path) -> None:
     path = tmp_path / 'graph.g2o'
     simulate(path, '--world', 'grid', '--duration', '300', '--closures', '1', '--false-rate',
              '0.3', '--false-groups', '2:5', '--fix-sigma', '0.5', '--tum')
@@ -158,7 +158,7 @@ def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path: Path)
 
 
 @pytest.mark.parametrize('out', ['bag', 'graph.g2o'])
-def test_a_map_is_drawn(out: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_is_drawn(out, tmp_path, capsys) -> None:
     words = ('--world', 'grid', '--duration', '300', '--fix', '--jump', '/gps/fix:50:9,9',
              '--closures', '1', '--false-rate', '0.5')
     simulate(tmp_path / out, *words, '--plot', tmp_path / 'map.svg')
@@ -172,14 +172,14 @@ def test_a_map_is_drawn(out: str, tmp_path: Path, capsys: pytest.CaptureFixture[
         'error: --plot map.txt: the name must end in .png, .pdf, .svg\n')
 
 
-def test_json_is_the_file_beside_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_the_file_beside_it(tmp_path, capsys) -> None:
     simulate(tmp_path / 'bag', '--duration', '20', '--json')
     printed = json.loads(capsys.readouterr().out)
     assert printed == about(tmp_path / 'bag')
     assert set(printed['topics']) == {'/odom', '/gps/fix', '/ground_truth'}
 
 
-def test_the_outage_and_the_jump_of_the_drive_can_be_taken_away(tmp_path: Path) -> None:
+def test_the_outage_and_the_jump_of_the_drive_can_be_taken_away(tmp_path) -> None:
     simulate(tmp_path / 'bag', '--duration', '340', '--outage', '/gps/fix:none', '--jump',
              '/gps/fix:none', '--false-rate', '0')
     truth = about(tmp_path / 'bag')
@@ -200,9 +200,7 @@ def test_the_outage_and_the_jump_of_the_drive_can_be_taken_away(tmp_path: Path) 
     (['--false-groups', '2:1'], "expected groups of at least 2, got '2:1'"),
     (['--fix-correlated', '1'], "expected 2 numbers with commas between them, got '1'"),
 ])
-def test_words_that_cannot_be_read_are_named(
-    words: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_words_that_cannot_be_read_are_named(words, expected, tmp_path, capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(['simulate', str(tmp_path / 'bag'), *words])
     assert ended.value.code == 2
@@ -224,10 +222,7 @@ def test_words_that_cannot_be_read_are_named(
     ('no/such/a.g2o', ['--duration', '20', '--jump', '/odom:1:reset'], 'error: jump of /odom'),
     ('file/a.g2o', ['--duration', '20'], 'error: '),
 ])
-def test_what_cannot_be_simulated_is_one_line(
-    out: str, words: list[str], expected: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_cannot_be_simulated_is_one_line(out, words, expected, tmp_path, capsys) -> None:
     (tmp_path / 'file').write_text('')
     assert main(['simulate', str(tmp_path / out), *words]) == 2
     line, = capsys.readouterr().err.splitlines()

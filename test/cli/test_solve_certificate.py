@@ -42,7 +42,7 @@ def wound_ring(n: int) -> str:
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_each_graph_is_certified(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_graph_is_certified(name, capsys) -> None:
     values = solved(capsys, DATA / name)
     assert set(values) == KEYS
     assert values['chi2'] == pytest.approx(GOLDEN[name]['chi2'], rel=1e-8)
@@ -57,7 +57,7 @@ def test_each_graph_is_certified(name: str, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_from_a_minimum_that_is_not_the_lowest_the_certificate_leads_to_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    tmp_path, capsys,
 ) -> None:
     path = tmp_path / 'ring.g2o'
     path.write_text(wound_ring(20), encoding='ascii')
@@ -74,9 +74,7 @@ def test_from_a_minimum_that_is_not_the_lowest_the_certificate_leads_to_it(
     assert re.search(r'certificate: certified, .*\n  near the poses found first', printed)
 
 
-def test_the_best_of_all_starts_is_kept(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_best_of_all_starts_is_kept(tmp_path, capsys) -> None:
     path = tmp_path / 'ring.g2o'
     path.write_text(wound_ring(20), encoding='ascii')
     values = solved(capsys, path, '--start', 'best', '--no-certificate')
@@ -96,9 +94,7 @@ def test_the_best_of_all_starts_is_kept(
     ('EDGE_SE2_XY 0 1 1 0 1 0 1\nVERTEX_XY 1 0 0\nVERTEX_SE2 0 0 0 0', 'landmarks'),
     ('EDGE_PRIOR_SE2_XY 5 1 1 1 0 1', 'do not determine'),
 ])
-def test_the_reason_is_said_where_there_is_none(
-    text: str, because: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_reason_is_said_where_there_is_none(text, because, tmp_path, capsys) -> None:
     path = tmp_path / 'graph.g2o'
     path.write_text(text, encoding='ascii')
     found = solved(capsys, path)['certificate']
@@ -112,7 +108,7 @@ def test_the_reason_is_said_where_there_is_none(
 @needs('graphs')
 @pytest.mark.parametrize(('name', 'chi2', 'bounded'), OPTIMA)
 def test_the_optimum_of_a_public_graph_is_reached_and_certified(
-    name: str, chi2: float, bounded: bool, capsys: pytest.CaptureFixture[str],
+    name, chi2, bounded, capsys,
 ) -> None:
     values = solved(capsys, PUBLIC / 'graphs' / name)
     assert values['chi2'] == pytest.approx(chi2, rel=1e-6)

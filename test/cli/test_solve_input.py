@@ -19,20 +19,19 @@ LARGEST = 2**63 - 1
 # Text behind two good lines, and what is said.
 WRONG = {
     'truncated': ('EDGE_SE2 1 2 1 0 0 1 0 0 1 0', ':3: EDGE_SE2 is followed by 11 .*got 10'),
-    'nan': (f'EDGE_SE2 1 2 1 0 nan {I}', ':3: EDGE_SE2 holds a number that is not finite'),
+    'nan': (f'EDGE_SE2 1 2 1 0 nan {I}', ':3: EDGE_SE2 is followed by 11 .*finite'),
     'indefinite': ('EDGE_SE2 1 2 1 0 0 1 2 0 1 0 1', ':3: .* not positive semidefinite'),
     'twice': ('VERTEX_SE2 0 1 0 0', ':3: vertex 0 is in the file twice'),
     'id': (f'EDGE_SE2 1 {LARGEST + 1} 1 0 0 {I}',
            ':3: EDGE_SE2: expected ids of at most 64 bits, got 9223372036854775808'),
     'landmark': ('LANDMARK 0 0 1 1 5 0', ':3: LANDMARK is followed by 7 numbers, got 6'),
     'fix': ('FIX 4', ':3: FIX 4: there is no such vertex'),
+    'word': (f'EDGE_SE2 1 2 1 x 0 {I}', ':3: EDGE_SE2: could not convert'),
 }
 
 
 @pytest.mark.parametrize('name', WRONG)
-def test_a_wrong_file_is_one_line_that_names_it(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_wrong_file_is_one_line_that_names_it(name, tmp_path, capsys) -> None:
     path, (line, said) = tmp_path / 'graph.g2o', WRONG[name]
     path.write_text(FIRST + line, encoding='ascii')
     assert main(['solve', str(path)]) == 2
@@ -42,11 +41,10 @@ def test_a_wrong_file_is_one_line_that_names_it(
 
 
 @pytest.mark.parametrize('content', [
-    b'', b'\xff\xfe', gzip.compress(FIRST.encode(), mtime=0)[:30], b'{"a": 1}', None],
-    ids=['empty', 'no text', 'half of a compressed file', 'JSON', 'folder'])
-def test_what_is_no_graph_is_one_line(
-    content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+    b'', b'# a comment\n', b'\xff\xfe', gzip.compress(FIRST.encode(), mtime=0)[:30], b'{"a": 1}',
+    b'VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n', None],
+    ids=['empty', 'comment', 'no text', 'half of a compressed file', 'JSON', 'space', 'folder'])
+def test_what_is_no_graph_is_one_line(content, tmp_path, capsys) -> None:
     path = tmp_path / 'graph.g2o'
     if content is None:
         path.mkdir()
@@ -58,9 +56,7 @@ def test_what_is_no_graph_is_one_line(
     assert error.count('\n') == 1
 
 
-def test_what_overflows_is_null_in_json(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_overflows_is_null_in_json(tmp_path, capsys) -> None:
     path = tmp_path / 'graph.g2o'
     path.write_text(f'EDGE_SE2 0 1 1e200 0 0 {I}\nEDGE_SE2 0 1 -1e200 0 0 {I}\n', encoding='ascii')
     assert main(['solve', str(path), '--json']) == 1
@@ -78,9 +74,7 @@ def solved(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dic
     return values
 
 
-def test_line_ends_and_compression_change_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_line_ends_and_compression_change_nothing(tmp_path, capsys) -> None:
     text = FIRST + f'EDGE_SE2 1 2 1 0 1 {I}\nEDGE_SE2 2 0 -1.7 0.2 -1 {I}\n'
     results = []
     for name, content in (('unix.g2o', text.encode()), ('old.g2o', text.replace(
@@ -94,9 +88,7 @@ def test_line_ends_and_compression_change_nothing(
 
 
 @pytest.mark.parametrize('ids', [(0, 7, 5), (-5, -4, -9), (LARGEST, LARGEST - 1, 0)])
-def test_ids_are_any_integers(
-    ids: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_ids_are_any_integers(ids, tmp_path, capsys) -> None:
     path, out = tmp_path / 'graph.g2o', tmp_path / 'out.g2o'
     a, b, c = ids
     path.write_text(f'EDGE_SE2 {a} {b} 1 0 0 {I}\nEDGE_SE2 {b} {c} 1 0 0 {I}\n'
@@ -105,17 +97,7 @@ def test_ids_are_any_integers(
     assert sorted(ids) == read_g2o(out).ids.tolist()
 
 
-def test_numbers_that_overflow_are_not_said_to_have_converged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    path = tmp_path / 'huge.g2o'
-    path.write_text(''.join(f'EDGE_SE2 {i} {j} {x} 0 0 {I}\n' for i, j, x in (
-        (0, 1, '1e200'), (1, 2, '1e200'), (0, 2, '-1e200'))), encoding='ascii')
-    assert main(['solve', str(path)]) == 1
-    assert 'failed after 0 iterations' in capsys.readouterr().out
-
-
-def test_landmarks_of_isam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_landmarks_of_isam(tmp_path, capsys) -> None:
     root = '10 0 0 10 0 10'
     seen = ((0, 0, 1.0, 1.0), (1, 0, 0.1, 1.0), (2, 1, 1.0, -1.0))
     path, same = tmp_path / 'isam.txt', tmp_path / 'same.g2o'
@@ -136,9 +118,7 @@ def test_landmarks_of_isam(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     np.testing.assert_array_equal(read_g2o(path, 'isam').graph.is_pose, [True] * 3 + [False] * 2)
 
 
-def test_an_edge_from_a_node_to_itself_is_skipped_with_one_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_edge_from_a_node_to_itself_is_skipped_with_one_warning(tmp_path, capsys) -> None:
     path = tmp_path / 'graph.g2o'
     one = '1 0 0 1 0 1'
     path.write_text(f'EDGE_SE2 0 1 1 0 0 {one}\nEDGE_SE2 1 1 0 0 0 {one}\n'
@@ -149,16 +129,7 @@ def test_an_edge_from_a_node_to_itself_is_skipped_with_one_warning(
     assert err == f'warning: {path}: 2 edges from a node to itself are skipped\n'
 
 
-def test_a_graph_in_space_is_said_to_be_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    path = tmp_path / 'sphere.g2o'
-    path.write_text('VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n', encoding='ascii')
-    assert main(['solve', str(path)]) == 2
-    assert '3D), which is not supported' in capsys.readouterr().err
-
-
-def test_a_toro_file_is_replayed_and_reported_as_it_is_solved(tmp_path: Path) -> None:
+def test_a_toro_file_is_replayed_and_reported_as_it_is_solved(tmp_path) -> None:
     path = tmp_path / 'drive.graph'
     path.write_text(''.join(f'EDGE2 {k} {k + 1} 1 0 0.1 100 0 100 400 0 0\n' for k in range(9)),
                     encoding='ascii')

@@ -65,8 +65,7 @@ def truncated(path: Path, poses: FloatArray, scale: float) -> float:
     (0, 15.0, 4.0, 0), (4, 10.0, 4.0, 0), (5, 15.0, 1.0, 0), (8, 15.0, 4.0, 0),
     (9, 15.0, 1.0, 2)])
 def test_a_robust_solution_costs_no_more_than_the_plain_one(  # noqa: PLR0917
-    seed: int, odometry: float, closure: float, n_wrong: int, method: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    seed, odometry, closure, n_wrong, method, tmp_path, capsys,
 ) -> None:
     path, plain, robust = (tmp_path / name for name in ('graph.g2o', 'plain.g2o', 'robust.g2o'))
     drive(path, seed, odometry, closure, n_wrong)
@@ -81,9 +80,7 @@ def test_a_robust_solution_costs_no_more_than_the_plain_one(  # noqa: PLR0917
     assert told['truncated_cost_of_all'] == pytest.approx(before, rel=1e-3)
 
 
-def test_a_robust_solution_costs_no_more_than_the_poses_of_the_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_robust_solution_costs_no_more_than_the_poses_of_the_file(tmp_path, capsys) -> None:
     path, given, out = (tmp_path / name for name in ('graph.g2o', 'given.g2o', 'out.g2o'))
     drive(path, 5, 15.0, 1.0)
     main(['solve', str(path), '-o', str(given)])
@@ -99,7 +96,7 @@ def test_a_robust_solution_costs_no_more_than_the_poses_of_the_file(
 
 @pytest.mark.parametrize('seed', range(6))
 def test_odometry_that_is_loose_does_not_speak_against_honest_closures(
-    seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    seed, tmp_path, capsys,
 ) -> None:
     path = tmp_path / 'graph.g2o'
     drive(path, seed, 4.0, 0.2)
@@ -109,9 +106,7 @@ def test_odometry_that_is_loose_does_not_speak_against_honest_closures(
     assert values['robust']['scale'] <= 1.2
 
 
-def test_landmarks_between_poses_do_not_make_odometry_a_closure(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_landmarks_between_poses_do_not_make_odometry_a_closure(tmp_path, capsys) -> None:
     """iSAM numbers poses and landmarks in one sequence, as they come."""
     rng = np.random.default_rng(3)
     points = rng.uniform([-6.0, -1.0], [6.0, 12.0], (25, 2))

@@ -42,7 +42,7 @@ def tuned(overconfident: Path) -> tuple[Path, dict[str, Any]]:
     return out, json.loads(text.getvalue())
 
 
-def test_it_makes_errors_at_held_out_fixes_lower(tuned: tuple[Path, dict[str, Any]]) -> None:
+def test_it_makes_errors_at_held_out_fixes_lower(tuned) -> None:
     _, facts = tuned
     assert facts['verdict'] == 'better'
     assert facts['after']['rms'] < 0.9 * facts['before']['rms']
@@ -51,7 +51,7 @@ def test_it_makes_errors_at_held_out_fixes_lower(tuned: tuple[Path, dict[str, An
     assert facts['before']['n'] == facts['after']['n'] > 100
 
 
-def test_the_node_takes_the_file(tuned: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_the_node_takes_the_file(tuned, tmp_path) -> None:
     path, facts = tuned
     content = yaml.safe_load(path.read_text())['/**']['ros__parameters']
     assert 0.8 < content['fix']['covariance_scale'] * 0.03**2 < 1.25
@@ -61,9 +61,7 @@ def test_the_node_takes_the_file(tuned: tuple[Path, dict[str, Any]], tmp_path: P
     assert given == {f'{source}.{name}' for source, of in content.items() for name in of}
 
 
-def test_no_file_is_written_where_nothing_becomes_better(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_no_file_is_written_where_nothing_becomes_better(tmp_path, capsys) -> None:
     bag, out = write(tmp_path / 'bag', *made(4, 60), claimed=1.0), tmp_path / 'tuned.yaml'
     out.write_text('from before')
     assert main(['tune', str(bag), '-o', str(out), '--folds', '2']) == 1
@@ -75,18 +73,13 @@ def test_no_file_is_written_where_nothing_becomes_better(
     assert json.loads(capsys.readouterr().out)['file'] is None
 
 
-def test_a_part_of_a_bag_can_be_tuned_with(
-    overconfident: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_part_of_a_bag_can_be_tuned_with(overconfident, tmp_path, capsys) -> None:
     main(['tune', str(overconfident), '--from', '30', '--until', '90', '--folds', '2', '--json',
           '-o', str(tmp_path / 'tuned.yaml')])
     assert 50 <= json.loads(capsys.readouterr().out)['before']['n'] <= 60
 
 
-def test_progress_has_a_total(
-    overconfident: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_progress_has_a_total(overconfident, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr('sys.stderr.isatty', lambda: True)
     main(['tune', str(overconfident), '--folds', '2', '-o', str(tmp_path / 'tuned.yaml')])
     steps = re.findall(r'step (\d+) of (\d+): ', capsys.readouterr().err)
@@ -102,10 +95,7 @@ def test_progress_has_a_total(
     (['{bag}', '--truth', '/none'], 'no topic /none'),
     (['{bag}', '-p', 'sources:=[odom]'], 'nothing to tune by'),
 ])
-def test_wrong_input_is_one_line(
-    args: list[str], message: str, overconfident: Path, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_wrong_input_is_one_line(args, message, overconfident, tmp_path, capsys) -> None:
     assert main(['tune', *(each.format(bag=overconfident, folder=tmp_path)
                            for each in args)]) == 2
     error = capsys.readouterr().err
@@ -116,9 +106,7 @@ def test_wrong_input_is_one_line(
 
 @pytest.mark.parametrize('args', [
     ('--folds', 'x'), ('--folds', '1'), ('--budget', 'x'), ('--budget', 'nan')])
-def test_numbers_that_are_none_are_told(
-    args: tuple[str, str], capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_numbers_that_are_none_are_told(args, capsys) -> None:
     with pytest.raises(SystemExit, match='2'):
         main(['tune', 'bag', *args])
     assert f'argument {args[0]}: expected a ' in capsys.readouterr().err
@@ -136,9 +124,7 @@ def test_a_sigma_that_is_kept_stays_when_its_factor_becomes_a_part_of_it() -> No
         f'odom.{name}': sigma for name, sigma in zip(ODOMETRY, expected, strict=True)}, rel=0.01)
 
 
-def test_a_truth_at_other_times_is_null_in_json(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_truth_at_other_times_is_null_in_json(tmp_path, capsys) -> None:
     odometry, fixes = made(4, 40)
     path = Trajectory(np.array([each.stamp_ns for each in odometry]),
                       np.array([each.pose for each in odometry]))
@@ -166,9 +152,7 @@ def facts_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
 
 @needs('robot/husky_test1_ros2')
 @pytest.mark.timeout(400)
-def test_husky_is_as_good_without_tuning_at_fixes_held_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_husky_is_as_good_without_tuning_at_fixes_held_out(tmp_path, capsys) -> None:
     """What a drive shows of odometry is found while it is driven, where it was not: 2.58 m."""
     args = str(HUSKY), '--odom', '/husky_velocity_controller/odom', '--fix', '/fix'
     facts = facts_of(capsys, *args, '--folds', '2', '-o', str(tmp_path / 'tuned.yaml'))
@@ -179,9 +163,7 @@ def test_husky_is_as_good_without_tuning_at_fixes_held_out(
 
 @needs('robot/plaza1')
 @pytest.mark.timeout(400)
-def test_plaza_is_as_good_without_tuning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_plaza_is_as_good_without_tuning(tmp_path, capsys) -> None:
     odometry, truth = (np.loadtxt(PLAZA / name, delimiter=',', skiprows=1)
                        for name in ('odom.csv', 'gt.csv'))
     odometry = odometry[:4000]

@@ -16,10 +16,10 @@ from pose_graph_ros.core.config import (
     FOUND,
     LOOP_CLOSURES,
     POSITIONS,
-    Prior,
     Robust,
     ThinningConfig,
     WindowConfig,
+    WindowPrior,
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
@@ -36,7 +36,8 @@ def configs(draw: st.DrawFn) -> BackendConfig:
     fixes = replace(
         POSITIONS, robust=draw(robust), correlation_time=draw(st.sampled_from((0.0, FOUND, 10.0))))
     return BackendConfig(
-        window=WindowConfig(**draw(st.sampled_from(LIMITS)), prior=draw(st.sampled_from(Prior))),
+        window=WindowConfig(
+            **draw(st.sampled_from(LIMITS)), prior=draw(st.sampled_from(WindowPrior))),
         thinning=ThinningConfig(
             cell=draw(st.sampled_from((0.0, 2.0))), newest=draw(st.sampled_from((1, 20)))),
         measurements={'fix': fixes, 'loop_closure': replace(LOOP_CLOSURES, robust=draw(robust))})

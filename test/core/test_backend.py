@@ -4,7 +4,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -13,13 +12,14 @@ from random_graphs import dense_system, free_part, snapshot
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import levenberg_marquardt, optimizer
+from pose_graph_ros.core.batch import gauss_newton, levenberg_marquardt, optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
 from pose_graph_ros.core.config import (
     BackendConfig,
     MeasurementSource,
     OdometrySource,
     POSITIONS,
+    SolverConfig,
 )
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry import se2
@@ -36,9 +36,8 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import UpdateResult
-from pose_graph_ros.core.solver_config import SolverConfig
+from pose_graph_ros.core.sources import pipeline
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
 # The promise: the same measurements give the same path, whatever their order [m, rad].
@@ -293,14 +292,6 @@ def test_bad_measurements_are_rejected_and_counted(
     assert snapshot(backend.graph) == before
 
 
-def test_two_loop_closures_at_one_stamp_with_different_references_are_both_taken() -> None:
-    backend = run(DRIVE.odometry)
-    for node in (0, 3):
-        assert backend.add_measurement(
-            LoopClosure(GOOD, np.zeros(3), np.eye(3), reference_node=node), 'scan',
-        ).status is AnswerStatus.ACCEPTED
-
-
 # --- Alignment -------------------------------------------------------------------------------
 
 def test_without_anything_in_the_map_the_map_is_the_odometry_frame() -> None:
@@ -342,53 +333,6 @@ def test_positions_align_once_they_tell_the_angle_and_the_estimate_says_so() -> 
 
 
 # --- Failing solvers -------------------------------------------------------------------------
-
-class Flaky(IncrementalSmoother):
-    """A smoother that applies an update, fails and undoes it while `broken`."""
-
-    broken = False
-
-    def update(self, update: GraphUpdate, **options: bool) -> UpdateResult:
-        if not self.broken:
-            return super().update(update, **options)
-        self.graph.begin()
-        self.graph.apply(update)
-        self.graph.rollback()
-        return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0)
-
-
-@pytest.mark.parametrize('known', [20, 100])
-def test_a_failing_update_leaves_the_graph_bit_equal_and_the_engine_recovers(known: int) -> None:
-    smoother = Flaky()
-    backend = PoseGraphBackend(prompt(), smoother=smoother)
-    for event in ALL[:known]:
-        feed(backend, event)
-    backend.update()
-    for event in ALL[known:known + 30]:
-        feed(backend, event)
-    before, estimate = snapshot(backend.graph), backend.estimate()
-    smoother.broken = True
-    report = backend.update()
-    assert report.status is Status.FAILED
-    assert report.reason == 'broken on purpose'
-    assert report.new_constraints == 0
-    assert snapshot(backend.graph) == before
-    assert backend.n_quarantined > 0
-    assert backend.counts['solver', 'failed'] == 1
-    after = backend.estimate()
-    np.testing.assert_array_equal(after.path.poses, estimate.path.poses)
-    np.testing.assert_array_equal(after.covariance, estimate.covariance)
-    assert after.alignment is estimate.alignment
-    assert after.chi2 == estimate.chi2
-
-    smoother.broken = False
-    for event in ALL[known + 30:]:
-        feed(backend, event)
-    assert backend.update().status is not Status.FAILED
-    assert backend.n_quarantined > 0     # not tried again by the timer ...
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend.n_quarantined == 0    # ... but at the end
-    assert_same_path(backend, REFERENCE_PATH)
 
 
 # --- Updates ---------------------------------------------------------------------------------
@@ -475,21 +419,6 @@ def test_the_path_is_current_after_every_update() -> None:
 
 # --- The estimate ----------------------------------------------------------------------------
 
-def test_snapshots_do_not_change_afterwards() -> None:
-    backend = PoseGraphBackend(prompt())
-    for event in ALL[:80]:
-        feed(backend, event)
-    backend.update()
-    estimate = backend.estimate()
-    arrays = (estimate.path.poses, estimate.path.stamps_ns, estimate.T_odom_base,
-              estimate.T_map_base, estimate.T_map_odom, estimate.covariance)
-    before = [array.tobytes() for array in arrays]
-    for event in ALL[80:]:
-        feed(backend, event)
-    backend.optimize()
-    assert [array.tobytes() for array in arrays] == before
-    assert not np.array_equal(backend.estimate().path.poses[:20], estimate.path.poses[:20])
-
 
 def test_the_estimate_reaches_to_the_newest_odometry() -> None:
     estimate = REFERENCE.estimate()
@@ -523,16 +452,16 @@ def test_the_covariance_of_the_newest_node_is_the_block_of_the_dense_inverse() -
 def test_the_covariance_is_that_of_the_solved_system_where_steps_were_damped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    kernels, refused = levenberg_marquardt.gn, []
+    evaluate, refused = gauss_newton.CompiledSystem.evaluate, []
 
-    def evaluate(head: FloatArray, right: FloatArray) -> tuple[float, float]:
+    def refusing(system: gauss_newton.CompiledSystem) -> tuple[float, float]:
         refused.append(len(refused) == 0)
-        return (np.inf, 0.0) if refused[-1] else kernels.evaluate(head, right)
+        return (np.inf, 0.0) if refused[-1] else evaluate(system)
 
     # the first step is refused, so that the two others are damped
-    monkeypatch.setattr(levenberg_marquardt, 'FIRST_DAMPING', 1.0)
     monkeypatch.setattr(
-        levenberg_marquardt, 'gn', SimpleNamespace(**{**vars(kernels), 'evaluate': evaluate}))
+        levenberg_marquardt, 'TUNING', levenberg_marquardt.Tuning(first_damping=1.0))
+    monkeypatch.setattr(gauss_newton.CompiledSystem, 'evaluate', refusing)
     backend = PoseGraphBackend(prompt(final_optimization=SolverConfig(max_iterations=2)))
     for event in in_order(DRIVE.odometry[:10], DRIVE.global_poses[:1]):
         feed(backend, event)
@@ -545,7 +474,7 @@ def test_the_covariance_is_that_of_the_solved_system_where_steps_were_damped(
 
 
 def test_too_many_waiting_measurements_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('pose_graph_ros.core.sources.waiting.MAX_WAITING', 3)
+    monkeypatch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_waiting=3))
     backend = PoseGraphBackend(prompt())
     answers = [feed(backend, position) for position in DRIVE.positions[:5]]
     assert [answer.status for answer in answers] == (

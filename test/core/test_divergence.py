@@ -16,7 +16,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import OdometrySample, Position
-from pose_graph_ros.core.smoother import batch_fallback
+from pose_graph_ros.core.smoother import trial as trials
 from pose_graph_ros.core.smoother.trial import Trial
 
 SECOND = 10**9
@@ -44,8 +44,8 @@ def test_all_is_solved_for_now_and_then_where_every_update_diverges(
     seed: int, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     solved = []
-    whole, trial = batch_fallback.optimize_copy, Trial.__init__
-    monkeypatch.setattr(batch_fallback, 'optimize_copy', lambda graph, copy: (
+    whole, trial = trials.optimize_copy, Trial.__init__
+    monkeypatch.setattr(trials, 'optimize_copy', lambda graph, copy: (
         solved.append(graph.n_nodes), whole(graph, copy))[1])
     monkeypatch.setattr(Trial, '__init__', lambda self, graph, *rest: (
         solved.append(graph.n_nodes), trial(self, graph, *rest))[1])

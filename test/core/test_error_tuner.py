@@ -20,8 +20,8 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
-from pose_graph_ros.core.smoother.results import UpdateResult
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.smoother.incremental import UpdateResult
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 
 SECOND = 1_000_000_000

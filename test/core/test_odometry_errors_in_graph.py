@@ -17,7 +17,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
+from pose_graph_ros.core.odometry.motion import OdometryErrors
 
 SECOND = 1_000_000_000
 RATE, LONGER = 0.006, 0.01

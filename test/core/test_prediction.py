@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, NodePolicy, NoiseFrom, OdometrySource
-from pose_graph_ros.core.estimate import Estimate
+from pose_graph_ros.core.config import NoiseFrom, OdometrySource
+from pose_graph_ros.core.estimate import Estimate, predict
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
-from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, odometry_covariance
-from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
-from pose_graph_ros.core.prediction import predict
+from pose_graph_ros.core.odometry.motion import (
+    Motion,
+    NO_MOTION,
+    odometry_covariance,
+    OdometryErrors,
+)
 
 SECOND = 1_000_000_000
 
@@ -44,38 +47,6 @@ def estimate_of(backend: PoseGraphBackend) -> Estimate:
     estimate = backend.estimate()
     assert estimate is not None
     return estimate
-
-
-def test_at_the_estimate_nothing_is_added(backend: PoseGraphBackend) -> None:
-    estimate = estimate_of(backend)
-    now = predict(estimate, sample(19))
-    np.testing.assert_allclose(now.T_map_base, estimate.T_map_base, atol=1e-12)
-    np.testing.assert_allclose(now.covariance, estimate.covariance, atol=1e-15)
-
-
-@pytest.mark.parametrize('odom', [
-    OdometrySource(covariance_scale=9.0), OdometrySource(sigma_scale=3.0),
-    OdometrySource(noise_from=NoiseFrom.TWIST),
-    OdometrySource(noise_from=NoiseFrom.TWIST, covariance_scale=0.25, sigma_scale=0.5),
-], ids=['scale', 'sigma_scale', 'twist', 'all'])
-def test_what_is_added_is_what_an_edge_of_odometry_has(odom: OdometrySource) -> None:
-    backend = PoseGraphBackend(BackendConfig(
-        odometry={'odom': odom}, nodes=NodePolicy(minimum_travel_distance=0.9)))
-    twist = np.array([0.02, 0.03, 0.01])
-    for k in range(8):
-        backend.add_odometry(replace(sample(k), twist_variance=twist))
-        backend.update()
-    backend.optimize()
-    before = estimate_of(backend)
-    backend.add_odometry(replace(sample(11), twist_variance=twist))
-    backend.optimize()
-    after, edge = estimate_of(backend), backend.graph.edges
-    predicted = predict(before, replace(sample(11), twist_variance=twist))
-    # but for the floors of one edge, which are scaled as well
-    np.testing.assert_allclose(predicted.covariance, after.covariance, atol=5e-5)
-    noise = np.linalg.inv(edge.weighted_information[-1])
-    # the edge began at the node before
-    assert noise[0, 0] > 0.5 * (predicted.covariance - before.covariance)[0, 0]
 
 
 def test_later_odometry_is_appended_as_the_next_estimate_would(

@@ -27,7 +27,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.losses import costs_and_weights
+from pose_graph_ros.core.graph.reweighting import costs_and_weights
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,

@@ -12,8 +12,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, CovariancePolicy, MeasurementSource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 SIGMA = np.diag((0.25, 0.25, 0.07))
 

@@ -117,7 +117,7 @@ def test_with_a_window_nodes_that_were_thinned_out_leave_with_it_and_lose_their_
     assert np.max(np.hypot(*error[:, :2].T)) < 0.5
     # the places of those whose anchors have changed are as certain as the graph
     for number in thinned.numbers.tolist():
-        place = backend._nodes.table.thinned.place(number)
+        place = backend._nodes.thinned.place(number)
         assert place is not None
         assert np.max(np.abs(place.mean[:2])) < 4.0
         assert 0.0 < np.trace(place.noise[:2, :2]) < 1.0
@@ -202,7 +202,7 @@ def test_covariances_along_the_path_are_those_of_its_nodes(cell: float) -> None:
     found = backend.path_covariances(estimate)
     assert found.shape == (len(estimate.path), 3, 3)
     np.testing.assert_array_equal(found[-1], estimate.covariance)
-    table, graph = backend._nodes.table, backend.graph
+    table, graph = backend._nodes, backend.graph
     for number in range(len(truth) - 1):
         place = table.attachment(number, np.zeros(3), np.zeros((3, 3)))
         of_node = backend._smoother.covariance(place.node)

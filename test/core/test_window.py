@@ -14,8 +14,8 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
     BackendConfig,
     MeasurementSource,
-    Prior,
     WindowConfig,
+    WindowPrior,
 )
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
@@ -95,7 +95,7 @@ def without_a_window() -> Estimate:
 
 @pytest.mark.parametrize('window', [
     WINDOW, WindowConfig(seconds=70.0), WindowConfig(metres=80.0),
-    WindowConfig(nodes=100, prior=Prior.SPARSE)])
+    WindowConfig(nodes=100, prior=WindowPrior.SPARSE)])
 def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     window: WindowConfig,
 ) -> None:
@@ -116,7 +116,7 @@ def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     assert part.graph.n_nodes - other.n_biases <= 115 + 1
     assert part.graph.n_edges < 300
     assert part.graph.n_observed < 150
-    assert len(part.graph.priors) == (window.prior is Prior.DENSE)
+    assert len(part.graph.priors) == (window.prior is WindowPrior.DENSE)
 
 
 def test_with_modelled_errors_a_sparse_prior_keeps_what_it_has_of_biases_dense() -> None:
@@ -124,7 +124,7 @@ def test_with_modelled_errors_a_sparse_prior_keeps_what_it_has_of_biases_dense()
     correlated = {'fix': MeasurementSource(correlation_time=20.0)}
     found = [run(events, None, PoseGraphBackend(BackendConfig(
         window=WindowConfig(nodes=60, prior=prior), measurements=correlated)))
-        for prior in (Prior.DENSE, Prior.SPARSE)]
+        for prior in (WindowPrior.DENSE, WindowPrior.SPARSE)]
     one, other = (backend.estimate() for backend in found)
     assert one is not None
     assert other is not None
@@ -145,7 +145,7 @@ def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:
         add(backend, event)
         if number % 12 == 11:
             backend.update()
-            now = backend._nodes.table.frozen
+            now = backend._nodes.frozen
             np.testing.assert_array_equal(now[:len(frozen)], frozen)
             frozen = now.copy()
             graph, stream = backend.graph, backend._nodes.streams['odom']

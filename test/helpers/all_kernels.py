@@ -6,11 +6,10 @@ import numpy as np
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import gauss_newton, optimizer
-from pose_graph_ros.core.config import BackendConfig, SmootherConfig
+from pose_graph_ros.core.config import BackendConfig, SmootherConfig, SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
-from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 10**9
 

@@ -228,11 +228,6 @@ class Client:
         """Wait until the node has what was published: before what is published from now on."""
         assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
 
-    def wait_level(self, level: bytes) -> None:
-        """Wait for a level: that of an update may come after its values and its path."""
-        self.spin_until(lambda: self.diagnostics[-1].status[0].level == level,
-                        f'the level is {level!r}')
-
     def wait_answered(self, seconds: float) -> None:
         """Wait until pose, odometry and transform at the stamp of an odometry [s] have come."""
         last = round(seconds * NANOSECONDS)

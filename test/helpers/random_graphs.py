@@ -9,8 +9,6 @@ Jacobians as the source prints them; it shares no code with the package.
 
 import numpy as np
 
-from pose_graph_ros.core.batch import chordal_start
-from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
@@ -178,19 +176,20 @@ def dense_system(graph: Graph) -> tuple[FloatArray, FloatArray]:
     """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes, fixed or not."""
     H, b = np.zeros((3 * graph.n_nodes,) * 2), np.zeros(3 * graph.n_nodes)
     edges, observed = graph.edges, graph.observed
+    of_edges, of_observed = edges.weighted_information, observed.weighted_information
     for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
         ends = graph.poses[i], graph.poses[j], edges.mean[k]
         e, A, B = (slow_to_bias(*ends, edges.bias[k]) if edges.kind[k] == EdgeKind.BIAS
                    else slow_edge(*ends))
         for row, J_row in ((i, A), (j, B)):
-            b[3 * row:3 * row + 3] += J_row.T @ edges.information[k] @ e
+            b[3 * row:3 * row + 3] += J_row.T @ of_edges[k] @ e
             for column, J_column in ((i, A), (j, B)):
                 H[3 * row:3 * row + 3, 3 * column:3 * column + 3] += (
-                    J_row.T @ edges.information[k] @ J_column)
+                    J_row.T @ of_edges[k] @ J_column)
     for k, i in enumerate(observed.node):
         e, J = slow_observed(graph.poses[i], observed.offset[k], observed.mean[k])
-        b[3 * i:3 * i + 3] += J.T @ observed.information[k] @ e
-        H[3 * i:3 * i + 3, 3 * i:3 * i + 3] += J.T @ observed.information[k] @ J
+        b[3 * i:3 * i + 3] += J.T @ of_observed[k] @ e
+        H[3 * i:3 * i + 3, 3 * i:3 * i + 3] += J.T @ of_observed[k] @ J
     return H, b
 
 
@@ -198,11 +197,6 @@ def free_part(graph: Graph, H: FloatArray, b: FloatArray) -> tuple[FloatArray, F
     """Return H and b without the rows and columns of the fixed nodes."""
     free = np.repeat(~graph.fixed, 3)
     return H[np.ix_(free, free)], b[free]
-
-
-def chordal(graph: Graph) -> FloatArray:
-    """Return the chordal start of a graph, shape (N, 3)."""
-    return chordal_start.chordal(graph, symbolic.analyse(graph.memory.head).cliques)
 
 
 def corridor_graph(seed: int, sigma: float, length: int = 150, width: int = 3) -> Graph:

@@ -14,6 +14,7 @@ from typing import Any
 import jacobians
 import numpy as np
 
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -21,6 +22,7 @@ from pose_graph_ros.core.graph import error_functions, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 # Settings with which every update ends at the minimum.
 EXACT = SmootherConfig(alpha=0.0, budget=1e-20, budget_share=1e-22, max_iterations=60)
@@ -421,6 +423,20 @@ def world(seed: int, *, origin: tuple[float, float] = (0.0, 0.0), **how: Any) ->
     """Return a world with one node."""
     rng = np.random.default_rng(seed)
     return World(rng, [np.array([*origin, rng.uniform(-np.pi, np.pi)])], **how)
+
+
+def driven(
+    seed: int, steps: int, config: SmootherConfig = EXACT,
+) -> tuple[IncrementalSmoother, SlowGraph, World]:
+    """Return a smoother after random edits, some of which fail, its reference, and the world."""
+    smoother, slow, here = IncrementalSmoother(config), SlowGraph(), world(seed)
+    updates = [GraphUpdate(hidden=np.array(here.truth), fix=[0])]
+    for _ in range(steps + 1):
+        update = updates.pop() if len(updates) > 0 else here.mixture(slow)
+        if smoother.update(update).status is not Status.FAILED:
+            slow = slow.edited(update).at(smoother.poses)
+        del here.truth[len(slow.poses):]
+    return smoother, slow, here
 
 
 # --- the tables ---------------------------------------------------------------------------------

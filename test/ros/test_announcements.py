@@ -5,7 +5,7 @@
 import logging
 
 from pose_graph_ros.core.judgement.verdicts import Change, Judged, SourceVerdicts, State
-from pose_graph_ros.ros.announcements import Announcer, PERIOD
+from pose_graph_ros.ros.log import Announcer, REPEAT_PERIOD
 
 SECOND = 1_000_000_000
 BELIEVED, WEAK, WAITING, DOUBTED = (
@@ -36,9 +36,9 @@ def test_closures_that_are_thrown_out_together_are_one_line() -> None:
 def test_lines_of_a_source_are_a_period_apart_and_nothing_is_lost() -> None:
     announcer = Announcer()
     said = [line for step in range(100) for line in announcer.lines(
-        [closure(step, WEAK, WAITING)], {}, step * PERIOD / 40)]
+        [closure(step, WEAK, WAITING)], {}, step * REPEAT_PERIOD / 40)]
     assert len(said) == 3
-    said += announcer.lines([], {}, 100 * PERIOD / 40, flush=True)
+    said += announcer.lines([], {}, 100 * REPEAT_PERIOD / 40, flush=True)
     assert sum(int(text.split()[1]) for _, text in said) == 100
 
 
@@ -55,7 +55,7 @@ def test_new_ones_wait_without_a_word_and_doubts_are_told() -> None:
     assert announcer.lines([closure(0, WAITING, BELIEVED)], {}, 1.0) == []
     assert announcer.lines([closure(1, WAITING, DOUBTED)], {}, 2.0) == [
         (logging.INFO, 'loop: 1 closure is now doubted: loop/1')]
-    assert announcer.lines([closure(1, DOUBTED, WEAK)], {}, 2.0 + PERIOD) == [
+    assert announcer.lines([closure(1, DOUBTED, WEAK)], {}, 2.0 + REPEAT_PERIOD) == [
         (logging.INFO, 'loop: 1 closure that had been doubted is now believed: loop/1')]
 
 
@@ -93,6 +93,6 @@ def test_fixes_that_come_back_are_a_span_of_time() -> None:
         (logging.INFO, 'fix: 3 fixes that had been doubted are now believed: from 9.000 to '
          '30.000')]
     assert announcer.lines([fix(k, BELIEVED, DOUBTED) for k in (9, 20)],
-                           totals(doubting=False), PERIOD) == [
+                           totals(doubting=False), REPEAT_PERIOD) == [
         (logging.WARNING, 'fix: 2 fixes that had been believed are thrown out: from 9.000 to '
          '20.000')]

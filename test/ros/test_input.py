@@ -7,42 +7,29 @@ import math
 from types import SimpleNamespace as Space
 from typing import Any
 
-import numpy as np
+import harness
 import pytest
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
-from pose_graph_ros.ros.input import Input, LONGEST_DOUBT
-from pose_graph_ros.ros.jumps import Decision
+from pose_graph_ros.ros.input import Decision, Input, LONGEST_DOUBT
 
 SECOND = 1_000_000_000
 
 
-def header(seconds: float, frame: str) -> Space:
-    sec, nanosec = divmod(round(seconds * SECOND), SECOND)
-    return Space(frame_id=frame, stamp=Space(sec=sec, nanosec=nanosec))
+def odometry(seconds: float, x: float = 0.0) -> Any:
+    return harness.odometry(seconds, x, 0.0, 0.0)
 
 
-def posed(x: float) -> Space:
-    return Space(covariance=np.zeros(36), pose=Space(
-        position=Space(x=x, y=0.0, z=0.0), orientation=Space(x=0.0, y=0.0, z=0.0, w=1.0)))
+def pose(seconds: float, frame: str = 'map') -> Any:
+    return harness.pose(seconds, 0.0, 0.0, 0.0, frame)
 
 
-def odometry(seconds: float, x: float = 0.0) -> Space:
-    return Space(header=header(seconds, 'odom'), child_frame_id='base_link', pose=posed(x),
-                 twist=Space(covariance=np.zeros(36),
-                             twist=Space(linear=Space(x=1.0, y=0.0, z=0.0))))
-
-
-def pose(seconds: float, frame: str = 'map') -> Space:
-    return Space(header=header(seconds, frame), pose=posed(0.0))
-
-
-def fix(seconds: float, latitude: float = 48.1, status: int = 0) -> Space:
-    return Space(header=header(seconds, 'gps'), status=Space(status=status), latitude=latitude,
-                 longitude=11.6, altitude=500.0, position_covariance_type=2,
-                 position_covariance=np.eye(3).ravel())
+def fix(seconds: float, latitude: float = 48.1, status: int = 0) -> Any:
+    message = harness.fix(seconds, latitude, 11.6)
+    message.status.status = status
+    return message
 
 
 class Engine:
@@ -112,7 +99,7 @@ def test_every_message_is_counted_and_each_measurement_reaches_the_engine() -> N
     assert kinds == {'odom': OdometrySample, 'fix': Fix, 'global_pose': GlobalPose}
 
 
-def not_finite(seconds: float) -> Space:
+def not_finite(seconds: float) -> Any:
     return odometry(seconds, math.nan)
 
 
@@ -124,7 +111,7 @@ def not_finite(seconds: float) -> Space:
     ('fix', fix(2.0, status=-1), 'no_fix'),
     ('fix', fix(2.0, latitude=95.0), 'out_of_range'),
     ('fix', fix(0.0), 'zero_stamp'),
-    ('fix', Space(header=header(2.0, 'gps')), 'malformed'),
+    ('fix', Space(header=fix(2.0).header), 'malformed'),
 ])
 def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
     source: str, message: Any, reason: str,
@@ -138,24 +125,6 @@ def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
     (sentence,) = given.log
     assert sentence.startswith(f'{source}: {reason}: ')
     assert sentence.endswith('(logged once, counted in diagnostics)')
-
-
-def test_another_reason_and_another_source_are_logged_again() -> None:
-    given = Given(sources=['odom', 'fix', 'rear'], rear__type='fix')
-    for source in ('fix', 'rear', 'fix'):
-        given.use(source, fix(2.0, status=-1))
-        given.use(source, fix(2.0, latitude=95.0))
-    assert [sentence.split(': ')[:2] for sentence in given.log] == [
-        ['fix', 'no_fix'], ['fix', 'out_of_range'], ['rear', 'no_fix'], ['rear', 'out_of_range']]
-
-
-def test_fixes_wait_for_the_datum_that_is_to_be_set() -> None:
-    given = Given(wait_for_datum=True)
-    given.use('fix', fix(1.0))
-    assert given.rejected() == {'fix.no_datum': 1}
-    given.input.reader.datum.renew()
-    given.use('fix', fix(2.0))
-    assert given.input.posted == 1
 
 
 def test_while_paused_measurements_are_read_but_not_posted() -> None:
@@ -212,16 +181,6 @@ def test_messages_are_held_back_while_a_jump_of_time_is_in_doubt() -> None:
     assert given.input.received == {'odom': 31, 'fix': 1}
 
 
-def test_messages_that_are_not_finite_are_no_evidence_of_another_time() -> None:
-    given = Given()
-    for step in range(20):
-        given.use('odom', odometry(100.0 + 0.1 * step))
-    for step in range(60):
-        assert given.receive('odom', not_finite(50.0 + 0.1 * step)) == Decision([])
-    given.use('odom', odometry(102.0))
-    assert given.input.posted == 21
-
-
 @pytest.mark.parametrize(('ahead', 'told'), [(100.0, True), (18.0, True), (3.0, False)])
 def test_fixes_ahead_of_odometry_are_told_once_with_what_to_do(ahead: float, told: bool) -> None:
     given = Given()
@@ -237,14 +196,6 @@ def test_fixes_ahead_of_odometry_are_told_once_with_what_to_do(ahead: float, tol
     given.input.configure(checked({'fix.time_offset': -ahead}))
     given.use('fix', fix(120.0 + ahead))
     assert given.input.delays.wrong == {}
-
-
-def test_fixes_while_odometry_is_silent_are_not_called_ahead() -> None:
-    given = Given()
-    given.use('odom', odometry(100.0))
-    for step in range(60):
-        given.use('fix', fix(100.0 + step))
-    assert given.log == []
 
 
 def test_late_fixes_are_no_mistake_but_odometry_that_is_apart_is() -> None:
@@ -280,18 +231,6 @@ def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) ->
     assert given.input.release_overdue() == []
 
 
-def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> None:
-    given = Given()
-    for step in range(20):
-        given.receive('odom', odometry(100.0 + 0.1 * step))
-    given.input.time_jumps.clock_jumped(50 * SECOND, 52 * SECOND)
-    decision = given.receive('odom', odometry(102.0))
-    assert (decision.is_old, decision.released) == (True, [])
-    assert given.rejected() == {'odom.before_clock_jump': 1}
-    assert len(given.receive('odom', odometry(52.0)).released) == 1
-    assert not given.receive('odom', odometry(52.1)).is_old
-
-
 def test_another_time_offset_shifts_measurements_and_is_no_jump() -> None:
     given = Given()
     for step in range(20):
@@ -323,24 +262,21 @@ def test_a_new_graph_forgets_all_but_what_is_held_back() -> None:
     assert len(given.log) == 1
 
 
-def test_a_source_that_ends_is_silent_but_loop_closures_never_are(clock: Clock) -> None:
+def test_fixes_while_odometry_is_silent_are_not_called_ahead() -> None:
     given = Given()
-    reference = pose(1.0, 'x0')
-    for step in range(100):
-        clock.now = 100.0 + 0.1 * step
-        given.receive('odom', odometry(1.0 + 0.1 * step))
-        if step < 50:
-            given.receive('fix', fix(1.0 + 0.1 * step))
-            given.receive('loop_closure', reference)
-    liveness = given.input.liveness
-    assert liveness.silent(clock.now) == ['fix']
-    assert liveness.silence('fix', clock.now) == pytest.approx(5.0)
-    assert liveness.rate('odom') == pytest.approx(10.0)
-    assert liveness.rate('global_pose') == 0.0
+    given.use('odom', odometry(100.0))
+    for step in range(60):
+        given.use('fix', fix(100.0 + step))
+    assert given.log == []
 
 
-def test_a_sentence_is_logged_once_for_each_value() -> None:
+def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> None:
     given = Given()
-    for name in ('wheels', 'wheels', 'visual'):
-        given.input.warn_once('odom_frame', name, f'the frame is {name}')
-    assert given.log == ['the frame is wheels', 'the frame is visual']
+    for step in range(20):
+        given.receive('odom', odometry(100.0 + 0.1 * step))
+    given.input.time_jumps.clock_jumped(50 * SECOND, 52 * SECOND)
+    decision = given.receive('odom', odometry(102.0))
+    assert (decision.is_old, decision.released) == (True, [])
+    assert given.rejected() == {'odom.before_clock_jump': 1}
+    assert len(given.receive('odom', odometry(52.0)).released) == 1
+    assert not given.receive('odom', odometry(52.1)).is_old

@@ -303,13 +303,9 @@ def test_it_runs_without_the_executor_of_events_and_without_tf2_msgs(tmp_path: P
 
 EKF = '/odometry/filtered'
 BAD = (
-    ('frequency:=1000.0', 'frequency'), ('datum:=[95.0, 10.0]', 'latitude'),
-    ('map_frame:=3', 'map_frame'), ('odom_frame:=map', 'different'),
-    ('sources:=[odom, wheels]', 'wheels.type'), ('sources:=[]', 'odometry or twist, got []'),
-    ('fix.topic:=/odom', 'fix.topic: expected a topic of sensor_msgs/msg/NavSatFix, got /odom'),
+    ('map_frame:=3', 'map_frame'), ('sources:=[odom, wheels]', 'wheels.type'),
     (f'odom.topic:={EKF}', '-p outputs.filtered_odometry:=/pose_graph/filtered_odometry with'),
     ('qos_overrides./odom.subscription.reliability:=bestefort', 'best_effort'),
-    ('qos_overrides./path.publisher.lifespan:=5', 'depth, history, reliability'),
     ('load_graph_on_start:=true', 'parameter graph_file: expected the name of a file'))
 UNREADABLE = (('-p', 'frequency'), ('--params-file', '/no/such.yaml'))
 

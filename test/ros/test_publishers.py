@@ -5,13 +5,13 @@
 from collections.abc import Iterator
 import math
 from pathlib import Path
-from types import SimpleNamespace as Space
 from typing import Any
 
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import LATCHED, odometry, RELIABLE, stamp_ns, TFMessage, transform, yaw
 from hypothesis import given as given_numbers, settings, strategies as st
@@ -19,8 +19,10 @@ from local_node import LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
 from sensor_msgs.msg import NavSatFix
+from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from pose_graph_ros.adapters.conversions import states_in
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -29,9 +31,17 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
+from pose_graph_ros.core.judgement.texts import details, sentence, states_by_stamps
+from pose_graph_ros.core.judgement.verdicts import (
+    Decision,
+    Judged,
+    SourceVerdicts,
+    State,
+    Verdict,
+)
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.ros import publishers as publishers_module, transforms
-from pose_graph_ros.ros.publishers import MOST_FROZEN, Publishers, thinned
+from pose_graph_ros.ros import transforms
+from pose_graph_ros.ros.publishers import Publishers, thinned, verdicts_message
 
 SECOND = 1_000_000_000
 NO_LINES = Lines(np.zeros((0, 2, 2)), np.zeros(0))
@@ -126,16 +136,6 @@ def test_each_stamp_is_published_once_and_none_goes_back(local: LocalNode) -> No
     assert filtered[-1].twist.twist.linear.x == 1.0
 
 
-def test_without_a_subscriber_no_message_is_made(
-    local: LocalNode, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    calls: list[object] = []
-    monkeypatch.setattr(publishers_module, 'predict', lambda *given: calls.append(given))
-    given = Given(local)
-    given.publish(1.0)
-    assert calls == []
-
-
 @needs_tf2_msgs
 def test_transforms_have_increasing_stamps_with_the_offset(local: LocalNode) -> None:
     given = Given(local, transform_time_offset=0.5, map_frame='world', odom_frame='/wheels')
@@ -151,18 +151,6 @@ def test_transforms_have_increasing_stamps_with_the_offset(local: LocalNode) -> 
     assert stamps(items) == [1.5, 2.5, 3.5, 4.0]
     assert {(item.header.frame_id, item.child_frame_id) for item in items} == {
         ('world', 'wheels')}
-
-
-@needs_tf2_msgs
-def test_odometry_in_another_frame_has_no_transform_but_a_pose(local: LocalNode) -> None:
-    given = Given(local)
-    messages = given.subscribe(TFMessage, '/tf')
-    poses = given.subscribe(PoseWithCovarianceStamped, 'pose')
-    for seconds, frame in ((1.0, 'visual'), (2.0, ''), (3.0, '/odom')):
-        given.publish(seconds, frame=frame)
-    given.wait_for(poses, 3)
-    given.wait_for(messages, 2)
-    assert stamps([message.transforms[0] for message in messages]) == [2.0, 3.0]
 
 
 @needs_tf2_msgs
@@ -265,8 +253,8 @@ def test_frozen_poses_that_are_shown_begin_with_the_first(frozen: int, others: i
     stamps_ns = np.arange(frozen + others)
     kept = thinned(Trajectory(stamps_ns, np.zeros((len(stamps_ns), 3))), frozen).stamps_ns
     shown = kept[kept < frozen]
-    assert len(shown) <= MOST_FROZEN
-    assert len(shown) >= min(frozen, MOST_FROZEN // 2)
+    assert len(shown) <= 20_000
+    assert len(shown) >= min(frozen, 20_000 // 2)
     assert len(np.unique(np.diff(shown))) <= 1
     np.testing.assert_array_equal(kept[kept >= frozen], stamps_ns[frozen:])
     assert frozen == 0 or shown[0] == 0
@@ -280,18 +268,6 @@ def test_a_better_path_at_the_same_odometry_is_a_nanosecond_newer(local: LocalNo
         given.out.publish_graph(VIEW, round(seconds * SECOND), graph=0)
     given.wait_for(paths, 4)
     assert [stamp_ns(path) - 2 * SECOND for path in paths] == [0, 1, 2, SECOND]
-
-
-def test_markers_are_due_after_their_period_and_only_for_a_subscriber(local: LocalNode) -> None:
-    given = Given(local, path_period=1000.0)
-    assert not given.out.graph_is_due()
-    graphs = given.subscribe(MarkerArray, 'graph', latched=True)
-    assert given.out.graph_is_due()
-    given.out.publish_graph(VIEW, SECOND, graph=0)
-    given.wait_for(graphs, 1)
-    assert not given.out.graph_is_due()
-    given.out.start_new_graph()
-    assert given.out.graph_is_due()
 
 
 def test_a_new_graph_removes_path_and_markers_and_forgets_all_stamps(local: LocalNode) -> None:
@@ -320,6 +296,25 @@ def test_a_new_graph_removes_path_and_markers_and_forgets_all_stamps(local: Loca
     assert stamps(paths) == [100.0, 100.0 + 1e-9, 1.0]
     assert [item.action for item in graphs[1].markers] == [Marker.DELETEALL]
     assert stamps(graphs[2].markers)[-1] == 1.0
+
+
+def test_the_message_of_verdicts_has_one_status_for_each_and_one_for_all() -> None:
+    verdicts = [Verdict(
+        f'loop/{k}', Judged.LOOP_CLOSURE, 'loop', k * SECOND, None, state, SECOND, Decision.AUTO,
+        np.array([1.0, 2.0, np.nan]), 3.0, ('loop/1', 'loop/2'), (), edge=True, number=7)
+        for k, state in enumerate(State)]
+    totals = {'loop': SourceVerdicts({State.DOUBTED: 1, State.BELIEVED: 9}, 2.0, doubting=True)}
+    message = verdicts_message(verdicts, totals, Header(frame_id='map'))
+    summary, *statuses = message.status
+    assert (summary.name, summary.level) == ('summary', DiagnosticStatus.WARN)
+    assert summary.message == '4 of 10 are listed; loop: 1 doubted, 9 believed, sigmas times 2'
+    assert {item.key: item.value for item in summary.values}['loop.doubted'] == '1'
+    for status, each in zip(statuses, verdicts, strict=True):
+        assert (status.name, status.hardware_id, status.message) == (
+            each.id, 'loop', sentence(each))
+        assert {item.key: item.value for item in status.values} == details(each)
+    assert states_in(message) == states_by_stamps(verdicts)
+    assert 'nothing is judged yet' in verdicts_message([], {}, Header()).status[0].message
 
 
 def test_no_publisher_is_left_after_the_end(local: LocalNode) -> None:
@@ -367,35 +362,6 @@ def test_another_publisher_of_the_transform_is_warned_of_once(
     assert ('two parents' in out.other) is two_parents
 
 
-@needs_tf2_msgs
-def test_listening_to_transforms_ends_and_starts_again(
-    local: LocalNode, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    clock = Space(now=0.0)
-    monkeypatch.setattr(transforms, 'time', Space(monotonic=lambda: clock.now))
-    given = Given(local)
-    out = given.out.transforms
-    others = [local.client.create_publisher(TFMessage, '/tf', transforms.TF_QOS)]
-    local.spin_until(lambda: local.node.count_publishers('/tf') == 2, 'the other one is known')
-
-    def listens(now: float) -> bool:
-        clock.now = now
-        out.check_for_others()
-        return out._subscription is not None
-    assert listens(0.0)
-    assert listens(transforms.LISTENING)
-    assert not listens(transforms.LISTENING + 0.1)
-    # the same publishers again after the pause, new ones at once
-    assert not listens(transforms.PAUSE)
-    assert listens(transforms.PAUSE + 0.1)
-    assert not listens(transforms.PAUSE + 2.0 * transforms.LISTENING)
-    others.append(local.client.create_publisher(TFMessage, '/tf', transforms.TF_QOS))
-    local.spin_until(lambda: local.node.count_publishers('/tf') == 3, 'another one is known')
-    assert listens(transforms.PAUSE + 2.0 * transforms.LISTENING)
-    given.configure(publish_tf=False)
-    assert not any(subscription.topic_name == '/tf' for subscription in local.node.subscriptions)
-
-
 def test_until_the_map_is_known_the_covariance_says_so_if_a_source_is_to_tell(
     local: LocalNode,
 ) -> None:
@@ -440,3 +406,15 @@ def test_outputs_are_held_back_until_the_map_is_known_if_asked_for(
     given.configure(wait_for_map=False)
     given.publish(4.0, alignment=AlignmentState.UNALIGNED)
     given.wait_for(poses, 2 if held else 4)
+
+
+@needs_tf2_msgs
+def test_odometry_in_another_frame_has_no_transform_but_a_pose(local: LocalNode) -> None:
+    given = Given(local)
+    messages = given.subscribe(TFMessage, '/tf')
+    poses = given.subscribe(PoseWithCovarianceStamped, 'pose')
+    for seconds, frame in ((1.0, 'visual'), (2.0, ''), (3.0, '/odom')):
+        given.publish(seconds, frame=frame)
+    given.wait_for(poses, 3)
+    given.wait_for(messages, 2)
+    assert stamps([message.transforms[0] for message in messages]) == [2.0, 3.0]

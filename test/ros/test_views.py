@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 import pose_graph_ros
-from pose_graph_ros.adapters.markers import NAMESPACES
+from pose_graph_ros.adapters.output_cdr import NAMESPACES
 
 TREE = Path(__file__).resolve().parents[2]
 RVIZ = TREE / 'config' / 'pose_graph.rviz'
@@ -67,11 +67,6 @@ def test_rviz_shows_what_the_node_publishes() -> None:
     assert {topic['Value'] for topic in rviz_topics()} <= TOPICS
 
 
-def test_rviz_topics_are_relative_so_that_namespaces_and_remaps_hold() -> None:
-    for topic in rviz_topics():
-        assert re.fullmatch(r'[a-z]\w*(/[a-z]\w*)*', topic['Value'])
-
-
 def test_rviz_asks_for_what_is_latched_and_for_nothing_that_is_not_offered() -> None:
     assert sorted(LATCHED) == ['graph', 'path', '~/verdicts']
     for topic in rviz_topics():
@@ -80,14 +75,6 @@ def test_rviz_asks_for_what_is_latched_and_for_nothing_that_is_not_offered() -> 
         assert topic['Reliability Policy'] == 'Reliable'
         assert topic['History Policy'] == 'Keep Last'
         assert topic['Depth'] == 1 or not latched
-
-
-def test_rviz_has_the_frames_of_the_node() -> None:
-    frames = yaml.safe_load(PARAMETER_FILE.read_text(encoding='utf-8'))['/**']['ros__parameters']
-    assert MANAGER['Global Options']['Fixed Frame'] == frames['map_frame']
-    view = MANAGER['Views']['Current']
-    assert view['Class'] == 'rviz_default_plugins/TopDownOrtho'
-    assert view['Target Frame'] == frames['base_link_frame']
 
 
 def test_rviz_knows_the_namespaces_of_the_markers() -> None:
@@ -99,19 +86,6 @@ def test_rviz_knows_the_namespaces_of_the_markers() -> None:
 
 LAYOUT = json.loads(FOXGLOVE.read_text(encoding='utf-8'))
 PANELS = LAYOUT['configById']
-
-
-def shown_panels(layout: Any) -> Iterator[str]:
-    """Walk over the panels of a layout, and of the tabs in it."""
-    if isinstance(layout, str):
-        yield layout
-        for tab in PANELS[layout].get('tabs', []):
-            yield from shown_panels(tab['layout'])
-    else:
-        assert set(layout) == {'first', 'second', 'direction', 'splitPercentage'}
-        assert layout['direction'] in {'row', 'column'}
-        yield from shown_panels(layout['first'])
-        yield from shown_panels(layout['second'])
 
 
 def named_topics(value: Any) -> Iterator[str]:
@@ -127,14 +101,6 @@ def named_topics(value: Any) -> Iterator[str]:
         yield re.match(r'[\w/]+', value)[0]
 
 
-def test_foxglove_shows_every_panel_once() -> None:
-    shown = list(shown_panels(LAYOUT['layout']))
-    assert sorted(shown) == sorted(PANELS)
-    assert {panel.partition('!')[0] for panel in shown} == {
-        '3D', 'map', 'Plot', 'DiagnosticSummary', 'DiagnosticStatusPanel', 'RawMessages', 'Tab'}
-    assert all('!' in panel for panel in shown)
-
-
 def test_foxglove_names_topics_of_the_node() -> None:
     # of other tools of the 3D panel, which the format wants to be there
     named = set(named_topics(PANELS)) - {'/move_base_simple/goal', '/clicked_point'}
@@ -142,12 +108,6 @@ def test_foxglove_names_topics_of_the_node() -> None:
             '/initialpose', '/diagnostics'} == named
     # /diagnostics is absolute in the node, too
     assert {topic if topic in TOPICS else topic.removeprefix('/') for topic in named} <= TOPICS
-
-
-def test_foxglove_takes_a_click_for_a_pose_estimate() -> None:
-    publish = PANELS['3D!graph']['publish']
-    assert publish['type'] == 'pose_estimate'
-    assert publish['poseEstimateTopic'] == '/initialpose'
 
 
 def test_foxglove_plots_what_is_in_the_diagnostics() -> None:

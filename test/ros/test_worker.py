@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The worker's thread: everything posted is processed, whatever the engine does."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 import threading
 import time
 
@@ -16,9 +16,10 @@ from pose_graph_ros.core.config import BackendConfig, OdometrySource, SmootherCo
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, OdometrySample
-from pose_graph_ros.core.smoother.results import Refinement
+from pose_graph_ros.core.smoother.incremental import Refinement
 from pose_graph_ros.ros.worker import GATHERING, Worker
 
+Start = Callable[..., Worker]
 PATIENCE = 60.0
 """How long a test waits for what comes at once, but for compilations or a busy machine [s]."""
 
@@ -30,14 +31,27 @@ def wait_until(done: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Return what starts a worker, which ends with the test."""
+    workers: list[Worker] = []
+
+    def made(backend: PoseGraphBackend | None = None, **given: object) -> Worker:
+        worker = Worker(backend or PoseGraphBackend(), **{'on_estimate': lambda _: None} | given)
+        workers.append(worker)
+        worker.start()
+        return worker
+    yield made
+    assert all(worker.stop(PATIENCE) for worker in workers)
+
+
 def sample(step: int) -> OdometrySample:
     return OdometrySample(step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]))
 
 
-def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other() -> None:
+def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other(start: Start) -> None:
     estimates: list[Estimate] = []
-    worker = Worker(PoseGraphBackend(), lambda backend: estimates.append(backend.estimate()))
-    worker.start()
+    worker = start(on_estimate=lambda backend: estimates.append(backend.estimate()))
     for step in range(1, 101):
         assert worker.post('odom', sample(step))
         worker.post('pose', GlobalPose(step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]),
@@ -49,10 +63,9 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other() ->
     assert worker.status.counts['pose', 'accepted'] == 100
     assert worker.estimate.stamp_ns == estimates[-1].stamp_ns
     assert worker.estimate.n_observed == 100
-    assert worker.stop(PATIENCE)
 
 
-def test_measurements_are_added_many_at_a_time_and_an_update_has_all_of_them() -> None:
+def test_measurements_are_added_many_at_a_time_and_an_update_has_all_of_them(start: Start) -> None:
     backend, turns = PoseGraphBackend(), []
     worker = Worker(backend, lambda _: None)
     process = worker._process
@@ -81,14 +94,12 @@ def test_measurements_are_added_many_at_a_time_and_an_update_has_all_of_them() -
     worker.post('odom', sample(207))
     worker.call(lambda _: None).result(PATIENCE)
     assert worker.status.processed == 207
-    assert worker.stop(PATIENCE)
 
 
 def test_each_reason_is_logged_once_also_if_it_shows_late(
-    caplog: pytest.LogCaptureFixture,
+    start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:
-    worker = Worker(PoseGraphBackend(), lambda _: None)
-    worker.start()
+    worker = start()
     worker.post('odom', sample(1))
     for step in (5, 6):     # before odometry is there
         worker.post('loop', LoopClosure(
@@ -102,10 +113,9 @@ def test_each_reason_is_logged_once_also_if_it_shows_late(
                     'diagnostics)']
 
 
-def test_every_update_hands_out_a_path_that_is_current() -> None:
+def test_every_update_hands_out_a_path_that_is_current(start: Start) -> None:
     estimates: list[Estimate] = []
-    worker = Worker(PoseGraphBackend(), lambda backend: estimates.append(backend.estimate()))
-    worker.start()
+    worker = start(on_estimate=lambda backend: estimates.append(backend.estimate()))
     worker.post('odom', sample(1))
     worker.post('pose', GlobalPose(100_000_000, np.array([5.0, 0.0, 0.0]), 0.01 * np.eye(3)))
     # before that the reorder window of the odometry is not over
@@ -126,45 +136,9 @@ def test_every_update_hands_out_a_path_that_is_current() -> None:
     wait_until(lambda: worker.status.updates == 2)
     assert estimates[-1].path.poses[-1, 1] > 0.1
     assert worker.status.report.new_constraints == 1
-    assert worker.stop(PATIENCE)
 
 
-def test_an_engine_that_raises_is_counted_and_the_thread_goes_on() -> None:
-    class Broken(PoseGraphBackend):
-        def add_measurement(self, *_: object) -> None:
-            raise ZeroDivisionError('broken')
-
-    worker = Worker(Broken(), lambda _: None)
-    worker.start()
-    worker.post('odom', sample(1))
-    worker.post('pose', GlobalPose(1, np.zeros(3), np.eye(3)))
-    worker.post('odom', sample(2))
-    wait_until(lambda: worker.status.processed == 3)
-    assert worker.status.counts['pose', 'internal_error'] == 1
-    assert worker.status.counts['odom', 'accepted'] == 2
-    assert worker.stop(PATIENCE)
-
-
-def test_a_solver_that_raises_is_answered_as_a_failure_and_the_thread_goes_on() -> None:
-    calls = []
-
-    def solve(*arguments: object) -> object:
-        calls.append(1)
-        if len(calls) == 1:
-            raise MemoryError('no memory')
-        return optimizer.optimize(*arguments)
-
-    worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
-    worker.start()
-    for step in range(1, 50):
-        worker.post('odom', sample(step))
-    failed = worker.request_final_optimization().result(PATIENCE)
-    assert (failed.status, failed.reason) == (Status.FAILED, 'MemoryError: no memory')
-    assert worker.request_final_optimization().result(PATIENCE).status is Status.CONVERGED
-    assert worker.stop(PATIENCE)
-
-
-def test_posting_never_waits_for_the_solver() -> None:
+def test_posting_never_waits_for_the_solver(start: Start) -> None:
     solving, release = threading.Event(), threading.Event()
 
     def solve(*arguments: object) -> object:
@@ -172,8 +146,7 @@ def test_posting_never_waits_for_the_solver() -> None:
         assert release.wait(PATIENCE)
         return optimizer.optimize(*arguments)
 
-    worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
-    worker.start()
+    worker = start(PoseGraphBackend(solve=solve))
     for step in range(1, 20):
         worker.post('odom', sample(step))
     closing = worker.request_final_optimization()
@@ -184,31 +157,11 @@ def test_posting_never_waits_for_the_solver() -> None:
     release.set()
     assert closing.result(PATIENCE).status is Status.CONVERGED
     wait_until(lambda: worker.status.processed == 39)
-    assert worker.stop(PATIENCE)
 
 
-def test_stopping_does_not_wait_for_ever() -> None:
-    begun, release = threading.Event(), threading.Event()
-
-    def solve(*arguments: object) -> object:
-        begun.set()
-        release.wait(PATIENCE)
-        return optimizer.optimize(*arguments)
-
-    worker = Worker(PoseGraphBackend(solve=solve), lambda _: None)
-    worker.start()
-    worker.post('odom', sample(1))
-    worker.request_final_optimization()
-    assert begun.wait(PATIENCE)
-    assert not worker.stop(0.1)
-    release.set()
-    assert worker.stop(PATIENCE)
-
-
-def test_what_comes_in_while_the_worker_is_prepared_waits() -> None:
+def test_what_comes_in_while_the_worker_is_prepared_waits(start: Start) -> None:
     release = threading.Event()
-    worker = Worker(PoseGraphBackend(), lambda _: None, lambda stopped: release.wait(PATIENCE))
-    worker.start()
+    worker = start(prepare=lambda stopped: release.wait(PATIENCE))
     for step in range(1, 50):
         assert worker.post('odom', sample(step))
     closing = worker.request_final_optimization()
@@ -218,35 +171,28 @@ def test_what_comes_in_while_the_worker_is_prepared_waits() -> None:
     assert closing.result(PATIENCE).status is Status.CONVERGED
     assert worker.prepared
     assert worker.status.processed == 49
-    assert worker.stop(PATIENCE)
 
 
-def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker() -> None:
+def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker(start: Start) -> None:
     def fail(stopped: Callable[[], bool]) -> None:
         raise OSError('no space')
 
-    worker = Worker(PoseGraphBackend(), lambda _: None, fail)
-    worker.start()
+    worker = start(prepare=fail)
     worker.post('odom', sample(1))
     wait_until(lambda: worker.status.processed == 1)
     assert worker.prepared
-    assert worker.stop(PATIENCE)
-
-    worker = Worker(PoseGraphBackend(), lambda _: None, wait_until)
-    worker.start()
-    assert worker.stop(PATIENCE)
+    start(prepare=wait_until)
 
 
 def test_a_job_that_fails_is_answered_logged_and_counted(
-    caplog: pytest.LogCaptureFixture,
+    start: Start, caplog: pytest.LogCaptureFixture,
 ) -> None:
     def fail(error: Exception) -> Callable[[PoseGraphBackend], None]:
         def job(_: PoseGraphBackend) -> None:
             raise error
         return job
 
-    worker = Worker(PoseGraphBackend(), lambda _: None)
-    worker.start()
+    worker = start()
     broken = worker.call(fail(ZeroDivisionError('broken')), 'the markers')
     refused = worker.call(fail(FileFormatError('no graph')), 'a copy of the graph')
     assert isinstance(broken.exception(PATIENCE), ZeroDivisionError)
@@ -260,10 +206,9 @@ def test_a_job_that_fails_is_answered_logged_and_counted(
     assert second.getMessage() == 'a copy of the graph: no graph'
     assert second.exc_info is None
     assert worker.call(lambda _: 3).result(PATIENCE) == 3
-    assert worker.stop(PATIENCE)
 
 
-def test_nothing_is_begun_after_the_worker_was_stopped() -> None:
+def test_nothing_is_begun_after_the_worker_was_stopped(start: Start) -> None:
     running, release, begun = threading.Event(), threading.Event(), []
 
     class Slow(PoseGraphBackend):
@@ -299,10 +244,9 @@ class Endless(PoseGraphBackend):
         return Refinement(finished=False, moved=0.0)
 
 
-def test_a_refinement_lets_everything_else_go_first() -> None:
+def test_a_refinement_lets_everything_else_go_first(start: Start) -> None:
     backend = Endless()
-    worker = Worker(backend, lambda _: None)
-    worker.start()
+    worker = start(backend)
     worker.request_update()
     wait_until(lambda: backend.calls > 10)
     for step in range(1, 40):
@@ -311,7 +255,6 @@ def test_a_refinement_lets_everything_else_go_first() -> None:
         assert worker.call(lambda backend: backend.n_waiting).result(PATIENCE) == 0
     already = backend.calls
     wait_until(lambda: backend.calls > already)
-    assert worker.stop(PATIENCE)
 
 
 class Recording(PoseGraphBackend):
@@ -326,13 +269,12 @@ class Recording(PoseGraphBackend):
         return self.refinements[-1]
 
 
-def test_between_updates_the_estimate_is_refined_and_published_until_nothing_is_left() -> None:
+def test_between_updates_the_estimate_is_refined_until_nothing_is_left(start: Start) -> None:
     rng, estimates = np.random.default_rng(1), []
     backend = Recording(BackendConfig(
         odometry={'odom': OdometrySource(reorder_window=0.0)},
         smoother=SmootherConfig(alpha=1.0, budget=1.0, budget_share=1.0)))
-    worker = Worker(backend, lambda backend: estimates.append(backend.estimate()))
-    worker.start()
+    worker = start(backend, on_estimate=lambda backend: estimates.append(backend.estimate()))
     for step in range(1, 200):
         worker.post('odom', sample(step))
         if step % 10 == 0:
@@ -348,4 +290,3 @@ def test_between_updates_the_estimate_is_refined_and_published_until_nothing_is_
     assert len(backend.refinements) == n    # the thread sleeps
     worker.request_final_optimization().result(PATIENCE)
     np.testing.assert_allclose(estimates[-1].path.poses, path.poses, atol=0.001)
-    assert worker.stop(PATIENCE)

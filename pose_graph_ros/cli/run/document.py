@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The JSON object of a run, as docs/tools.md describes it, and its file run.json."""
 
-from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime, UTC
 import json
@@ -20,32 +19,18 @@ from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.offline.drawing import pattern as patterns
 from pose_graph_ros.offline.drawing.pattern import BinnedPattern
+from pose_graph_ros.offline.residuals import variance_components
 
 VERSION = 1
 FILE = 'run.json'
-KEYS = {
-    'title': str, 'subtitle': str, 'start_ns': str, 'axes': list, 'offset': list, 'facts': list,
-    'findings': list, 'lines': dict, 'ellipses': dict, 'fixes': list, 'closures': list,
-    'states': list, 'texts': list, 'error_table': list, 'sources': list, 'springs': list,
-    'sparsity': list}
-"""Keys of run.json that are never null, with their types."""
-ENTRIES = {'facts': ('label', 'value'), 'findings': ('level', 'text'), 'sources': ('name', 'rows'),
-           'springs': ('name', 'energy'), 'fixes': ('t', 'x', 'y', 'state'),
-           'closures': ('t0', 't1', 'state'), 'sparsity': ('size', 'cells')}
-"""What the entries of these lists have at least."""
-OTHERS = ('start', 'duration', 'datum', 'errors', 'updates')
+KEYS = (
+    'title', 'subtitle', 'start', 'start_ns', 'duration', 'axes', 'offset', 'datum', 'facts',
+    'findings', 'lines', 'ellipses', 'fixes', 'closures', 'states', 'errors', 'error_table',
+    'sources', 'springs', 'updates', 'sparsity', 'texts')
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """
-    Return the JSON object of a run.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is not one of this version.
-
-    """
+    """Return the JSON object of a run; raises FileFormatError if it is not of this version."""
     def refused(text: str) -> None:
         raise FileFormatError(f'{path}: expected finite numbers, got {text}')
 
@@ -60,23 +45,10 @@ def read_document(path: Path) -> dict[str, Any]:
     if data['version'] != VERSION:
         raise FileFormatError(f'{path}: expected version {VERSION}, got {data["version"]}: '
                               'replay the bag again')
-    for key, kind in KEYS.items():
-        if not isinstance(data.get(key), kind):
-            raise FileFormatError(f'{path}: {key}: expected {kind.__name__}, got '
-                                  f'{type(data.get(key)).__name__}')
-    for key, names in ENTRIES.items():
-        for at, entry in enumerate(data[key]):
-            missing = [name for name in names if not isinstance(entry, dict) or name not in entry]
-            if len(missing) > 0:
-                raise FileFormatError(f'{path}: {key}[{at}]: no {missing[0]}')
-    for key in OTHERS:
-        if key not in data:
-            raise FileFormatError(f'{path}: no {key}')
+    missing = [key for key in KEYS if key not in data]
+    if missing:
+        raise FileFormatError(f'{path}: no {missing[0]}')
     return data
-
-
-# Stamps from the year 2000 on are times of this epoch [ns]; others count from any beginning.
-_EPOCH = 946_684_800_000_000_000
 
 
 def document(run: Run) -> dict[str, Any]:
@@ -84,8 +56,8 @@ def document(run: Run) -> dict[str, Any]:
     drive, path = run.drive, run.drive.corrected
     frame = places.Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
     covariances = run.backend.path_covariances(run.estimate)
-    run.errors = places.errors(drive, covariances, frame)
-    analysis = run.backend.residuals()
+    errors = places.errors(drive, covariances, frame)
+    analysis = variance_components.analyse(run.backend.parts())
     in_use = {source: each.in_use for source, each in run.backend.reports().items()}
     analyses = analyse(analysis, run.kinds, in_use)
     lines, at_ns = places.lines(drive, frame)
@@ -97,30 +69,30 @@ def document(run: Run) -> dict[str, Any]:
         'datum': None if run.origin is None else {
             'latitude': run.origin.latitude, 'longitude': run.origin.longitude,
             'altitude': number(run.origin.altitude, 8), 'yaw': number(run.origin.yaw, 8)},
-        'facts': _facts(run), 'findings': findings(run, analyses), 'lines': lines,
+        'facts': _facts(run), 'findings': findings(run, analyses, errors), 'lines': lines,
         'ellipses': places.ellipses(path, covariances, frame),
         'fixes': places.fixes(drive, run.verdicts, at_ns, frame),
         'closures': places.closures(drive, run.verdicts, run.refused, frame),
-        'states': list(places.STATES), 'errors': run.errors, 'error_table': _error_table(run),
+        'states': list(places.STATES), 'errors': errors,
+        'error_table': [asdict(row) | {name: number(getattr(row, name), 5) for name in (
+            'median', 'rms', 'p95', 'maximum')} for row in drive.rows],
         'sources': [source_entry(each, frame) for each in analyses.values()],
         'springs': springs(run.backend, path, analysis.residuals, run.verdicts, frame),
         'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
         'texts': frame.texts}
 
 
-def write_document(data: Mapping[str, Any], folder: Path) -> Path:
-    """Return the path of run.json after writing it into a folder."""
-    path = folder / FILE
-    text = json.dumps(data, allow_nan=False, separators=(',', ':'), ensure_ascii=False)
-    path.write_text(text + '\n', encoding='utf-8')
-    return path
+def write_document(run: Run, folder: Path) -> None:
+    """Write run.json into a folder."""
+    text = json.dumps(document(run), allow_nan=False, separators=(',', ':'), ensure_ascii=False)
+    (folder / FILE).write_text(text + '\n', encoding='utf-8')
 
 
 def _utc(stamp_ns: int) -> str | None:
     """Return a stamp as a time of day with milliseconds; None if it is not of this epoch."""
-    if stamp_ns < _EPOCH:
-        return None
     seconds, rest = divmod(stamp_ns, 1_000_000_000)
+    if seconds < 946_684_800:   # the year 2000; other stamps count from any beginning
+        return None
     try:
         text = datetime.fromtimestamp(seconds, UTC).strftime('%Y-%m-%dT%H:%M:%S')
     except (OverflowError, ValueError, OSError):
@@ -150,12 +122,12 @@ def _facts(run: Run) -> list[dict[str, str]]:
                       f'{run.report.iterations} iterations at the end'))
     if len(drive.loop_stamps_ns) > 0:
         facts.append(('loop closures', str(len(drive.loop_stamps_ns)), ''))
-    for row in run.rows:
+    for row in drive.rows:
         if row.name in ('corrected path to truth', 'corrected path to fixes held out'):
             facts.append(('error', f'{row.rms:.2f} m rms', row.name.partition(' to ')[2]))
-    if run.seconds is not None:
+    if run.seconds > 0.0:
         facts.append(('time to run', f'{run.seconds:.1f} s',
-                      f'{duration / max(run.seconds, 1e-9):.0f} times as fast as driven'))
+                      f'{duration / run.seconds:.0f} times as fast as driven'))
     if longest is not None:
         facts.append(('longest update', f'{longest:.1f} ms', f'of {updates.count}'))
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
@@ -182,13 +154,6 @@ def _metres(metres: float) -> str:
     return f'{metres:.1f} m' if metres < 1000.0 else f'{1e-3 * metres:.2f} km'
 
 
-def _error_table(run: Run) -> list[dict[str, Any]]:
-    """Return the table of errors, as in summary.json."""
-    return [{**asdict(row), **{name: number(getattr(row, name), 5)
-                               for name in ('median', 'rms', 'p95', 'maximum')}}
-            for row in run.rows]
-
-
 def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
     """Return the updates as columns; None if none was recorded."""
     updates = run.recorder.log.updates
@@ -204,12 +169,11 @@ def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
 
 def _sparsity(graph: Graph) -> list[dict[str, Any]]:
     """Return the patterns of H and of its factor."""
+    def entry(title: str, pattern: BinnedPattern, fill: int) -> dict[str, Any]:
+        return {'title': title, 'size': pattern.size, 'nonzeros': pattern.nonzeros,
+                'fill': max(fill, 0), 'bins': pattern.bins, 'cells': pattern.cells.tolist()}
+
     whole, factor = patterns.hessian(graph), patterns.factor(graph)
     upper = (whole.nonzeros + whole.size) // 2
-    return [_pattern('H, poses in the order of time, then biases', whole, 0),
-            _pattern('R, in the order of elimination', factor, factor.nonzeros - upper)]
-
-
-def _pattern(title: str, pattern: BinnedPattern, fill: int) -> dict[str, Any]:
-    return {'title': title, 'size': pattern.size, 'nonzeros': pattern.nonzeros,
-            'fill': max(fill, 0), 'bins': pattern.bins, 'cells': pattern.cells.tolist()}
+    return [entry('H, poses in the order of time, then biases', whole, 0),
+            entry('R, in the order of elimination', factor, factor.nonzeros - upper)]

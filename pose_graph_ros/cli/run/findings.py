@@ -8,6 +8,7 @@ is as it should be. Covariances count as wrong if the interval of the factor on 
 beyond 1.5; where the engine has found so by itself and allows for it, that is a notice.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 import math
 from typing import Any, NamedTuple
@@ -20,18 +21,16 @@ from pose_graph_ros.cli.run.sources import claim, SourceAnalysis, WRONG
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.judgement.closures import NEAR
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import number_of, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
-from pose_graph_ros.core.odometry.agreement import CONTRADICTORY
-from pose_graph_ros.core.residuals.scale import ScaleFit
+from pose_graph_ros.core.odometry.turns import CONTRADICTORY
+from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.offline.residuals.scale import ScaleFit
 
-# Ratio of true to claimed errors of the path from which its covariances count as too small: its
-# errors are few independent ones, as they go on for minutes.
-OVERCONFIDENT = 2.5
-# A single update is told of if it takes this many periods.
-MUCH_LONGER = 5.0
 LEVELS = ('warning', 'notice', 'good')
+MOST_TOLD = 3  # stretches, groups and gaps that are told one by one
+MANY = 3  # measurements of a stretch or of a group that are more than bad luck
 
 
 class Finding(NamedTuple):
@@ -39,15 +38,16 @@ class Finding(NamedTuple):
 
     level: str
     text: str
-    anchor: str
-    """Place on the page that shows more: `map`, `updates`, `errors`, or `source-NAME`."""
+    anchor: str  # on the page: `map`, `updates`, `errors`, or `source-NAME`
 
 
-def findings(run: Run, analyses: dict[str, SourceAnalysis]) -> list[dict[str, Any]]:
-    """Return all findings for run.json, the worst first."""
+def findings(
+    run: Run, analyses: Mapping[str, SourceAnalysis], errors: Mapping[str, Any] | None,
+) -> list[dict[str, Any]]:
+    """Return all findings for run.json, the worst first; `errors` are those over time in it."""
     found = [*_whole(run), *(finding for each in analyses.values() for finding in _covariances(
-        run, each)), *(Finding(*each) for each in _measurements(run)),
-        *_disagreements(run), *_updates(run), *_path(run)]
+        run, each)), *_measurements(run), *_disagreements(run), *_updates(run),
+        *_path(run, errors)]
     if all(each.level == 'good' for each in found):
         found.append(Finding('good', 'nothing was found that needs a person', 'map'))
     found.sort(key=lambda each: LEVELS.index(each.level))
@@ -164,7 +164,7 @@ def _updates(run: Run) -> Iterator[Finding]:
     slow = [each for each in updates if each.milliseconds > period]
     worst = max(slow, key=lambda each: each.milliseconds, default=None)
     # a single one may be the machine's fault
-    if worst is not None and (len(slow) > 2 or worst.milliseconds > MUCH_LONGER * period):
+    if worst is not None and (len(slow) > 2 or worst.milliseconds > 5.0 * period):
         at = (worst.stamp_ns - run.start_ns) * 1e-9
         yield Finding(
             'notice', f'{len(slow)} of {run.recorder.log.count} updates took longer than their '
@@ -172,9 +172,8 @@ def _updates(run: Run) -> Iterator[Finding]:
             f'with {worst.nodes} nodes; a window bounds them (window.seconds)', 'updates')
 
 
-def _path(run: Run) -> Iterator[Finding]:
+def _path(run: Run, errors: Mapping[str, Any] | None) -> Iterator[Finding]:
     """Yield how large the errors of the path are, where there is a truth or held-out fixes."""
-    errors = run.errors
     if errors is None:
         return
     far = np.array(errors['position'], dtype=float)
@@ -191,16 +190,18 @@ def _path(run: Run) -> Iterator[Finding]:
     # else the covariances are those to the first pose, which is no better known than the others
     aligned = run.estimate.alignment is AlignmentState.ALIGNED
     ratio = _to_claimed(errors, far) if aligned else 0.0
-    if ratio > OVERCONFIDENT:
+    # errors of a path are few independent ones, as they go on for minutes
+    overconfident = ratio > 2.5
+    if overconfident:
         yield Finding('warning', f'errors of the path are {short(ratio)} times what its '
                                  'covariances say', 'errors')
     worse = alone is not None and rms > alone and aligned
     better = alone is None or float(short(rms)) < float(short(alone))
-    yield Finding('warning' if worse else 'good' if better and ratio <= OVERCONFIDENT
+    yield Finding('warning' if worse else 'good' if better and not overconfident
                   else 'notice', text, 'errors')
 
 
-def _to_claimed(errors: dict[str, Any], far: FloatArray) -> float:
+def _to_claimed(errors: Mapping[str, Any], far: FloatArray) -> float:
     """Return the ratio of the errors of a path, shape (N,) [m], to what it claims; 0 unknown."""
     sigma = np.array([np.nan if each is None else each for each in errors['sigma'] or ()])
     known = np.isfinite(sigma) & (sigma > 0.0)
@@ -209,27 +210,7 @@ def _to_claimed(errors: dict[str, Any], far: FloatArray) -> float:
     return math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
 
 
-Texts = tuple[str, str, str]
-"""Level, text and anchor of a finding."""
-
-# Number of stretches, groups and gaps that are told one by one.
-MOST_TOLD = 3
-# Doubted fixes belong to one stretch if at most so many others are between them.
-MOST_BETWEEN = 2
-# Stretches and groups of at least so many measurements are more than bad luck.
-MANY = 3
-# A silence of odometry, or of fixes, is a gap if it is this long [s], and this many periods.
-GAPS = {True: (0.5, 8.0), False: (4.0, 8.0)}
-# A gap from which it is a warning [s].
-LONG_GAP = 20.0
-# Share of the messages of a source that are refused, from which it is a warning.
-MANY_REFUSED = 0.05
-# Answers that are no refusals; those that begin with `repaired` are none either.
-HARMLESS = ('accepted', 'pending', 'sorted', 'thinned', 'rotations', 'default_covariance',
-            'done_over')
-
-
-def _measurements(run: Run) -> Iterator[Texts]:
+def _measurements(run: Run) -> Iterator[Finding]:
     """Yield what is doubted or refused, where and why, and what is missing."""
     for source in sorted({each.source for each in run.verdicts}):
         own = [each for each in run.verdicts if each.source == source]
@@ -240,79 +221,67 @@ def _measurements(run: Run) -> Iterator[Texts]:
     yield from _refusals(run)
 
 
-def _seconds(run: Run, stamp_ns: int) -> float:
-    return (stamp_ns - run.start_ns) * 1e-9
-
-
-def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Texts]:
+def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
     """Yield the stretches of fixes that are doubted."""
     every = sorted((each for each in verdicts if each.kind is Judged.FIX),
                    key=lambda each: each.stamp_ns)
-    places = np.flatnonzero([each.state is State.DOUBTED for each in every])
-    doubted = [every[place] for place in places.tolist()]
-    if len(doubted) == 0:
+    at = np.flatnonzero([each.state is State.DOUBTED for each in every])
+    if len(at) == 0:
         return
-    ends = np.flatnonzero(np.diff(places) > 1 + MOST_BETWEEN) + 1
-    parts = [part.tolist() for part in np.split(np.arange(len(places)), ends)]
-    parts.sort(key=len, reverse=True)
+    # of one stretch if at most two others are between them
+    parts = sorted(np.split(at, np.flatnonzero(np.diff(at) > 3) + 1), key=len, reverse=True)
     long = [part for part in parts if len(part) >= MANY]
     for part in long[:MOST_TOLD]:
-        begin, end = (_seconds(run, doubted[at].stamp_ns) for at in (part[0], part[-1]))
-        far = [float(np.hypot(*doubted[at].residual[:2])) for at in part]
+        begin, end = (1e-9 * (every[k].stamp_ns - run.start_ns) for k in (part[0], part[-1]))
+        far = [float(np.hypot(*every[k].residual[:2])) for k in part]
         size = f', {short(np.nanmedian(far))} m from the path' if np.any(np.isfinite(far)) else ''
-        yield ('warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} s to '
-               f'{end:.1f} s contradict the path and are not used{size}: look for reflections, '
-               f'or a jump of the receiver', 'map')
-    rest = sum(map(len, parts)) - sum(map(len, long[:MOST_TOLD]))
+        yield Finding(
+            'warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} s to '
+            f'{end:.1f} s contradict the path and are not used{size}: look for reflections, '
+            f'or a jump of the receiver', 'map')
+    rest = len(at) - sum(map(len, long[:MOST_TOLD]))
     if rest > 0:
         more = ' more' if len(long) > 0 else ''
-        yield ('notice', f'{source}: {rest}{more} of {number_of(len(every), Judged.FIX)} '
-               f'contradict the path, alone or in other stretches, and are not used', 'map')
+        yield Finding(
+            'notice', f'{source}: {rest}{more} of {number_of(len(every), Judged.FIX)} '
+            f'contradict the path, alone or in other stretches, and are not used', 'map')
 
 
-def _groups(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Texts]:
+def _groups(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
     """Yield the groups of loop closures that are doubted, and how many wait."""
     every = [each for each in verdicts if each.kind is Judged.LOOP_CLOSURE]
+    of_all = f'of {number_of(len(every), Judged.LOOP_CLOSURE)}'
     doubted = sorted((each for each in every if each.state is State.DOUBTED),
                      key=lambda each: each.stamp_ns)
-    anchor = 'map'
     if len(doubted) > 0:
-        groups = _closure_groups(run, doubted)
-        large = [group for group in groups if len(group) >= MANY]
+        large = [group for group in _closure_groups(run, doubted) if len(group) >= MANY]
         largest = ''
         if len(large) > 0:
-            first = large[0]
-            ends = [[_seconds(run, stamp) for stamp in stamps] for stamps in (
-                [each.reference_ns or 0 for each in first], [each.stamp_ns for each in first])]
-            here, there = (f'{min(each):.0f} to {max(each):.0f} s' for each in ends)
+            here, there = (f'{min(each):.0f} to {max(each):.0f} s' for each in (
+                (np.array(stamps) - run.start_ns) * 1e-9 for stamps in (
+                    [each.reference_ns or 0 for each in large[0]],
+                    [each.stamp_ns for each in large[0]])))
             largest = (f'; {len(large)} group{"s" if len(large) > 1 else ""} of {MANY} or more, '
                        f'the largest takes the place at {there} for that at {here} '
-                       f'({len(first)} closures)')
-        level = 'warning' if len(doubted) >= MANY else 'notice'
-        yield (level, f'{source}: {len(doubted)} of {number_of(len(every), Judged.LOOP_CLOSURE)} '
-               f'contradict the others and are not used{largest}; the strongest: '
-               f'{_strongest(doubted)}', anchor)
-    waiting = sum(each.state is State.WAITING for each in every)
-    if waiting > 0:
-        yield ('notice', f'{source}: {waiting} of {number_of(len(every), Judged.LOOP_CLOSURE)} '
-               'are not used, as too little speaks for or against them', anchor)
-    weakly = sum(each.state is State.WEAKLY_BELIEVED for each in every)
-    if weakly > 0:
-        yield ('notice', f'{source}: {weakly} of {number_of(len(every), Judged.LOOP_CLOSURE)} '
-               'are used, though little but the record of the source speaks for them', anchor)
+                       f'({len(large[0])} closures)')
+        worst = max(doubted, key=lambda each: np.nan_to_num(
+            each.distance, nan=-1.0, posinf=-1.0))
+        far = f', {worst.distance:.1f} sigma' if np.isfinite(worst.distance) else ''
+        yield Finding(
+            'warning' if len(doubted) >= MANY else 'notice', f'{source}: {len(doubted)} {of_all} '
+            f'contradict the others and are not used{largest}; the strongest: {worst.id}{far}',
+            'map')
+    for state, text in (
+            (State.WAITING, 'are not used, as too little speaks for or against them'),
+            (State.WEAKLY_BELIEVED,
+             'are used, though little but the record of the source speaks for them')):
+        count = sum(each.state is state for each in every)
+        if count > 0:
+            yield Finding('notice', f'{source}: {count} {of_all} {text}', 'map')
     refused = [reason for (name, _, _), reason in run.refused.items() if name == source]
     if len(refused) > 0:
-        yield ('notice', f'{source}: {number_of(len(refused), Judged.LOOP_CLOSURE)} could not be '
-               f'added; the first: {refused[0]}', anchor)
-
-
-def _strongest(doubted: Sequence[Verdict]) -> str:
-    """Return the name and the distance of the closure that contradicts most."""
-    known = [each for each in doubted if np.isfinite(each.distance)]
-    if len(known) == 0:
-        return doubted[0].id
-    worst = max(known, key=lambda each: each.distance)
-    return f'{worst.id}, {worst.distance:.1f} sigma'
+        yield Finding('notice', f'{source}: {number_of(len(refused), Judged.LOOP_CLOSURE)} could '
+                                f'not be added; the first: {refused[0]}', 'map')
 
 
 def _closure_groups(run: Run, closures: Sequence[Verdict]) -> list[list[Verdict]]:
@@ -322,52 +291,44 @@ def _closure_groups(run: Run, closures: Sequence[Verdict]) -> list[list[Verdict]
     ends = path.at(np.clip(stamps, *path.stamps_ns[[0, -1]]))[:, :, :2]
     groups: list[list[int]] = []
     for k, here in enumerate(ends):
-        for group in groups:
-            # as near as those are that can agree with one another
-            if np.all(np.hypot(*(here - ends[group[-1]]).T) <= NEAR):
-                group.append(k)
-                break
-        else:
+        # as near as those are that can agree with one another
+        group = next((group for group in groups if np.all(
+            np.hypot(*(here - ends[group[-1]]).T) <= BELIEF.near)), None)
+        if group is None:
             groups.append([k])
+        else:
+            group.append(k)
     return [[closures[k] for k in group] for group in sorted(groups, key=len, reverse=True)]
 
 
-def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Texts]:
+def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
     """Yield where odometry is doubted."""
     doubted = [each for each in verdicts
                if each.kind is Judged.ODOMETRY and not each.state.in_graph]
     for each in doubted[:MOST_TOLD]:
-        at = _seconds(run, each.stamp_ns)
-        yield ('warning', f'{source}: odometry is wrong before {at:.1f} s: '
-               f'{sentence(each, run.start_ns)}', 'map')
+        at = (each.stamp_ns - run.start_ns) * 1e-9
+        yield Finding('warning', f'{source}: odometry is wrong before {at:.1f} s: '
+                                 f'{sentence(each, run.start_ns)}', 'map')
     if len(doubted) > MOST_TOLD:
-        yield ('warning', f'{source}: odometry is doubted in {len(doubted) - MOST_TOLD} more '
-               'places', 'map')
+        yield Finding('warning', f'{source}: odometry is doubted in {len(doubted) - MOST_TOLD} '
+                                 'more places', 'map')
     jumps = run.counts.get((source, 'jump'), 0)
     if jumps > 0:
-        yield ('warning', f'{source}: odometry jumped {jumps} times by more than '
-               f'{source}.maximum_speed allows; the motion there is taken as unknown', 'map')
+        yield Finding('warning', f'{source}: odometry jumped {jumps} times by more than '
+                                 f'{source}.maximum_speed allows; the motion there is taken as '
+                                 'unknown', 'map')
 
 
 def silences(
-    recorder: Recorder, kinds: Mapping[str, Kind], start_ns: int,
-) -> Iterator[Texts]:
-    """
-    Yield silences of odometry, and of fixes and global poses.
-
-    Parameters
-    ----------
-    recorder : Recorder
-    kinds : mapping, of the sources
-    start_ns : int, from which times count [ns]
-
-    """
+    recorder: Recorder, kinds: Mapping[str, Kind], start_ns: StampNs,
+) -> Iterator[Finding]:
+    """Yield silences of odometry, and of fixes and global poses."""
     for source, arrivals in recorder.arrivals.items():
         kind = kinds.get(source)
-        if kind not in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO, Kind.FIX, Kind.GLOBAL_POSE):
-            continue
         moves = kind in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO)
-        gaps = arrivals.gaps(*GAPS[moves]) - start_ns * 1e-9
+        if not moves and kind not in (Kind.FIX, Kind.GLOBAL_POSE):
+            continue
+        gaps = arrivals.gaps(0.5 if moves else 4.0, periods=8.0) - start_ns * 1e-9
         if len(gaps) == 0:
             continue
         lengths = gaps[:, 1] - gaps[:, 0]
@@ -381,26 +342,27 @@ def silences(
                 'the motion there is that of other odometry, as far as it goes on' if others else
                 'the motion there is not known')
         longest = float(np.max(lengths))
-        level = 'warning' if longest > LONG_GAP else 'notice'
-        yield (level, f'{source}: no messages from {where}{more} ({short(longest, 3)} s at '
-               f'most); {what}', f'source-{source}')
+        yield Finding('warning' if longest > 20.0 else 'notice',
+                      f'{source}: no messages from {where}{more} ({short(longest, 3)} s at most); '
+                      f'{what}', f'source-{source}')
 
 
-def _refusals(run: Run) -> Iterator[Texts]:
+def _refusals(run: Run) -> Iterator[Finding]:
     """Yield how many messages were refused, by source and reason."""
-    totals: dict[str, int] = {}
+    totals: Counter[str] = Counter()
     for (source, _), count in run.counts.items():
-        totals[source] = totals.get(source, 0) + count
-    for (source, reason), count in sorted(run.counts.items()):
-        if reason in HARMLESS or reason.startswith('repaired') or reason == 'jump' or (
-                source in ('solver', 'alignment')):
-            continue
-        level = 'warning' if count > MANY_REFUSED * totals[source] else 'notice'
-        detail = run.backend.refusals.get((source, reason), '')
-        yield (level, f'{source}: {count} of {totals[source]} messages are not used: {reason}'
-               + (f', the last: {detail}' if detail else ''), f'source-{source}')
+        totals[source] += count
+    invalid = []
     for (source, reason), count in sorted(run.counts.items()):
         if reason == 'default_covariance' or reason.startswith('repaired'):
-            yield ('notice', f'{source}: {count} messages with a covariance that is not valid '
-                   f'({reason}); set {source}.covariance_override to its sigma',
-                   f'source-{source}')
+            invalid.append(Finding(
+                'notice', f'{source}: {count} messages with a covariance that is not valid '
+                f'({reason}); set {source}.covariance_override to its sigma', f'source-{source}'))
+        elif source not in ('solver', 'alignment') and reason not in (
+                'accepted', 'pending', 'sorted', 'thinned', 'rotations', 'done_over', 'jump'):
+            detail = run.backend.refusals.get((source, reason), '')
+            yield Finding(
+                'warning' if count > 0.05 * totals[source] else 'notice',
+                f'{source}: {count} of {totals[source]} messages are not used: {reason}'
+                + (f', the last: {detail}' if detail else ''), f'source-{source}')
+    yield from invalid

@@ -10,30 +10,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.cli.evaluation import distances, Drive, place_odometry
+from pose_graph_ros.cli.drive import distances, Drive
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import Key, sentence
-from pose_graph_ros.core.judgement.verdicts import State, Verdict
-from pose_graph_ros.core.residuals.source_residuals import spread
+from pose_graph_ros.core.judgement.verdicts import Verdict
+from pose_graph_ros.core.quantities import Metres, StampNs
+from pose_graph_ros.offline.residuals.source_residuals import spread
 
-TOLERANCE = 0.015
-"""Distance between a line and the points that are left out [m]."""
-_CHUNK = 512  # a point is kept in every so many, so that few rounds are needed
-_STRETCH = 20 * _CHUNK  # number of points that are looked at together
+STATES = ('believed', 'believed weakly', 'waiting', 'doubted', 'refused', 'held out')
+"""What the numbers of states in run.json stand for."""
+BELIEVED, REFUSED, HELD_OUT = 0, 4, 5
+MOST_POSES = 10_000  # of a path
+MOST_OF_SOURCE = 20_000  # fixes or loop closures; half are kept for those not believed
 
 
 def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
-    """
-    Return values as a list for JSON, None for those that are not finite.
-
-    Parameters
-    ----------
-    values : array_like, of any shape
-    digits : int, after the point
-
-    """
+    """Return values as a list for JSON, None for those that are not finite."""
     array = np.round(np.asarray(values, dtype=np.float64), digits) + 0.0
     if np.all(np.isfinite(array)):
         return list(array.tolist())
@@ -43,31 +37,16 @@ def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
 
 
 def number(value: float | None, digits: int = 4) -> float | None:
-    """
-    Return a number with some significant digits; None if it is not finite.
-
-    Parameters
-    ----------
-    value : float or None
-    digits : int
-
-    """
+    """Return a number with some significant digits; None if it is not finite."""
     return None if value is None or not math.isfinite(value) else float(f'{value:.{digits}g}')
 
 
-def simplified(points: FloatArray, tolerance: float = TOLERANCE, most: int = 20_000) -> IntArray:
+def simplified(points: Points, tolerance: Metres = 0.015, most: int = 20_000) -> IntArray:
     """
-    Return which points a line needs, shape (K,), increasing.
+    Return which points a line needs, increasing: no others are farther from it than the tolerance.
 
     This is the method of Douglas and Peucker, for all parts of a stretch at once. While more than
     `most` points are needed, those that are left are simplified again with twice the tolerance.
-
-    Parameters
-    ----------
-    points : ndarray, shape (N, 2)
-    tolerance : float, distance from the line up to which a point may be left out [m]
-    most : int, at least 2
-
     """
     kept = _needed(points, tolerance)
     while len(kept) > most:
@@ -76,22 +55,25 @@ def simplified(points: FloatArray, tolerance: float = TOLERANCE, most: int = 20_
     return kept
 
 
-def _needed(points: FloatArray, tolerance: float) -> IntArray:
+def _needed(points: Points, tolerance: Metres) -> IntArray:
     """Return which points a line needs, stretch by stretch, as memory grows with their length."""
-    n = len(points)
+    n, stretch = len(points), 10_240
     if n <= 2:
         return np.arange(n)
     return np.unique(np.concatenate([
-        begin + _needed_in_stretch(points[begin:begin + _STRETCH + 1], tolerance)
-        for begin in range(0, n - 1, _STRETCH)]))
+        begin + _needed_in_stretch(points[begin:begin + stretch + 1], tolerance)
+        for begin in range(0, n - 1, stretch)]))
 
 
-def _needed_in_stretch(points: FloatArray, tolerance: float) -> IntArray:
+def _needed_in_stretch(points: Points, tolerance: Metres) -> IntArray:
     n = len(points)
-    kept = np.unique(np.append(np.arange(0, n, _CHUNK), n - 1))
+    kept = np.unique(np.append(np.arange(0, n, 512), n - 1))  # some, so that rounds are few
     while True:
         part = np.clip(np.searchsorted(kept, np.arange(n), side='right') - 1, 0, len(kept) - 2)
-        far = _distances(points, points[kept][part], points[kept][part + 1])
+        begin, along = points[kept][part], np.diff(points[kept], axis=0)[part]
+        length2 = np.maximum(np.sum(along**2, axis=1), 1e-18)
+        share = np.clip(np.sum((points - begin) * along, axis=1) / length2, 0.0, 1.0)
+        far = np.hypot(*(points - begin - share[:, None] * along).T)
         largest = np.maximum.reduceat(far, kept[:-1])
         candidates = np.flatnonzero((far > tolerance) & (far == largest[part]))
         _, first = np.unique(part[candidates], return_index=True)
@@ -100,31 +82,12 @@ def _needed_in_stretch(points: FloatArray, tolerance: float) -> IntArray:
         kept = np.union1d(kept, candidates[first])
 
 
-def _distances(points: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the distances of points from line segments, shape (N,)."""
-    along = end - begin
-    length2 = np.maximum(np.sum(along**2, axis=1), 1e-18)
-    share = np.clip(np.sum((points - begin) * along, axis=1) / length2, 0.0, 1.0)
-    return np.asarray(np.hypot(*(points - begin - share[:, None] * along).T))
-
-
-STATES = ('believed', 'believed weakly', 'waiting', 'doubted', 'refused', 'held out')
-"""What the numbers of states in run.json stand for."""
-BELIEVED, REFUSED, HELD_OUT = 0, 4, 5
-_NUMBERS = {state: STATES.index(state.value) for state in State}
-# Most points of a path, of a series of errors, and ellipses.
-MOST_POSES, MOST_ERRORS, MOST_ELLIPSES = 10_000, 2000, 200
-# Most fixes, and most loop closures, of a source; half of them are kept for those not believed.
-MOST_OF_SOURCE = 20_000
-
-
 @dataclass(slots=True)
 class Frame:
     """Where times and places of run.json begin, and the texts that its tables refer to."""
 
-    start_ns: int
-    offset: FloatArray
-    """Shape (2,) [m]."""
+    start_ns: StampNs
+    offset: FloatArray  # (2,) [m]
     texts: list[str] = field(default_factory=list)
     _known: dict[str, int] = field(default_factory=dict)
 
@@ -132,16 +95,8 @@ class Frame:
         """Return stamps as seconds since the start."""
         return rounded((np.asarray(stamps_ns) - self.start_ns) * 1e-9)
 
-    def places(self, points: FloatArray, digits: int = 2) -> tuple[list[float], list[float]]:
-        """
-        Return x and y of points relative to the offset.
-
-        Parameters
-        ----------
-        points : ndarray, shape (N, 2) [m]
-        digits : int
-
-        """
+    def places(self, points: Points, digits: int = 2) -> tuple[list[float], list[float]]:
+        """Return x and y of points relative to the offset."""
         moved = np.asarray(points).reshape(-1, 2) - self.offset
         return rounded(moved[:, 0], digits), rounded(moved[:, 1], digits)
 
@@ -157,28 +112,21 @@ class Frame:
 
 def lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
     """Return the paths, and the stamps of the poses of the corrected one [ns]."""
-    def line(path: Trajectory, *, heading: bool, whole: bool = False) -> dict[str, Any]:
+    def line(path: Trajectory, *, heading: bool = True, whole: bool = False) -> dict[str, Any]:
         kept = np.arange(len(path)) if whole and len(path) <= MOST_POSES else simplified(
             path.poses[:, :2], most=MOST_POSES)
         x, y = frame.places(path.poses[kept, :2])
         columns = {'t': frame.seconds(path.stamps_ns[kept]), 'x': x, 'y': y}
         return columns | ({'theta': rounded(path.poses[kept, 2])} if heading else {})
 
-    corrected = line(drive.corrected, heading=True, whole=True)
+    corrected = line(drive.corrected, whole=True)
     stamps = np.round(np.array(corrected['t']) * 1e9).astype(np.int64) + frame.start_ns
-    return {'corrected': corrected, 'odometry': line(place_odometry(drive), heading=False),
-            'truth': None if drive.truth is None else line(drive.truth, heading=True)}, stamps
+    return {'corrected': corrected, 'odometry': line(drive.placed_odometry, heading=False),
+            'truth': None if drive.truth is None else line(drive.truth)}, stamps
 
 
-def ellipses(path: Trajectory, covariances: FloatArray, frame: Frame) -> dict[str, Any]:
-    """
-    Return the covariances of positions along a path, in map axes.
-
-    Parameters
-    ----------
-    covariances : ndarray, shape (P, 3, 3), NaN where unknown
-
-    """
+def ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[str, Any]:
+    """Return some 200 covariances of positions along a path, in map axes; NaN where unknown."""
     known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
     if len(known) == 0:
         return {name: [] for name in ('t', 'x', 'y', 'xx', 'xy', 'yy')}
@@ -187,147 +135,125 @@ def ellipses(path: Trajectory, covariances: FloatArray, frame: Frame) -> dict[st
     travelled = np.concatenate(([0.0], np.cumsum(steps)))
     times = (path.stamps_ns[known] - path.stamps_ns[known[0]]) * 1e-9
     measure = sum(each / max(each[-1], 1e-9) for each in (travelled, times))
-    at = np.unique(np.searchsorted(measure, np.linspace(0.0, measure[-1], MOST_ELLIPSES)))
+    at = np.unique(np.searchsorted(measure, np.linspace(0.0, measure[-1], 200)))
     some = known[np.clip(at, 0, len(known) - 1)]
     x, y = frame.places(path.poses[some, :2])
-    cov = covariances[some]
     return {'t': frame.seconds(path.stamps_ns[some]), 'x': x, 'y': y,
-            'xx': _significant(cov[:, 0, 0]), 'xy': _significant(cov[:, 0, 1]),
-            'yy': _significant(cov[:, 1, 1])}
-
-
-def _significant(values: FloatArray) -> list[float]:
-    return [float(f'{value:.4g}') for value in values.tolist()]
+            **{name: [number(value) for value in covariances[some, row, column].tolist()]
+               for name, row, column in (('xx', 0, 0), ('xy', 0, 1), ('yy', 1, 1))}}
 
 
 def fixes(
     drive: Drive, verdicts: Sequence[Verdict], at_ns: IntArray, frame: Frame,
 ) -> list[dict[str, Any]]:
-    """
-    Return the fixes and global poses of each source.
-
-    Parameters
-    ----------
-    verdicts : sequence of Verdict, all that there are
-    at_ns : ndarray of int, stamps of the poses of the corrected line [ns]
-
-    """
+    """Return the fixes and global poses of each source; `at_ns` are stamps of the path."""
     known = {(each.source, each.stamp_ns): each for each in verdicts if each.reference_ns is None}
     sources = np.array(drive.fix_sources or ['fix'] * len(drive.fix_stamps_ns), dtype=str)
+    refused = (np.zeros_like(drive.fix_held_out) if drive.fix_refused is None
+               else drive.fix_refused)
     found = []
     for source in dict.fromkeys(sources.tolist()):
-        rows = np.flatnonzero(sources == source)
-        rows = rows[np.argsort(drive.fix_stamps_ns[rows], kind='stable')]
-        stamps, held_out = drive.fix_stamps_ns[rows], drive.fix_held_out[rows]
-        each = [known.get((source, stamp)) for stamp in stamps.tolist()]
-        refused = np.zeros_like(held_out) if drive.fix_refused is None else (
-            drive.fix_refused[rows])
-        states = [HELD_OUT if out else REFUSED if no else BELIEVED if verdict is None
-                  else _NUMBERS[verdict.state] for out, no, verdict in zip(
-                      held_out.tolist(), refused.tolist(), each, strict=True)]
+        every = np.flatnonzero(sources == source)
+        every = every[np.argsort(drive.fix_stamps_ns[every], kind='stable')]
+        judged = [known.get((source, stamp)) for stamp in drive.fix_stamps_ns[every].tolist()]
+        states = [HELD_OUT if out else REFUSED if no else _state(verdict)
+                  for out, no, verdict in zip(drive.fix_held_out[every].tolist(),
+                                              refused[every].tolist(), judged, strict=True)]
         shown = _shown(states)
-        left_out = len(rows) - len(shown)
-        rows, stamps, held_out = rows[shown], stamps[shown], held_out[shown]
-        each, states = [each[k] for k in shown.tolist()], [states[k] for k in shown.tolist()]
+        rows, judged = every[shown], [judged[k] for k in shown.tolist()]
+        states = [states[k] for k in shown.tolist()]
         x, y = frame.places(drive.fix_positions[rows])
         found.append({
-            'source': source, 'left_out': left_out,
-            't': frame.seconds(stamps), 'x': x, 'y': y, 'state': states,
+            'source': source, 'left_out': len(every) - len(rows),
+            't': frame.seconds(drive.fix_stamps_ns[rows]), 'x': x, 'y': y, 'state': states,
             'why': [-1 if verdict is None or state in (BELIEVED, HELD_OUT)
                     else frame.text(sentence(verdict, frame.start_ns))
-                    for verdict, state in zip(each, states, strict=True)],
-            'held_out': held_out.astype(int).tolist(),
-            'id': None if not any(each) else [
-                '' if verdict is None else verdict.id for verdict in each],
-            'd': rounded([np.nan if verdict is None else verdict.distance for verdict in each], 2),
-            'at': _nearest(stamps, at_ns)})
+                    for verdict, state in zip(judged, states, strict=True)],
+            'held_out': drive.fix_held_out[rows].astype(int).tolist(),
+            'id': _ids(judged) if any(judged) else None, 'd': _sigmas(judged),
+            'at': _nearest(drive.fix_stamps_ns[rows], at_ns)})
     return found
 
 
 def closures(
     drive: Drive, verdicts: Sequence[Verdict], refused: Mapping[Key, str], frame: Frame,
 ) -> list[dict[str, Any]]:
-    """
-    Return the loop closures of each source, in the order of their later ends.
-
-    Parameters
-    ----------
-    verdicts : sequence of Verdict
-    refused : mapping, why closures were refused
-
-    """
+    """Return the loop closures of each source, in the order of their later ends."""
     known = {(each.source, each.stamp_ns, each.reference_ns): each for each in verdicts}
     sources = np.array(
         drive.loop_sources or ['loop_closure'] * len(drive.loop_stamps_ns), dtype=str)
     found = []
     for source in dict.fromkeys(sources.tolist()):
         rows = np.flatnonzero(sources == source)
-        rows = rows[np.argsort(drive.loop_stamps_ns[rows, 1], kind='stable')]
-        ends = np.sort(drive.loop_stamps_ns[rows], axis=1)
-        keys = [(source, later, earlier) for earlier, later in drive.loop_stamps_ns[rows].tolist()]
-        states = [_NUMBERS[known[key].state] if key in known
-                  else REFUSED if key in refused else BELIEVED for key in keys]
+        stamps = drive.loop_stamps_ns[rows[np.argsort(
+            drive.loop_stamps_ns[rows, 1], kind='stable')]]
+        keys = [(source, later, earlier) for earlier, later in stamps.tolist()]
+        states = [REFUSED if key in refused and key not in known else _state(known.get(key))
+                  for key in keys]
         shown = _shown(states)
-        left_out = len(rows) - len(shown)
-        rows, ends = rows[shown], ends[shown]
-        why, ids, far = list[int](), list[str](), list[float]()
-        for key in [keys[k] for k in shown.tolist()]:
-            verdict = known.get(key)
-            reason = refused.get(key, '')
-            why.append(frame.text(reason if verdict is None
-                                  else sentence(verdict, frame.start_ns)))
-            ids.append('' if verdict is None else verdict.id)
-            far.append(np.nan if verdict is None else verdict.distance)
-        first, last = drive.corrected.stamps_ns[[0, -1]]
-        places = drive.corrected.at(np.clip(ends, first, last))[:, :, :2]
+        keys, ends = [keys[k] for k in shown.tolist()], np.sort(stamps[shown], axis=1)
+        judged = [known.get(key) for key in keys]
+        places = drive.corrected.at(
+            np.clip(ends, *drive.corrected.stamps_ns[[0, -1]]))[:, :, :2]
         (x0, y0), (x1, y1) = frame.places(places[:, 0]), frame.places(places[:, 1])
         found.append({
-            'source': source, 'left_out': left_out,
+            'source': source, 'left_out': len(rows) - len(keys),
             't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
             'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1,
-            'state': [states[k] for k in shown.tolist()], 'why': why, 'id': ids,
-            'd': rounded(far, 2)})
+            'state': [states[k] for k in shown.tolist()],
+            'why': [frame.text(refused.get(key, '') if verdict is None
+                               else sentence(verdict, frame.start_ns))
+                    for key, verdict in zip(keys, judged, strict=True)],
+            'id': _ids(judged), 'd': _sigmas(judged)})
     return found
 
 
-def errors(drive: Drive, covariances: FloatArray, frame: Frame) -> dict[str, Any] | None:
+def _state(verdict: Verdict | None) -> int:
+    return BELIEVED if verdict is None else STATES.index(verdict.state.value)
+
+
+def _ids(verdicts: Sequence[Verdict | None]) -> list[str]:
+    return ['' if each is None else each.id for each in verdicts]
+
+
+def _sigmas(verdicts: Sequence[Verdict | None]) -> list[float | None]:
+    """Return the distances when they were judged [sigma]."""
+    return rounded([np.nan if each is None else each.distance for each in verdicts], 2)
+
+
+def errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, Any] | None:
     """
     Return the errors of the path over time; None without a truth and fixes that are held out.
 
-    Parameters
-    ----------
-    covariances : ndarray, shape (P, 3, 3), of the corrected path, NaN where unknown
-
+    Covariances are those of the corrected path, NaN where unknown.
     """
-    path, truth, odometry = drive.corrected, drive.truth, place_odometry(drive)
+    path, truth, odometry = drive.corrected, drive.truth, drive.placed_odometry
     if truth is not None:
         stamps = truth.stamps_ns[path.covers(truth.stamps_ns)]
         against, places = 'truth', truth.at(stamps) if len(stamps) > 0 else np.empty((0, 3))
     else:
         out = drive.fix_held_out & path.covers(drive.fix_stamps_ns)
         order = np.argsort(drive.fix_stamps_ns[out], kind='stable')
-        stamps, positions = drive.fix_stamps_ns[out][order], drive.fix_positions[out][order]
-        against, places = 'held-out fixes', np.column_stack((positions, np.zeros(len(stamps))))
+        stamps = drive.fix_stamps_ns[out][order]
+        against, places = 'held-out fixes', drive.fix_positions[out][order]
     if len(stamps) == 0:
         return None
-    some = spread(len(stamps), MOST_ERRORS)
+    some = spread(len(stamps), 2000)
     stamps, places = stamps[some], places[some]
     _, far = distances(path, stamps, places[:, :2])
     by_odometry = np.full(len(stamps), np.nan)
-    covered = odometry.covers(stamps)
-    by_odometry[covered] = distances(odometry, stamps, places[:, :2])[1]
+    by_odometry[odometry.covers(stamps)] = distances(odometry, stamps, places[:, :2])[1]
     sigma = np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1])
     at = np.clip(np.searchsorted(path.stamps_ns, stamps), 0, len(path) - 1)
-    heading = None if truth is None else rounded(
-        se2.wrap(path.at(stamps)[:, 2] - places[:, 2]), 4)
     return {'against': against, 't': frame.seconds(stamps), 'position': rounded(far),
-            'heading': heading,
+            'heading': None if truth is None else rounded(
+                se2.wrap(path.at(stamps)[:, 2] - places[:, 2]), 4),
             'sigma': None if not np.any(np.isfinite(sigma)) else rounded(sigma[at]),
             'odometry': rounded(by_odometry)}
 
 
 def _shown(states: Sequence[int]) -> IntArray:
-    """Return which measurements are in run.json: of very many that are believed, only some."""
+    """Return which measurements of a source are in run.json: of very many, only some."""
     believed = np.isin(states, (BELIEVED, HELD_OUT))
     others, rest = np.flatnonzero(~believed), np.flatnonzero(believed)
     others = others[spread(len(others), MOST_OF_SOURCE // 2)]

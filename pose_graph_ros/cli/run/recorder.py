@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.evaluation import Drive, ErrorRow
+from pose_graph_ros.cli.drive import Drive
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
@@ -18,62 +18,57 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, Measurement
+from pose_graph_ros.core.quantities import Seconds, StampNs
 
-MOST_UPDATES = 2000
-"""Number of updates that are kept: of more, two neighbours become one with the longer time."""
-MOST_SILENCES = 20
-"""Number of the longest silences of a source that are kept."""
-MOST_REFUSED = 5000
-"""Number of refused loop closures whose reasons are kept."""
+MOST_UPDATES = 2000  # that are kept: of more, two neighbours become one with the longer time
+MOST_SILENCES = 20  # of a source that are kept, the longest
+MOST_REFUSED = 5000  # loop closures whose reasons are kept
 
 
 class Update(NamedTuple):
     """An update, or the worst of several."""
 
-    stamp_ns: int
+    stamp_ns: StampNs
     nodes: int
     milliseconds: float
     chi2: float
-    iterations: int
-    """-1 if unknown."""
+    iterations: int  # -1 if unknown
 
 
 class UpdateLog:
-    """Updates in the order of time, at most `MOST_UPDATES` of them."""
+    """Updates in the order of time, at most `MOST_UPDATES` of them, of `count`."""
 
     def __init__(self) -> None:
         self._kept: list[Update] = []
-        self._open: Update | None = None
-        self._n_open, self._stride = 0, 1
+        self._open: list[Update] = []  # those that become the next one that is kept
+        self._stride = 1
         self.count = 0
-        """Number of all updates."""
 
     def add(self, update: Update) -> None:
         """Add an update, which is later than the others; the first one only loads the solver."""
         self.count += 1
         if self.count == 1:
             return
-        self._open = update if self._open is None else _joined(self._open, update)
-        self._n_open += 1
-        if self._n_open < self._stride:
+        self._open.append(update)
+        if len(self._open) < self._stride:
             return
-        self._kept.append(self._open)
-        self._open, self._n_open = None, 0
+        self._kept.append(_worst(*self._open))
+        self._open = []
         if len(self._kept) >= MOST_UPDATES:
-            self._kept = [_joined(*pair) for pair in zip(
+            self._kept = [_worst(*pair) for pair in zip(
                 self._kept[::2], self._kept[1::2], strict=True)]
             self._stride *= 2
 
     @property
     def updates(self) -> list[Update]:
         """The updates that are kept."""
-        return [*self._kept, *([] if self._open is None else [self._open])]
+        return [*self._kept, *([_worst(*self._open)] if self._open else [])]
 
 
-def _joined(first: Update, second: Update) -> Update:
-    """Return the later of two updates with the larger time and number of iterations."""
-    return second._replace(milliseconds=max(first.milliseconds, second.milliseconds),
-                           iterations=max(first.iterations, second.iterations))
+def _worst(*updates: Update) -> Update:
+    """Return the last of some updates with the largest time and number of iterations."""
+    return updates[-1]._replace(milliseconds=max(each.milliseconds for each in updates),
+                                iterations=max(each.iterations for each in updates))
 
 
 @dataclass(slots=True)
@@ -81,44 +76,31 @@ class Arrivals:
     """When the measurements of a source were made, and the longest silences between them."""
 
     count: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    silences: list[tuple[int, int]] = field(default_factory=list)
-    """Length and begin [ns], as a heap with the shortest first."""
+    first_ns: StampNs = 0
+    last_ns: StampNs = 0
+    silences: list[tuple[int, StampNs]] = field(default_factory=list)  # length, begin: a heap
 
-    def add(self, stamp_ns: int) -> None:
+    def add(self, stamp_ns: StampNs) -> None:
         """Add a measurement; the silence before a late one is not seen."""
         if self.count == 0:
             self.first_ns = self.last_ns = stamp_ns
         elif stamp_ns > self.last_ns:
-            silence = (stamp_ns - self.last_ns, self.last_ns)
-            if len(self.silences) < MOST_SILENCES:
-                heapq.heappush(self.silences, silence)
-            elif silence > self.silences[0]:
-                heapq.heapreplace(self.silences, silence)
+            heapq.heappush(self.silences, (stamp_ns - self.last_ns, self.last_ns))
+            if len(self.silences) > MOST_SILENCES:
+                heapq.heappop(self.silences)
             self.last_ns = stamp_ns
         self.count += 1
 
-    def gaps(self, least_s: float, periods: float) -> FloatArray:
-        """
-        Return the longest silences, in the order of time: begin and end [s], shape (K, 2).
-
-        Parameters
-        ----------
-        least_s : float, shortest one [s]
-        periods : float, the same in units of the usual period without these silences
-
-        """
+    def gaps(self, least_s: Seconds, periods: float) -> FloatArray:
+        """Return the longest silences, in the order of time: begin and end [s], shape (K, 2)."""
         if self.count < 3:
             return np.empty((0, 2))
-        longest = sum(length for length, _ in self.silences)
-        n = self.count - 1 - len(self.silences)
-        usual = (self.last_ns - self.first_ns - longest) / max(n, 1)
-        if n <= 0:
-            usual = float(np.median([length for length, _ in self.silences]))
-        limit = max(least_s * 1e9, periods * usual)
+        lengths = [length for length, _ in self.silences]
+        others = self.count - 1 - len(lengths)
+        usual = (self.last_ns - self.first_ns - sum(lengths)) / others if others > 0 else (
+            float(np.median(lengths)))
         found = sorted((begin, begin + length) for length, begin in self.silences
-                       if length > limit)
+                       if length > max(least_s * 1e9, periods * usual))
         return np.array(found, dtype=np.float64).reshape(-1, 2) * 1e-9
 
 
@@ -128,24 +110,12 @@ class Recorder:
 
     log: UpdateLog = field(default_factory=UpdateLog)
     arrivals: dict[str, Arrivals] = field(default_factory=dict)
-    refused: dict[Key, str] = field(default_factory=dict)
-    """Why loop closures were refused, of the first `MOST_REFUSED`."""
+    refused: dict[Key, str] = field(default_factory=dict)  # why, of the first loop closures
 
-    def add_measurement(self, source: str, stamp_ns: int) -> None:
-        """
-        Add a measurement in the order of arrival; one without a stamp does not count.
-
-        Parameters
-        ----------
-        stamp_ns : int
-
-        """
-        if stamp_ns <= 0:
-            return
-        arrivals = self.arrivals.get(source)
-        if arrivals is None:
-            arrivals = self.arrivals[source] = Arrivals()
-        arrivals.add(stamp_ns)
+    def add_measurement(self, source: str, stamp_ns: StampNs) -> None:
+        """Add a measurement in the order of arrival; one without a stamp does not count."""
+        if stamp_ns > 0:
+            self.arrivals.setdefault(source, Arrivals()).add(stamp_ns)
 
     def add_answer(self, source: str, measurement: Measurement, answer: Answer) -> None:
         """Add what was answered to a measurement at once."""
@@ -156,7 +126,7 @@ class Recorder:
                 f'Refused ({answer.reason}): {answer.detail}.')
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Run:
     """A run at its end."""
 
@@ -164,30 +134,18 @@ class Run:
     subtitle: str
     drive: Drive
     backend: PoseGraphBackend
-    estimate: Estimate
-    """With its path, which is that of `drive`."""
+    estimate: Estimate  # with its path, which is that of `drive`
     verdicts: Sequence[Verdict]
     recorder: Recorder
-    values: Mapping[str, Any]
-    """All parameters of the node."""
-    kinds: Mapping[str, Kind]
-    """Kinds of the sources that have a topic."""
-    counts: Mapping[tuple[str, str], int]
-    """Messages by source and answer."""
-    rows: Sequence[ErrorRow]
-    """Table of errors."""
-    report: UpdateReport | None = None
-    """Of the final optimisation; None if it was made elsewhere."""
-    origin: MapOrigin | None = None
-    """Of the map on the Earth; None if it is unknown."""
-    seconds: float | None = None
-    """Time that the run took [s]."""
-    refused: Mapping[Key, str] = field(default_factory=dict)
-    """Why loop closures were refused."""
-    errors: dict[str, Any] | None = None
-    """Errors over time, as in run.json."""
+    values: Mapping[str, Any]  # all parameters of the node
+    kinds: Mapping[str, Kind]  # of the sources that have a topic
+    counts: Mapping[tuple[str, str], int]  # messages by source and answer
+    report: UpdateReport | None = None  # of the final optimisation; None if made elsewhere
+    origin: MapOrigin | None = None  # of the map on the Earth; None if it is unknown
+    seconds: Seconds = 0.0  # that the run took; 0 if it is unknown
+    refused: Mapping[Key, str] = field(default_factory=dict)  # why loop closures were refused
 
     @property
-    def start_ns(self) -> int:
-        """Stamp of the first pose of the path [ns]."""
+    def start_ns(self) -> StampNs:
+        """Stamp of the first pose of the path."""
         return int(self.drive.corrected.stamps_ns[0])

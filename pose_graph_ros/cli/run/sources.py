@@ -15,19 +15,13 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import Verdict
-from pose_graph_ros.core.residuals.components import Analysis
-from pose_graph_ros.core.residuals.scale import RowFit, ScaleFit
-from pose_graph_ros.core.residuals.source_residuals import SourceResiduals, spread
-from pose_graph_ros.core.residuals.whiteness import Whiteness, whiteness
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+from pose_graph_ros.offline.residuals.scale import RowFit, ScaleFit, Whiteness, whiteness
+from pose_graph_ros.offline.residuals.source_residuals import SourceResiduals, spread
+from pose_graph_ros.offline.residuals.variance_components import Analysis
 
-MOST_SERIES = 2000
-"""Number of residuals of a source in its series."""
-WRONG = 1.5
-"""Ratio of true to claimed sigmas, or its reciprocal, from which covariances count as wrong."""
-EDGES = np.linspace(-5.0, 5.0, 41)
-"""Of the histogram of residuals [sigma]; those beyond count in the outermost bins."""
+WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong
 _NAMES = {'map': ('x', 'y', 'heading'), 'edge': ('along', 'across', 'heading')}
 
 
@@ -37,15 +31,11 @@ class SourceAnalysis(NamedTuple):
     residuals: SourceResiduals
     kind: Kind
     at_estimate: ScaleFit
-    fit: ScaleFit
-    """The same where all sources are weighed by what their residuals show."""
+    fit: ScaleFit  # where all sources are weighed by what their residuals show
     whiteness: Whiteness | None
-    in_use: CorrelatedErrors | None
-    """Statistics of its errors that the graph is built with; None for white errors."""
-    correlated: bool
-    """Whether its errors are correlated, and the graph takes them for independent."""
-    suspects: tuple[str, ...]
-    """Other sources of which this is so, so that their errors may show in its residuals."""
+    in_use: CorrelatedErrors | None  # that the graph is built with; None for white errors
+    correlated: bool  # whether its errors are, and the graph takes them for independent
+    suspects: tuple[str, ...]  # others of which this is so: their errors may show in its residuals
 
     @property
     def row_names(self) -> tuple[str, str, str]:
@@ -63,15 +53,7 @@ def analyse(
     analysis: Analysis, kinds: Mapping[str, Kind],
     in_use: Mapping[str, CorrelatedErrors | None],
 ) -> dict[str, SourceAnalysis]:
-    """
-    Return the analysis of each source.
-
-    Parameters
-    ----------
-    kinds : mapping, kinds of the sources by the parameters
-    in_use : mapping, statistics of the errors of sources in the map
-
-    """
+    """Return the analysis of each source."""
     guesses = {'odometry': Kind.ODOMETRY, 'loop_closure': Kind.LOOP_CLOSURE, 'turn': Kind.GYRO,
                'map': Kind.GLOBAL_POSE}
     return {source: SourceAnalysis(
@@ -93,7 +75,8 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
     rows = [row.coordinate for row in present.rows]
-    some = spread(len(used.ids), MOST_SERIES)
+    some = spread(len(used.ids), 2000)
+    edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
     values = normalised[np.isfinite(normalised)]
     return {
         'name': residuals.source, 'kind': analysis.kind.value,
@@ -109,8 +92,8 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
         'unused': {'count': len(unused.ids),
                    'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
         'histogram': None if len(values) == 0 or found.says_nothing else {
-            'edges': rounded(EDGES), 'count': np.histogram(
-                np.clip(values, EDGES[0] + 1e-9, EDGES[-1] - 1e-9), EDGES)[0].tolist()},
+            'edges': rounded(edges), 'count': np.histogram(
+                np.clip(values, edges[0] + 1e-9, edges[-1] - 1e-9), edges)[0].tolist()},
         'series': {'t': frame.seconds(used.stamps_ns[some]),
                    'rows': [rounded(normalised[some, row], 2) for row in rows]},
         'autocorrelation': _autocorrelation(analysis),
@@ -170,27 +153,15 @@ def claim(analysis: SourceAnalysis) -> str:
     return f'claims {short(sigma)} deg{per}, found {short(sigma * analysis.fit.ratio)} deg'
 
 
-MOST_SPRINGS = 10
-
-
 def springs(
     backend: PoseGraphBackend, path: Trajectory, residuals: Mapping[str, SourceResiduals],
     verdicts: Sequence[Verdict], frame: Frame,
 ) -> list[dict[str, Any]]:
-    """
-    Return the constraints with the largest weighted energies, in descending order.
-
-    Parameters
-    ----------
-    path : Trajectory, of the hidden nodes
-    residuals : mapping, by source
-    verdicts : sequence of Verdict
-
-    """
+    """Return the constraints with the largest weighted energies, in descending order."""
     names = {(each.edge, each.number): each.id for each in verdicts}
     stamps = backend.node_stamps_ns
     found = []
-    for rank, each in enumerate(backend.largest_energies(MOST_SPRINGS), 1):
+    for rank, each in enumerate(backend.largest_energies(10), 1):
         place = residual = sigma = expected = None
         source = residuals.get(each.source)
         at = [] if source is None else np.flatnonzero(
@@ -240,14 +211,7 @@ def _name(each: ConstraintEnergy, start_ns: int) -> str:
 def _text(
     each: ConstraintEnergy, ends: Sequence[Mapping[str, Any]], residual: FloatArray | None,
 ) -> str:
-    """
-    Return what a constraint is and how far it is off.
-
-    Parameters
-    ----------
-    residual : ndarray, shape (3,), or None if unknown
-
-    """
+    """Return what a constraint is and how far it is off; the residual is None if unknown."""
     times = ' to '.join(f'{end["t"]:.1f}' for end in sorted(ends, key=lambda end: end['t']))
     at = f' at {times} s' if len(ends) > 0 else ''
     if each.kind == 'bias':

@@ -22,53 +22,71 @@ import numpy as np
 
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 
-# Least fraction of positions that must agree on a motion, or of parts of a drive on an angle.
-LEAST_AGREEMENT = 0.6
-# Squared residual of an outlier; 0.25 % of a Gaussian in the plane are beyond [sigma^2].
-TRUNCATION = 12.0
-# Greatest factor by which the stated variances may be too small; with K positions it is at most K.
-LARGEST_INFLATION = 100.0
-# Cost of inflated variances for each position, as a factor on the logarithm of the inflation. The
-# likelihood has a factor of 2; it is larger as outliers are likelier than understated variances.
-PRICE = 4.0
-# Greatest scale of a motion, or of its inverse.
-LARGEST_SCALE = 2.0
-# Number of sections of the path, and of positions that a fit uses of each.
-PLACES, PER_PLACE = 25, 4
-# Number of positions whose pairs make hypotheses, of best hypotheses that are refined, and of
-# iterations of that.
-ANCHORS, REFINED, ITERATIONS = 20, 6, 10
-# Magnitude of z below which the rotation is undefined.
-LEAST_SCALE = 1e-6
-# Lower bound of sums of weights and of spreads, against division by zero.
-TINY = 1e-300
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """When a motion of odometry into the map counts as known."""
+
+    # fraction of positions that must agree on a motion, or of parts of a drive on an angle
+    least_agreement: float = 0.6
+    # squared residual of an outlier; 0.25 % of a Gaussian in the plane are beyond [sigma^2]
+    truncation: float = 12.0
+    # factor by which stated variances may be too small at most; with K positions it is at most K
+    largest_inflation: float = 100.0
+    # cost of inflated variances for each position, as a factor on the logarithm of the inflation;
+    # the likelihood has 2, this is larger as outliers are likelier than understated variances
+    price: float = 4.0
+    largest_scale: float = 2.0  # of a motion, or of its inverse
+    places: int = 25  # sections of the path
+    per_place: int = 4  # positions that a fit uses of each
+    anchors: int = 20  # positions whose pairs make hypotheses
+    refined: int = 6  # best hypotheses that are refined
+    iterations: int = 10  # of that
+
+    # sigma of the heading of a global pose that aligns the graph alone [rad]
+    aligning_sigma: float = 0.5
+    # sigma of the scale between two positions without noise; two alone are only used if the scale
+    # is within 2 sigma of 1, as no third one could show an error
+    scale_of_two: float = 0.05
+    stretch: float = 0.3  # drift of the heading by odometry within a stretch of the drive [rad]
+    # factors by which stretches are shortened, one after the other, until their fits agree
+    shortenings: tuple[float, ...] = (1.0, 3.0, 9.0, 27.0)
+    stretches: int = 8  # that are used at most
+    # positions of a shortened stretch, as three may fit a wrong motion by chance
+    least_of_shortened: int = 5
+    # the newest angle is preferred unless its sigma is greater than the least by this factor
+    comparable_sigma: float = 2.0
+    # two angles disagree if they differ by more than both of these [sigma, rad]; the solver
+    # corrects smaller differences
+    disagreement: float = 4.0
+    least_correction: float = 0.3
+    # numbers of measurements at which the angle is checked first, and beyond which not any more
+    first_recheck: int = 8
+    last_recheck: int = 4096
+
+
+TUNED = Tuning()
 
 
 @dataclass(frozen=True, slots=True)
 class Positions:
     """K observed positions in the order of the drive, one row of each array per position."""
 
-    odometry: ComplexArray
-    """Position of the antenna in the odometry frame [m]."""
-    observed: ComplexArray
-    """Observed position in the map [m]."""
+    odometry: ComplexArray  # position of the antenna in the odometry frame [m]
+    observed: ComplexArray  # observed position in the map [m]
+    # Cholesky factor of the covariance of `observed` in map axes, shape (K, 2, 2) [m]
     root: FloatArray
-    """Cholesky factor of the covariance of `observed` in map axes, shape (K, 2, 2) [m]."""
+    # heading of the robot in the odometry frame, a complex number of length 1
     direction: ComplexArray
-    """Heading of the robot in the odometry frame, a complex number of length 1."""
-    node: IntArray
-    """Row of the hidden node in the table of poses."""
-    path: FloatArray
-    """Path length so far [m]."""
-    walk: FloatArray
-    """Variance of the heading by odometry so far [rad^2]."""
-    stamp: FloatArray
-    """Stamp [s]."""
+    node: IntArray  # row of the hidden node in the table of poses
+    path: FloatArray  # path length so far [m]
+    walk: FloatArray  # variance of the heading by odometry so far [rad^2]
+    stamp: FloatArray  # [s]
+    # correlation time of the error of `observed` [s]; 0 for white noise
     correlation_time: FloatArray
-    """Correlation time of the error of `observed` [s]; 0 for white noise."""
 
     def rows(self, index: IntArray | BoolArray) -> Self:
         """Return the chosen positions, in order."""
@@ -87,42 +105,28 @@ class Positions:
     def thinned(self) -> Self:
         """Return some positions of each section of the path, so that no standstill dominates."""
         along = self.path - self.path[0]
-        place = np.floor(along * (PLACES / max(float(along[-1]), 1e-9)))
+        place = np.floor(along * (TUNED.places / max(float(along[-1]), 1e-9)))
         _, start, size = np.unique(place, return_index=True, return_counts=True)
         n, rank = np.repeat(size, size), np.arange(len(place)) - np.repeat(start, size)
-        return self.rows((n <= PER_PLACE)
-                         | (rank * PER_PLACE // n != (rank - 1) * PER_PLACE // n))
+        return self.rows((n <= TUNED.per_place)
+                         | (rank * TUNED.per_place // n != (rank - 1) * TUNED.per_place // n))
 
 
 class TimeCorrelation(NamedTuple):
     """Correlation in time of the errors of K positions: exp(-t / time) after t."""
 
-    stamps: FloatArray
-    """Stamps of the positions, shape (K,) [s]; only differences matter."""
-    time: float | FloatArray
-    """
-    Correlation time, shape () or (K,) [s]; 0 for white noise. Errors with different correlation
-    times are taken to be independent, as those of different receivers.
-    """
+    stamps: FloatArray  # of the positions [s]; only differences matter
+    # correlation times [s]; 0 for white noise. Errors with different ones are taken to be
+    # independent, as those of different receivers.
+    time: FloatArray
 
 
 def positions_along(
-    poses: FloatArray, observed: ObservedNodes, noise: OdometryNoise,
-    correlation: TimeCorrelation | None,
+    poses: Poses, observed: ObservedNodes, noise: OdometryNoise,
+    correlation: TimeCorrelation,
 ) -> Positions:
-    """
-    Return the positions of observed nodes in the order of the drive.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), poses of the hidden nodes by odometry [m, m, rad]
-    observed : ObservedNodes, K >= 1 positions or global poses, whose headings are not used
-    correlation : TimeCorrelation, optional, correlation of the errors; None for white noise
-
-    """
-    none = np.zeros(len(observed))
-    stamp, time = (none, none) if correlation is None else correlation
-    tau = np.broadcast_to(np.asarray(time, dtype=np.float64), (len(observed),))
+    """Return the positions of observed nodes in the order of the drive."""
+    stamp, tau = correlation
     # by all columns, so that the order of the result does not depend on that of the input
     order = np.lexsort((tau, *observed.information.reshape(-1, 9).T, *observed.mean.T,
                         *observed.offset.T, stamp, observed.node))
@@ -154,26 +158,18 @@ def _points(poses: FloatArray) -> ComplexArray:
 class Consensus:
     """The motion that most positions agree on."""
 
-    T_map_odom: FloatArray
-    """Shape (3,) [m, m, rad]."""
+    T_map_odom: FloatArray  # shape (3,) [m, m, rad]
+    # standard deviation of the angle at the node, with the drift of odometry [rad]
     sigma_heading: float
-    """Standard deviation of the angle at the node, with the drift of odometry [rad]."""
-    node: int
-    """Hidden node at which the angle has the least variance."""
-    walk: float
-    """Variance of the heading by odometry up to the node [rad^2]."""
-    baseline: float
-    """Diagonal of the box around the inliers in the odometry frame [m]."""
+    node: int  # hidden node at which the angle has the least variance
+    walk: float  # variance of the heading by odometry up to the node [rad^2]
+    baseline: float  # diagonal of the box around the inliers in the odometry frame [m]
+    # standard deviation of a position, by the mean weight, inflated by the residuals [m]
     sigma_position: float
-    """Standard deviation of a position, by the mean weight, inflated by the residuals [m]."""
-    scale: float
-    """Ratio of lengths in the map to lengths by odometry."""
-    count: int
-    """Number of inliers."""
-    inlier_fraction: float
-    """Number of inliers over the number of positions."""
-    cost: float
-    """Minus twice the log likelihood of all positions, truncated for outliers."""
+    scale: float  # ratio of lengths in the map to lengths by odometry
+    count: int  # number of inliers
+    inlier_fraction: float  # number of inliers over the number of positions
+    cost: float  # minus twice the log likelihood of all positions, truncated for outliers
 
 
 def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
@@ -189,8 +185,8 @@ def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
     p, q = chosen.odometry - p_mean, chosen.observed - q_mean
     spread = float(np.sum(weight * np.abs(p)**2))
     z = complex(np.sum(weight * p.conj() * q)) / spread if spread > 0.0 else 0j
-    if abs(z) < LEAST_SCALE:
-        return None
+    if abs(z) < 1e-6:
+        return None  # the rotation is undefined
     chi2 = float(np.sum(weight * np.abs(q - z * p)**2))
     inflation = max(1.0, chi2 / (2.0 * n - 4.0)) if n > 2 else 1.0
     variance_heading, best = _heading_variance(chosen, weight * p / spread, z, noise)
@@ -213,17 +209,10 @@ def _drift(positions: Positions, noise: OdometryNoise) -> FloatArray:
 
 
 def mirrored(positions: Positions, found: Consensus, noise: OdometryNoise) -> bool:
-    """
-    Tell whether the mirror image of odometry fits better, as with a left-handed frame.
-
-    Parameters
-    ----------
-    found : Consensus, result of `consensus` for the same positions
-
-    """
+    """Tell whether the mirror image of odometry fits better, as with a left-handed frame."""
     variance = positions.variance + _drift(positions, noise)
     inlier, cost = _inliers(positions.odometry.conj(), positions.observed, variance)
-    return cost < found.cost - TRUNCATION and bool(np.mean(inlier) >= LEAST_AGREEMENT)
+    return cost < found.cost - TUNED.truncation and bool(np.mean(inlier) >= TUNED.least_agreement)
 
 
 def _inliers(
@@ -232,22 +221,22 @@ def _inliers(
     """Return which positions are inliers of the best motion, shape (K,), and its cost."""
     # near the origin, as products of large coordinates would lose digits
     p, q = p - np.median(p.real) - 1j * np.median(p.imag), q - q[0]
-    anchors = np.unique(np.linspace(0, len(p) - 1, ANCHORS).round().astype(np.int64))
+    anchors = np.unique(np.linspace(0, len(p) - 1, TUNED.anchors).round().astype(np.int64))
     i, j = (anchors[index] for index in np.triu_indices(len(anchors), 1))
     length = np.abs(p[j] - p[i])
     # no short pairs; a quarter, as the inliers may all lie on a part of the path
     far = length >= max(0.25 * np.max(length, initial=0.0), 1e-9)
     i, j = i[far], j[far]
     z = (q[j] - q[i]) / (p[j] - p[i])
-    likely = (np.abs(z) <= LARGEST_SCALE) & (np.abs(z) >= 1.0 / LARGEST_SCALE)
+    likely = (np.abs(z) <= TUNED.largest_scale) & (np.abs(z) >= 1.0 / TUNED.largest_scale)
     i, j, z = i[likely], j[likely], z[likely]
     # without outliers the fit to all positions is the best hypothesis
     all_z, all_shift = _fitted(1.0 / variance[None], p, q)
     z = np.append(all_z, z)
     shift = np.append(all_shift, 0.5 * (q[i] + q[j] - z[1:] * (p[i] + p[j])))
     inlier, cost = _scored(z, shift, p, q, variance)
-    inlier = inlier[np.argsort(cost, kind='stable')[:REFINED]]
-    for _ in range(ITERATIONS):
+    inlier = inlier[np.argsort(cost, kind='stable')[:TUNED.refined]]
+    for _ in range(TUNED.iterations):
         before = inlier
         inlier, cost = _scored(*_fitted(before / variance, p, q), p, q, variance)
         if np.array_equal(before, inlier):
@@ -260,11 +249,11 @@ def _fitted(
     weight: FloatArray, p: ComplexArray, q: ComplexArray,
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return the least-squares z and s for each row of weights, shape (H, K)."""
-    total = np.maximum(np.sum(weight, axis=1), TINY)
+    total = np.maximum(np.sum(weight, axis=1), 1e-300)
     p_mean, q_mean = weight @ p / total, weight @ q / total
     p_off, q_off = p - p_mean[:, None], q - q_mean[:, None]
     spread = np.sum(weight * np.abs(p_off)**2, axis=1)
-    z = np.sum(weight * p_off.conj() * q_off, axis=1) / np.maximum(spread, TINY)
+    z = np.sum(weight * p_off.conj() * q_off, axis=1) / np.maximum(spread, 1e-300)
     return z, q_mean - z * p_mean
 
 
@@ -279,14 +268,15 @@ def _scored(
     """
     n = len(p)
     energy = np.abs(q - z[:, None] * p - shift[:, None])**2 / variance
-    rank = int(np.ceil(LEAST_AGREEMENT * n - 1e-9))
+    rank = int(np.ceil(TUNED.least_agreement * n - 1e-9))
     # expected value at this rank of n draws of a chi2 with 2 degrees of freedom
     expected = -2.0 * np.log1p(-rank / (n + 1.0))
     inflation = np.partition(energy, rank - 1, axis=1)[:, rank - 1] / expected
-    inflation = np.clip(inflation, 1.0, min(LARGEST_INFLATION, n))
+    inflation = np.clip(inflation, 1.0, min(TUNED.largest_inflation, n))
     energy /= inflation[:, None]
-    cost = np.sum(np.minimum(energy, TRUNCATION), axis=1) + PRICE * n * np.log(inflation)
-    return energy <= TRUNCATION, np.asarray(cost)
+    cost = np.sum(np.minimum(energy, TUNED.truncation), axis=1)
+    cost += TUNED.price * n * np.log(inflation)
+    return energy <= TUNED.truncation, np.asarray(cost)
 
 
 def _heading_variance(

@@ -16,73 +16,44 @@ import numpy as np
 from pose_graph_ros.core.alignment.consensus import (
     Consensus,
     consensus,
-    LARGEST_SCALE,
-    LEAST_AGREEMENT,
     mirrored,
     Positions,
     positions_along,
     TimeCorrelation,
+    TUNED,
 )
 from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses, PoseVector
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import observed_errors
-
-# Greatest sigma of the heading of a global pose that aligns the graph alone [rad].
-ALIGNING_SIGMA = 0.5
-# Standard deviation of the scale between two positions without noise. Two positions alone are only
-# used if the scale is within 2 sigma of 1, as no third one could show an error.
-SCALE_OF_TWO = 0.05
-# Greatest drift of the heading by odometry, 1 sigma, within a stretch of the drive [rad].
-STRETCH = 0.3
-# Factors by which stretches are shortened, one after the other, until their fits agree.
-SHORTENINGS = (1.0, 3.0, 9.0, 27.0)
-# Greatest number of stretches that are used.
-MOST_STRETCHES = 8
-# Least number of positions of a shortened stretch, as three may fit a wrong motion by chance.
-LEAST_OF_SHORTENED = 5
-# The newest angle is preferred unless its sigma is greater than the least one by this factor.
-COMPARABLE_SIGMA = 2.0
-# Two angles disagree if they differ by more than both of these [sigma, rad]; the solver corrects
-# smaller differences.
-DISAGREEMENT = 4.0
-LEAST_CORRECTION = 0.3
+from pose_graph_ros.core.quantities import Radians
 
 
 class GraphAlignment(NamedTuple):
     """Pose of a graph in the map, from observed nodes."""
 
+    # shape (3,) [m, m, rad]; None while the angle is not known well enough
     T_map_graph: FloatArray | None
-    """Shape (3,) [m, m, rad]; None while the angle is not known well enough."""
-    sigma: float
-    """Standard deviation of the angle at the node, with the drift of odometry [rad]."""
-    node: int = -1
-    """Hidden node at which the angle has the least variance; -1 without an angle."""
+    sigma: float  # standard deviation of the angle at the node, with the drift of odometry [rad]
+    node: int = -1  # hidden node at which the angle has the least variance; -1 without an angle
 
 
 def find_alignment(
     poses: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy, noise: OdometryNoise,
-    correlation: TimeCorrelation | None = None,
+    correlation: TimeCorrelation,
 ) -> GraphAlignment:
     """
     Return the rigid motion that takes a graph into the map, if it is known well enough.
 
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
-    observed : ObservedNodes
-        Positions and global poses on these hidden nodes, in any order; K >= 1.
-    noise : OdometryNoise, noise of the odometry between the nodes
-    correlation : TimeCorrelation, optional, that of the errors; None for white noise
-
+    It is found from positions and global poses on its hidden nodes, at least one, in any order.
     """
     sigma = np.full(len(observed), np.inf)
     full = observed.kind == ObservedKind.GLOBAL_POSE
     sigma[full] = np.sqrt(np.linalg.inv(observed.information[full])[:, 2, 2])
     best = int(np.argmin(sigma))
-    if sigma[best] <= ALIGNING_SIGMA:
+    if sigma[best] <= TUNED.aligning_sigma:
         predicted = se2.compose(poses[observed.node[best]], observed.offset[best])
         return GraphAlignment(se2.compose(observed.mean[best], se2.inverse(predicted)),
                               float(sigma[best]), int(observed.node[best]))
@@ -91,8 +62,8 @@ def find_alignment(
 
 
 def recheck(
-    solved: FloatArray, odometry: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy,
-    noise: OdometryNoise, *, correlation: TimeCorrelation | None = None, sigma: float = 0.0,
+    solved: Poses, odometry: Poses, observed: ObservedNodes, policy: AlignmentPolicy,
+    noise: OdometryNoise, *, correlation: TimeCorrelation, sigma: Radians = 0.0,
 ) -> GraphAlignment | None:
     """
     Return a new alignment if more positions show that the angle in use is wrong.
@@ -100,15 +71,6 @@ def recheck(
     The angle found from the positions alone, as by `find_alignment`, is compared with the angle
     between the solved graph and odometry at the same node. The result is the motion from the
     odometry frame into the map; None if the angle in use is right, or none is determined.
-
-    Parameters
-    ----------
-    solved : ndarray, shape (N, 3), hidden nodes in the map by the present solution [m, m, rad]
-    odometry : ndarray, shape (N, 3), the same nodes by odometry alone, in its frame [m, m, rad]
-    observed : ObservedNodes, all positions and global poses so far, on these nodes; K >= 1
-    policy, noise, correlation : as in `find_alignment`
-    sigma : float, standard deviation of the angle in use [rad]
-
     """
     positions = positions_along(odometry, observed, noise, correlation)
     found = _from_positions(positions, policy, noise)
@@ -116,7 +78,7 @@ def recheck(
         return None
     in_use = solved[found.node, 2] - odometry[found.node, 2]
     difference = abs(float(se2.wrap(found.T_map_graph[2] - in_use)))
-    limit = max(LEAST_CORRECTION, DISAGREEMENT * float(np.hypot(found.sigma, sigma)))
+    limit = max(TUNED.least_correction, TUNED.disagreement * float(np.hypot(found.sigma, sigma)))
     return found if difference > limit else None
 
 
@@ -125,7 +87,7 @@ def _certain(found: Consensus, policy: AlignmentPolicy) -> bool:
     sigmas = policy.baseline_in_sigmas
     if found.count < 3:
         # only a third position could show that one of the two is wrong
-        tolerance = 2.0 * float(np.hypot(found.sigma_heading, SCALE_OF_TWO))
+        tolerance = 2.0 * float(np.hypot(found.sigma_heading, TUNED.scale_of_two))
         if found.inlier_fraction < 1.0 or abs(found.scale - 1.0) > tolerance:
             return False
         sigmas *= 2.0
@@ -134,8 +96,8 @@ def _certain(found: Consensus, policy: AlignmentPolicy) -> bool:
     return (found.sigma_heading <= policy.sigma_heading
             and found.baseline >= policy.minimum_baseline
             and found.baseline >= sigmas * found.sigma_position
-            and 1.0 / LARGEST_SCALE <= found.scale <= LARGEST_SCALE
-            and found.inlier_fraction >= LEAST_AGREEMENT - 1e-9)
+            and 1.0 / TUNED.largest_scale <= found.scale <= TUNED.largest_scale
+            and found.inlier_fraction >= TUNED.least_agreement - 1e-9)
 
 
 def _from_positions(
@@ -145,8 +107,8 @@ def _from_positions(
     if positions.baseline < policy.minimum_baseline:
         return GraphAlignment(None, np.inf)
     sigma, sparse = np.inf, True
-    for shortening in SHORTENINGS:
-        least = LEAST_OF_SHORTENED if shortening > 1.0 else min(3, len(positions.node))
+    for shortening in TUNED.shortenings:
+        least = TUNED.least_of_shortened if shortening > 1.0 else min(3, len(positions.node))
         stretches = _stretches(positions, shortening)
         found = [consensus(stretch, noise) if len(stretch.node) >= least else None
                  for stretch in stretches]
@@ -171,13 +133,13 @@ def _stretches(positions: Positions, shortening: float) -> list[Positions]:
     """Return stretches of the drive with about the same drift of odometry, newest first."""
     # the path length decides where odometry has no noise of the heading
     to_come = positions.walk[-1] - positions.walk + 1e-9 * (positions.path[-1] - positions.path)
-    n = shortening * np.ceil(to_come[0] / STRETCH**2)
+    n = shortening * np.ceil(to_come[0] / TUNED.stretch**2)
     if n == 0.0:
         return [positions.thinned()]
     number = np.minimum(np.floor(to_come * (n / to_come[0])), n - 1.0)
     used = np.unique(number)
     # the newest, the oldest, and some evenly in between
-    used = used[np.unique(np.linspace(0, len(used) - 1, MOST_STRETCHES).round().astype(np.int64))]
+    used = used[np.unique(np.linspace(0, len(used) - 1, TUNED.stretches).round().astype(np.int64))]
     return [positions.rows(number == k).thinned() for k in used]
 
 
@@ -187,7 +149,7 @@ def _left_handed(
     """Tell whether most stretches with a fit are mirrored; short ones may be too straight."""
     left = [mirrored(stretch, item, noise)
             for stretch, item in zip(stretches, found, strict=True) if item is not None]
-    return any(left) and sum(left) >= LEAST_AGREEMENT * len(left)
+    return any(left) and sum(left) >= TUNED.least_agreement * len(left)
 
 
 def _supported(
@@ -206,7 +168,7 @@ def _supported(
             sigma = float(np.sqrt(np.median(stretch.variance)))
             far = max(policy.minimum_baseline, policy.baseline_in_sigmas * sigma)
             n_relevant += len(stretch.node) >= least and (
-                stretch.path[-1] - stretch.path[0] >= far if least == LEAST_OF_SHORTENED
+                stretch.path[-1] - stretch.path[0] >= far if least == TUNED.least_of_shortened
                 else stretch.baseline >= 2.0 * far)
     if len(candidates) == 0:
         return None
@@ -214,19 +176,19 @@ def _supported(
         (item.T_map_odom[2], item.sigma_heading**2, item.walk) for item in candidates]).T
     allowed = variance[:, None] + variance + np.abs(walk[:, None] - walk)
     agree = np.abs(se2.wrap(theta[:, None] - theta)) <= np.maximum(
-        DISAGREEMENT * np.sqrt(allowed), LEAST_CORRECTION)
+        TUNED.disagreement * np.sqrt(allowed), TUNED.least_correction)
     # also through fits in between, as odometry may drift more than its noise allows
     reached = np.linalg.matrix_power(agree.astype(np.int64), len(theta)) > 0
-    supported = np.sum(reached, axis=1) >= LEAST_AGREEMENT * n_relevant - 1e-9
+    supported = np.sum(reached, axis=1) >= TUNED.least_agreement * n_relevant - 1e-9
     if not np.any(supported):
         return None
     # the newest, as receivers converge over time, unless it is much less certain
-    good = supported & (variance <= COMPARABLE_SIGMA**2 * np.min(variance[supported]))
+    good = supported & (variance <= TUNED.comparable_sigma**2 * np.min(variance[supported]))
     return candidates[int(np.argmax(good))]
 
 
 def guess(
-    poses: FloatArray, newest: FloatArray, observed: ObservedNodes,
+    poses: Poses, newest: PoseVector, observed: ObservedNodes,
 ) -> tuple[FloatArray, FloatArray]:
     """
     Return a shift of the graph into the map and a covariance while the angle is not known.
@@ -235,13 +197,6 @@ def guess(
     the shifted pose of the robot in map axes. With d the distance from there and an angle that is
     uniform on the circle, the mean square error of each coordinate is d^2, that of the heading
     pi^2 / 3.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), hidden nodes in the frame of the graph [m, m, rad]
-    newest : ndarray, shape (3,), pose of the robot in the same frame [m, m, rad]
-    observed : ObservedNodes, positions or global poses on these hidden nodes; K >= 1
-
     """
     certainty = np.trace(observed.information[:, :2, :2], axis1=1, axis2=2)
     best = int(np.argmax(certainty))

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.consensus import TimeCorrelation
-from pose_graph_ros.core.alignment.estimator import ALIGNING_SIGMA, GraphAlignment
+from pose_graph_ros.core.alignment.consensus import TimeCorrelation, TUNED
+from pose_graph_ros.core.alignment.estimator import GraphAlignment
 from pose_graph_ros.core.config import BackendConfig, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -26,23 +26,16 @@ from pose_graph_ros.core.graph.constraints import (
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
-from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement
-
-# Number of measurements beyond which the angle is not checked any more.
-LAST_RECHECK = 4096
-# Number of measurements at which the angle is checked for the first time.
-FIRST_RECHECK = 8
+from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement
 
 
 class AlignmentState(Enum):
     """Whether the pose of the odometry frame in the map is known."""
 
-    LOCAL = 'local'
-    """No positions in the map yet: the map is the odometry frame of the start."""
+    LOCAL = 'local'  # no positions in the map yet: the map is the odometry frame of the start
+    # there are positions, but the angle between odometry and map is not known yet
     UNALIGNED = 'unaligned'
-    """There are positions, but the angle between odometry and map is not known yet."""
-    ALIGNED = 'aligned'
-    """The graph lies in the map."""
+    ALIGNED = 'aligned'  # the graph lies in the map
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,22 +43,15 @@ class SavedAlignment:
     """Saved state of the alignment, and the M measurements for the next check."""
 
     state: str
-    sigma: float | None
-    """Standard deviation of the angle [rad]; None for infinite."""
-    next_verdict: int
-    """Number of measurements at which the angle is checked next."""
+    sigma: float | None  # standard deviation of the angle [rad]; None for infinite
+    next_verdict: int  # number of measurements at which the angle is checked next
     sources: tuple[str, ...]
-    """Names of the sources."""
-    source: Integers
-    """Index of each measurement's source, shape (M,)."""
+    source: Integers  # index of each measurement's source, shape (M,)
     stamps_ns: Integers
-    """Shape (M,) [ns]."""
-    node: Integers
-    """Columns of `ObservedNodes`, as the four below; shape (M,)."""
+    node: Integers  # columns of `ObservedNodes`, as the four below; shape (M,)
     offset: Rows3
     mean: Rows3
-    information: Rows6
-    """Upper triangles, shape (M, 6)."""
+    information: Rows6  # upper triangles, shape (M, 6)
     kind: ObservedKinds
 
 
@@ -88,10 +74,9 @@ class AlignmentMonitor:
     def __init__(self, config: BackendConfig) -> None:
         self._config = config
         self.state = AlignmentState.LOCAL
-        self.sigma = np.inf
-        """Standard deviation of the angle when it was found [rad]."""
+        self.sigma = np.inf  # standard deviation of the angle when it was found [rad]
         self._evidence: list[Evidence] = []
-        self._next_recheck = FIRST_RECHECK
+        self._next_recheck = TUNED.first_recheck
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for checks from now on, which use all measurements so far."""
@@ -105,11 +90,6 @@ class AlignmentMonitor:
 
         It has the shape (3,), and is None if the graph is aligned already, or the angle is not
         known well enough.
-
-        Parameters
-        ----------
-        waiting : list of AttachedMeasurement, on its hidden nodes, but not in it yet
-
         """
         if self.state is AlignmentState.ALIGNED or len(waiting) == 0:
             return None
@@ -125,7 +105,7 @@ class AlignmentMonitor:
         if len(headings) > 0:
             by_heading = _by_heading(poses, *(
                 _numbered(nodes, _table(some)) for some in (headings, positions)))
-            if by_heading.sigma < min(found.sigma, ALIGNING_SIGMA):
+            if by_heading.sigma < min(found.sigma, TUNED.aligning_sigma):
                 found = by_heading
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
                       else AlignmentState.ALIGNED)
@@ -134,13 +114,13 @@ class AlignmentMonitor:
 
     def add(self, added: list[AttachedMeasurement]) -> None:
         """Store the measurements that were added to the graph for the next check."""
-        if self._next_recheck <= LAST_RECHECK:
+        if self._next_recheck <= TUNED.last_recheck:
             self._evidence += map(_evidence_of, placed(added))
 
     def stop_rechecking(self) -> None:
         """Stop checking the angle, because the path is not that of odometry any more."""
         self._evidence.clear()
-        self._next_recheck = LAST_RECHECK + 1
+        self._next_recheck = TUNED.last_recheck + 1
 
     def forget(self, node: int) -> None:
         """Drop the stored measurements on hidden nodes before one, by its id."""
@@ -153,11 +133,6 @@ class AlignmentMonitor:
         The check is only made when the number of measurements has doubled since the last one. The
         poses are those of odometry, moved into the map, shape (N, 3), with biases of 0; None if
         the angle is not checked or not wrong.
-
-        Parameters
-        ----------
-        graph : Graph, in the map
-
         """
         if self.state is not AlignmentState.ALIGNED or len(self._evidence) < self._next_recheck:
             return None
@@ -167,7 +142,7 @@ class AlignmentMonitor:
             nodes.recent_poses(graph), nodes.odometry, _numbered(nodes, _table(self._evidence)),
             self._config.alignment, _noise(nodes),
             correlation=self._correlation(self._evidence), sigma=self.sigma)
-        if self._next_recheck > LAST_RECHECK:
+        if self._next_recheck > TUNED.last_recheck:
             self._evidence.clear()
         if found is None or found.T_map_graph is None:
             return None
@@ -233,14 +208,7 @@ def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
 
 
 def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> ObservedNodes:
-    """
-    Return the observed nodes of measurements, with the rows of their hidden nodes.
-
-    Parameters
-    ----------
-    graph : Graph, with the hidden nodes
-
-    """
+    """Return the observed nodes of measurements, with the rows of their hidden nodes."""
     table = _table(measurements)
     return ObservedNodes(graph.node_rows(table.node), *table.columns[1:])
 

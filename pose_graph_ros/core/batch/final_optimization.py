@@ -8,7 +8,7 @@ the weights of constraints with a robust loss are computed from initial values.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -20,25 +20,32 @@ from pose_graph_ros.core.batch.optimizer import (
     Solve,
     Status,
 )
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.solver_config import SolverConfig
 
-# Maximum number of reweighting iterations.
-REWEIGHTINGS = 200
-# Where contradictions are believed, each solution can take all iterations that it may: that many
-# of these in all.
-MOST_SOLUTIONS = 10
-# Number of iterations from one solution to the next, and of reweightings, that are many: more than
-# the last iterations without effect are, and than weights take that converge fast. Then it is
-# enough that the cost converges.
-MANY, MANY_REWEIGHTINGS = 11, 50
-# Largest change of a weight at which the reweighting has converged.
-SAME_WEIGHT = 1e-12
-# Successive factors on the thresholds of the losses, after plain least squares.
-WIDENED = (32.0, 16.0, 8.0, 4.0, 2.0)
-# Initial weight of constraints with a loss in the start from the constraints without one.
-SMALL_WEIGHT = 1e-4
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """Numbers of the optimisation with robust losses."""
+
+    reweightings: int = 200  # at most
+    # Where contradictions are believed, each solution can take all iterations that it may: that
+    # many of these in all.
+    solutions: int = 10
+    # Numbers of iterations from one solution to the next, and of reweightings, that are many: more
+    # than the last iterations without effect are, and than weights take that converge fast. Then
+    # it is enough that the cost converges.
+    many: int = 11
+    many_reweightings: int = 50
+    same_weight: float = 1e-12  # largest change of a weight at which the reweighting has converged
+    # factors on the thresholds of the losses, one after the other, after plain least squares
+    widened: tuple[float, ...] = (32.0, 16.0, 8.0, 4.0, 2.0)
+    # weight of constraints with a loss in the start from the constraints without one
+    small_weight: float = 1e-4
+
+
+TUNING = Tuning()
 
 
 def optimize(
@@ -49,14 +56,6 @@ def optimize(
 
     With robust losses, chi2 is the robust cost. All poses and weights are restored if it fails;
     an exception of `solve` counts as a failure.
-
-    Parameters
-    ----------
-    graph : Graph
-    reweighting : Reweighting, constraints of the graph that have a robust loss
-    config : SolverConfig
-    solve : callable, optimises a graph in place
-
     """
     poses, weights = graph.poses.copy(), graph.weights
     try:
@@ -86,7 +85,7 @@ def _optimize_robustly(
     weights, because these depend on the order in which the measurements were received.
     """
     best, poses, weights = None, graph.poses, graph.weights
-    for weight, widened in ((1.0, WIDENED), (SMALL_WEIGHT, ())):
+    for weight, widened in ((1.0, TUNING.widened), (TUNING.small_weight, ())):
         _set_weights(graph, *reweighting.all_alike(weight))
         result = optimize_from_two_starts(graph, config, solve)
         for factor in widened:
@@ -118,7 +117,7 @@ def _reweighted(
     kept then, and the status is MAX_ITERATIONS.
     """
     iterations, largest, cost = 0, 1.0, math.inf
-    for k in range(REWEIGHTINGS):
+    for k in range(TUNING.reweightings):
         before, cost_before = graph.weights, cost
         found = _solved_with(graph, reweighting.all_changes(graph), config, solve)
         if found is None:
@@ -129,15 +128,15 @@ def _reweighted(
         result = found
         iterations += result.iterations
         cost = result.chi2 + reweighting.cost(graph)
-        is_slow = result.iterations >= MANY or k >= MANY_REWEIGHTINGS
+        is_slow = result.iterations >= TUNING.many or k >= TUNING.many_reweightings
         if (is_slow and result.status is not Status.MAX_ITERATIONS
                 and not cost < cost_before * (1.0 - SAME_MINIMUM)):
             largest = 0.0
-        if largest < SAME_WEIGHT or iterations > MOST_SOLUTIONS * config.max_iterations:
+        if largest < TUNING.same_weight or iterations > TUNING.solutions * config.max_iterations:
             break
     if result.status is Status.FAILED:
         return result
-    if largest >= SAME_WEIGHT:
+    if largest >= TUNING.same_weight:
         result = replace(result, status=Status.MAX_ITERATIONS)
     return replace(result, iterations=iterations, chi2=result.chi2 + reweighting.cost(graph))
 
@@ -155,7 +154,7 @@ def _solved_with(
     _set_weights(graph, *changes)
     result = solve(graph, config)
     smallest = min(min(new.values(), default=1.0) for new in changes)
-    if result.status is not Status.FAILED or smallest > SMALL_WEIGHT:
+    if result.status is not Status.FAILED or smallest > TUNING.small_weight:
         return result
     graph.set_weights(before)
     return None

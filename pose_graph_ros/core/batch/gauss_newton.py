@@ -12,14 +12,14 @@ a whole iteration. Near the minimum it converges nearly as fast as Gauss-Newton;
 the Jacobians change fast, it does not converge.
 """
 
+import math
+
+import numpy as np
+
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, ROWS
 from pose_graph_ros.core.elimination.assembly import eliminate_clique
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
-
-# Relative rounding error of a sum of many numbers, and of a coordinate.
-SUM_ROUNDING = 1e-12
-COORDINATE_ROUNDING = 2.0**-52
 
 
 @kernel(signature=(tb.HEAD, ROWS))
@@ -69,10 +69,10 @@ def linearize(head):  # type: ignore[no-untyped-def]
     _refer_to_poses(head)
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.WEIGHT] > 0.0:
-            factors.linearize_edge(head, e)
+            factors.linearize(head, e)
     for k in range(head[tb.N_OBSERVED]):
         if observed_f[k, tb.WEIGHT] > 0.0:
-            factors.linearize_observed(head, k)
+            factors.linearize(head, -1 - k)
 
 
 @kernel(signature=(tb.HEAD, NUMBER))
@@ -203,13 +203,13 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.WEIGHT] > 0.0:
-            energy, size, terms = normal_equations.edge_gradient(head, e, right)
+            energy, size, terms = normal_equations.gradient(head, e, right)
             chi2 += energy
             gradient_sum += size
             cancelled += terms
     for k in range(head[tb.N_OBSERVED]):
         if observed_f[k, tb.WEIGHT] > 0.0:
-            energy, size, terms = normal_equations.observed_gradient(head, k, right)
+            energy, size, terms = normal_equations.gradient(head, -1 - k, right)
             chi2 += energy
             gradient_sum += size
             cancelled += terms
@@ -219,7 +219,8 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     cancelled += terms
     for v in range(head[tb.N_NODES]):
         reach = max(reach, abs(node_f[v, tb.POSE]), abs(node_f[v, tb.POSE + 1]))
-    return chi2, SUM_ROUNDING * max(chi2, 1.0) + COORDINATE_ROUNDING * (
+    # rounding of a sum of many numbers, and of coordinates
+    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (
         reach * gradient_sum + cancelled)
 
 
@@ -279,13 +280,13 @@ def settle(head):  # type: ignore[no-untyped-def]
     for e in range(head[tb.N_EDGES]):
         edge_i[e, tb.EDGE_WAITS] = 0
         if edge_f[e, tb.WEIGHT] > 0.0:
-            factors.check_edge(head, e, factors.NO_TURN)
+            factors.check(head, e, factors.NO_TURN)
             chi2 += edge_f[e, tb.ENERGY]
             error2 += edge_f[e, tb.ERROR2]
     for k in range(head[tb.N_OBSERVED]):
         observed_i[k, tb.OBS_WAITS] = 0
         if observed_f[k, tb.WEIGHT] > 0.0:
-            factors.check_observed(head, k)
+            factors.check(head, -1 - k, factors.NO_TURN)
             chi2 += observed_f[k, tb.ENERGY]
             error2 += observed_f[k, tb.ERROR2]
     scalars[tb.CHI2] = chi2
@@ -304,3 +305,37 @@ def settle(head):  # type: ignore[no-untyped-def]
             observed_i[k, tb.OBS_WAITS] = 1
             waiting[head[tb.N_WAITING]] = -1 - k
             head[tb.N_WAITING] += 1
+
+
+class CompiledSystem:
+    """The `System` of `levenberg_marquardt` for a graph in tables whose cliques are planted."""
+
+    def __init__(self, head: tb.IntHead) -> None:
+        self._head = head
+        # -b, and the best poses
+        self._right, self._best = np.empty((2, int(head[tb.N_NODES]), 3))
+
+    def keep_poses(self) -> None:
+        keep_poses(self._head, self._best)
+
+    def restore_poses(self) -> None:
+        put_poses(self._head, self._best)
+
+    def halve_step(self) -> None:
+        halve_step(self._head, self._best)
+
+    def evaluate(self) -> tuple[float, float]:
+        chi2, rounding = evaluate(self._head, self._right)
+        return chi2, rounding
+
+    def step(self, damping: float, *, chord: bool) -> float:
+        if chord:
+            return float(chord_step(self._head, self._right))
+        linearize(self._head)
+        return float(gauss_newton_step(self._head)) if eliminate(self._head, damping) else math.inf
+
+    def decrease(self) -> float:
+        return float(product_with_step(self._head, self._right))
+
+    def settle(self) -> None:
+        settle(self._head)

@@ -7,92 +7,155 @@ Every iteration solves `(H + lambda D) dx = -b`. D is diagonal and holds the inf
 constraints of a node have on its position and on its heading, which makes the damping independent
 of units (Marquardt 1963). With lambda = 0 the step is that of Gauss-Newton.
 
-chi2 may rise for up to `UPHILL_STEPS` Gauss-Newton steps in a row, since the path to a minimum can
-cross a ridge that no damped step crosses. If chi2 is not below its lowest value after these, the
-best poses are restored and lambda grows until a step, or half of it, lowers chi2. Each step that
-lowers chi2 reduces lambda, which is set to 0 below `LEAST_DAMPING` and after `DAMPED_STEPS`.
+chi2 may rise for a few Gauss-Newton steps in a row, since the path to a minimum can cross a ridge
+that no damped step crosses. If chi2 is not below its lowest value after these, the best poses are
+restored and lambda grows until a step, or half of it, lowers chi2. Each step that lowers chi2
+reduces lambda, which is set to 0 when it is small and after some damped steps.
+
+Nothing in here is compiled; a `System` does the linear algebra.
 """
 
 from collections.abc import Generator
+from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import NamedTuple
+from typing import Protocol, TypeVar
 
-import numpy as np
+from pose_graph_ros.core.config import SolverConfig
 
-from pose_graph_ros.core.batch import gauss_newton as gn
-from pose_graph_ros.core.batch.outcome import (
-    CHORD_RATIO,
-    has_converged,
-    KEEP_RATIO,
-    UPHILL_STEPS,
-)
-from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.solver_config import SolverConfig
-
-# Damping lambda after the first rejected step, its factor of growth after each further one and of
-# decay after each accepted one, the value below which it is set to 0, and the largest value.
-FIRST_DAMPING = 1e-5
-DAMPING_GROWTH = 10.0
-DAMPING_DECAY = 0.1
-LEAST_DAMPING = 1e-9
-LARGEST_DAMPING = 1e12
-# Number of damped steps in a row after which one without damping is tried again.
-DAMPED_STEPS = 10
-# Number of damped steps, each of which lowers chi2 by less than this fraction, until the
-# optimisation ends: where residuals are so large that only short steps lower chi2, thousands of
-# them would change it no more than the rounding of the measurements does.
-SLOW_STEPS, SLOW = 10, 1e-9
-# Number of steps that change chi2 by rounding only and do not become shorter, until convergence.
-LEVEL_STEPS = 2
-# Where no step lowers chi2, the optimisation has stalled if the linear model predicts a decrease
-# by more than this fraction of chi2 (of 1 if chi2 is smaller), and has converged otherwise. After
-# the last iteration it has converged below the second, and it ends early below the third.
-STALL = 1e-6
-AT_THE_END = 1e-9
-LEAST_DECREASE = 1e-16
+# Relative difference of chi2 below which two minima count as the same.
+SAME_MINIMUM = 1e-9
+# Iterations within which a good start converges; if it takes more, the next one is tried.
+TRUSTED_ITERATIONS = 20
 
 
-class Termination(Enum):
-    """Why the iterations ended."""
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """Numbers of the loop, found on graphs of the benchmark; lengths of steps in m and rad."""
 
-    CONVERGED = 0
-    MAX_ITERATIONS = 1
-    STALLED = 2
-    UNDETERMINED = 3
-    """H is singular: a node is not determined."""
+    # lambda after the first rejected step, its growth after each further one, its decay after each
+    # accepted one, the value below which it is set to 0, and the largest value
+    first_damping: float = 1e-5
+    damping_growth: float = 10.0
+    damping_decay: float = 0.1
+    least_damping: float = 1e-9
+    largest_damping: float = 1e12
+    # damped steps in a row after which one without damping is tried again
+    damped_steps: int = 10
+    # steps in a row for which chi2 may exceed the lowest so far, by any factor: a step along a
+    # narrow curved valley, as stiff constraints make it, ends high up, the next one far down
+    uphill_steps: int = 2
+    # It ends after so many damped steps that each lower chi2 by less than this fraction: where
+    # residuals are so large that only short steps lower chi2, thousands of them would change it
+    # no more than the rounding of the measurements does.
+    slow_steps: int = 10
+    slow: float = 1e-9
+    # steps that change chi2 by rounding only and do not become shorter, until convergence
+    level_steps: int = 2
+    # Where no step lowers chi2, the optimisation has stalled if the linear model predicts a
+    # decrease by more than this fraction of chi2 (at least 1), and has converged otherwise. After
+    # the last iteration it has converged below the second, and it ends early below the third.
+    stall: float = 1e-6
+    at_the_end: float = 1e-9
+    least_decrease: float = 1e-16
+    # largest ratio of the lengths of two steps after which the next one is a chord step: after a
+    # step with a new factorisation, and after a chord step
+    keep_ratio: float = 0.1
+    chord_ratio: float = 0.4
+    # a step that is no shorter than the last one but below this is rounding noise
+    noise_step: float = 1e-7
+    # largest predicted sum of all further steps at convergence, as a fraction of the tolerance
+    sure: float = 0.1
 
 
-class Minimum(NamedTuple):
-    """Result of `minimize`."""
-
-    termination: Termination
-    iterations: int
-    """Number of steps."""
-    chi2: float
+TUNING = Tuning()
 
 
-def minimize(
-    head: tb.IntHead, chi2: float, config: SolverConfig,
-) -> Generator[None, None, Minimum]:
+class Status(Enum):
+    """Outcome of an optimisation or of an update."""
+
+    CONVERGED = 'converged'
+    MAX_ITERATIONS = 'max_iterations'
+    STALLED = 'stalled'
+    """
+    No step lowers chi2 although the linear model predicts a decrease: a heading error is at pi.
+    """
+    FAILED = 'failed'
+
+
+class Start(Enum):
+    """Poses from which an optimisation began."""
+
+    CHORDAL = 'chordal start'
+    JOINT = 'joint start'
+    """Headings and positions solved for together, where nodes are observed."""
+    UNIT = 'start with unit headings'
+    PRESENT = 'present poses'
+
+
+@dataclass(frozen=True, slots=True)
+class BatchResult:
+    """Result of an optimisation."""
+
+    status: Status
+    reason: str  # a sentence when the status is FAILED, else empty
+    iterations: int  # number of steps
+    chi2: float  # at the poses after the call
+    start: Start = Start.PRESENT
+
+
+Result = TypeVar('Result')
+Optimization = Generator[None, None, BatchResult]
+"""An optimisation that pauses after parts of at most an iteration; it returns the result."""
+
+
+def to_the_end(parts: Generator[None, None, Result]) -> Result:
+    """Return the result of what is done in parts after doing all of them."""
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            result: Result = end.value
+            return result
+
+
+class System(Protocol):
+    """A graph whose poses are moved; it keeps the best of them and the last factorisation."""
+
+    def keep_poses(self) -> None:
+        """Take the present poses for the best."""
+
+    def restore_poses(self) -> None:
+        """Go back to the best poses."""
+
+    def halve_step(self) -> None:
+        """Go half of the way back to the best poses."""
+
+    def evaluate(self) -> tuple[float, float]:
+        """Return chi2 at the poses and its rounding error; note the gradient."""
+
+    def step(self, damping: float, *, chord: bool) -> float:
+        """
+        Move all poses; return the largest change of a coordinate, infinite if H is singular.
+
+        A chord step takes the last factorisation, with the gradient that was noted.
+        """
+
+    def decrease(self) -> float:
+        """Return the last step times the noted gradient, which a quadratic chi2 falls by."""
+
+    def settle(self) -> None:
+        """Bring what else depends on the poses up to date."""
+
+
+def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
     """
     Return the result of moving all nodes to a local minimum of chi2, after a pause at each step.
 
-    Unless the result is UNDETERMINED, the poses are those of the lowest chi2 found and the tables
-    are in the state after a step of the smoother.
-
-    Parameters
-    ----------
-    head : ndarray, head of tables that hold the cliques of the whole graph (`symbolic.plant`)
-    chi2 : float, chi2 at the present poses
-    config : SolverConfig
-
+    The poses are those of the lowest chi2 found, unless it has failed as H is singular.
     """
-    n_nodes = int(head[tb.N_NODES])
-    right, best = np.empty((n_nodes, 3)), np.empty((n_nodes, 3))
-    gn.keep_poses(head, best)
-    end, iterations, uphill = Termination.MAX_ITERATIONS, 0, 0
+    system.keep_poses()
+    end, iterations, uphill = Status.MAX_ITERATIONS, 0, 0
     solved = False  # whether any factorisation succeeded
     rejected = False  # whether any step was rejected
     chord = False  # whether the next step is a chord step
@@ -103,17 +166,17 @@ def minimize(
     while iterations < config.max_iterations:
         yield
         trial = math.inf
-        length = _step(head, damping, right, chord=chord)
+        length = system.step(damping, chord=chord)
         if length < math.inf:
             solved = True
             if rejected and damping == uphill == 0 and not chord and (
-                    gn.product_with_step(head, right) < LEAST_DECREASE * max(chi2, 1.0)):
-                end = Termination.CONVERGED
+                    system.decrease() < TUNING.least_decrease * max(chi2, 1.0)):
+                end = Status.CONVERGED
                 break
-            trial, rounding = gn.evaluate(head, right)
+            trial, rounding = system.evaluate()
             if damping > 0.0 and not trial <= chi2 + rounding < math.inf:
-                gn.halve_step(head, best)
-                trial, rounding = gn.evaluate(head, right)
+                system.halve_step()
+                trial, rounding = system.evaluate()
         lower = trial <= chi2 + rounding
         current = lower and damping == 0.0
         if lower:
@@ -122,74 +185,74 @@ def minimize(
             elif length >= shortest:
                 n_level += 1
             shortest = min(shortest, length)
-            slow = damping > 0.0 and chi2 - trial < SLOW * max(chi2, 1.0)
+            slow = damping > 0.0 and chi2 - trial < TUNING.slow * max(chi2, 1.0)
             n_slow = n_slow + 1 if slow else 0
             chi2 = trial
-            gn.keep_poses(head, best)
+            system.keep_poses()
             iterations += 1
             # an uphill step or stronger damping before this step changes its length
             comparable = uphill == 0 and damping <= last_damping
-            if n_level >= LEVEL_STEPS or n_slow >= SLOW_STEPS or (
+            if n_level >= TUNING.level_steps or n_slow >= TUNING.slow_steps or (
                     comparable and has_converged(length, previous, config.step_tolerance)):
-                end = Termination.CONVERGED
+                end = Status.CONVERGED
                 break
             chord = comparable and damping == 0.0 and previous < math.inf and (
-                length < (CHORD_RATIO if chord else KEEP_RATIO) * previous)
+                length < (TUNING.chord_ratio if chord else TUNING.keep_ratio) * previous)
             last_damping = damping
             n_damped = n_damped + 1 if damping > 0.0 else 0
-            damping *= DAMPING_DECAY
-            if damping < LEAST_DAMPING or n_damped >= DAMPED_STEPS:
+            damping *= TUNING.damping_decay
+            if damping < TUNING.least_damping or n_damped >= TUNING.damped_steps:
                 damping, n_damped = 0.0, 0
             uphill, previous = 0, length
         elif (damping == 0.0 and not chord and trial < math.inf
-              and uphill < UPHILL_STEPS and iterations + 1 < config.max_iterations):
+              and uphill < TUNING.uphill_steps and iterations + 1 < config.max_iterations):
             iterations += 1
             uphill, previous = uphill + 1, length
         else:
-            gn.put_poses(head, best)
-            gn.evaluate(head, right)
+            system.restore_poses()
+            system.evaluate()
             rejected = True
             if not chord:
-                damping = max(FIRST_DAMPING, damping * DAMPING_GROWTH)
-                if damping > LARGEST_DAMPING:
-                    end = Termination.STALLED if solved else Termination.UNDETERMINED
+                damping = max(TUNING.first_damping, damping * TUNING.damping_growth)
+                if damping > TUNING.largest_damping:
+                    end = Status.STALLED if solved else Status.FAILED
                     break
             # a rejected chord step is repeated with a new factorisation before any damping
             chord, uphill = False, 0
     # after a rejected step short steps may mean that it is stuck where an error is at pi
-    at_best = current and not rejected and end is not Termination.MAX_ITERATIONS
-    if not at_best and end is not Termination.UNDETERMINED:
-        gn.put_poses(head, best)
-        end = _refactorized(head, best, end, chi2)
-    if end is not Termination.UNDETERMINED:
-        gn.settle(head)
-    return Minimum(end, iterations, chi2)
+    at_best = current and not rejected and end is not Status.MAX_ITERATIONS
+    if not at_best and end is not Status.FAILED:
+        system.restore_poses()
+        end = _refactorized(system, end, chi2)
+    if end is not Status.FAILED:
+        system.settle()
+    return BatchResult(end, '', iterations, chi2)
 
 
-def _step(head: tb.IntHead, damping: float, right: FloatArray, *, chord: bool) -> float:
-    """Move all nodes; return the largest change of a coordinate, infinite if H is singular."""
-    if chord:
-        return float(gn.chord_step(head, right))
-    gn.linearize(head)
-    if not gn.eliminate(head, damping):
-        return math.inf
-    return float(gn.gauss_newton_step(head))
-
-
-def _refactorized(
-    head: tb.IntHead, best: FloatArray, end: Termination, chi2: float,
-) -> Termination:
-    """Eliminate all cliques at the best poses without damping; return the final termination."""
-    gn.linearize(head)
-    if not gn.eliminate(head, 0.0):
-        return Termination.UNDETERMINED
-    right = np.empty_like(best)
-    gn.evaluate(head, right)
-    gn.gauss_newton_step(head)
-    # b^T H^-1 b, the decrease of a quadratic chi2
-    predicted = gn.product_with_step(head, right)
-    gn.put_poses(head, best)
-    least = AT_THE_END if end is Termination.MAX_ITERATIONS else STALL
+def _refactorized(system: System, end: Status, chi2: float) -> Status:
+    """Eliminate all nodes at the best poses without damping; return the final status."""
+    system.evaluate()
+    if not system.step(0.0, chord=False) < math.inf:
+        return Status.FAILED
+    predicted = system.decrease()
+    system.restore_poses()
+    least = TUNING.at_the_end if end is Status.MAX_ITERATIONS else TUNING.stall
     if not predicted > least * max(chi2, 1.0):
-        return Termination.CONVERGED
-    return Termination.STALLED if end is Termination.CONVERGED else end
+        return Status.CONVERGED
+    return Status.STALLED if end is Status.CONVERGED else end
+
+
+def has_converged(length: float, previous: float, tolerance: float) -> bool:
+    """
+    Tell whether the sum of all further steps is below the tolerance [m, rad].
+
+    Gauss-Newton converges linearly if errors remain at the minimum. If r is the ratio of the
+    lengths of the last two steps and remains so, the further steps add up to r / (1 - r) times the
+    last one. `previous` is infinite for the first step.
+    """
+    if length >= previous:
+        return length < TUNING.noise_step
+    if previous == math.inf:
+        return length < tolerance
+    ratio = length / previous
+    return length * ratio < TUNING.sure * tolerance * (1.0 - ratio)

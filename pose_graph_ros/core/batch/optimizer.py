@@ -8,33 +8,34 @@ these cliques (`levenberg_marquardt`). Afterwards the tables hold the cliques of
 poses, with which the incremental smoother can continue.
 """
 
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
-from pose_graph_ros.core.batch import chordal_start, gauss_newton
-from pose_graph_ros.core.batch.levenberg_marquardt import minimize, Termination
-from pose_graph_ros.core.batch.outcome import (
+from pose_graph_ros.core.batch import gauss_newton, linear_starts
+from pose_graph_ros.core.batch.levenberg_marquardt import (
     BatchResult,
+    minimize,
+    Optimization,
     SAME_MINIMUM,
     Start,
     Status,
+    to_the_end,
     TRUSTED_ITERATIONS,
 )
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.solver_config import SolverConfig
 
 __all__ = [
     'SAME_MINIMUM',
     'TRUSTED_ITERATIONS',
     'BatchResult',
-    'Parts',
+    'Optimization',
     'Solve',
     'Start',
     'Status',
@@ -47,14 +48,8 @@ __all__ = [
     'to_the_end',
 ]
 
-Result = TypeVar('Result')
-Parts = Generator[None, None, BatchResult]
-"""An optimisation that pauses after parts of at most an iteration; it returns the result."""
 Solve = Callable[[Graph, SolverConfig], BatchResult]
 """Function that optimises a graph in place, such as `optimize`."""
-
-_STATUS = {Termination.CONVERGED: Status.CONVERGED, Termination.STALLED: Status.STALLED,
-           Termination.MAX_ITERATIONS: Status.MAX_ITERATIONS}
 
 
 def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
@@ -64,25 +59,13 @@ def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
     If the optimisation fails numerically, the result says so, the poses are as before the call,
     and the smoother eliminates everything anew at its next step. All cliques are replaced, so this
     must not be called between `Graph.begin` and `Graph.rollback`.
-
-    Parameters
-    ----------
-    graph : Graph
-    config : SolverConfig
-
     """
     return to_the_end(in_parts(graph, config))
 
 
-def in_parts(graph: Graph, config: SolverConfig) -> Parts:
+def in_parts(graph: Graph, config: SolverConfig) -> Optimization:
     """
     Return the result of `optimize`, after a pause at each iteration.
-
-    Parameters
-    ----------
-    graph : Graph
-    config : SolverConfig
-
     """
     chi2, answer = _check_before(graph)
     if answer is not None:
@@ -92,48 +75,24 @@ def in_parts(graph: Graph, config: SolverConfig) -> Parts:
         yield from _minimize(graph, config, _analysed(graph), chi2)))
 
 
-def to_the_end(parts: Generator[None, None, Result]) -> Result:
-    """Return the result of what is done in parts after doing all of them."""
-    while True:
-        try:
-            next(parts)
-        except StopIteration as end:
-            result: Result = end.value
-            return result
-
-
 def optimize_from_linear_start(
     graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
 ) -> BatchResult:
     """
     Return the result of `from_linear_start` without pauses.
-
-    Parameters
-    ----------
-    graph : Graph
-    config : SolverConfig
-    starts : collection of Start
-
     """
     return to_the_end(from_linear_start(graph, config, starts))
 
 
 def from_linear_start(
     graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
-) -> Parts:
+) -> Optimization:
     """
     Return the result of moving the hidden nodes to a minimum from a start without initial poses.
 
     Starts are tried in their order until one converges in a few iterations, to a chi2 not
     above that of the present poses, which should be the last of them. The lowest minimum is kept,
     and the result says from which start it is. Failures are treated as in `optimize`.
-
-    Parameters
-    ----------
-    graph : Graph
-    config : SolverConfig
-    starts : collection of Start
-
     """
     chi2, answer = _check_before(graph)
     if answer is not None:
@@ -147,7 +106,7 @@ def from_linear_start(
     for start in starts:
         gauss_newton.put_poses(head, poses)
         try:
-            gauss_newton.put_poses(head, _start(graph, start, cliques))
+            gauss_newton.put_poses(head, _start(graph, start))
         except LinearSolveError:
             continue
         yield
@@ -179,13 +138,7 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
     After a long time without a position the heading may have drifted far. Gauss-Newton can then
     converge to a minimum with the heading wrapped the wrong way round, which takes many
     iterations. The lower of the two minima is kept.
-
-    Parameters
-    ----------
-    graph : Graph, is optimised in place; without observed nodes, from the present poses only
-    config : SolverConfig
-    solve : callable, optimises a graph in place
-
+    Without observed nodes, only the present poses are a start.
     """
     before = graph.poses.copy()
     result = solve(graph, config)
@@ -193,7 +146,7 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
         return result
     poses = graph.poses.copy()
     try:
-        graph.set_poses(_joint(graph))
+        graph.set_poses(linear_starts.joint(graph))
         other = solve(graph, config)
     except LinearSolveError:
         other = None
@@ -209,30 +162,15 @@ def _is_observed(graph: Graph) -> bool:
     return graph.n_observed > 0 or any(prior.anchored for prior in graph.priors)
 
 
-def _start(graph: Graph, start: Start, cliques: symbolic.Cliques) -> FloatArray:
-    """
-    Return the poses of a start, shape (N, 3), or raise LinearSolveError if there are none.
-
-    The modules that load SciPy are imported where they are needed.
-    """
+def _start(graph: Graph, start: Start) -> FloatArray:
+    """Return the poses of a start, or raise LinearSolveError if there are none."""
     if start is Start.CHORDAL:
-        return chordal_start.chordal(graph, cliques)
+        return linear_starts.chordal(graph)
     if start is Start.PRESENT:
         return graph.poses.copy()
-    if start is Start.JOINT:
-        if not _is_observed(graph):
-            raise LinearSolveError('joint start: no node is observed')
-        return _joint(graph)
-    from pose_graph_ros.core.batch.joint_start import unit_headings  # noqa: PLC0415
-
-    return unit_headings(graph)
-
-
-def _joint(graph: Graph) -> FloatArray:
-    """Return the joint start; its module is imported here because it loads SciPy."""
-    from pose_graph_ros.core.batch.joint_start import joint  # noqa: PLC0415
-
-    return joint(graph)
+    if start is Start.JOINT and not _is_observed(graph):
+        raise LinearSolveError('joint start: no node is observed')
+    return linear_starts.joint(graph, unit=start is Start.UNIT)
 
 
 def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
@@ -270,15 +208,15 @@ def _analysed(graph: Graph) -> symbolic.Cliques:
 
 def _minimize(
     graph: Graph, config: SolverConfig, cliques: symbolic.Cliques, chi2: float,
-) -> Parts:
+) -> Optimization:
     """Optimise from the present poses; the poses after a failure have no meaning."""
     head = graph.memory.head
     symbolic.plant(head, cliques)
-    termination, iterations, after = yield from minimize(head, chi2, config)
-    if termination is Termination.UNDETERMINED:
+    result = yield from minimize(gauss_newton.CompiledSystem(head), chi2, config)
+    if result.status is Status.FAILED:
         node = graph.node_ids[head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
-    return BatchResult(_STATUS[termination], '', iterations, after)
+    return result
 
 
 def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult) -> BatchResult:

@@ -1,222 +1,208 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Gauss-Newton from a chordal start for a `PlainGraph`, with NumPy and SuperLU.
+Optimisation of a graph of poses and edges alone with NumPy and SuperLU, for tools that run once.
 
-The method is that of `optimizer`, for the usual case: from a chordal start (`chordal_start` says
-what it is) few steps of Gauss-Newton lead to the minimum, the last ones with the factorisation of
-an earlier step. What is not so simple is left to `optimizer`: there is no damping, no other start,
-and no result unless the poses converge in a few steps.
+Nothing in here is compiled, since to load the kernels takes longer than to solve such a graph. The
+method is that of `optimizer` for the usual case: a chordal start or the present poses, and few
+steps of Gauss-Newton. What is not so simple is left to `optimizer`: there is no damping, no other
+start, and no result unless the poses converge in a few steps.
 """
 
-from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from pose_graph_ros.core.batch.outcome import (
+from pose_graph_ros.core.batch.levenberg_marquardt import (
     BatchResult,
-    CHORD_RATIO,
-    has_converged,
-    KEEP_RATIO,
+    minimize,
     Start,
     Status,
+    to_the_end,
     TRUSTED_ITERATIONS,
-    UPHILL_STEPS,
 )
-from pose_graph_ros.core.batch.plain_graph import linearized, PlainGraph
+from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
-from pose_graph_ros.core.solver_config import SolverConfig
-from pose_graph_ros.core.sparse.block_matrix import BlockFactors, BlockPattern, order_of
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph.checks import are_definite
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, NodeKind, ObservedNodes
+from pose_graph_ros.core.graph.graph_update import Energies, GraphRows
+from pose_graph_ros.core.sparse import BlockFactors, components
 
-# Smallest |u| of the chordal start before normalisation, as in `chordal_start`.
-SMALLEST_ROTATION = 1e-6
-# Relative rounding error of chi2.
-ROUNDING = 1e-9
-# What overflows has no finite chi2, and is no result.
-_quiet = np.errstate(over='ignore', invalid='ignore', divide='ignore')
+
+class PlainGraph:
+    """A graph of poses and edges between them."""
+
+    def __init__(self, rows: GraphRows) -> None:
+        self._rows = rows
+        self.poses = rows.poses.copy()
+        """Of the hidden nodes in the map, shape (N, 3) [m, m, rad]."""
+        self.fixed: BoolArray = rows.fixed.copy()
+        """Whether hidden nodes keep their pose, shape (N,)."""
+        self.edges = self.edges_by_row = rows.edges
+        """All edges; ids are rows."""
+        self.observed = self.observed_by_row = ObservedNodes()
+        """There are none."""
+        self.n_nodes, self.n_priors = len(rows.poses), 0
+        self.node_kind: npt.NDArray[np.uint8] = np.zeros(self.n_nodes, dtype=np.uint8)
+
+    @classmethod
+    def is_covered(cls, rows: GraphRows) -> bool:
+        """
+        Tell whether a graph has nothing but poses and edges between them, all with weight 1.
+
+        Each edge has to measure all coordinates. Otherwise a pose may not be determined, and the
+        factors of H, without pivoting, need not show that it is singular.
+        """
+        return (len(rows.observed) == len(rows.priors) == 0
+                and bool(np.all(rows.node_kind == NodeKind.POSE))
+                and bool(np.all(rows.edges.kind <= EdgeKind.LOOP_CLOSURE))
+                and bool(np.all(rows.edges.weight == 1.0))
+                and bool(np.all(are_definite(rows.edges.information)))
+                and np.array_equal(rows.node_ids, np.arange(len(rows.poses))))
+
+    @property
+    def is_pose(self) -> BoolArray:
+        """Whether hidden nodes are poses, shape (N,)."""
+        return np.ones(self.n_nodes, dtype=bool)
+
+    def set_poses(self, poses: FloatArray) -> None:
+        """Set the poses of all hidden nodes, shape (N, 3) [m, m, rad]."""
+        self.poses = se2.wrapped(poses)
+
+    def hold_parts(self) -> list[int]:
+        """Fix the first node of each part without a fixed one; return these nodes."""
+        part = components(self.edges.i, self.edges.j, self.n_nodes)
+        is_held = np.zeros(self.n_nodes, dtype=bool)
+        is_held[part[self.fixed]] = True
+        held = np.flatnonzero((part == np.arange(self.n_nodes)) & ~is_held)
+        self.fixed[held] = True
+        return [*map(int, held)]
+
+    def edges_at(self, rows: IntArray) -> Edges:
+        """Return some of the edges."""
+        return self.edges.rows(rows)
+
+    def energies(self) -> Energies:
+        """Return the energies of all edges."""
+        # what overflows is infinite
+        with np.errstate(over='ignore', invalid='ignore'):
+            error = linearized(self.poses, self.edges)[0]
+            return Energies(np.einsum('mi,mij,mj->m', error, self.edges.information, error),
+                            np.empty(0), np.empty(0))
+
+    def rows(self) -> GraphRows:
+        """Return the graph with the present poses."""
+        return self._rows._replace(poses=self.poses.copy(), fixed=self.fixed.copy())
+
+
+def linearized(poses: Poses, edges: Edges) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """
+    Return the errors (3.48) of edges, shape (M, 3), and their Jacobians by both ends, (M, 3, 3).
+
+    With R the rotation by th_i + th_z and d = t_j - t_i, e_t = R^T d - R_z^T t_z. Its derivative
+    by t_j is R^T, by t_i -R^T, and by th_i that of R^T d, (y, -x) if that is (x, y).
+    """
+    start, mean = poses[edges.i], edges.mean
+    difference = poses[edges.j] - start
+    heading = start[:, 2] + mean[:, 2]
+    c, s = np.cos(heading), np.sin(heading)
+    own_c, own_s = np.cos(mean[:, 2]), np.sin(mean[:, 2])
+    x = c * difference[:, 0] + s * difference[:, 1]
+    y = c * difference[:, 1] - s * difference[:, 0]
+    error = np.stack((
+        x - (own_c * mean[:, 0] + own_s * mean[:, 1]),
+        y - (own_c * mean[:, 1] - own_s * mean[:, 0]),
+        se2.wrap(difference[:, 2] - mean[:, 2])), axis=1)
+    by_j = np.zeros((len(c), 3, 3))
+    by_j[:, 0, 0], by_j[:, 0, 1], by_j[:, 1, 0], by_j[:, 1, 1] = c, s, -s, c
+    by_j[:, 2, 2] = 1.0
+    by_i = -by_j
+    by_i[:, 0, 2], by_i[:, 1, 2] = y, -x
+    return error, by_i, by_j
 
 
 class PlainOptimizer:
-    """
-    Optimiser of one graph, whose poses it changes.
-
-    Parameters
-    ----------
-    graph : PlainGraph
-        Every node has to be connected to a fixed one.
-    config : SolverConfig
-
-    """
+    """Optimiser of one graph, whose poses it changes: a `System` of `levenberg_marquardt`."""
 
     def __init__(self, graph: PlainGraph, config: SolverConfig) -> None:
         self._graph, self._config = graph, config
-        self._free = np.flatnonzero(~graph.fixed)
-        number = np.full(graph.n_nodes, -1)
-        number[self._free] = np.arange(len(self._free))
-        i, j = number[graph.edges.i], number[graph.edges.j]
-        # of the blocks (i, i), (i, j), (j, i) and (j, j) of the edges those of free nodes
-        pairs = ((i, i), (i, j), (j, i), (j, j))
-        self._kept = [(row >= 0) & (column >= 0) for row, column in pairs]
-        both = self._kept[1]
-        rows, columns = (np.concatenate([pair[side][kept] for pair, kept in zip(
-            pairs, self._kept, strict=True)]) for side in (0, 1))
-        self.places = order_of(i[both], j[both], len(self._free))
+        self._nodes = NodeSystem(graph.edges.i, graph.edges.j, ~graph.fixed)
+        self.places = self._nodes.places
         """Place of each node that is not fixed in the order of elimination."""
-        self._last: BlockFactors | None = None
-        self._pattern = BlockPattern(rows, columns, self.places)
+        self._factors: BlockFactors | None = None
 
-    @_quiet
-    def from_chordal_start(self) -> BatchResult | None:
+    def optimize(self, start: Start) -> BatchResult | None:
         """
-        Return the result of moving the poses to a minimum from a chordal start.
+        Return the result of moving the poses to a minimum from a chordal start or where they are.
 
         None, with the poses as they were, if it is not reached in a few steps, or is above chi2 of
         the poses before.
         """
-        graph = self._graph
-        before, chi2 = graph.poses, graph.energies().chi2
-        if not chi2 < np.inf:
-            return None
-        try:
-            graph.poses = self._chordal()
-            result = self._minimize(TRUSTED_ITERATIONS, Start.CHORDAL)
-        except LinearSolveError:
-            result = None
-        if result is None or not result.chi2 <= chi2:
-            graph.poses = before
-            return None
-        return result
-
-    @_quiet
-    def from_present_poses(self) -> BatchResult | None:
-        """Return the result of moving the poses to the near minimum; None as above."""
-        before = self._graph.poses
-        try:
-            result = self._minimize(self._config.max_iterations, Start.PRESENT)
-        except LinearSolveError:
-            result = None
-        if result is None:
-            self._graph.poses = before
-        return result
-
-    def heading_steps(self, derivative: FloatArray) -> FloatArray:
-        """
-        Return a step of Gauss-Newton of the headings of nodes that are not fixed, shape (F,).
-
-        Parameters
-        ----------
-        derivative : ndarray, shape (F,), of chi2 by these headings
-
-        """
-        assert self._last is not None
-        right = np.zeros((len(self._free), 3))
-        right[:, 2] = derivative
-        return self._last.solve(right.ravel())[2::3]
-
-    def _minimize(self, steps: int, start: Start) -> BatchResult | None:
-        graph, free = self._graph, self._free
-        chi2, best, uphill = np.inf, graph.poses, 0
-        length, previous, chord = np.inf, np.inf, False
-        factors: BlockFactors | None = None
-        for iteration in range(min(steps, self._config.max_iterations) + 1):
-            error, by_i, by_j = linearized(graph.poses, graph.edges)
-            weighted = np.einsum('mij,mj->mi', graph.edges.information, error)
-            after = float(np.einsum('mi,mi->', weighted, error))
-            if not after < np.inf:
-                return None
-            if after <= chi2 * (1.0 + ROUNDING):
-                comparable = uphill == 0
-                chi2, best, uphill = after, graph.poses, 0
-                if comparable and iteration > 0 and has_converged(
-                        length, previous, self._config.step_tolerance):
-                    return BatchResult(Status.CONVERGED, '', iteration, chi2, start)
-                # the factors of an earlier step do while steps become shorter fast
-                chord = comparable and previous < np.inf and (
-                    length < (CHORD_RATIO if chord else KEEP_RATIO) * previous)
-            elif chord:
-                # with a new factorisation from the poses before
-                graph.set_poses(best)
-                chord, length, previous, factors = False, np.inf, np.inf, None
-                continue
-            elif uphill == UPHILL_STEPS:
-                return None
-            else:
-                uphill += 1
-            previous = length
-            if not chord or factors is None:
-                factors = self._last = self._factors(by_i, by_j)
-            right = np.zeros((graph.n_nodes, 3))
-            for end, by in ((graph.edges.i, by_i), (graph.edges.j, by_j)):
-                gradient = np.einsum('mji,mj->mi', by, weighted)
-                for k in range(3):
-                    right[:, k] -= np.bincount(end, gradient[:, k], graph.n_nodes)
-            step = factors.solve(right[free].ravel()).reshape(-1, 3)
-            length = float(np.max(np.abs(step), initial=0.0))
-            poses = graph.poses.copy()
-            poses[free] += step
-            graph.set_poses(poses)
+        graph, before, steps = self._graph, self._graph.poses, self._config.max_iterations
+        # what overflows has no finite chi2, and is no result
+        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
+            try:
+                first = chi2 = self.evaluate()[0]
+                if start is Start.CHORDAL and first < np.inf:
+                    steps = min(steps, TRUSTED_ITERATIONS)
+                    graph.poses = chordal(graph, self._nodes)
+                    chi2 = self.evaluate()[0]
+                if chi2 < np.inf:
+                    result = to_the_end(minimize(
+                        self, chi2, replace(self._config, max_iterations=steps)))
+                    if result.status is Status.CONVERGED and (
+                            start is Start.PRESENT or result.chi2 <= first):
+                        return replace(result, start=start)
+            except LinearSolveError:
+                pass
+        graph.poses = before
         return None
 
-    def _factors(self, by_i: FloatArray, by_j: FloatArray) -> BlockFactors:
-        """Return the factors of H, from the Jacobians of all edges."""
-        information = self._graph.edges.information
+    def heading_steps(self, derivative: FloatArray) -> FloatArray:
+        """Return a step of Gauss-Newton of the headings of nodes that are not fixed, (F,)."""
+        assert self._factors is not None
+        right = np.zeros((len(derivative), 3))
+        right[:, 2] = derivative
+        return np.asarray(self._factors.solve(right.ravel())[2::3])
 
-        def blocks() -> Iterator[FloatArray]:
-            for a, b, kept in zip((by_i, by_i, by_j, by_j), (by_i, by_j, by_i, by_j), self._kept,
-                                  strict=True):
-                yield np.swapaxes(a[kept], 1, 2) @ (information[kept] @ b[kept])
+    def keep_poses(self) -> None:
+        self._best = self._graph.poses
 
-        return self._pattern.factors(blocks())
+    def restore_poses(self) -> None:
+        self._graph.poses = self._best
 
-    def _chordal(self) -> FloatArray:
-        """Return the poses of the chordal start, or raise LinearSolveError."""
-        graph, edges, free = self._graph, self._graph.edges, self._free
-        u = np.exp(1j * graph.poses[:, 2])
-        turn = np.exp(1j * edges.mean[:, 2])
-        u = self._relaxed(edges.information[:, 2, 2], turn, np.zeros(len(turn), complex), u)
-        length = np.abs(u)
-        if np.any(length < SMALLEST_ROTATION):
-            raise LinearSolveError('chordal start: the measured headings cancel each other out')
-        u /= length
-        t = self._relaxed(
-            0.5 * (edges.information[:, 0, 0] + edges.information[:, 1, 1]),
-            np.ones(len(turn)),
-            u[edges.i] * (edges.mean[:, 0] + 1j * edges.mean[:, 1]),
-            graph.poses[:, 0] + 1j * graph.poses[:, 1])
+    def halve_step(self) -> None:
+        raise AssertionError('only damped steps are halved')
+
+    def evaluate(self) -> tuple[float, float]:
+        graph = self._graph
+        error, by_i, by_j = linearized(graph.poses, graph.edges)
+        weighted = np.einsum('mij,mj->mi', graph.edges.information, error)
+        self._by = by_i, by_j
+        self._right = -self._nodes.gathered(self._by, weighted)
+        chi2 = float(np.einsum('mi,mi->', weighted, error))
+        return chi2, 1e-9 * chi2   # its rounding
+
+    def step(self, damping: float, *, chord: bool) -> float:
+        if damping > 0.0:
+            raise LinearSolveError('left to the compiled optimiser: it needs damping')
+        graph, (by_i, by_j) = self._graph, self._by
+        if not chord or self._factors is None:
+            information = graph.edges.information
+            self._factors = self._nodes.factors(
+                self._by, (information @ by_i, information @ by_j))
+        self._step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
         poses = graph.poses.copy()
-        poses[free] = np.stack((t.real, t.imag, np.angle(u)), axis=1)[free]
-        return poses
+        poses[self._nodes.free] += self._step
+        graph.set_poses(poses)
+        return float(np.max(np.abs(self._step), initial=0.0))
 
-    def _relaxed(
-        self, weight: FloatArray, factor: ComplexArray | FloatArray, offset: ComplexArray,
-        known: ComplexArray,
-    ) -> ComplexArray:
-        """
-        Return v at the minimum of the sum of weight |v_j - factor v_i - offset|^2 over all edges.
+    def decrease(self) -> float:
+        return float(np.sum(self._right * self._step))
 
-        Parameters
-        ----------
-        weight, factor, offset : ndarray, shape (M,)
-        known : ndarray, shape (N,), v of the fixed nodes
-
-        """
-        graph, edges = self._graph, self._graph.edges
-        v = np.where(graph.fixed, known, 0.0)
-        residual = weight * (offset + factor * v[edges.i] - v[edges.j])
-        right = np.zeros(graph.n_nodes, dtype=complex)
-        for end, value in ((edges.j, residual), (edges.i, -factor.conj() * residual)):
-            right += np.bincount(end, value.real, graph.n_nodes)
-            right += 1j * np.bincount(end, value.imag, graph.n_nodes)
-        own = weight.astype(factor.dtype)
-        blocks = (own, -weight * factor.conj(), -weight * factor, own)
-        factors = self._pattern.factors(
-            block[kept][:, None, None] for block, kept in zip(blocks, self._kept, strict=True))
-        free = right[self._free][:, None]
-        if factor.dtype == np.float64:
-            # a complex column as two real ones
-            solved = np.ascontiguousarray(factors.solve(free.view(np.float64)))
-            v[self._free] = solved.view(np.complex128)[:, 0]
-        else:
-            v[self._free] = factors.solve(free)[:, 0]
-        return v
+    def settle(self) -> None:
+        pass

@@ -13,45 +13,76 @@ more believed constraint pays if all together bend by less than c^2 for it.
 
 Each set is solved for from the same start, because the minimum that Gauss-Newton ends in after
 wrong constraints have bent the graph may be a tangle even where they are all gone again.
+
+`TruncatedProblem.graduated` finds a set without a start that is nearly right (H. Yang,
+P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception: from
+non-minimal solvers to global outlier rejection", RA-L 2020). The truncated cost is the minimum
+over weights w in [0, 1] of
+
+    w r^2 + P(w),        P(w) = c^2 (1 - w).
+
+It is replaced by a cost with a control mu that is convex at first and tends to it, in which
+weights between 0 and 1 cost less. With s = r^2 / c^2,
+
+    truncated:      P / c^2 = mu (1 - w) / (mu + w),   so w = sqrt(mu (mu + 1) / s) - mu in [0, 1]
+    Geman-McClure:  P / c^2 = mu (1 - sqrt(w))^2,      so w = (mu / (mu + s))^2
+
+each w where the derivative by w is zero. mu grows from near 0 to infinity for the truncated
+surrogate (where its curvature, -2 mu between the bounds, does not outweigh the rest), and falls
+from twice the largest s to 1 for that of Geman-McClure.
 """
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import Final
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.solver_config import SolverConfig
 
 # Value that 99 % of the energies of right constraints are below, by the rank of the information.
 LIMITS: Final = np.array([0.0, 6.635, 9.210, 11.345])
+# Factor on mu from step to step of graduated non-convexity.
+GRADUATION = 1.4
 # Of a set that is compared, and of a step on the way to one.
 CONFIG = SolverConfig(max_iterations=60, step_tolerance=1e-6)
 ROUGH = SolverConfig(max_iterations=15, step_tolerance=1e-4)
-# Eigenvalue of an information matrix with unit diagonal above which it counts for the rank.
-_RANK = 1e-9
-# Maximum number of sets that a retest leads to, and of those whose solution is kept.
-RETESTS, MOST_KEPT = 20, 16
+
+
+class Surrogate(Enum):
+    """Cost that tends to the truncated one."""
+
+    TRUNCATED = 'truncated'
+    GEMAN_MCCLURE = 'geman_mcclure'
+
+    def weights(self, share: FloatArray, mu: float) -> FloatArray:
+        """Return the weights of constraints."""
+        if self is Surrogate.GEMAN_MCCLURE:
+            return (mu / (mu + share)) ** 2
+        root = np.sqrt(mu * (mu + 1.0) / np.maximum(share, 1e-12))
+        return np.clip(root - mu, 0.0, 1.0)
+
+    def first(self, largest: float) -> float:
+        """Return mu to begin with, given the largest r^2 / c^2, which is above 1."""
+        if self is Surrogate.GEMAN_MCCLURE:
+            return min(2.0 * largest, 1e12)
+        return max(1.0 / (2.0 * largest - 1.0), 1e-6)
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
     """A set of believed constraints."""
 
-    believed: BoolArray
-    """Of the edges that may be wrong, shape (M,)."""
-    energies: FloatArray
-    """r^2 of the same at the poses, shape (M,) [sigma^2]."""
-    cost: float
-    """The truncated cost [sigma^2]."""
-    poses: FloatArray
-    """Those that minimise chi2 of what is believed, shape (N, 3) [m, m, rad]."""
-    known: float
-    """chi2 of all that is known to be right [sigma^2]."""
+    believed: BoolArray  # of the M edges that may be wrong
+    energies: FloatArray  # r^2 of the same at the poses
+    cost: float  # the truncated cost
+    poses: Poses  # those that minimise chi2 of what is believed
+    known: float  # chi2 of all that is known to be right
 
     def cost_by(self, limits: FloatArray) -> float:
         """Return the truncated cost with other limits, shape (M,)."""
@@ -62,15 +93,9 @@ class TruncatedProblem:
     """
     A graph with M edges that may be wrong. Their weights and its poses are for trying.
 
-    Parameters
-    ----------
-    graph : Graph
-        It is changed. The information of what may be wrong is that to decide by.
-    rows : ndarray of int, shape (M,), the edges that may be wrong, without repetition
-    start : ndarray, shape (N, 3), optional
-        Where each solution starts; by default the minimum of chi2 of all that is right, from the
-        poses of the graph.
-
+    The graph is changed; the information of the edges of `rows`, without repetition, is that to
+    decide by. Each solution starts at `start`, by default at the minimum of chi2 of all that is
+    right, from the poses of the graph.
     """
 
     def __init__(
@@ -103,13 +128,6 @@ class TruncatedProblem:
     ) -> bool:
         """
         Return whether the graph could be moved from the start to the minimum for some weights.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (M,), of what may be wrong
-        config : SolverConfig
-        go_on : bool, whether to start from the present poses instead
-
         """
         self._weigh(weights)
         if not go_on:
@@ -134,21 +152,13 @@ class TruncatedProblem:
         return self.graph.edge_errors(self.edges.rows(numbers))
 
     def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choice | None:
-        """
-        Return a set with its cost; None if it leaves a node undetermined.
-
-        Parameters
-        ----------
-        believed : ndarray of bool, shape (M,)
-        config : SolverConfig
-
-        """
+        """Return a set with its cost; None if it leaves a node undetermined."""
         # retests of different sets often lead to the same one
         key = believed.tobytes(), self.limits.tobytes(), config
         choice = self._choices.pop(key, None) or self._solved(believed, config)
         if choice is not None:
             self._choices[key] = choice
-            if len(self._choices) > MOST_KEPT:
+            if len(self._choices) > 16:
                 del self._choices[next(iter(self._choices))]
         return choice
 
@@ -172,21 +182,44 @@ class TruncatedProblem:
         self.graph.set_poses(poses)
         return chi2_of(self.graph) + float(np.sum(np.minimum(self.energies(), self.limits)))
 
+    def graduated(self, surrogate: Surrogate, *, patient: bool = False) -> Choice | None:
+        """
+        Return the set that graduated non-convexity ends with.
+
+        None if no step could be solved, or, unless `patient`, if each would take long: with many
+        random edges the factorisation is nearly dense.
+        """
+        if not patient and self.factorisation(self.allowed.astype(np.float64)) > 500_000:
+            return None
+        if not self.solve(np.zeros(len(self))):
+            return None
+        share = self.shares()
+        largest = float(np.max(share, initial=0.0, where=np.isfinite(share)))
+        if largest > 1.0:
+            mu = surrogate.first(largest)
+            for _ in range(100):
+                weights = surrogate.weights(share, mu)
+                if not self.solve(weights):
+                    break
+                share = self.shares()
+                if surrogate is Surrogate.GEMAN_MCCLURE:
+                    if mu == 1.0:
+                        break
+                    mu = max(mu / GRADUATION, 1.0)
+                elif np.max(np.minimum(weights, 1.0 - weights), initial=0.0) < 1e-3:
+                    break   # all weights are final
+                else:
+                    mu *= GRADUATION
+        return self.choice(share <= 1.0)
+
     def improved(
-        self, choice: Choice, retests: int = RETESTS, config: SolverConfig = CONFIG,
+        self, choice: Choice, retests: int = 20, config: SolverConfig = CONFIG,
     ) -> Choice:
         """
         Return a set that no retest lowers the cost of.
 
         All that is within its limit at the poses of the set is believed, and nothing else, as long
         as that lowers the cost.
-
-        Parameters
-        ----------
-        choice : Choice
-        retests : int, their maximum number
-        config : SolverConfig
-
         """
         for _ in range(retests):
             believed = self.allowed & (choice.energies <= self.limits)
@@ -210,5 +243,5 @@ def _ranks(information: FloatArray) -> IntArray:
     diagonal = np.einsum('mii->mi', information)
     root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = information / root[:, :, None] / root[:, None, :]
-    ranks: IntArray = np.sum(np.linalg.eigvalsh(scaled) > _RANK, axis=1)
+    ranks: IntArray = np.sum(np.linalg.eigvalsh(scaled) > 1e-9, axis=1)
     return ranks

@@ -9,15 +9,7 @@ import numpy.typing as npt
 
 
 class GrowingArray:
-    """
-    Array of rows that doubles its capacity when it is full.
-
-    Parameters
-    ----------
-    row_shape : tuple of int, shape of one row; `()` for numbers
-    dtype : dtype, type of the elements
-
-    """
+    """Array of rows that doubles its capacity when it is full."""
 
     def __init__(self, row_shape: tuple[int, ...], dtype: npt.DTypeLike) -> None:
         self._data = np.empty((16, *row_shape), dtype=dtype)

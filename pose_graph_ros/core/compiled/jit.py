@@ -55,20 +55,12 @@ def kernel(
     allocates: bool = False, **options: Any,
 ) -> Function:
     """
-    Return a function that is compiled at its first call.
+    Return a function that is compiled at its first call; a decorator, also as `@kernel(...)`.
 
-    It is a decorator, used as `@kernel` or with options as `@kernel(fastmath=True)`.
-
-    Parameters
-    ----------
-    function : callable, optional
-    signature : tuple of numba types
-        Of the arguments, for a kernel that Python calls; a call with other types raises TypeError.
-    allocates : bool
-        Whether the kernel allocates arrays, or calls a kernel that returns a new array. Only then
-        are references counted; without it all arrays must belong to the caller or the tables.
-    **options : options of `numba.njit`, which override `OPTIONS`
-
+    A kernel that Python calls has a signature; a call with other types raises TypeError. Only a
+    kernel that allocates arrays, or calls one that returns a new array, counts references; without
+    it all arrays must belong to the caller or the tables. Options are those of `numba.njit`, which
+    override `OPTIONS`.
     """
     if function is None:
         return lambda function: _kernel(function, signature, allocates, options)
@@ -141,30 +133,16 @@ def declared() -> list[str]:
 
 
 def compile_kernels(names: Iterable[str] | None = None) -> None:
-    """
-    Compile kernels, or load them from the cache.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Some of those that `declared` returns; all of them by default.
-
-    """
+    """Compile kernels, or load them from the cache: all `declared` ones, or some of them."""
     for name in declared() if names is None else names:
         _compile(_registered[name], _signatures[name])
 
 
 def is_cached(*names: str) -> bool:
     """
-    Tell whether kernels have valid code in the cache.
+    Tell whether kernels have valid code in the cache: all `declared` ones, or some of them.
 
     This takes about a millisecond per kernel, and neither loads nor compiles code.
-
-    Parameters
-    ----------
-    *names : str
-        Some of those that `declared` returns; all of them by default.
-
     """
     caches = [_registered[name]._cache for name in names or _signatures]  # noqa: SLF001
     return all(isinstance(cache, KernelCache) and cache.holds_code() for cache in caches)

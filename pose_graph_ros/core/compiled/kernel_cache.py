@@ -10,9 +10,9 @@ changed. Two processes that compile different signatures at once can store the c
 the name of the other. The cache in this module uses Numba's files with these differences:
 
 - The folder is the first writeable one of: `NUMBA_CACHE_DIR` if it is set, `__pycache__` beside
-  the source, `pose_graph_ros` in the user's cache, a private folder in the temporary directory.
-  Code is also loaded from those before it, such as the `__pycache__` that root has filled when it
-  made a robot's image. If there is none, a warning is logged and every start compiles again.
+  the source, `pose_graph_ros` in the user's cache. Code is also loaded from those before it, such
+  as the `__pycache__` that root has filled when it made a robot's image. If there is none, a
+  warning is logged and every start compiles again.
 - Each entry contains a fingerprint of everything that its code was made from, and a check sum. It
   is used only if both are correct.
 - A cache that cannot be read or written costs time, but never raises an exception.
@@ -21,7 +21,7 @@ Only the dispatchers of our kernels are changed. Numba's settings and the enviro
 whole process and stay as they are.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from enum import Enum
 import functools
 import hashlib
@@ -30,7 +30,6 @@ import logging
 import os
 from pathlib import Path
 import pickle
-import stat
 import tempfile
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, ClassVar
@@ -68,24 +67,17 @@ def find_folder(source: Path) -> Path | None:
             tried.append(f'{folder} ({error.strerror or error})')
         else:
             return folder
-    if len(_readable(_candidates(source))) == 0:
+    if len(read_only_folders(source, None)) == 0:
         logger.warning(
             'compiled kernels cannot be kept, every start compiles them again; set '
             'NUMBA_CACHE_DIR to a folder that can be written to; tried: %s', ', '.join(tried))
     return None
 
 
-def read_only_folders(source: Path) -> list[Path]:
-    """Return the existing folders that come before the writeable one; all if none is writeable."""
-    own = find_folder(source)
-    return _readable(takewhile(lambda folder: folder != own, _candidates(source)))
-
-
-def _readable(folders: Iterable[Path]) -> list[Path]:
-    # what is in a private folder that is not writeable may be of another user
-    private = _private_folder()
-    return [folder for folder in folders if folder.is_dir() and os.access(folder, os.R_OK)
-            and not folder.is_relative_to(private)]
+def read_only_folders(source: Path, own: Path | None) -> list[Path]:
+    """Return the folders with code that come before our own one; all of them if there is none."""
+    before = takewhile(lambda folder: folder != own, _candidates(source))
+    return [folder for folder in before if folder.is_dir() and os.access(folder, os.R_OK)]
 
 
 def _candidates(source: Path) -> Iterator[Path]:
@@ -98,23 +90,10 @@ def _candidates(source: Path) -> Iterator[Path]:
     for cache in caches:
         if cache.is_absolute():     # '~' is not expanded if the user has no home directory
             yield cache / OWNER / own
-    yield _private_folder() / own
-
-
-def _private_folder() -> Path:
-    return Path(tempfile.gettempdir()) / f'{OWNER}-{os.getuid()}'
 
 
 def _make_writable(folder: Path) -> None:
     """Create a folder if it does not exist; raise OSError if files cannot be written in it."""
-    private = _private_folder()
-    if folder.is_relative_to(private):
-        # Code in this folder is executed, and any user may create folders in /tmp.
-        private.mkdir(mode=0o700, exist_ok=True)
-        found = private.lstat()
-        if (not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid()
-                or stat.S_IMODE(found.st_mode) & 0o077):
-            raise PermissionError(None, 'not a folder of this user alone')
     folder.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=folder).close()
 
@@ -213,7 +192,8 @@ class _Locator:
         if not source.is_file():
             _warn_once(f'compiled kernels of {py_file} cannot be kept: it is no file')
             return None
-        folder = find_folder(source.parent) or next(iter(read_only_folders(source.parent)), None)
+        folder = find_folder(source.parent) or next(
+            iter(read_only_folders(source.parent, None)), None)
         return None if folder is None else cls(source, folder)
 
     def ensure_cache_path(self) -> None:
@@ -259,22 +239,16 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         self._impl.dispatcher = dispatcher
         self._dispatcher = dispatcher
         source = Path(dispatcher.py_func.__code__.co_filename).absolute().parent
-        self.is_writable = find_folder(source) is not None
+        own = find_folder(source)
+        self.is_writable = own is not None
         # its own files first
         self._files = [self._cache_file, *(
             IndexDataCacheFile(
                 str(folder), self._impl.filename_base, self._impl.locator.get_source_stamp())
-            for folder in read_only_folders(source) if str(folder) != self.cache_path)]
+            for folder in read_only_folders(source, own) if str(folder) != self.cache_path)]
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """
-        Return the cached code for a signature; None if there is no valid entry.
-
-        Parameters
-        ----------
-        signature, target_context : as Numba passes them
-
-        """
+        """Return the cached code for a signature; None if there is no valid entry."""
         # Numba refreshes the context, which imports all that can be compiled (0.5 s) and does
         # this, which is all that machine code needs. The compiler refreshes the context itself.
         rtsys.initialize(target_context)
@@ -293,14 +267,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """
-        Store the code for a signature; log a warning if that fails.
-
-        Parameters
-        ----------
-        signature, result : as Numba passes them
-
-        """
+        """Store the code for a signature; log a warning if that fails."""
         try:
             super().save_overload(signature, result)
         except Exception as error:

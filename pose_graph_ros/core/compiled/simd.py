@@ -54,15 +54,7 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, at: Any) -
 
 @_intrinsic
 def load(_context: Any, array: Any, at: Any) -> Any:
-    """
-    Return the vector `array[at:at + 4]`.
-
-    Parameters
-    ----------
-    array : ndarray
-    at : int
-
-    """
+    """Return the vector `array[at:at + 4]`."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _address(context, builder, signature.args[0], *arguments)
         return builder.load(pointer, align=8)
@@ -71,20 +63,7 @@ def load(_context: Any, array: Any, at: Any) -> Any:
 
 @_intrinsic
 def store(_context: Any, array: Any, at: Any, vector: Any) -> Any:
-    """
-    Write a vector to `array[at:at + 4]`.
-
-    Parameters
-    ----------
-    array : ndarray
-    at : int
-    vector : vector
-
-    Returns
-    -------
-    None
-
-    """
+    """Write a vector to `array[at:at + 4]`."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _address(context, builder, signature.args[0], *arguments[:2])
         builder.store(arguments[2], pointer, align=8)
@@ -94,19 +73,7 @@ def store(_context: Any, array: Any, at: Any, vector: Any) -> Any:
 
 @_intrinsic
 def fetch(_context: Any, array: Any, at: Any) -> Any:
-    """
-    Prefetch the cache line of `array[at]`, for a later read.
-
-    Parameters
-    ----------
-    array : ndarray
-    at : int
-
-    Returns
-    -------
-    None
-
-    """
+    """Prefetch the cache line of `array[at]`, for a later read."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         byte = ir.IntType(8).as_pointer()
         three = [ir.IntType(32)] * 3
@@ -134,14 +101,7 @@ def spread(_context: Any, number: Any) -> Any:
 
 @_intrinsic
 def fnmadd(_context: Any, total: Any, a: Any, b: Any) -> Any:
-    """
-    Return `total - a * b`, with a single rounding where the processor has fused multiply-add.
-
-    Parameters
-    ----------
-    total, a, b : vector
-
-    """
+    """Return `total - a * b`, with a single rounding where the processor can."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         total, a, b = arguments
         product = builder.fmul(a, b, flags=('contract',))
@@ -151,14 +111,7 @@ def fnmadd(_context: Any, total: Any, a: Any, b: Any) -> Any:
 
 @_intrinsic
 def times(_context: Any, a: Any, b: Any) -> Any:
-    """
-    Return `a * b`, element by element.
-
-    Parameters
-    ----------
-    a, b : vector
-
-    """
+    """Return `a * b`, element by element."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.fmul(*arguments)
     return VECTOR(VECTOR, VECTOR), codegen
@@ -166,14 +119,7 @@ def times(_context: Any, a: Any, b: Any) -> Any:
 
 @_intrinsic
 def plus(_context: Any, a: Any, b: Any) -> Any:
-    """
-    Return `a + b`, element by element.
-
-    Parameters
-    ----------
-    a, b : vector
-
-    """
+    """Return `a + b`, element by element."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.fadd(*arguments)
     return VECTOR(VECTOR, VECTOR), codegen
@@ -181,15 +127,7 @@ def plus(_context: Any, a: Any, b: Any) -> Any:
 
 @kernel(inline='always')
 def copy(source, begin, target, to, n):  # type: ignore[no-untyped-def]
-    """
-    Copy `source[begin:begin + n]` to `target[to:to + n]`.
-
-    Parameters
-    ----------
-    source, target : ndarray
-    begin, to, n : int
-
-    """
+    """Copy `source[begin:begin + n]` to `target[to:to + n]`."""
     k = 0
     while k + WIDTH <= n:
         store(target, to + k, load(source, begin + k))
@@ -201,15 +139,7 @@ def copy(source, begin, target, to, n):  # type: ignore[no-untyped-def]
 
 @kernel(inline='always')
 def add(source, begin, target, to, n):  # type: ignore[no-untyped-def]
-    """
-    Add `source[begin:begin + n]` to `target[to:to + n]`.
-
-    Parameters
-    ----------
-    source, target : ndarray
-    begin, to, n : int
-
-    """
+    """Add `source[begin:begin + n]` to `target[to:to + n]`."""
     k = 0
     while k + WIDTH <= n:
         store(target, to + k, plus(load(target, to + k), load(source, begin + k)))

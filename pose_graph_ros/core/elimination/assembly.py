@@ -3,9 +3,9 @@
 """Numeric elimination of one clique: assemble its front, factorise it and store the result."""
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.compiled.simd import add, copy
-from pose_graph_ros.core.elimination import clique_frames, prior_model
-from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded
+from pose_graph_ros.core.compiled.simd import add
+from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
 from pose_graph_ros.core.graph import (
     factors,
     normal_equations,
@@ -13,7 +13,7 @@ from pose_graph_ros.core.graph import (
     tables as tb,
     transaction_log,
 )
-from pose_graph_ros.core.graph.factor_types import anchors, dimension_of
+from pose_graph_ros.core.graph.factors import anchors, dimension_of
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
 # Where constraints are stiff in one direction and weak in another, as those of a turn on the spot,
@@ -30,14 +30,8 @@ def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
 
     Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
     a pivot is small, it is judged again by the weakest direction of the constraints of its node.
-
-    Parameters
-    ----------
-    c : int, row of the clique
-    relinearize : bool
-        Linearize the constraints at the present estimate before they are added: the frame in which
-        they were linearized may have turned since. Their rows are logged for a rollback.
-
+    If asked to relinearize, the constraints are logged and linearized at the present estimate
+    before they are added: the frame in which they were linearized may have turned since.
     """
     by_weakest = False
     while True:     # one call, as the compiler then inlines it
@@ -93,18 +87,18 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                         or (side == 2 and at_j < rows)):
                     continue
             if relinearize:
-                transaction_log.log_edge(head, e)
-                factors.linearize_edge(head, e)
+                transaction_log.log_constraint(head, e)
+                factors.linearize(head, e)
             ends[tb.OWNER] = c
             anchored |= anchors(ends[tb.EDGE_KIND])
-            normal_equations.add_edge(head, e, at_i, at_j, at_k, front, ld)
+            normal_equations.add(head, e, at_i, at_j, at_k, front, ld)
         entry = node_i[v, tb.OBSERVED_LIST]
         while entry >= 0:
             anchored = 1
             if relinearize:
-                transaction_log.log_observed(head, entry)
-                factors.linearize_observed(head, entry)
-            normal_equations.add_observed(head, entry, 3 * k, front, ld)
+                transaction_log.log_constraint(head, -1 - entry)
+                factors.linearize(head, -1 - entry)
+            normal_equations.add(head, -1 - entry, 3 * k, -1, -1, front, ld)
             entry = observed_i[entry, tb.OBS_NEXT]
         scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
@@ -134,7 +128,7 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
     if any_fixed:
         for k in range(n_frontal):
             if node_i[nodes[k], tb.FIXED] != 0:
-                _substitute_fixed(head, nodes[k], 3 * k, front, n, ld)
+                substitute_fixed(head, nodes[k], 3 * k, front, n, ld)
                 least[3 * k:3 * k + 3] = 0.0
     bad = factorize(front, rows, n, ld, least)
     if bad >= 0:
@@ -145,11 +139,7 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
             for m in range(3 * k + dimension_of(node_i[nodes[k]]), 3 * k + 3):
                 front[m * (ld + 1)] = 0.0
     # the rows of R, directly followed by the update matrix
-    at = row[tb.VALUES]
-    for k in range(n):
-        copy(front, k * (ld + 1), pool_f, at, n - k)
-        at += n - k + 1
-        pool_f[at - 1] = front[(k + 1) * ld - 1]
+    write_rows(front, n, ld, pool_f, row[tb.VALUES])
     # the squared error of the parent's linear model of a slip beta is about SLIP_SCALE beta^4
     scale, first = 0.0, node_f[nodes[n_frontal]] if n_separator > 0 else node_f[nodes[0]]
     for k in range(n_frontal + 1, n_all):
@@ -216,7 +206,8 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     clique_f[child, tb.TURN_SEEN] = phi
     if n_frontal == 0:
         linear = work_f[len(front) + len(front) // ld:]
-        prior_model.linearize(head, child, phi, linear, linear[triangle_size(size, size):])
+        clique_frames.linearize_prior(
+            head, child, phi, linear, linear[triangle_size(size, size):])
         update = linear
     elif phi != 0.0:
         turned = work_f[len(front) + len(front) // ld:]
@@ -273,7 +264,7 @@ def _add_in_other_order(update, n_separator, index, front, ld):  # type: ignore[
 
 
 @kernel
-def _substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
+def substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
     """Substitute the known solution of a fixed node: move its columns to the right-hand side."""
     node_f = tb.node_f(head)
     right = ld - 1

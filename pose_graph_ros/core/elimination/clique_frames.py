@@ -24,16 +24,16 @@ translation changes no linear model.
 *slip* beta is by how much the frame has turned relative to the parent's frame since then. The
 parent works with a linear model of that rotation, and `interface_error2` returns its error, in the
 units of the squared linearization error of a constraint.
+
+A prior is a clique without frontal nodes: `linearize_prior` writes its update matrix, and
+`prior_error2` is its `interface_error2`. `graph.priors` has the equations.
 """
 
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import prior_rows, tables as tb
+from pose_graph_ros.core.graph import factors, prior_rows, tables as tb
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
-
-# Angles of a frame below this are set to zero [rad].
-LEAST_TURN = 1e-12
 
 
 @kernel
@@ -58,21 +58,12 @@ def present_turn(head, c):  # type: ignore[no-untyped-def]
         phi = 0.0
     else:
         phi = mean_turn(head, c) - clique_f[c, tb.TURN_ZERO]
-    return phi if abs(phi) > LEAST_TURN else 0.0
+    return phi if abs(phi) > 1e-12 else 0.0     # rounding
 
 
 @kernel
 def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
-    """
-    Return the solution delta' of a node in a clique's frame.
-
-    Parameters
-    ----------
-    f : ndarray, row of the node in `node_f`
-    px, py : float, point P in the map [m]
-    cos, sin, phi : float, angle of the frame [rad], with its cosine and sine
-
-    """
+    """Return the solution delta' of a node, by its row, in a clique's frame of angle phi."""
     x, y = f[tb.REF] + f[tb.DELTA] - px, f[tb.REF + 1] + f[tb.DELTA + 1] - py
     return (cos * x + sin * y + px - f[tb.REF], cos * y - sin * x + py - f[tb.REF + 1],
             f[tb.DELTA + 2] - phi)
@@ -80,83 +71,53 @@ def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
 
 @kernel
 def map_delta(f, x, y, px, py, cos, sin):  # type: ignore[no-untyped-def]
-    """
-    Return the position part of a node's solution in map axes, the inverse of `local_delta`.
-
-    Parameters
-    ----------
-    f : ndarray, row of the node in `node_f`
-    x, y : float, position part of delta' [m]
-    px, py, cos, sin : float, as for `local_delta`
-
-    """
+    """Return the position of a node's solution in map axes, the inverse of `local_delta`."""
     x, y = x + f[tb.REF] - px, y + f[tb.REF + 1] - py
     return cos * x - sin * y + px - f[tb.REF], sin * x + cos * y + py - f[tb.REF + 1]
 
 
 @kernel
+def add_product(update, size, x, out):  # type: ignore[no-untyped-def]
+    """Add U x to a vector; U is an upper triangle laid out by `pools.row_start`."""
+    for i in range(size):
+        r = update[row_start(i, size):]
+        total = r[i] * x[i]
+        for k in range(i + 1, size):
+            total += r[k] * x[k]
+            out[k] += r[k] * x[i]
+        out[i] += total
+
+
+@kernel
 def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped-def]
     """
-    Transform an update matrix and its right-hand side from a clique's frame into map axes.
+    Transform an update matrix of n nodes from a clique's frame, of angle phi, into map axes.
 
-    Parameters
-    ----------
-    update : ndarray, flat, 3n columns and the right-hand side, laid out by `pools.row_start`
-    n : int, number of separator nodes
-    nodes : ndarray of int32, shape (n,), separator nodes
-    node_f : ndarray, table of the nodes
-    phi : float, angle of the clique's frame [rad]
-    to : ndarray, flat, receives the result, laid out as `update`
-
+    The result, and 2 * 3n numbers of work space behind it, are in `to`.
     """
     size = 3 * n
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[nodes[0]]
     px, py = first[tb.POSE], first[tb.POSE + 1]
+    # u - U m in local axes, with m of the module's docstring
+    work = to[triangle_size(size, size):]
+    shift, right = work[:size], work[size:2 * size]
     for a in range(n):
-        r0, r1, r2 = (row_start(3 * a, size), row_start(3 * a + 1, size),
-                      row_start(3 * a + 2, size))
-        # u - U m in local axes, with m of the module's docstring
-        u0, u1, u2 = update[r0 + size], update[r1 + size], update[r2 + size]
-        for b in range(n):
-            f = node_f[nodes[b]]
-            x, y = f[tb.REF] - px, f[tb.REF + 1] - py
-            mx, my = cos * x + sin * y - x, cos * y - sin * x - y
-            if b < a:
-                p = row_start(3 * b, size) + 3 * a
-                q = p + size - 3 * b
-                r = q + size - 3 * b - 1
-                u0 -= update[p] * mx + update[q] * my - update[r] * phi
-                u1 -= update[p + 1] * mx + update[q + 1] * my - update[r + 1] * phi
-                u2 -= update[p + 2] * mx + update[q + 2] * my - update[r + 2] * phi
-            elif b == a:
-                q = 3 * a
-                u0 -= update[r0 + q] * mx + update[r0 + q + 1] * my - update[r0 + q + 2] * phi
-                u1 -= update[r0 + q + 1] * mx + update[r1 + q + 1] * my - update[r1 + q + 2] * phi
-                u2 -= update[r0 + q + 2] * mx + update[r1 + q + 2] * my - update[r2 + q + 2] * phi
-            else:
-                q = 3 * b
-                u0 -= update[r0 + q] * mx + update[r0 + q + 1] * my - update[r0 + q + 2] * phi
-                u1 -= update[r1 + q] * mx + update[r1 + q + 1] * my - update[r1 + q + 2] * phi
-                u2 -= update[r2 + q] * mx + update[r2 + q + 1] * my - update[r2 + q + 2] * phi
-        to[r0 + size], to[r1 + size], to[r2 + size] = u0, u1, u2
+        f = node_f[nodes[a]]
+        x, y = f[tb.REF] - px, f[tb.REF + 1] - py
+        shift[3 * a], shift[3 * a + 1] = x - cos * x - sin * y, y - cos * y + sin * x
+        shift[3 * a + 2] = phi
+    for i in range(size):
+        right[i] = update[row_start(i, size) + size]
+    add_product(update, size, shift, right)
+    for i in range(size):
+        to[row_start(i, size) + size] = right[i]
     rotated_triangle(update, n, cos, sin, to)
 
 
 @kernel
 def rotated_triangle(update, n, cos, sin, to):  # type: ignore[no-untyped-def]
-    """
-    Rotate the axes of an update matrix, and of a right-hand side in place.
-
-    Parameters
-    ----------
-    update : ndarray, flat, 3n columns, laid out by `pools.row_start`
-    n : int, number of nodes
-    cos, sin : float, of the angle of the present axes in the new ones
-    to : ndarray, flat, laid out as `update` or `update` itself
-        Receives the matrix, and has the right-hand side.
-
-    """
+    """Rotate the axes of an update matrix, and of a right-hand side in place."""
     size = 3 * n
     for a in range(n):
         r0, r1, r2 = (row_start(3 * a, size), row_start(3 * a + 1, size),
@@ -195,19 +156,13 @@ def frame_slip(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
     """
-    Return the squared error [sigma^2] of the parent's linear model of a slip.
+    Return the squared error [sigma^2] of the parent's linear model of a clique's slip beta [rad].
 
     An infinitesimal rotation is in the null space of the update matrix U. Of a rotation of the
     local coordinates v by beta this leaves `w = ((1 - cos beta) + (beta - sin beta) S) v`, with
     S = ((0, -1), (1, 0)), and the error w^T U w. The gradient g = U delta' - u has rotated by beta
-    as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U.
-
-    Parameters
-    ----------
-    c : int, row of the clique; it has a parent
-    beta : float, slip [rad]
-    work : ndarray, work space of 9 numbers for each separator node
-
+    as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U. Work space is 9
+    numbers for each separator node.
     """
     clique_i = tb.clique_i(head)
     pool_i, pool_f, node_f = tb.pool_i(head), tb.pool_f(head), tb.node_f(head)
@@ -221,7 +176,7 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
     first = node_f[nodes[0]]
     px, py = first[tb.POSE], first[tb.POSE + 1]
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
-    w, local, gradient = work[:3 * n], work[3 * n:6 * n], work[6 * n:9 * n]
+    w, local, gradient = work[:size], work[size:2 * size], work[2 * size:3 * size]
     for a in range(n):
         f = node_f[nodes[a]]
         x, y, th = local_delta(f, px, py, cos, sin, phi)
@@ -229,20 +184,100 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
         x, y = x + f[tb.REF] - px, y + f[tb.REF + 1] - py
         w[3 * a], w[3 * a + 1] = versine * x - lag * y, versine * y + lag * x
         w[3 * a + 2] = 0.0
-    error2 = 0.0
     for i in range(size):
         gradient[i] = -update[row_start(i, size) + size]
+    add_product(update, size, local, gradient)
+    local[:] = 0.0
+    add_product(update, size, w, local)
+    error2 = turned = 0.0
     for i in range(size):
-        r = update[row_start(i, size):]
-        error2 += w[i] * w[i] * r[i]
-        gradient[i] += r[i] * local[i]
-        for k in range(i + 1, size):
-            error2 += 2.0 * w[i] * w[k] * r[k]
-            gradient[i] += r[k] * local[k]
-            gradient[k] += r[k] * local[i]
-    turned = 0.0
+        error2 += w[i] * local[i]
     for i in range(0, size, 3):
         scale = update[row_start(i, size) + i] + update[row_start(i + 1, size) + i + 1]
         if scale > 0.0:
             turned += 2.0 * (gradient[i] ** 2 + gradient[i + 1] ** 2) / scale
     return max(error2, 0.0) + beta * beta * turned
+
+
+@kernel
+def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
+    """
+    Write the matrix and right-hand side of a prior whose frame has turned by phi, in map axes.
+
+    They are linearized at the present poses. Work space is 12 numbers for each node.
+    """
+    node_f, pool_i, pool_f = tb.node_f(head), tb.pool_i(head), tb.pool_f(head)
+    row = tb.clique_i(head)[c]
+    n, begin = 3 * row[tb.N_SEPARATOR], row[tb.NODES]
+    update = pool_f[row[tb.VALUES]:]
+    prior_rows.evaluate(head, c, phi, work)
+    g, r, z = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
+    prior_rows.product(head, c, r, z)
+    prior_rows.keep_linearization(head, c, r)
+    turned = stiff = 0.0
+    for i in range(n):
+        turned += g[i] * r[i]
+        stiff += z[i] * r[i]
+    # P^T U P and P^T g, with P = I - r m^T, m = 3 / n at the headings
+    share = 3.0 / n
+    for i in range(n):
+        at = row_start(i, n)
+        of_i = share if i % 3 == 2 else 0.0
+        for k in range(i, n):
+            of_k = share if k % 3 == 2 else 0.0
+            to[at + k] = update[at + k] - z[i] * of_k - of_i * z[k] + stiff * of_i * of_k
+        to[at + n] = g[i] - of_i * turned
+    if phi != 0.0:
+        rotated_triangle(to, row[tb.N_SEPARATOR], math.cos(phi), math.sin(phi), to)
+    # the unknowns are the solutions of the nodes, not changes of them
+    for i in range(n):
+        g[i] = -to[row_start(i, n) + n]
+        z[i] = node_f[pool_i[begin + i // 3], tb.DELTA + i % 3]
+    add_product(to, n, z, g)
+    for i in range(n):
+        to[row_start(i, n) + n] = g[i]
+
+
+@kernel
+def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
+    """
+    Return the squared linearization error of a prior that turns with its nodes [sigma^2].
+
+    Since it was linearized its frame has turned by beta against that of its parent, and positions
+    in the frame have changed by D. The displacement then differs from its linear model by
+    `w = ((1 - cos beta) + (beta - sin beta) S) p - beta S D`, p the positions, and gradients have
+    turned: that of the nodes by beta, as in `interface_error2`, and that of the
+    frame by `m g^T S D`. A large change of S D against p would falsify covariances in any case.
+    """
+    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
+    n = 3 * row[tb.N_SEPARATOR]
+    beta = frame_slip(head, c)
+    prior_rows.evaluate(head, c, present_turn(head, c), work)
+    g, r, w = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
+    change = work[4 * n:5 * n]
+    prior_rows.change_of_frame(head, c, r, change)
+    if row[tb.ANCHORED] != 0:
+        prior_rows.add_reference_arms(head, c, r)
+    versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
+    of_nodes = of_frame = compliance = moved = arms = 0.0
+    for i in range(0, n, 3):
+        w[i] = versine * r[i + 1] + lag * r[i] - beta * change[i]
+        w[i + 1] = -versine * r[i] + lag * r[i + 1] - beta * change[i + 1]
+        w[i + 2] = 0.0
+        k = row[tb.VALUES] + row_start(i, n) + i
+        iso = 0.5 * (pool_f[k] + pool_f[row[tb.VALUES] + row_start(i + 1, n) + i + 1])
+        heading = pool_f[row[tb.VALUES] + row_start(i + 2, n) + i + 2]
+        if iso > 0.0:
+            of_nodes += (g[i] ** 2 + g[i + 1] ** 2) / iso
+        if heading > 0.0:
+            compliance += 9.0 / (n * n * heading)
+        of_frame += change[i] * g[i] + change[i + 1] * g[i + 1]
+        moved += iso * (change[i] ** 2 + change[i + 1] ** 2)
+        arms += heading + iso * (r[i] ** 2 + r[i + 1] ** 2)
+    error2 = beta * beta * of_nodes + of_frame * of_frame * compliance
+    if moved > factors.MUCH_LONGER * arms:
+        error2 += moved / (arms + 1e-300)
+    prior_rows.product(head, c, w, change)
+    for i in range(n):
+        error2 += w[i] * change[i]
+    return max(error2, 0.0)

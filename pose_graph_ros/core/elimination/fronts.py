@@ -17,7 +17,7 @@ keeps its rows of R and its update matrix as upper triangles without gaps (`grap
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.compiled.simd import fnmadd, load, spread, store, times, WIDTH
+from pose_graph_ros.core.compiled.simd import copy, fnmadd, load, spread, store, times, WIDTH
 from pose_graph_ros.core.graph.pools import row_start
 
 # Smallest pivot, as a fraction of what the constraints of its node add to it. A smaller one has
@@ -120,16 +120,8 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
     """
     Return the first row with a bad pivot, or -1, after factorising the first rows of a front.
 
-    They are replaced by rows of R; the other rows become the update matrix.
-
-    Parameters
-    ----------
-    front : ndarray, flat
-        n rows of `ld` numbers; only the upper triangle and the last column are used.
-    rows, n : int, rows to factorise and all rows, both multiples of 3
-    ld : int, `padded(n)`
-    least : ndarray, shape (rows,), lower bound of each pivot, itself excluded
-
+    They are replaced by rows of R; the other ones of all n rows, of `ld = padded(n)` numbers,
+    become the update matrix. Each pivot must be above its `least`.
     """
     k = 0
     while k < rows:
@@ -151,18 +143,21 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
     return -1
 
 
+@kernel
+def write_rows(front, n, ld, pool_f, at):  # type: ignore[no-untyped-def]
+    """Write the upper triangle of the n rows of a front with right-hand sides, without gaps."""
+    for k in range(n):
+        copy(front, k * (ld + 1), pool_f, at, n - k)
+        at += n - k + 1
+        pool_f[at - 1] = front[(k + 1) * ld - 1]
+
+
 @kernel(fastmath=_FAST)
 def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """
     Solve `R^T y = x` for the frontal rows of a clique, and subtract them from the separator's.
 
-    Parameters
-    ----------
-    values : ndarray, flat
-        First `rows` rows of R of an upper triangle of n columns, laid out by `pools.row_start`.
-    rows, n : int, rows of the frontal nodes and of all nodes of the clique, both multiples of 3
-    x : ndarray, shape (n,), right-hand side; receives y in the frontal part
-
+    The values are the first rows of a triangle of n columns, laid out by `pools.row_start`.
     """
     for k in range(0, rows, 3):
         r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
@@ -195,11 +190,7 @@ def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
     """
     Solve `R x = y` for the frontal nodes of a clique, with y given in the frontal part of x.
 
-    Parameters
-    ----------
-    values, rows, n : as for `forward_rows`
-    x : ndarray, shape (n,), y, then the solution of the separator; y becomes the solution
-
+    Values are as for `forward_rows`; behind y, x has the solution of the separator.
     """
     for k in range(rows - 3, -1, -3):
         _backward_block(values, k, n, x, x[k], x[k + 1], x[k + 2])
@@ -207,15 +198,7 @@ def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 
 @kernel
 def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
-    """
-    Solve `R x = y` for the frontal nodes of a clique, with y the right-hand side column of R.
-
-    Parameters
-    ----------
-    values, rows, n : as for `forward_rows`
-    x : ndarray, shape (n,), solution of the separator; receives that of the frontal nodes
-
-    """
+    """Solve as `backward_rows`, with y the right-hand side column of R."""
     for k in range(rows - 3, -1, -3):
         at = row_start(k, n) + n
         _backward_block(

@@ -11,52 +11,207 @@ last nodes of the list can be eliminated last, in their order, so that the newes
 the root of the tree, where the next nodes are attached. The first nodes can be eliminated before
 all others, in any order among themselves: nodes that are about to leave the graph.
 
-The elements are the cliques, so the ordering yields the symbolic factorisation as well.
+The elements are the cliques, so the ordering yields the symbolic factorisation as well. SciPy has
+no such ordering, and none with these extensions.
 """
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 
+# Columns of the table of nodes and elements; an element has the number of its eliminated node.
+# BEGIN, LENGTH: of its list in `iw`. N_IN: number of elements at the front of a node's list.
+# WEIGHT: nodes in the supernode of a principal node; 0: not principal. SIZE: number of nodes in an
+# element; 0: absorbed. ABSORBER: what has absorbed an element. OUTSIDE: w of the paper, a
+# flag and the nodes of an element that are not in the new one. MEMBER: next node of the supernode,
+# MEMBER_END the last one. DEGREE: approximate; FIRST, AFTER, BEFORE: doubly linked lists of the
+# principal nodes by it. BUCKET, BUCKET_NEXT: lists by the hash of a node's list, its CODE.
+(BEGIN, LENGTH, N_IN, WEIGHT, SIZE, ABSORBER, OUTSIDE, MEMBER, MEMBER_END, MARK, DEGREE, FIRST,
+ AFTER, BEFORE, BUCKET, BUCKET_NEXT, CODE, COLUMNS) = range(18)
+
 
 @kernel(allocates=True)
-def _grown(array, size):  # type: ignore[no-untyped-def]
-    """Return a copy with room for at least `size` numbers."""
-    grown = np.empty(max(size, 2 * len(array)), np.int32)
+def grown(array, size):  # type: ignore[no-untyped-def]
+    """Return a copy with room for twice as many numbers, and for at least `size`."""
+    longer = np.empty(max(size, 2 * len(array)), array.dtype)
     for k in range(len(array)):
-        grown[k] = array[k]
-    return grown
+        longer[k] = array[k]
+    return longer
 
 
 @kernel
-def _insert(i, d, first, after, before):  # type: ignore[no-untyped-def]
-    """Put node i at the front of the list of degree d."""
-    before[i] = -1
-    after[i] = first[d]
-    if first[d] >= 0:
-        before[first[d]] = i
-    first[d] = i
+def _insert(t, i):  # type: ignore[no-untyped-def]
+    """Put node i at the front of the list of its degree."""
+    d = t[i, DEGREE]
+    t[i, BEFORE] = -1
+    t[i, AFTER] = t[d, FIRST]
+    if t[d, FIRST] >= 0:
+        t[t[d, FIRST], BEFORE] = i
+    t[d, FIRST] = i
 
 
 @kernel
-def _remove(i, d, first, after, before):  # type: ignore[no-untyped-def]
-    """Remove node i from the list of degree d."""
-    if before[i] >= 0:
-        after[before[i]] = after[i]
+def _remove(t, i):  # type: ignore[no-untyped-def]
+    """Remove node i from the list of its degree."""
+    if t[i, BEFORE] >= 0:
+        t[t[i, BEFORE], AFTER] = t[i, AFTER]
     else:
-        first[d] = after[i]
-    if after[i] >= 0:
-        before[after[i]] = before[i]
+        t[t[i, DEGREE], FIRST] = t[i, AFTER]
+    if t[i, AFTER] >= 0:
+        t[t[i, AFTER], BEFORE] = t[i, BEFORE]
 
 
 @kernel
-def _put(i, member, nodes, end):  # type: ignore[no-untyped-def]
+def _put(t, i, nodes, end):  # type: ignore[no-untyped-def]
     """Write all nodes of a supernode, given by its principal node; return where they end."""
     while i >= 0:
         nodes[end] = i
         end += 1
-        i = member[i]
+        i = t[i, MEMBER]
     return end
+
+
+@kernel
+def _fill(t, n, start, iw):  # type: ignore[no-untyped-def]
+    """Write the first rows of nodes and elements, whose lists begin at `start`."""
+    for i in range(len(t)):
+        for m in range(COLUMNS):
+            t[i, m] = 0
+        t[i, ABSORBER] = t[i, MEMBER] = t[i, FIRST] = t[i, AFTER] = t[i, BEFORE] = -1
+        t[i, BUCKET] = t[i, BUCKET_NEXT] = -1
+        t[i, MEMBER_END] = i
+        t[i, BEGIN] = start[i]
+        t[i, LENGTH] = start[i + 1] - start[i]
+        if i < n:
+            t[i, WEIGHT] = 1
+        else:
+            t[i, SIZE] = t[i, LENGTH]
+    for i in range(n):
+        d = 0
+        for k in range(t[i, BEGIN], t[i, BEGIN] + t[i, LENGTH]):
+            if iw[k] >= n:
+                t[i, N_IN] += 1
+                d += t[iw[k], SIZE] - 1
+            else:
+                d += 1
+        t[i, DEGREE] = min(d, n - 1)
+
+
+@kernel
+def _write_element(t, iw, p, stamp, top):  # type: ignore[no-untyped-def]
+    """
+    Write the nodes of the element of p, with the nodes of elements that it absorbs, marked.
+
+    Return where they end, and their number.
+    """
+    n = 0
+    for k in range(t[p, BEGIN], t[p, BEGIN] + t[p, LENGTH]):
+        e = iw[k]
+        if k < t[p, BEGIN] + t[p, N_IN]:
+            if t[e, SIZE] == 0:
+                continue
+            for m in range(t[e, BEGIN], t[e, BEGIN] + t[e, LENGTH]):
+                i = iw[m]
+                if t[i, WEIGHT] > 0 and t[i, MARK] != stamp:
+                    t[i, MARK] = stamp
+                    iw[top] = i
+                    top += 1
+                    n += t[i, WEIGHT]
+            t[e, SIZE] = 0
+            t[e, ABSORBER] = p
+        elif t[e, WEIGHT] > 0 and t[e, MARK] != stamp:
+            t[e, MARK] = stamp
+            iw[top] = e
+            top += 1
+            n += t[e, WEIGHT]
+    return top, n
+
+
+@kernel
+def _count_outside(t, iw, first, last, flag):  # type: ignore[no-untyped-def]
+    """Count how many nodes of each other element are not in the new one."""
+    for k in range(first, last):
+        i = iw[k]
+        for m in range(t[i, BEGIN], t[i, BEGIN] + t[i, N_IN]):
+            e = iw[m]
+            if t[e, SIZE] > 0:
+                if t[e, OUTSIDE] < flag:
+                    t[e, OUTSIDE] = flag + t[e, SIZE]
+                t[e, OUTSIDE] -= t[i, WEIGHT]
+
+
+@kernel
+def _prune(t, iw, i, p, flag, stamp, absorbs):  # type: ignore[no-untyped-def]
+    """
+    Remove from the list of a node what the new element p has.
+
+    Return its approximate degree outside, where the nodes begin in the list, its end and a hash.
+    Aggressive absorption: an element all of whose nodes are in the new one goes, but not for a
+    node before all others, as what is below such a node leaves with it.
+    """
+    to, d, h = t[i, BEGIN], 0, np.int64(0)
+    for m in range(t[i, BEGIN], t[i, BEGIN] + t[i, N_IN]):
+        e = iw[m]
+        if t[e, SIZE] > 0:
+            if t[e, OUTSIDE] > flag or not absorbs:
+                d += t[e, OUTSIDE] - flag
+                iw[to] = e
+                to += 1
+                h += e
+            else:
+                t[e, SIZE] = 0
+                t[e, ABSORBER] = p
+    first_node = to
+    for m in range(t[i, BEGIN] + t[i, N_IN], t[i, BEGIN] + t[i, LENGTH]):
+        j = iw[m]
+        if t[j, WEIGHT] > 0 and t[j, MARK] != stamp:
+            d += t[j, WEIGHT]
+            iw[to] = j
+            to += 1
+            h += j
+    return d, first_node, to, h
+
+
+@kernel
+def _merge_twins(t, iw, first, last, n_first, stamp):  # type: ignore[no-untyped-def]
+    """Merge indistinguishable nodes, found by a hash of their lists, into supernodes."""
+    for k in range(first, last):
+        i = iw[k]
+        if i < n_first:
+            t[i, BUCKET_NEXT] = t[t[i, CODE], BUCKET]
+            t[t[i, CODE], BUCKET] = i
+    for k in range(first, last):
+        i = iw[k]
+        if i >= n_first or t[t[i, CODE], BUCKET] < 0:
+            continue
+        i, t[t[i, CODE], BUCKET] = t[t[i, CODE], BUCKET], -1
+        while i >= 0:
+            if t[i, WEIGHT] > 0 and t[i, BUCKET_NEXT] >= 0:
+                stamp += 1
+                for m in range(t[i, BEGIN], t[i, BEGIN] + t[i, LENGTH]):
+                    t[iw[m], MARK] = stamp
+                j = t[i, BUCKET_NEXT]
+                while j >= 0:
+                    if t[j, WEIGHT] > 0 and _is_marked(t, iw, j, i, stamp):
+                        t[i, DEGREE] -= t[j, WEIGHT]
+                        t[i, WEIGHT] += t[j, WEIGHT]
+                        t[j, WEIGHT] = 0
+                        t[t[i, MEMBER_END], MEMBER] = j
+                        t[i, MEMBER_END] = t[j, MEMBER_END]
+                    j = t[j, BUCKET_NEXT]
+            i = t[i, BUCKET_NEXT]
+    return stamp
+
+
+@kernel
+def _is_marked(t, iw, j, i, stamp):  # type: ignore[no-untyped-def]
+    """Tell whether node j has the list of node i, whose entries are marked."""
+    same = t[j, LENGTH] == t[i, LENGTH] and t[j, N_IN] == t[i, N_IN]
+    m = t[j, BEGIN]
+    while same and m < t[j, BEGIN] + t[j, LENGTH]:
+        same = t[iw[m], MARK] == stamp
+        m += 1
+    return same
 
 
 @kernel(signature=(INTEGER, INTEGER, INTEGER, INTEGER, INDICES, INDICES), allocates=True)
@@ -89,227 +244,106 @@ def minimum_degree(n, n_elements, n_before, n_last, start, adjacency):  # type: 
     end = np.int64(start[n + n_elements])
     for k in range(end):    # a slice assignment would take two seconds to compile
         iw[k] = adjacency[k]
-    total = n + n_elements
-    # lists of nodes and elements in iw; an element has the number of its eliminated node
-    begin = np.empty(total, np.int64)
-    length = np.empty(total, np.int32)
-    n_in = np.zeros(n, np.int32)  # number of elements at the front of a node's list
-    weight = np.ones(n, np.int32)  # nodes in the supernode of a principal node; 0: not principal
-    size = np.zeros(total, np.int32)  # number of nodes in an element; 0: absorbed
-    outside = np.zeros(total, np.int64)  # w of the paper: flag + nodes not in the new element
-    clique_of = np.full(total, -1, np.int32)
-    member = np.full(n, -1, np.int32)  # next node of the same supernode
-    member_end = np.arange(n).astype(np.int32)
-    mark = np.zeros(total, np.int32)
-    stamp = 0
-    # doubly linked lists of principal nodes by degree
-    degree = np.zeros(n, np.int32)
-    first = np.full(n + 1, -1, np.int32)
-    after = np.full(n, -1, np.int32)
-    before = np.full(n, -1, np.int32)
-    bucket = np.full(n, -1, np.int32)
-    bucket_next = np.full(n, -1, np.int32)
-    code = np.zeros(n, np.int32)
-
+    t = np.empty((n + n_elements, COLUMNS), np.int64)
+    _fill(t, n, start, iw)
     n_first = n_before if n_before > 0 else n - n_last
-    for i in range(total):
-        begin[i] = start[i]
-        length[i] = start[i + 1] - start[i]
-        if i >= n:
-            size[i] = length[i]
-    for i in range(n):
-        d = 0
-        for k in range(begin[i], begin[i] + length[i]):
-            if iw[k] >= n:
-                n_in[i] += 1
-                d += size[iw[k]] - 1
-            else:
-                d += 1
-        degree[i] = min(d, n - 1)
-        if i < n_first:
-            _insert(i, degree[i], first, after, before)
-
+    for i in range(n_first):
+        _insert(t, i)
     offset = np.empty(n + 1, np.int64)
     n_frontal = np.empty(n, np.int32)
-    parent = np.full(n + n_elements, -1, np.int32)
     nodes = np.empty(4 * n + 16, np.int32)
     nodes_end = np.int64(0)
-    n_cliques = 0
-    smallest = 0
+    n_cliques = smallest = eliminated = stamp = 0
     flag = np.int64(1)
-    eliminated = 0
     next_last = n - n_last
     while eliminated < n:
         if eliminated == n_first and n_first < n - n_last:  # the nodes before all others are done
             n_first = n - n_last
             for i in range(n_before, n_first):
-                degree[i] = max(min(degree[i], n - eliminated - 1), 0)
-                _insert(i, degree[i], first, after, before)
+                t[i, DEGREE] = max(min(t[i, DEGREE], n - eliminated - 1), 0)
+                _insert(t, i)
             smallest = 0
-        # 1. the pivot
         if eliminated < n_first:
-            while first[smallest] < 0:
+            while t[smallest, FIRST] < 0:
                 smallest += 1
-            p = first[smallest]
-            _remove(p, degree[p], first, after, before)
+            p = t[smallest, FIRST]
+            _remove(t, p)
         else:
             p = next_last
             next_last += 1
-        # 2. its element: its neighbours and the nodes of the elements that it is a member of
-        bound = np.int64(length[p])
-        for k in range(begin[p], begin[p] + n_in[p]):
-            bound += length[iw[k]]
+        bound = np.int64(t[p, LENGTH])
+        for k in range(t[p, BEGIN], t[p, BEGIN] + t[p, N_IN]):
+            bound += t[iw[k], LENGTH]
         if end + bound > len(iw):
-            iw = _grown(iw, end + bound)
+            iw = grown(iw, end + bound)
         if nodes_end + n > len(nodes):
-            nodes = _grown(nodes, nodes_end + n)
+            nodes = grown(nodes, nodes_end + n)
         stamp += 1
-        mark[p] = stamp
-        weight_p = weight[p]
-        weight[p] = 0
+        t[p, MARK] = stamp
+        weight_p = t[p, WEIGHT]
+        t[p, WEIGHT] = 0
         eliminated += weight_p
-        top = end
-        element_size = 0
-        for k in range(begin[p], begin[p] + length[p]):
-            e = iw[k]
-            if k < begin[p] + n_in[p]:
-                if size[e] == 0:
-                    continue
-                for m in range(begin[e], begin[e] + length[e]):
-                    i = iw[m]
-                    if weight[i] > 0 and mark[i] != stamp:
-                        mark[i] = stamp
-                        iw[top] = i
-                        top += 1
-                        element_size += weight[i]
-                size[e] = 0
-                if e < n:
-                    parent[clique_of[e]] = n_cliques
-                else:
-                    parent[e] = n_cliques
-            elif weight[e] > 0 and mark[e] != stamp:
-                mark[e] = stamp
-                iw[top] = e
-                top += 1
-                element_size += weight[e]
-        e_begin, e_end = end, top
+        new = end
+        top, element_size = _write_element(t, iw, p, stamp, new)
+        _count_outside(t, iw, new, top, flag)
         offset[n_cliques] = nodes_end
-        nodes_end = _put(p, member, nodes, nodes_end)
-        # 3. how many nodes of each other element are not in the new one
-        for k in range(e_begin, e_end):
-            i = iw[k]
-            for m in range(begin[i], begin[i] + n_in[i]):
-                e = iw[m]
-                if size[e] > 0:
-                    if outside[e] < flag:
-                        outside[e] = flag + size[e]
-                    outside[e] -= weight[i]
-        # 4. prune the lists and update the approximate degrees
-        keep = e_begin
-        for k in range(e_begin, e_end):
+        nodes_end = _put(t, p, nodes, nodes_end)
+        keep = new
+        for k in range(new, top):
             i = iw[k]
             if i < n_first:
-                _remove(i, degree[i], first, after, before)
-            to = begin[i]
-            d = 0
-            h = np.int64(0)
-            for m in range(begin[i], begin[i] + n_in[i]):
-                e = iw[m]
-                if size[e] > 0:
-                    if outside[e] > flag or p < n_before:
-                        d += outside[e] - flag
-                        iw[to] = e
-                        to += 1
-                        h += e
-                    else:
-                        # aggressive absorption: all its nodes are in the new element, but not of
-                        # a node before all others, as what is below such a node leaves with it
-                        size[e] = 0
-                        if e < n:
-                            parent[clique_of[e]] = n_cliques
-                        else:
-                            parent[e] = n_cliques
-            first_node = to
-            for m in range(begin[i] + n_in[i], begin[i] + length[i]):
-                j = iw[m]
-                if weight[j] > 0 and mark[j] != stamp:
-                    d += weight[j]
-                    iw[to] = j
-                    to += 1
-                    h += j
-            if d == 0 and i < n_first and (p >= n_before or first_node == begin[i]):
+                _remove(t, i)
+            d, first_node, to, h = _prune(t, iw, i, p, flag, stamp, p >= n_before)
+            if d == 0 and i < n_first and (p >= n_before or first_node == t[i, BEGIN]):
                 # mass elimination: all its neighbours are in the new element
-                nodes_end = _put(i, member, nodes, nodes_end)
-                eliminated += weight[i]
-                element_size -= weight[i]
-                weight[i] = 0
+                nodes_end = _put(t, i, nodes, nodes_end)
+                eliminated += t[i, WEIGHT]
+                element_size -= t[i, WEIGHT]
+                t[i, WEIGHT] = 0
                 continue
             # the new element comes first; there is room, as at least one entry was removed
             iw[to] = iw[first_node]
-            iw[first_node] = iw[begin[i]]
-            iw[begin[i]] = p
-            n_in[i] = first_node - begin[i] + 1
-            length[i] = to - begin[i] + 1
-            degree[i] = min(degree[i] + element_size - weight[i], d + element_size - weight[i])
-            code[i] = (h + p) % n
+            iw[first_node] = iw[t[i, BEGIN]]
+            iw[t[i, BEGIN]] = p
+            t[i, N_IN] = first_node - t[i, BEGIN] + 1
+            t[i, LENGTH] = to - t[i, BEGIN] + 1
+            t[i, DEGREE] = min(t[i, DEGREE], d) + element_size - t[i, WEIGHT]
+            t[i, CODE] = (h + p) % n
             iw[keep] = i
             keep += 1
-        e_end = keep
-        # 5. merge indistinguishable nodes, found by a hash of their lists, into supernodes
         if eliminated < n_first:
-            for k in range(e_begin, e_end):
-                i = iw[k]
-                if i < n_first:
-                    bucket_next[i] = bucket[code[i]]
-                    bucket[code[i]] = i
-            for k in range(e_begin, e_end):
-                i = iw[k]
-                if i >= n_first or bucket[code[i]] < 0:
-                    continue
-                i, bucket[code[i]] = bucket[code[i]], -1
-                while i >= 0:
-                    if weight[i] > 0 and bucket_next[i] >= 0:
-                        stamp += 1
-                        for m in range(begin[i], begin[i] + length[i]):
-                            mark[iw[m]] = stamp
-                        j = bucket_next[i]
-                        while j >= 0:
-                            if weight[j] > 0 and length[j] == length[i] and n_in[j] == n_in[i]:
-                                same = True
-                                for m in range(begin[j], begin[j] + length[j]):
-                                    if mark[iw[m]] != stamp:
-                                        same = False
-                                        break
-                                if same:
-                                    degree[i] -= weight[j]
-                                    weight[i] += weight[j]
-                                    weight[j] = 0
-                                    member[member_end[i]] = j
-                                    member_end[i] = member_end[j]
-                            j = bucket_next[j]
-                    i = bucket_next[i]
-        # 6. write the clique
+            stamp = _merge_twins(t, iw, new, keep, n_first, stamp)
         n_frontal[n_cliques] = nodes_end - offset[n_cliques]
-        keep = e_begin
-        for k in range(e_begin, e_end):
+        end = new
+        for k in range(new, keep):
             i = iw[k]
-            if weight[i] > 0:
-                iw[keep] = i
-                keep += 1
-                nodes_end = _put(i, member, nodes, nodes_end)
+            if t[i, WEIGHT] > 0:
+                iw[end] = i
+                end += 1
+                nodes_end = _put(t, i, nodes, nodes_end)
                 if i < n_first:
-                    degree[i] = max(min(degree[i], n - eliminated - weight[i]), 0)
-                    smallest = min(smallest, degree[i])
-                    _insert(i, degree[i], first, after, before)
-        begin[p] = e_begin
-        length[p] = keep - e_begin
-        end = keep
-        size[p] = element_size
-        clique_of[p] = n_cliques
+                    t[i, DEGREE] = max(min(t[i, DEGREE], n - eliminated - t[i, WEIGHT]), 0)
+                    smallest = min(smallest, t[i, DEGREE])
+                    _insert(t, i)
+        t[p, BEGIN] = new
+        t[p, LENGTH] = end - new
+        t[p, SIZE] = element_size
         n_cliques += 1
         flag += n + 1
     offset[n_cliques] = nodes_end
-    # parents of the elements from the start, behind those of the cliques
-    for k in range(n_elements):
-        parent[n_cliques + k] = parent[n + k]
-    return n_cliques, offset, n_frontal, parent, nodes
+    return n_cliques, offset, n_frontal, _parents(t, n, n_cliques, offset, nodes), nodes
+
+
+@kernel(allocates=True)
+def _parents(t, n, n_cliques, offset, nodes):  # type: ignore[no-untyped-def]
+    """Return the parent of each clique, then of each element from the start."""
+    n_elements = len(t) - n
+    clique_of = np.full(n, -1, np.int32)
+    for k in range(n_cliques):
+        clique_of[nodes[offset[k]]] = k
+    parent = np.full(n_cliques + n_elements, -1, np.int32)
+    for k in range(n_cliques + n_elements):
+        e = nodes[offset[k]] if k < n_cliques else n + k - n_cliques
+        if t[e, ABSORBER] >= 0:
+            parent[k] = clique_of[t[e, ABSORBER]]
+    return parent

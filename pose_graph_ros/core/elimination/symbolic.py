@@ -1,9 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Symbolic factorisation of a whole graph, done once for all iterations of a batch optimisation.
+The structure of cliques: what `ordering` starts from, what becomes of its result, whole graphs.
 
-The cliques are in postorder: children precede their parent, and each subtree is contiguous. So the
+`structure` is the quotient graph of the nodes that an update orders, `amalgamate` merges the
+resulting cliques. `analyse` and `plant` are the symbolic factorisation of a whole graph, done once
+for all iterations of a batch optimisation.
+
+Its cliques are in postorder: children precede their parent, and each subtree is contiguous. So the
 elimination is a loop over all cliques, the back-substitution is the same loop in reverse, and the
 update matrices of the children are still in the processor's cache when the parent needs them.
 Separators are sorted by the order of elimination. Columns that are adjacent in a separator are
@@ -18,9 +22,10 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, INTEGERS, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import minimum_degree
-from pose_graph_ros.core.elimination.quotient_graph import amalgamate, newest_last, structure
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 
+# Number of the newest nodes that are eliminated last, since the next constraints involve them.
+NEWEST_LAST = 10
 # Limits of amalgamation: explicit zero blocks and frontal nodes of a merged clique. They differ
 # from those of the incremental smoother, as every clique is eliminated in every iteration here.
 RELAXED_ZEROS = 8
@@ -30,14 +35,10 @@ RELAXED_FRONTAL = 24
 class Cliques(NamedTuple):
     """The C cliques of a whole graph, in postorder."""
 
-    first: Any
-    """The nodes of clique k are `nodes[first[k]:first[k + 1]]`, shape (C + 1,)."""
-    n_frontal: Any
-    """Number of frontal nodes, which come first; the others are the separator, shape (C,)."""
-    parent: Any
-    """Parent of each clique, -1 for a root, shape (C,)."""
+    first: Any  # (C + 1,); the nodes of clique k are `nodes[first[k]:first[k + 1]]`
+    n_frontal: Any  # (C,) number of frontal nodes, which come first; the others are the separator
+    parent: Any     # (C,), -1 for a root
     nodes: Any
-    """Nodes of all cliques."""
 
 
 # What `minimum_degree` returns.
@@ -49,12 +50,157 @@ class Analysis(NamedTuple):
     """The cliques and the memory that they need."""
 
     cliques: Cliques
-    need_f: int
-    """Numbers in the pool of values, `pool_f`."""
-    need_i: int
-    """Numbers in the pool of node lists, `pool_i`."""
-    largest: int
-    """Numbers of work space for the largest front."""
+    need_f: int     # numbers in the pool of values, `pool_f`
+    need_i: int     # numbers in the pool of node lists, `pool_i`
+    largest: int    # numbers of work space for the largest front
+
+
+@kernel(signature=(INDICES, INTEGER))
+def newest_last(affected, newest):  # type: ignore[no-untyped-def]
+    """
+    Return how many of the newest nodes were moved to the end of the list, in order of age.
+
+    The very last is the newest pose, if it is affected: biases may have been added after it, but
+    the next odometry edge starts at it.
+    """
+    n = len(affected)
+    n_last = min(NEWEST_LAST, n)
+    for k in range(n_last):
+        best = 0
+        for i in range(1, n - k):
+            if affected[best] != newest and (
+                    affected[i] > affected[best] or affected[i] == newest):
+                best = i
+        last = n - k - 1
+        affected[best], affected[last] = affected[last], affected[best]
+    return n_last
+
+
+@kernel
+def _other_ends(edge_i, e, side):  # type: ignore[no-untyped-def]
+    """Return the nodes at the other ends of an edge; the second is -1 where there is but one."""
+    return (edge_i[e, tb.END_J if side == 0 else tb.END_I],
+            edge_i[e, tb.END_J if side == 2 else tb.END_K])
+
+
+@kernel(allocates=True)
+def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
+    """
+    Return the orphans, and the quotient graph of the affected nodes with them as elements.
+
+    Orphans are children of marked cliques that are not marked themselves, then the loose priors.
+    Marked cliques have FRONT_SERIAL of the head in their column MARKED. The graph is given as
+    `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
+    """
+    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
+    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
+    n = len(affected)
+    serial = head[tb.FRONT_SERIAL] + 1
+    head[tb.FRONT_SERIAL] = serial
+    for k in range(n):
+        node_i[affected[k], tb.INDEX] = k
+        node_i[affected[k], tb.FRONT] = serial
+    stamp = serial - 1
+    n_orphans = len(loose)
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                n_orphans += 1
+            c = clique_i[c, tb.SIBLING]
+    orphans = np.empty(n_orphans, np.int32)
+    n_orphans = 0
+    for k in range(len(marked)):
+        c = clique_i[marked[k], tb.CHILD]
+        while c >= 0:
+            if clique_i[c, tb.MARKED] != stamp:
+                orphans[n_orphans] = c
+                n_orphans += 1
+            c = clique_i[c, tb.SIBLING]
+    for k in range(len(loose)):
+        orphans[n_orphans + k] = loose[k]
+    n_orphans = len(orphans)
+    # which orphans each node is a member of
+    first = np.zeros(n + 1, np.int32)
+    n_entries = 0
+    for k in range(n_orphans):
+        row = clique_i[orphans[k]]
+        begin = row[tb.NODES] + row[tb.N_FRONTAL]
+        for m in range(begin, begin + row[tb.N_SEPARATOR]):
+            first[node_i[pool_i[m], tb.INDEX] + 1] += 1
+            n_entries += 2
+    for k in range(n):
+        first[k + 1] += first[k]
+        entry = node_i[affected[k], tb.EDGE_LIST]
+        while entry >= 0:
+            n_entries += 2
+            entry = edge_i[entry >> 2, tb.NEXT_I + (entry & 3)]
+    orphans_of, filled = np.empty(first[n], np.int32), first.copy()
+    for k in range(n_orphans):
+        row = clique_i[orphans[k]]
+        begin = row[tb.NODES] + row[tb.N_FRONTAL]
+        for m in range(begin, begin + row[tb.N_SEPARATOR]):
+            i = node_i[pool_i[m], tb.INDEX]
+            orphans_of[filled[i]] = n + k
+            filled[i] += 1
+    start = np.empty(n + n_orphans + 1, np.int32)
+    adjacency = np.empty(n_entries, np.int32)
+    last_seen = np.full(n, -1, np.int32)
+    end = 0
+    for k in range(n):
+        start[k] = end
+        for m in range(first[k], first[k + 1]):
+            adjacency[end] = orphans_of[m]
+            end += 1
+        entry = node_i[affected[k], tb.EDGE_LIST]
+        while entry >= 0:
+            e, side = entry >> 2, entry & 3
+            for other in _other_ends(edge_i, e, side):
+                if other >= 0 and node_i[other, tb.FRONT] == serial:
+                    i = node_i[other, tb.INDEX]
+                    if last_seen[i] != k:   # each neighbour once
+                        last_seen[i] = k
+                        adjacency[end] = i
+                        end += 1
+            entry = edge_i[e, tb.NEXT_I + side]
+    for k in range(n_orphans):
+        start[n + k] = end
+        row = clique_i[orphans[k]]
+        begin = row[tb.NODES] + row[tb.N_FRONTAL]
+        for m in range(begin, begin + row[tb.N_SEPARATOR]):
+            adjacency[end] = node_i[pool_i[m], tb.INDEX]
+            end += 1
+    start[n + n_orphans] = end
+    return orphans, start, adjacency
+
+
+@kernel(allocates=True)
+def amalgamate(  # type: ignore[no-untyped-def]
+    n_cliques, n_frontal, offset, parent, n_apart, most_zeros, most_frontal,
+):
+    """
+    Return into which clique to merge each: a parent where that stores few explicit zero blocks.
+
+    That is itself, or a later one, but never the last, that of the newest pose: the next edge
+    changes it. With them come the numbers of frontal nodes after merging.
+    """
+    into = np.arange(n_cliques).astype(np.int32)
+    frontal = n_frontal[:n_cliques].copy()
+    zeros = np.zeros(n_cliques, np.int32)
+    for k in range(n_cliques - 1):
+        q = parent[k]
+        if q < 0 or q == n_cliques - 1 or k < n_apart <= q:
+            continue
+        separator = offset[k + 1] - offset[k] - n_frontal[k]
+        width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]
+        added = zeros[k] + zeros[q] + frontal[k] * (width - separator)
+        if added <= most_zeros and frontal[k] + frontal[q] <= most_frontal:
+            into[k] = q
+            frontal[q] += frontal[k]
+            zeros[q] = added
+    for k in range(n_cliques - 1, -1, -1):
+        into[k] = into[into[k]]
+    return into, frontal
 
 
 def analyse(head: tb.IntHead) -> Analysis:
@@ -118,14 +264,7 @@ def _amalgamated(order, eliminated):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
 def _required_memory(head, cliques):  # type: ignore[no-untyped-def]
-    """
-    Return what cliques and priors need in both pools, and the work space of the largest front.
-
-    Parameters
-    ----------
-    cliques : Cliques
-
-    """
+    """Return what cliques and priors need in both pools, and work space of the largest front."""
     need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
     for c in prior_rows.all_priors(head):
         n_separator = np.int64(tb.clique_i(head)[c, tb.N_SEPARATOR])
@@ -172,35 +311,26 @@ def _postorder(n_cliques, into, parent):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _write_separators(cliques, separators, raw_nodes, n):  # type: ignore[no-untyped-def]
-    """Write the separators, each sorted by the order of elimination by two transpositions."""
+    """Write the separators, each sorted by the order of elimination."""
     first, n_frontal, nodes = cliques.first, cliques.n_frontal, cliques.nodes
     n_cliques = len(n_frontal)
-    order = np.empty(n, np.int32)
-    position = np.empty(n, np.int32)
+    order, position = np.empty(n, np.int32), np.empty(n, np.int32)
     at = 0
     for k in range(n_cliques):
         for m in range(first[k], first[k] + n_frontal[k]):
             order[at], position[nodes[m]] = nodes[m], at
             at += 1
-    # for each node, in order of elimination, the cliques whose separator contains it
-    begin = np.zeros(n + 1, np.int32)
     for k in range(n_cliques):
-        for m in range(separators[k, 0], separators[k, 1]):
-            begin[position[raw_nodes[m]] + 1] += 1
-    for i in range(n):
-        begin[i + 1] += begin[i]
-    holders = np.empty(begin[n], np.int32)
-    to = begin[:n].copy()
-    for k in range(n_cliques):
-        for m in range(separators[k, 0], separators[k, 1]):
-            i = position[raw_nodes[m]]
-            holders[to[i]] = k
-            to[i] += 1
-    filled = first[:n_cliques] + n_frontal
-    for i in range(n):
-        for m in range(begin[i], begin[i + 1]):
-            nodes[filled[holders[m]]] = order[i]
-            filled[holders[m]] += 1
+        places = nodes[first[k] + n_frontal[k]:first[k + 1]]
+        for m in range(len(places)):    # they are nearly sorted
+            place = position[raw_nodes[separators[k, 0] + m]]
+            i = m
+            while i > 0 and places[i - 1] > place:
+                places[i] = places[i - 1]
+                i -= 1
+            places[i] = place
+        for m in range(len(places)):
+            places[m] = order[places[m]]
 
 
 @kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
@@ -230,18 +360,19 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
             node_i[cliques.nodes[m], tb.CLIQUE] = c
     for k in range(len(n_frontal)):
         if cliques.parent[k] >= 0:
-            _attach(head, n_priors + cliques.parent[k], n_priors + k)
+            attach(head, n_priors + cliques.parent[k], n_priors + k)
     for c in range(n_priors):   # to the clique of the node that is eliminated first
         parent = head[tb.N_CLIQUES]
         for m in range(clique_i[c, tb.NODES], clique_i[c, tb.NODES] + clique_i[c, tb.N_SEPARATOR]):
             parent = min(parent, node_i[pool_i[m], tb.CLIQUE])
-        _attach(head, parent, c)
+        attach(head, parent, c)
     head[tb.LOOSE] = -1
     head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
 
 
 @kernel
-def _attach(head, parent, child):  # type: ignore[no-untyped-def]
+def attach(head, parent, child):  # type: ignore[no-untyped-def]
+    """Make a clique a child of another one."""
     clique_i = tb.clique_i(head)
     clique_i[child, tb.PARENT] = parent
     clique_i[child, tb.SIBLING], clique_i[parent, tb.CHILD] = clique_i[parent, tb.CHILD], child
@@ -260,17 +391,14 @@ def loose_part(head):  # type: ignore[no-untyped-def]
     part = np.arange(n).astype(np.int32)  # union-find: an earlier node of the same part
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.WEIGHT] > 0.0:
-            i = _first_node(part, edge_i[e, tb.END_I])
-            for m in range(1, 3):
-                if edge_i[e, m] >= 0:
-                    j = _first_node(part, edge_i[e, m])
-                    part[max(i, j)] = i = min(i, j)
+            _join(part, edge_i[e, tb.END_I], edge_i[e, tb.END_J])
+            if edge_i[e, tb.END_K] >= 0:
+                _join(part, edge_i[e, tb.END_I], edge_i[e, tb.END_K])
     clique_i, pool_i, priors = tb.clique_i(head), tb.pool_i(head), prior_rows.all_priors(head)
     for c in priors:
         begin = clique_i[c, tb.NODES]
         for m in range(begin + 1, begin + clique_i[c, tb.N_SEPARATOR]):
-            i, j = _first_node(part, pool_i[begin]), _first_node(part, pool_i[m])
-            part[max(i, j)] = min(i, j)
+            _join(part, pool_i[begin], pool_i[m])
     held = np.zeros(n, np.bool_)
     for c in priors:
         if clique_i[c, tb.ANCHORED] != 0:
@@ -289,7 +417,13 @@ def loose_part(head):  # type: ignore[no-untyped-def]
     return node, count
 
 
-@kernel(allocates=True)
+@kernel
+def _join(part, v, w):  # type: ignore[no-untyped-def]
+    i, j = _first_node(part, v), _first_node(part, w)
+    part[max(i, j)] = min(i, j)
+
+
+@kernel
 def _first_node(part, v):  # type: ignore[no-untyped-def]
     """Return the first node of the part that v is in, and shorten the path to it."""
     while part[v] != v:

@@ -49,12 +49,6 @@ def floored(covariance: FloatArray, floors: FloatArray) -> FloatArray:
     Return a symmetric covariance whose variances are raised to the floors.
 
     Only the diagonal is changed, and only upwards, so the matrix stays positive definite.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (d, d)
-    floors : ndarray, shape (d,), lower bounds of the variances
-
     """
     covariance = 0.5 * (covariance + covariance.T)
     missing = np.maximum(floors - np.diagonal(covariance), 0.0)
@@ -63,17 +57,11 @@ def floored(covariance: FloatArray, floors: FloatArray) -> FloatArray:
 
 def turned(covariance: FloatArray, theta: float) -> FloatArray:
     """
-    Return a covariance expressed in axes that are rotated by theta.
+    Return a covariance, shape (2, 2) or (3, 3), expressed in axes that are rotated by theta.
 
     With the heading of a measured pose as theta, it converts from the axes of the parent frame, as
     in ROS messages, to the frame of the measured pose, as in the errors (3.48) and (3.52) of
     Merfels. Footnote 4 there is the inverse conversion.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (2, 2) or (3, 3)
-    theta : float, angle from the old axes to the new ones [rad]
-
     """
     axes = np.eye(len(covariance))
     axes[:2, :2] = se2.rotation(theta)
@@ -90,15 +78,9 @@ def propagated(
     pose: FloatArray, covariance: FloatArray, increment: FloatArray, noise: FloatArray,
 ) -> FloatArray:
     """
-    Return the covariance of `compose(pose, increment)` in map axes, shape (3, 3).
+    Return the covariance of `compose(pose, increment)` in map axes.
 
-    Parameters
-    ----------
-    pose : ndarray, shape (3,), `T_map_a` [m, m, rad]
-    covariance : ndarray, shape (3, 3), of the pose, in map axes
-    increment : ndarray, shape (3,), `T_a_b` [m, m, rad]
-    noise : ndarray, shape (3, 3), covariance of the increment, in frame b
-
+    That of the pose is in map axes, the noise of the increment in the frame at its end.
     """
     end = se2.compose(pose, increment)
     jacobian = np.eye(3)

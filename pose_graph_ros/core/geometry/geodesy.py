@@ -17,22 +17,14 @@ import pyproj
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
-# Number of iterations that find the height above the plane for a given altitude. Each reduces the
-# error by the square of the angle [rad] between the verticals at the point and at the datum.
-LIFTS = 4
-
 
 class MapOrigin(NamedTuple):
     """Position of a map's origin on the Earth, and direction of its x axis."""
 
-    latitude: float
-    """WGS 84 [degrees]."""
-    longitude: float
-    """WGS 84 [degrees]."""
-    altitude: float = 0.0
-    """Height above the ellipsoid [m]."""
-    yaw: float = 0.0
-    """Angle of the x axis from east, counter-clockwise [rad]."""
+    latitude: float  # WGS 84 [degrees]
+    longitude: float  # WGS 84 [degrees]
+    altitude: float = 0.0  # height above the ellipsoid [m]
+    yaw: float = 0.0  # angle of the x axis from east, counter-clockwise [rad]
 
     def __str__(self) -> str:
         return (f'[{self.latitude:.9f}, {self.longitude:.9f}] at {self.altitude:.2f} m '
@@ -101,7 +93,9 @@ class TangentPlane:
         east_north = se2.transform(self._map, position)
         east, north = east_north[..., 0], east_north[..., 1]
         up = np.zeros_like(east)
-        for _ in range(1 if altitude is None else LIFTS):
+        # each reduces the error by the square of the angle between the verticals at the point and
+        # at the datum
+        for _ in range(1 if altitude is None else 4):
             longitude, latitude, height = self._projection.transform(
                 east, north, up, direction='INVERSE')
             if altitude is not None:
@@ -110,15 +104,7 @@ class TangentPlane:
 
 
 def distances(point: MapOrigin, latitude: npt.ArrayLike, longitude: npt.ArrayLike) -> FloatArray:
-    """
-    Return the geodesic distances of points from one point, shape (N,) [m].
-
-    Parameters
-    ----------
-    point : MapOrigin
-    latitude, longitude : array_like, shape (N,) or (), WGS 84 [degrees]
-
-    """
+    """Return the geodesic distances of points, given in degrees, from one point [m]."""
     latitude, longitude = (
         np.atleast_1d(np.asarray(numbers, dtype=np.float64)) for numbers in (latitude, longitude))
     _, _, metres = pyproj.Geod(ellps='WGS84').inv(

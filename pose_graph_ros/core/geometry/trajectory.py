@@ -1,14 +1,29 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""An immutable sequence of stamped poses, with interpolation."""
+"""
+Sequences of stamped poses: interpolation, alignment, and the odometry in between.
+"""
 
+import bisect
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import (
+    between_one,
+    BoolArray,
+    compose_one,
+    FloatArray,
+    IntArray,
+    Points,
+    Pose,
+    Poses,
+    PoseVector,
+    wrap_one,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,10 +34,9 @@ class Trajectory:
     Raises ValueError if the shapes do not match or the stamps do not increase.
     """
 
-    stamps_ns: IntArray
-    """Stamps [ns], shape (N,)."""
+    stamps_ns: IntArray  # stamps [ns], shape (N,)
+    # `T_map_base`, or poses in another frame of the owner's choice, shape (N, 3) [m, m, rad]
     poses: FloatArray
-    """`T_map_base`, or poses in another frame of the owner's choice, shape (N, 3) [m, m, rad]."""
 
     def __post_init__(self) -> None:
         stamps = np.array(self.stamps_ns, dtype=np.int64)
@@ -40,15 +54,7 @@ class Trajectory:
         object.__setattr__(self, 'poses', poses)
 
     def continued(self, stamp_ns: int, pose: FloatArray) -> 'Trajectory':
-        """
-        Return the trajectory with one pose more, unless that is not later than the last one.
-
-        Parameters
-        ----------
-        stamp_ns : int, [ns]
-        pose : ndarray, shape (3,) [m, m, rad]
-
-        """
+        """Return the trajectory with one pose more, unless that is not later than the last one."""
         if len(self) > 0 and stamp_ns <= self.stamps_ns[-1]:
             return self
         return Trajectory(np.append(self.stamps_ns, stamp_ns), np.vstack((self.poses, pose)))
@@ -82,3 +88,73 @@ class Trajectory:
         start, end = self.stamps_ns[after - 1], self.stamps_ns[after]
         fraction = (stamps - start) / (end - start)
         return se2.interpolate(self.poses[after - 1], self.poses[after], fraction)
+
+
+def interpolated(path: Trajectory, samples: Iterable[tuple[int, Pose]]) -> Poses:
+    """
+    Return the poses at the stamps of a path, by samples with stamps [ns]; NaN outside of these.
+
+    A sample that is older than one before it is ignored.
+    """
+    stamps, poses = [0], [(0.0, 0.0, 0.0)]
+    for stamp_ns, pose in samples:
+        if stamp_ns > stamps[-1]:
+            stamps.append(stamp_ns)
+            poses.append(pose)
+    odometry = Trajectory(np.array(stamps[1:]), np.array(poses[1:]).reshape(-1, 3))
+    found = np.full((len(path), 3), np.nan)
+    inside = odometry.covers(path.stamps_ns)
+    found[inside] = odometry.at(path.stamps_ns[inside])
+    return found
+
+
+class PathCorrection:
+    """Corrects poses of odometry by a path and the poses of odometry at it, NaN where unknown."""
+
+    def __init__(self, path: Trajectory, odometry: FloatArray) -> None:
+        self._path, self._stamps = path, path.stamps_ns.tolist()
+        self._poses = path.poses.tolist()
+        self._odometry = odometry.tolist()
+        moved = se2.between(odometry[:-1], odometry[1:])
+        wanted = se2.between(path.poses[:-1], path.poses[1:])
+        change = np.abs(se2.between(moved, wanted))
+        # where odometry alone differs by more, or is unknown, it does not follow [m, rad]
+        self._follows = np.all(change <= 0.5, axis=1).tolist()
+
+    def at(self, stamp_ns: int, odometry: Pose) -> Pose | None:
+        """
+        Return the corrected pose at a stamp inside the path; None outside.
+
+        Where odometry has jumped, the path is interpolated instead.
+        """
+        k = bisect.bisect_right(self._stamps, stamp_ns) - 1
+        if k < 0 or stamp_ns > self._stamps[-1]:
+            return None
+        if self._stamps[k] == stamp_ns:
+            x, y, theta = self._poses[k]
+            return x, y, theta
+        if not self._follows[k]:
+            x, y, theta = self._path.at(stamp_ns).tolist()
+            return x, y, theta
+        part = (stamp_ns - self._stamps[k]) / (self._stamps[k + 1] - self._stamps[k])
+        first = compose_one(self._poses[k], between_one(self._odometry[k], odometry))
+        last = compose_one(self._poses[k + 1], between_one(self._odometry[k + 1], odometry))
+        return (first[0] + part * (last[0] - first[0]), first[1] + part * (last[1] - first[1]),
+                wrap_one(first[2] + part * wrap_one(last[2] - first[2])))
+
+
+def fit_motion(source: Points, target: Points) -> PoseVector:
+    """
+    Return the rigid motion `T_target_source` that aligns points with others by least squares.
+
+    This is the solution of Umeyama (1991), which in the plane needs no decomposition: the sums of
+    the dot and the cross products of the centred points are cosine and sine of the angle times one
+    number. If the points do not determine the angle, it is 0.
+    """
+    if source.shape != target.shape or source.ndim != 2 or len(source) == 0:
+        raise ValueError(
+            f'expected equally many points (N, 2), N > 0, got {source.shape} and {target.shape}')
+    source_mean, target_mean = np.mean(source, axis=0), np.mean(target, axis=0)
+    p, q = source - source_mean, target - target_mean
+    theta = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
+    return se2.wrapped(np.append(target_mean - se2.rotation(theta) @ source_mean, theta))

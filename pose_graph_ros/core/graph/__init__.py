@@ -5,9 +5,9 @@ The pose graph: hidden nodes, edges and observed nodes as rows of flat tables.
 
 `graph` is the module to read first: a `Graph` takes in `GraphUpdate`s, each applied whole or not
 at all, and gives out poses, constraints and energies. `constraints` describes edges and observed
-nodes as arrays and validates them; `tables` holds all rows in memory that compiled kernels share,
-and names every column. The kernels in `rows` and `editing` write rows, those in `factors` evaluate
-and linearize constraints, and `transaction_log` logs changes for a rollback. `error_functions`
-has the errors in NumPy, `reweighting` the robust losses, and `graph_view` what is shown of a
-graph. Solving is done in `elimination`, `smoother` and `batch`.
+nodes as arrays, `checks` validates all that goes in; `tables` holds all rows in memory that
+compiled kernels share, and names every column. The kernels in `rows` and `editing` write rows,
+those in `factors` evaluate and linearize constraints, and `transaction_log` logs changes for a
+rollback. `error_functions` has the errors in NumPy, `reweighting` the robust losses, and
+`graph_view` what is shown of a graph. Solving is done in `elimination`, `smoother` and `batch`.
 """

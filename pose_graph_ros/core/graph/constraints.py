@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The two types of constraints, as struct of arrays: edges and observed nodes.
+The kinds of nodes, and the two types of constraints as struct of arrays: edges, observed nodes.
 
 An *edge* leads from hidden node i to hidden node j and has the measured pose of j in i. An
 *observed node* is a pose measured in the map; it constrains one hidden node. A position is an
@@ -9,49 +9,89 @@ observed node whose information on the heading and whose mean heading are zero, 
 in map axes. A heading is an observed node whose information on the position is zero.
 
 A *bias* is a hidden node that is not a pose but the time-correlated error of a source of
-measurements, in units of its sigma. Edges of the kind `BIAS` lead to it. `factor_types` has all
-kinds of edges, with their errors.
+measurements, in units of its sigma. Edges of the kind `BIAS` lead to it. `factors` has the errors
+of all kinds. Nothing in here is compiled, so that programs which read a file and work on arrays
+need not load Numba.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 from operator import attrgetter
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.ids import Ids
-from pose_graph_ros.core.graph.kinds import EdgeKind, FACTORS, NodeKind, ObservedKind
 from pose_graph_ros.core.saved_columns import Choices
 
-__all__ = [
-    'SEMIDEFINITE_TOLERANCE',
-    'Constraints',
-    'EdgeKind',
-    'EdgeKinds',
-    'Edges',
-    'KindArray',
-    'NodeKind',
-    'ObservedKind',
-    'ObservedKinds',
-    'ObservedNodes',
-    'check',
-    'full',
-    'upper',
-]
+
+class NodeKind(IntEnum):
+    """What a hidden node is."""
+
+    POSE = 0
+    BIAS = 1        # time-correlated error of a source of measurements, of dimension 1 to 3
+    LANDMARK = 2    # a point in the map, of dimension 2
+
+
+class EdgeKind(IntEnum):
+    """Where an edge comes from."""
+
+    ODOMETRY = 0
+    LOOP_CLOSURE = 1
+    # leads to a bias j, from the pose i that was measured with it or from the next bias i; the
+    # error is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th)
+    BIAS = 2
+    TURN = 3    # change of the heading, as from a gyro, whose bias, if any, is the third node
+    POINT = 4   # position of landmark j in the frame of i
+    PRIOR = 5   # what marginalisation leaves of edges between poses; the error is that of odometry
+    RANGE = 6   # distance of landmark j from a point of the robot i
+
+
+class ObservedKind(IntEnum):
+    """What was measured of an observed node; the error is the same for all kinds."""
+
+    GLOBAL_POSE = 0
+    POSITION = 1
+    HEADING = 2
+    PRIOR = 3   # what marginalisation leaves
+
+
+class FactorType(NamedTuple):
+    """What checks, files and pictures need to know of a kind of edges."""
+
+    name: str
+    i: tuple[NodeKind, ...]         # kinds of nodes that the edge may start from
+    j: tuple[NodeKind, ...]
+    k: tuple[NodeKind, ...] = ()    # of the third node, which may be missing
+    # rows that the error has; mean and information are zero in the others
+    rows: tuple[int, ...] = (0, 1, 2)
+    bias: tuple[int, ...] = ()      # columns of `Edges.bias` that it uses
+    # tag in g2o files, followed by i, j and, of the rows that it has, mean and upper triangle of
+    # the information
+    tag: str = ''
+
+    @property
+    def places(self) -> bool:
+        """Whether its mean is a position of j in the frame of i."""
+        return self.rows[:2] == (0, 1) and self.j != (NodeKind.BIAS,)
+
+
+_POSE, _BIAS, _LANDMARK = (NodeKind.POSE,), (NodeKind.BIAS,), (NodeKind.LANDMARK,)
+FACTORS = {
+    EdgeKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
+    EdgeKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
+    EdgeKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS, bias=(0, 1, 2, 3)),
+    EdgeKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,), bias=(3,)),
+    EdgeKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
+    EdgeKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
+    EdgeKind.RANGE: FactorType(
+        'range', _POSE, _LANDMARK, rows=(0,), bias=(0, 1), tag='EDGE_RANGE_SE2_XY'),
+}
 
 KindArray = npt.NDArray[np.uint8]
-
-# How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
-# below zero and its triangles may differ, because files print few digits.
-SEMIDEFINITE_TOLERANCE = 1e-5
-# Minors of such a matrix above which it is positive definite without computing eigenvalues.
-_MINOR, _ROUNDING = 1e-9, 1e-12
-
-
 EdgeKinds = Annotated[IntArray, Choices(EdgeKind)]
 ObservedKinds = Annotated[IntArray, Choices(ObservedKind)]
 
@@ -98,8 +138,6 @@ Constraints = TypeVar('Constraints', bound=_Table)
 
 # The constructors of the frozen tables set columns by this.
 _set = object.__setattr__
-
-
 _NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
 _FLOAT, _INT, _KIND = (np.dtype(kind) for kind in (np.float64, np.int64, np.uint8))
 
@@ -121,51 +159,30 @@ def _integers(values: npt.ArrayLike, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     return array.astype(dtype, copy=False)
 
 
-def _weights(weight: npt.ArrayLike | None, size: int) -> FloatArray:
-    if weight is not None:
-        return _numbers(weight)
-    ones = np.empty(size)
-    ones.fill(1.0)  # np.ones takes three times as long for short arrays
-    return ones
-
-
-def _no_nodes(size: int) -> IntArray:
-    none = np.empty(size, dtype=_INT)
-    none.fill(-1)
-    return none
+def _filled(size: int, value: float, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    column = np.empty(size, dtype)
+    column.fill(value)  # np.full takes three times as long for short arrays
+    return column
 
 
 @dataclass(frozen=True, slots=True)
 class Edges(_Table):
-    """
-    M directed edges.
+    """M directed edges; raises GraphUpdateError for ends and kinds that are no integers."""
 
-    Parameters
-    ----------
-    i, j : array_like of int, shape (M,), nodes that the edges start from and lead to
-    mean : array_like, shape (M, 3)
-        Measured poses of j in i [m, m, rad]; of edges to a bias those of i in the map, of ranges
-        the distance (r, 0, 0).
-    information : array_like, shape (M, 3, 3)
-        Inverse covariances of the errors (3.48), in the frames of the measured poses; of edges to
-        a bias in map axes. It is zero in rows that the error of the kind has not.
-    kind : array_like of int, shape (M,), `EdgeKind`
-    weight : array_like, shape (M,), optional, factors on the information: 0 removed, default 1
-    bias : array_like, shape (M, 4), optional
-        Measured offset in i and factors of the bias, `(o_x, o_y, f_t, f_th)` [m, m, m, rad]; used
-        for edges to a bias, of a range (o_x, o_y), of a turn f_th, the duration [s].
-    k : array_like of int, shape (M,), optional, third nodes: of turns the bias; -1, the default
-
-    """
-
-    i: IntArray
-    j: IntArray
+    i: IntArray     # nodes that they start from
+    j: IntArray     # nodes that they lead to
+    # measured poses of j in i, shape (M, 3) [m, m, rad]; of edges to a bias those of i in the map,
+    # of ranges the distance (r, 0, 0)
     mean: FloatArray
+    # inverse covariances of the errors (3.48), shape (M, 3, 3), in the frames of the measured
+    # poses; of edges to a bias in map axes; zero in rows that the error of the kind has not
     information: FloatArray
     kind: KindArray
-    weight: FloatArray
+    weight: FloatArray  # factors on the information: 0 removed, by default 1
+    # measured offset in i and factors of the bias, (o_x, o_y, f_t, f_th), shape (M, 4)
+    # [m, m, m, rad]: of edges to a bias, of a range (o_x, o_y), of a turn f_th, the duration [s]
     bias: FloatArray
-    k: IntArray
+    k: IntArray     # third nodes: of turns the bias; -1, the default, for none
 
     def __init__(
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,
@@ -179,9 +196,9 @@ class Edges(_Table):
         _set(self, 'mean', _numbers(mean))
         _set(self, 'information', _numbers(information))
         _set(self, 'kind', _integers(kind, _KIND))
-        _set(self, 'weight', _weights(weight, len(i)))
+        _set(self, 'weight', _filled(len(i), 1.0, _FLOAT) if weight is None else _numbers(weight))
         _set(self, 'bias', np.zeros((len(i), 4)) if bias is None else _numbers(bias))
-        _set(self, 'k', _no_nodes(len(i)) if k is None else _integers(k, _INT))
+        _set(self, 'k', _filled(len(i), -1, _INT) if k is None else _integers(k, _INT))
 
     def __len__(self) -> int:
         return len(self.i)
@@ -189,30 +206,18 @@ class Edges(_Table):
 
 @dataclass(frozen=True, slots=True)
 class ObservedNodes(_Table):
-    """
-    K observed nodes, each with one constraint.
+    """K observed nodes, each with one constraint; raises GraphUpdateError as `Edges`."""
 
-    Parameters
-    ----------
-    node : array_like of int, shape (K,), hidden nodes that are observed
-    offset : array_like, shape (K, 3), optional
-        Poses of the observed frames in the hidden nodes [m, m, rad]: motion by odometry since the
-        hidden node, then the lever arm. The identity, which is the default, makes the error that
-        of (3.52).
-    mean : array_like, shape (K, 3), observed poses in the map [m, m, rad]
-    information : array_like, shape (K, 3, 3)
-        Inverse covariances of the errors (3.52), in the frames of the observed poses.
-    kind : array_like of int, shape (K,), `ObservedKind`
-    weight : array_like, shape (K,), optional, factors on the information: 0 removed, default 1
-
-    """
-
-    node: IntArray
+    node: IntArray  # hidden nodes that are observed
+    # poses of the observed frames in the hidden nodes, shape (K, 3) [m, m, rad]: motion by
+    # odometry since the hidden node, then the lever arm; the identity, which is the default, makes
+    # the error that of (3.52)
     offset: FloatArray
-    mean: FloatArray
+    mean: FloatArray    # observed poses in the map, shape (K, 3) [m, m, rad]
+    # inverse covariances of the errors (3.52), shape (K, 3, 3), in the observed frames
     information: FloatArray
     kind: KindArray
-    weight: FloatArray
+    weight: FloatArray  # factors on the information: 0 removed, by default 1
 
     def __init__(
         self, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
@@ -220,158 +225,32 @@ class ObservedNodes(_Table):
         kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
     ) -> None:
         node = _integers(node, _INT)
+        n = len(node)
         _set(self, 'node', node)
-        _set(self, 'offset', _numbers(np.zeros((len(node), 3)) if offset is None else offset))
+        _set(self, 'offset', np.zeros((n, 3)) if offset is None else _numbers(offset))
         _set(self, 'mean', _numbers(mean))
         _set(self, 'information', _numbers(information))
         _set(self, 'kind', _integers(kind, _KIND))
-        _set(self, 'weight', _weights(weight, len(node)))
+        _set(self, 'weight', _filled(n, 1.0, _FLOAT) if weight is None else _numbers(weight))
 
     def __len__(self) -> int:
         return len(self.node)
 
     def weighted(self, weight: float) -> 'ObservedNodes':
         """Return the same observed nodes with another weight."""
-        return ObservedNodes(self.node, self.offset, self.mean, self.information, self.kind,
-                             np.full(len(self), weight))
+        return replace(self, weight=np.full(len(self), weight))
 
 
-_FULL: IntArray = np.array((0, 1, 2, 1, 3, 4, 2, 4, 5))
+_COLUMNS: dict[type, Any] = {
+    table: attrgetter(*(item.name for item in fields(table))) for table in (Edges, ObservedNodes)}
 
 
 def full(triangles: FloatArray) -> FloatArray:
     """Return symmetric matrices, shape (M, 3, 3), from their upper triangles, shape (M, 6)."""
-    return np.ascontiguousarray(triangles[:, _FULL]).reshape(-1, 3, 3)
+    return np.ascontiguousarray(triangles[:, (0, 1, 2, 1, 3, 4, 2, 4, 5)]).reshape(-1, 3, 3)
 
 
 def upper(matrices: FloatArray) -> FloatArray:
     """Return upper triangles, (M, 6), row by row, of nearly symmetric matrices, (M, 3, 3)."""
     both = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
     return np.asarray(both[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)])
-
-
-_COLUMNS: dict[type, Any] = {
-    table: attrgetter(*(item.name for item in fields(table))) for table in (Edges, ObservedNodes)}
-# Shapes of the rows of columns that are not of numbers.
-_ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
-
-
-def check(
-    table: Edges | ObservedNodes, kind: npt.NDArray[Any], dimension: IntArray | None = None,
-    nodes: Ids | None = None,
-) -> None:
-    """
-    Raise GraphUpdateError for invalid constraints, with the row, what was expected and the value.
-
-    Invalid are wrong shapes, kinds or nodes, negative weights, an edge from a node to itself, a
-    node of a kind that the kind of edge does not have for this end, numbers that are not finite,
-    numbers in rows that an error has not, an information matrix that is zero, not symmetric or not
-    positive semidefinite.
-
-    Parameters
-    ----------
-    table : Edges or ObservedNodes
-    kind : ndarray, shape (N,), `NodeKind` of the hidden nodes, by row
-    dimension : ndarray of int, shape (N,), optional, by default 2 for landmarks, 3 for others
-    nodes : Ids, optional, of the hidden nodes; by default they are the rows
-
-    """
-    name, ids = type(table).__name__, Ids(len(kind)) if nodes is None else nodes
-    columns = {item.name: getattr(table, item.name) for item in fields(table)}
-    for key, column in columns.items():
-        expected = (len(table), *_ROW_SHAPES.get(key, ()))
-        if column.shape != expected:
-            raise GraphUpdateError(
-                f'{name}.{key}: expected shape {expected}, got {column.shape}')
-    for key, column in columns.items():
-        _refuse_rows(~np.isfinite(column), f'{name}.{key} is not finite', column)
-    ends = ((table.i, table.j, table.k[table.k != -1])
-            if isinstance(table, Edges) else (table.node,))
-    for end in ends:
-        _refuse_rows((end < 0) | (end >= ids.end),
-                     f'{name}: expected a hidden node in 0..{ids.end - 1}', end)
-        gone = np.flatnonzero(ids.rows(end) < 0)
-        if len(gone) > 0:
-            raise GraphUpdateError(
-                f'{name}: hidden node {end[gone[0]]} has left the graph; row {gone[0]}')
-    known = tuple(FACTORS) if isinstance(table, Edges) else tuple(ObservedKind)
-    _refuse_rows(~np.isin(table.kind, known),
-                 f'{name}.kind is none of {", ".join(each.name for each in known)}', table.kind)
-    _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
-    if dimension is None:
-        dimension = np.where(kind == NodeKind.LANDMARK, 2, 3)
-    if isinstance(table, Edges):
-        _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
-        _check_ends(table, kind, ids)
-        rows = np.array([np.isin(range(3), factor.rows) for factor in FACTORS.values()])
-        missing = ~rows[table.kind]
-        _refuse_rows(missing & (table.mean != 0.0),
-                     f'{name}.mean: expected 0 in rows that the error has not', table.mean)
-        least = np.where(table.kind == EdgeKind.BIAS, np.minimum(
-            dimension[ids.rows(table.i)], dimension[ids.rows(table.j)]), 3)
-    else:
-        least, missing = dimension[ids.rows(table.node)], np.zeros((len(table), 3), dtype=bool)
-    missing = missing | (np.arange(3) >= least[:, None])
-    diagonal = np.diagonal(table.information, axis1=1, axis2=2)
-    _refuse_rows(missing & (diagonal != 0.0), f'{name}.information: expected 0 in rows that the '
-                 'error or the node has not', diagonal)
-    check_information(f'{name}.information', table.information)
-
-
-def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
-    """Raise GraphUpdateError if an edge has a node of the wrong kind for an end."""
-    for each, factor in FACTORS.items():
-        rows = edges.kind == each
-        for end, allowed in (('i', factor.i), ('j', factor.j), ('k', factor.k)):
-            node = getattr(edges, end)
-            wrong = rows & (node >= 0) & ~np.isin(kind[ids.rows(node)], allowed)
-            expected = ' or '.join(item.name.lower() for item in allowed) or 'none'
-            _refuse_rows(wrong, f'Edges.{end}: expected an edge of kind {each.name} to have '
-                         f'{expected} for this end', node)
-
-
-def check_information(name: str, matrix: FloatArray) -> None:
-    """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
-    diagonal, scaled = np.diagonal(matrix, axis1=1, axis2=2), _scaled(matrix)
-    skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)
-    _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
-    smallest = np.zeros(len(matrix))
-    doubtful = ~_are_definite(scaled)
-    smallest[doubtful] = np.min(
-        np.linalg.eigvalsh(scaled[doubtful]), axis=-1, initial=np.inf)
-    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
-    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
-                 f'{name} is not positive semidefinite, or zero', matrix)
-
-
-def are_definite(information: FloatArray) -> BoolArray:
-    """Tell which matrices, shape (M, 3, 3), are clearly positive definite, whatever their unit."""
-    return _are_definite(_scaled(information))
-
-
-def _scaled(matrix: FloatArray) -> FloatArray:
-    """Return matrices with 1 in place of each positive number on the diagonal."""
-    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
-    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    with np.errstate(over='ignore'):
-        scaled = matrix / root[:, :, None] / root[:, None, :]
-    # correlations beyond 1 are invalid however large they are, and might overflow
-    return np.clip(scaled, -2.0, 2.0)
-
-
-def _are_definite(scaled: FloatArray) -> BoolArray:
-    """Tell for which matrices with 1 on the diagonal the leading minors are clearly positive."""
-    a, b, c = scaled[:, 0, 1], scaled[:, 0, 2], scaled[:, 1, 2]
-    diagonal = np.diagonal(scaled, axis1=1, axis2=2)
-    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
-    return np.asarray(np.all(np.abs(diagonal - 1.0) < _ROUNDING, axis=1)
-                      & (1.0 - a * a > _MINOR) & (determinant > _MINOR))
-
-
-def _refuse_rows(
-    bad: BoolArray, reason: str, values: npt.NDArray[np.generic],
-) -> None:
-    """Raise GraphUpdateError with the first bad row, if there is one."""
-    if np.any(bad):
-        row = int(np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0])
-        raise GraphUpdateError(f'{reason}; row {row}: {values[row].tolist()}')

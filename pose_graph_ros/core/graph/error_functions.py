@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Errors of constraints at given poses: `factor_types` for tables that need not be in a graph.
+Errors of constraints at given poses: `factors` for tables that need not be in a graph.
 
 The energy of a constraint is `e^T information e`, without a factor 1/2; chi2 is the sum of all
 energies.
@@ -13,24 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.graph.factor_types import OBSERVED, prepare
-from pose_graph_ros.core.graph.factors import model, wrap
+from pose_graph_ros.core.graph.factors import model, OBSERVED, prepare, wrap
 
 
-def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
+def edge_errors(poses: Poses, edges: Edges) -> FloatArray:
     """
     Return the errors (3.48) of edges, shape (M, 3) [m, m, rad], theta in [-pi, pi).
 
     They are in the frames of the measured poses, those of edges to a bias in map axes.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), hidden nodes in the map [m, m, rad]
-    edges : Edges
-
     """
     error = np.empty((len(edges), 3))
     _edge_errors(*map(_writable, (
@@ -38,18 +31,8 @@ def edge_errors(poses: FloatArray, edges: Edges) -> FloatArray:
     return error
 
 
-def observed_errors(poses: FloatArray, observed: ObservedNodes) -> FloatArray:
-    """
-    Return the errors (3.52) of observed nodes, with their offsets, shape (K, 3) [m, m, rad].
-
-    They are in the frames of the observed poses; theta lies in [-pi, pi).
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), hidden nodes in the map [m, m, rad]
-    observed : ObservedNodes
-
-    """
+def observed_errors(poses: Poses, observed: ObservedNodes) -> FloatArray:
+    """Return the errors (3.52) of observed nodes, in their frames, as `edge_errors`."""
     error = np.empty((len(observed), 3))
     _observed_errors(*map(_writable, (
         poses, observed.node, observed.offset, observed.mean)), error)
@@ -63,15 +46,7 @@ def _writable(column: Any) -> npt.NDArray[Any]:
 
 @kernel
 def write_data(f, kind, mean, bias):  # type: ignore[no-untyped-def]
-    """
-    Write what the error of an edge depends on into a row as of `edge_f`.
-
-    Parameters
-    ----------
-    f, kind : ndarray and int
-    mean, bias : ndarray, values of the columns of `Edges`
-
-    """
+    """Write what the error of an edge depends on into a row as of `edge_f`."""
     f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2] = mean[0], mean[1], mean[2]
     f[tb.OFFSET], f[tb.OFFSET + 1] = bias[0], bias[1]
     f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[2], bias[3]
@@ -99,13 +74,5 @@ def _observed_errors(poses, node, offset, mean, error):  # type: ignore[no-untyp
 
 
 def energies(error: FloatArray, information: FloatArray) -> FloatArray:
-    """
-    Return the energies `e^T information e`, shape (M,) [sigma^2].
-
-    Parameters
-    ----------
-    error : ndarray, shape (M, 3)
-    information : ndarray, shape (M, 3, 3), in the frames of the errors
-
-    """
+    """Return the energies [sigma^2] for information in the frames of the errors."""
     return np.einsum('mi,mij,mj->m', error, information, error)

@@ -1,13 +1,35 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What solvers need of constraints, derived from the errors in `factor_types` for all types alike.
+The types of constraints (factors): the error of each, and what solvers derive from it.
 
-These are the linearization of a constraint, its linearization error, its energy and gradient, and
-what it adds to a front. The unknown of a node is its pose minus a constant reference, delta =
-x - x_ref, in map axes. Translation and heading are added as plain numbers, so every constraint may
-be linearized at a point of its own. Symbols are those of `factor_types`; a bar marks values at the
-linearization point. In map axes an error is
+`constraints.FACTORS` says which nodes a kind of edge has for ends, which rows its error has, and
+its tag in g2o files. `error` has the errors with their Jacobians, each defined here and nowhere
+else. Numbers in parentheses are equations of C. Merfels, "Sensor fusion for localization of
+automated vehicles", section 3.4.6. A node is x = (t, th), its theta wrapped; R_i and R_z are the
+rotations (3.47) of node i and of the measured pose z = (t_z, th_z), o an offset in node i. With
+F = diag(f_t, f_t, f_th) and `d = f_t t_j - t_i` the errors are
+
+    odometry, loop closure (3.48)    e = (R_z^T (R_i^T d - t_z), wrap(th_j - th_i - th_z)), F = 1
+    bias j of a measurement at i     e = (d + t_z - R_i o, wrap(f_th th_j - th_i + th_z))
+    turn (integrated yaw rate)       e_th = wrap(th_j - th_i - th_z + f_th b), b the bias k [rad/s]
+    point (landmark j seen from i)   e_t = R_i^T d - t_z
+    range (landmark j, antenna o)    e_x = |d - R_i o| - r
+    observed node (3.52), F = 0      e = -(R_z^T (t_i + R_i o - t_z), wrap(th_i + th_o - th_z))
+
+A row that a type has not is given no information: a point is an edge without a heading, a turn one
+without a position. All of them are, turned into map axes by the rotation R of their *frame*,
+
+    R e_t' = d - S a dth_i + constant,    e_th' = f_th dth_j - dth_i + f_th b + constant
+
+for small changes, S = ((0, -1), (1, 0)). Frame and *arm* a are all that a type says of its
+Jacobians; with them `R e_t = d + constant`. Of the heading of i only the rotation by th_i enters,
+which is given as (c, s).
+
+Solvers need the linearization of a constraint, its linearization error, and its energy. The
+unknown of a node is its pose minus a constant reference, delta = x - x_ref, in map axes.
+Translation and heading are added as plain numbers, so every constraint may be linearized at a
+point of its own; a bar marks values there. In map axes an error is
 
     e' = h + F delta_j - T delta_i,    T = ((1, 0, -a_y), (0, 1, a_x), (0, 0, 1)) at a_bar
     h_t = f_t x_ref_j - x_ref_i + constant + S a_bar delta_bar_th,   h_th constant
@@ -24,28 +46,23 @@ rotates, which changes the gradient by the relative change c of the Jacobian tim
 linearization error, `r^T W r + c^2 e^T W e` [sigma^2], decides what is linearized again (fluid
 relinearization, M. Kaess et al., "iSAM2", IJRR 2012, with whitened errors). Its sum over all
 constraints is about the distance of chi2 from its minimum.
+
+In the kernels of this package a constraint is given by its *entry*, as in the table `waiting`: e
+for the edge in row e, -1 - k for the observed node in row k.
 """
 
 import math
 
+import numpy as np
+
 from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.factor_types import (
-    BIAS,
-    constant,
-    error,
-    factors_of_end,
-    frame,
-    frame_moves,
-    heading_offset,
-    is_plain,
-    is_relative,
-    OBSERVED,
-    ODOMETRY,
-    relative_error,
-    rotation,
-)
+from pose_graph_ros.core.graph.constraints import EdgeKind
 
+# Numbers of the definitions: kinds of edges, then observed nodes.
+ODOMETRY, BIAS, TURN, PRIOR, RANGE = (int(kind) for kind in (
+    EdgeKind.ODOMETRY, EdgeKind.BIAS, EdgeKind.TURN, EdgeKind.PRIOR, EdgeKind.RANGE))
+OBSERVED = len(EdgeKind)
 # Smallest squared linearization error for which a constraint is linearized again, as a fraction of
 # `SmootherConfig.budget_share`.
 LEAST_FRACTION = 0.01
@@ -54,6 +71,123 @@ LEAST_FRACTION = 0.01
 MUCH_LONGER = 1e-4
 # Angle of a clique's frame, with its cosine and sine.
 NO_TURN = (0.0, 1.0, 0.0)
+
+
+@kernel(forceinline=True)
+def is_relative(kind):  # type: ignore[no-untyped-def]
+    """Tell whether an error lies in the frame of the pose that was measured from node i."""
+    return kind < BIAS or TURN < kind < RANGE
+
+
+@kernel(forceinline=True)
+def frame_moves(kind):  # type: ignore[no-untyped-def]
+    """Tell whether the frame of an error moves with the nodes, so that it is linearized."""
+    return is_relative(kind) or kind == RANGE
+
+
+@kernel(forceinline=True)
+def anchors(kind):  # type: ignore[no-untyped-def]
+    """Tell whether axes of an edge's errors or unknowns do not turn with its clique."""
+    return kind >= BIAS and kind != PRIOR
+
+
+@kernel
+def dimension_of(row):  # type: ignore[no-untyped-def]
+    """Return the number of coordinates of a node, given as its row of node_i."""
+    return 3 - (row[tb.NODE_TYPE] >> 2)
+
+
+@kernel
+def prepare(f, kind):  # type: ignore[no-untyped-def]
+    """Set what a row of `edge_f` needs of its mean: `R_z^T t_z`."""
+    if is_relative(kind):
+        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+        f[tb.OWN] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
+        f[tb.OWN + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+
+
+@kernel(forceinline=True)
+def rotation(f, kind, heading):  # type: ignore[no-untyped-def]
+    """Return cosine and sine of what an error needs of th_i: th_i + th_z, or th_i."""
+    if is_relative(kind):
+        heading += f[tb.MEAN + 2]
+    elif f[tb.OFFSET] == 0.0 and f[tb.OFFSET + 1] == 0.0:
+        return 1.0, 0.0     # no arm
+    return math.cos(heading), math.sin(heading)
+
+
+@kernel(forceinline=True)
+def parts(head, entry):  # type: ignore[no-untyped-def]
+    """Return row, kind, and ends i, j and k of a constraint; i = j where a node is observed."""
+    if entry >= 0:
+        row = tb.edge_i(head)[entry]
+        return (tb.edge_f(head)[entry], row[tb.EDGE_KIND],
+                row[tb.END_I], row[tb.END_J], row[tb.END_K])
+    v = tb.observed_i(head)[-1 - entry, tb.OBS_NODE]
+    return tb.observed_f(head)[-1 - entry], np.int32(OBSERVED), v, v, np.int32(-1)
+
+
+@kernel(forceinline=True)
+def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
+    """Return f_t and f_th of node j."""
+    if kind == BIAS:
+        return f[tb.FACTOR_T], f[tb.FACTOR_TH]
+    return (1.0, 1.0) if kind < OBSERVED else (0.0, 0.0)
+
+
+@kernel(forceinline=True)
+def heading_offset(f, kind):  # type: ignore[no-untyped-def]
+    """Return the constant part of the heading's error [rad]."""
+    if kind == BIAS:
+        return f[tb.MEAN + 2]
+    return -f[tb.MEAN + 2] if kind < OBSERVED else f[tb.MEAN + 2] - f[tb.OFFSET + 2]
+
+
+@kernel(forceinline=True)
+def frame(f, kind):  # type: ignore[no-untyped-def]
+    """Return cosine and sine of the frame at the linearization."""
+    if frame_moves(kind):
+        return f[tb.LIN_COS], f[tb.LIN_SIN]
+    if kind < OBSERVED or f[tb.MEAN + 2] == 0.0:
+        return 1.0, 0.0
+    return math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+
+
+@kernel(forceinline=True)
+def constant(f, kind, c, s, ax, ay):  # type: ignore[no-untyped-def]
+    """Return `R e_t - d`, in map axes, for cosine and sine of the frame R, and the arm a."""
+    if is_relative(kind):
+        return s * f[tb.OWN + 1] - c * f[tb.OWN], -s * f[tb.OWN] - c * f[tb.OWN + 1]
+    if kind == RANGE:
+        return -ax - c * f[tb.MEAN], -ay - s * f[tb.MEAN]
+    return f[tb.MEAN] - ax, f[tb.MEAN + 1] - ay
+
+
+@kernel(forceinline=True)
+def relative_error(f, x, y):  # type: ignore[no-untyped-def]
+    """Return e_t of a relative error, for d in the axes of its frame."""
+    return x - f[tb.OWN], y - f[tb.OWN + 1]
+
+
+@kernel(forceinline=True)
+def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
+    """Return the error e_t, cosine and sine of its frame, and its arm, for d and `rotation`."""
+    if is_relative(kind):
+        ex, ey = relative_error(f, c * dx + s * dy, c * dy - s * dx)
+        return ex, ey, c, s, dx, dy
+    ox, oy = f[tb.OFFSET], f[tb.OFFSET + 1]
+    ax, ay = c * ox - s * oy, s * ox + c * oy
+    c, s = 1.0, 0.0
+    if kind == RANGE:
+        vx, vy = dx - ax, dy - ay
+        length = math.sqrt(vx * vx + vy * vy)
+        if length > 0.0:
+            c, s = vx / length, vy / length
+    elif kind == OBSERVED and f[tb.MEAN + 2] != 0.0:
+        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+    kx, ky = constant(f, kind, c, s, ax, ay)
+    ex, ey = dx + kx, dy + ky
+    return c * ex + s * ey, c * ey - s * ex, c, s, ax, ay
 
 
 @kernel
@@ -76,17 +210,7 @@ def refer_to_pose(f):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
-    """
-    Return the error of a constraint, the cosine and sine of its frame, and its arm.
-
-    Parameters
-    ----------
-    f : ndarray, row of the constraint
-    kind : int, `EdgeKind` or OBSERVED
-    start, end : ndarray, rows of its nodes in node_f; those of an observed node are the same
-    third : float, first coordinate of the third node times its factor, 0 without one
-
-    """
+    """Return the error of a constraint, the cosine and sine of its frame, and its arm."""
     ft, fth = factors_of_end(f, kind)
     c, s = rotation(f, kind, start[tb.POSE + 2])
     ex, ey, c, s, ax, ay = error(
@@ -123,7 +247,7 @@ def _versine_and_sine(turn):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untyped-def]
-    """Set the squared linearization error and the energy, as for `check_edge`."""
+    """Set the squared linearization error and the energy, as `check`."""
     phi, cos, sin = clique_turn
     ft, fth = factors_of_end(f, kind)
     dx, dy = ft * end[tb.POSE] - start[tb.POSE], ft * end[tb.POSE + 1] - start[tb.POSE + 1]
@@ -176,64 +300,39 @@ def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untype
 
 
 @kernel(forceinline=True)
-def third(head, e, column):  # type: ignore[no-untyped-def]
-    """
-    Return the factor of the third node of an edge times one of its numbers, 0 without one.
+def third(node_f, f, k, column):  # type: ignore[no-untyped-def]
+    """Return f_th times a number of the third node k, 0 without one."""
+    return f[tb.FACTOR_TH] * node_f[k, column] if k >= 0 else 0.0
 
-    Parameters
-    ----------
-    e : int
-    column : int, POSE or DELTA
 
-    """
-    k = tb.edge_i(head)[e, tb.END_K]
-    return tb.edge_f(head)[e, tb.FACTOR_TH] * tb.node_f(head)[k, column] if k >= 0 else 0.0
-
+# Nearly all constraints have the error of odometry. What is derived from errors is compiled into
+# its callers, once for the constant ODOMETRY and once for all kinds: this takes a fifth less time.
 
 @kernel
-def linearize_edge(head, e):  # type: ignore[no-untyped-def]
-    """Linearize an edge at the present estimate; the caller has logged its row."""
-    node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
-    kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
-    if is_plain(row):
-        _linearize(f, ODOMETRY, start, end, 0.0, 0.0)
+def linearize(head, entry):  # type: ignore[no-untyped-def]
+    """Linearize a constraint at the present estimate; the caller has logged its row."""
+    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, entry)
+    if kind < BIAS:
+        _linearize(f, ODOMETRY, node_f[i], node_f[j], 0.0, 0.0)
     else:
-        _linearize(f, kind, start, end, third(head, e, tb.POSE), third(head, e, tb.DELTA))
+        _linearize(f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.POSE),
+                   third(node_f, f, k, tb.DELTA))
 
 
 @kernel
-def check_edge(head, e, clique_turn):  # type: ignore[no-untyped-def]
+def check(head, entry, clique_turn):  # type: ignore[no-untyped-def]
     """
-    Set the squared linearization error and the energy of an edge; the caller has logged them.
+    Set squared linearization error and energy of a constraint; the caller has logged them.
 
-    Parameters
-    ----------
-    e : int
-    clique_turn : tuple of float
-        Turn of its clique's frame since the linearization [rad], see `clique_frames`, with its
-        cosine and sine; `NO_TURN` at the linearization and in anchored cliques.
-
+    `clique_turn` is the turn of its clique's frame since the linearization [rad], see
+    `clique_frames`, with its cosine and sine; `NO_TURN` at the linearization, in anchored cliques
+    and for observed nodes.
     """
-    node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
-    kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
-    if is_plain(row):
-        _check(f, ODOMETRY, start, end, 0.0, clique_turn)
+    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, entry)
+    if kind < BIAS:
+        _check(f, ODOMETRY, node_f[i], node_f[j], 0.0, clique_turn)
     else:
-        _check(f, kind, start, end, third(head, e, tb.DELTA), clique_turn)
-
-
-@kernel
-def linearize_observed(head, k):  # type: ignore[no-untyped-def]
-    """Linearize an observed node at the present estimate; the caller has logged its row."""
-    node = tb.node_f(head)[tb.observed_i(head)[k, tb.OBS_NODE]]
-    _linearize(tb.observed_f(head)[k], OBSERVED, node, node, 0.0, 0.0)
-
-
-@kernel
-def check_observed(head, k):  # type: ignore[no-untyped-def]
-    """Set squared linearization error and energy of an observed node; the caller has logged it."""
-    node = tb.node_f(head)[tb.observed_i(head)[k, tb.OBS_NODE]]
-    _check(tb.observed_f(head)[k], OBSERVED, node, node, 0.0, NO_TURN)
+        _check(f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.DELTA), clique_turn)
 
 
 @kernel(forceinline=True)
@@ -246,23 +345,13 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD, NUMBERS, NUMBERS))
 def energies(head, edges, observed):  # type: ignore[no-untyped-def]
-    """
-    Write the unweighted energies of all constraints at the present poses.
-
-    Parameters
-    ----------
-    edges, observed : ndarray, shapes (M,) and (K,), output [sigma^2]
-
-    """
-    node_f, edge_f, observed_f = tb.node_f(head), tb.edge_f(head), tb.observed_f(head)
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
-    for e in range(head[tb.N_EDGES]):
-        row = edge_i[e]
+    """Write the unweighted energies of all constraints at the present poses [sigma^2]."""
+    node_f = tb.node_f(head)
+    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
+        f, kind, i, j, k = parts(head, entry)
         ex, ey, eth, _, _, _, _ = model(
-            edge_f[e], row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]],
-            third(head, e, tb.POSE))
-        edges[e] = _form(edge_f[e], ex, ey, eth)
-    for k in range(head[tb.N_OBSERVED]):
-        node = node_f[observed_i[k, tb.OBS_NODE]]
-        ex, ey, eth, _, _, _, _ = model(observed_f[k], OBSERVED, node, node, 0.0)
-        observed[k] = _form(observed_f[k], ex, ey, eth)
+            f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.POSE))
+        if entry >= 0:
+            edges[entry] = _form(f, ex, ey, eth)
+        else:
+            observed[-1 - entry] = _form(f, ex, ey, eth)

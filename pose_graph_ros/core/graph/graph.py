@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pose graph: hidden nodes, edges and observed nodes, as struct of arrays."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -9,21 +10,10 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import editing, removal, tables as tb, transaction_log
-from pose_graph_ros.core.graph.compaction import compact
-from pose_graph_ros.core.graph.constraints import check, NodeKind
-from pose_graph_ros.core.graph.contents import GraphContents
-from pose_graph_ros.core.graph.edit_checks import (
-    check_ids,
-    check_measured,
-    check_weights,
-    checked_poses,
-    integers,
-    other_nodes,
-    values,
-)
-from pose_graph_ros.core.graph.factor_types import type_of
+from pose_graph_ros.core.geometry.se2 import IntArray, Poses
+from pose_graph_ros.core.graph import checks, editing, removal, tables as tb, transaction_log
+from pose_graph_ros.core.graph.constraints import NodeKind
+from pose_graph_ros.core.graph.contents import COUNTERS, GraphContents
 from pose_graph_ros.core.graph.graph_update import (
     Energies,
     FIRST_EDIT,
@@ -32,42 +22,14 @@ from pose_graph_ros.core.graph.graph_update import (
     Left,
     NextIds,
     NO_EDGES,
-    NO_POINTS,
-    NO_POSES,
-    NO_WEIGHTS,
-    NOTHING_LEFT,
     NOTHING_OBSERVED,
 )
-from pose_graph_ros.core.graph.prior_edits import add_priors
-from pose_graph_ros.core.graph.priors import check_priors
+from pose_graph_ros.core.graph.prior_rows import add_priors
 
-__all__ = [
-    'NOTHING_OBSERVED',
-    'NO_EDGES',
-    'NO_POSES',
-    'NO_WEIGHTS',
-    'Energies',
-    'Graph',
-    'GraphRows',
-    'GraphUpdate',
-    'NextIds',
-]
+__all__ = ['Energies', 'Graph', 'GraphRows', 'GraphUpdate', 'NextIds']
 
-# Number of rows and next id of each table.
-_COUNTERS = {'node': (tb.N_NODES, tb.NEXT_NODE), 'edge': (tb.N_EDGES, tb.NEXT_EDGE),
-             'observed': (tb.N_OBSERVED, tb.NEXT_OBSERVED)}
-# What updates have in place of parts that they do not have, to save a microsecond.
-_NO_EDITS = GraphUpdate()[FIRST_EDIT:]
-_NO_OTHERS = other_nodes(NO_POSES, (), NO_POINTS)
-_NO_EDGES, _NOTHING_OBSERVED = NO_EDGES.columns, NOTHING_OBSERVED.columns
-
-
-def _has_edits(update: GraphUpdate) -> bool:
-    """Tell whether an update may edit rows that there are."""
-    try:
-        return update[FIRST_EDIT:] != _NO_EDITS     # identical parts are equal at once
-    except ValueError:  # an array
-        return True
+def _integers(numbers: Collection[int]) -> IntArray:
+    return np.fromiter(numbers, np.int64, len(numbers))
 
 
 class Graph(GraphContents):
@@ -79,11 +41,10 @@ class Graph(GraphContents):
 
     def __init__(self) -> None:
         super().__init__()
-        self.n_moves = 0
-        """How often `set_poses` has moved the nodes."""
+        self.n_moves = 0    # how often `set_poses` or new measurements have moved the nodes
         self._updating = False
 
-    def set_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
+    def set_weights(self, weights: tuple[npt.NDArray[Any], npt.NDArray[Any]]) -> None:
         """Set the weights of all edges and observed nodes to what `weights` has returned."""
         edges, observed = (
             dict(zip(ids[changed].tolist(), wanted[changed].tolist(), strict=True))
@@ -99,17 +60,13 @@ class Graph(GraphContents):
         Between `begin` and `commit` or `rollback`, what leaves keeps its rows; `commit` takes them
         out. Otherwise they are taken out at once.
         """
-        edits = _has_edits(update)
+        edits = any(len(part) > 0 for part in update[FIRST_EDIT:])
         if edits:
             self._check_edits(update)
-        others = _NO_OTHERS
-        if (update.biases is not NO_POSES or update.landmarks is not NO_POINTS
-                or len(update.dimensions) > 0):
-            others = other_nodes(update.biases, update.dimensions, update.landmarks)
-        edges = _NO_EDGES if update.edges is NO_EDGES else update.edges.columns
-        observed = (_NOTHING_OBSERVED if update.observed is NOTHING_OBSERVED
-                    else update.observed.columns)
-        columns, checked = (update.hidden, *others, *edges, *observed), False
+        others = checks.other_nodes(update.biases, update.dimensions, update.landmarks)
+        columns: tuple[npt.NDArray[Any], ...] = (
+            update.hidden, *others, *update.edges.columns, *update.observed.columns)
+        checked = False
         try:
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
@@ -127,120 +84,98 @@ class Graph(GraphContents):
 
     def _check_edits(self, update: GraphUpdate) -> None:
         """Raise GraphUpdateError for unknown ids or invalid weights; new rows may be edited."""
-        nodes = self._nodes.extended(
+        nodes = self._ids('node').extended(
             len(update.hidden) + len(update.biases) + len(update.landmarks))
-        edges = self._edges.extended(len(update.edges))
-        observed = self._observed.extended(len(update.observed))
-        for part in ('fix', 'free', 'remove_nodes'):
-            check_ids(part, getattr(update, part), 'hidden node', nodes)
-        for what, known_ids, parts in (
+        edges = self._ids('edge').extended(len(update.edges))
+        observed = self._ids('observed').extended(len(update.observed))
+        for what, known, parts in (
+                ('hidden node', nodes, ('fix', 'free', 'remove_nodes')),
                 ('edge', edges, ('remove_edges', 'drop_edges')),
                 ('observed node', observed, ('remove_observed', 'drop_observed'))):
             for part in parts:
-                check_ids(part, getattr(update, part), what, known_ids)
-        check_weights('weigh_edges', update.weigh_edges, 'edge', edges)
-        check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
+                checks.check_ids(part, getattr(update, part), what, known)
+        checks.check_weights('weigh_edges', update.weigh_edges, 'edge', edges)
+        checks.check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
         for measured in update.measure_edges:
-            check_ids('measure_edges', measured.ids.tolist(), 'edge', edges)
-            check_measured(measured.mean, measured.information, len(measured.ids))
-        check_priors(update.priors, update.remove_nodes)
+            checks.check_ids('measure_edges', measured.ids.tolist(), 'edge', edges)
+            checks.check_measured(measured.mean, measured.information, len(measured.ids))
+        checks.check_priors(update.priors, update.remove_nodes)
         for n, prior in enumerate(update.priors):
-            check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
+            checks.check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
 
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
         head = self.memory.head
-        for weigh, removed, weights, dropped in (
-                (editing.weigh_edges, update.remove_edges, update.weigh_edges, update.drop_edges),
-                (editing.weigh_observed, update.remove_observed, update.weigh_observed,
-                 update.drop_observed)):
-            if len(removed) > 0:
-                weigh(head, integers(removed), np.zeros(len(removed)))
-            if len(weights) > 0:
-                weigh(head, integers(weights), values(weights))
-            if len(dropped) > 0:
-                weigh(head, integers(dropped), np.full(len(dropped), editing.DROPPED))
+        for of_edges, removed, weights, dropped in (
+                (True, update.remove_edges, update.weigh_edges, update.drop_edges),
+                (False, update.remove_observed, update.weigh_observed, update.drop_observed)):
+            for ids, values in ((removed, [0.0] * len(removed)), (weights, weights.values()),
+                                (dropped, [editing.DROPPED] * len(dropped))):
+                if len(ids) > 0:
+                    editing.set_weights(
+                        head, _integers(ids), np.fromiter(values, np.float64, len(ids)), of_edges)
         for measured in update.measure_edges:
-            editing.measure_edges(head, integers(measured.ids), *map(
+            editing.measure_edges(head, _integers(measured.ids), *map(
                 np.ascontiguousarray, (measured.mean, measured.information)))
             self.n_moves += 1
         for nodes, fixed in ((update.fix, True), (update.free, False)):
             if len(nodes) > 0:
-                editing.set_fixed(head, integers(nodes), fixed)
+                editing.set_fixed(head, _integers(nodes), fixed)
         if len(update.remove_nodes) > 0:
-            removal.remove_nodes(head, integers(update.remove_nodes))
+            removal.remove_nodes(head, _integers(update.remove_nodes))
         if len(update.priors) > 0:
             self.ensure(self.n_nodes + len(update.priors), self.n_edges, self.n_observed)
             add_priors(self.memory, update.priors, [
                 self.node_rows(prior.nodes) for prior in update.priors])
         if not self._updating:
-            self._compact()
-
-    def _compact(self) -> Left:
-        """Take out the rows of what leaves."""
-        if self.memory.head[tb.N_LEAVING] == 0:
-            return NOTHING_LEFT
-        return Left(*(ids.astype(np.int64) for ids in compact(self.memory.head)))
+            removal.compact(self.memory)
 
     def _checked_columns(
         self, update: GraphUpdate, others: tuple[npt.NDArray[Any], ...],
     ) -> tuple[npt.NDArray[Any], ...]:
         """Return new rows as arrays for the kernel; raise GraphUpdateError if one is invalid."""
-        hidden = checked_poses('hidden', update.hidden)
-        others = (checked_poses('biases', others[0]), *others[1:])
-        edges, observed = update.edges, update.observed
+        hidden = checks.checked_poses('hidden', update.hidden)
+        others = (checks.checked_poses('biases', others[0]), *others[1:])
         kind, dimension = (np.concatenate((present, np.full(len(hidden), usual), new))
                            for present, usual, new in (
                                (self.node_kind, 0, others[1] & 3),
                                (self.dimension, 3, 3 - (others[1] >> 2))))
-        nodes = self._nodes.extended(len(hidden) + len(others[0]))
+        nodes = self._ids('node').extended(len(hidden) + len(others[0]))
+        edges = update.edges if len(update.edges) > 0 else NO_EDGES
+        observed = update.observed if len(update.observed) > 0 else NOTHING_OBSERVED
         for table in (edges, observed):
-            if len(table) > 0:
-                check(table, kind, dimension, nodes)
-        edges = edges if len(edges) > 0 else NO_EDGES
-        observed = observed if len(observed) > 0 else NOTHING_OBSERVED
+            checks.check(table, kind, dimension, nodes)
         return tuple(np.array(column, order='C')
                      for column in (hidden, *others, *edges.columns, *observed.columns))
 
     def ensure(self, n_nodes: int, n_edges: int, n_observed: int) -> None:
-        """
-        Make the tables and the transaction log large enough for a graph.
-
-        Parameters
-        ----------
-        n_nodes, n_edges, n_observed : int, numbers of hidden nodes, edges and observed nodes
-
-        """
+        """Make the tables and the transaction log large enough for a graph of this size."""
         memory, head = self.memory, self.memory.head
         n_nodes += int(head[tb.N_PRIORS])   # of which there is as much space as of nodes
         if (n_nodes <= head[tb.NODE_ROOM] and n_edges <= head[tb.EDGE_ROOM]
                 and n_observed <= head[tb.OBSERVED_ROOM]):
             return
-        for name, needed, used in (
-                ('node', n_nodes, self.n_nodes), ('edge', n_edges, self.n_edges),
-                ('observed', n_observed, self.n_observed)):
+        for name, needed in (('node', n_nodes), ('edge', n_edges), ('observed', n_observed)):
             for suffix in ('_f', '_i', '_id'):
-                memory.ensure(name + suffix, needed, keep=used)
+                memory.ensure(name + suffix, needed, keep=int(head[COUNTERS[name][0]]))
         nodes, edges, observed = (
             len(memory[name]) for name in ('node_f', 'edge_f', 'observed_f'))
         # the rest costs address space: little of the log and the work space is ever written to
-        for name in ('clique_f', 'clique_i'):
-            memory.ensure(name, 2 * nodes, keep=int(head[tb.N_CLIQUES]))
-        memory.ensure('touched', nodes, keep=int(head[tb.N_TOUCHED]))
-        memory.ensure('freed', 4 * nodes, keep=int(head[tb.N_FREED]))
+        for name, needed, used in (
+                ('clique_f', 2 * nodes, tb.N_CLIQUES), ('clique_i', 2 * nodes, tb.N_CLIQUES),
+                ('touched', nodes, tb.N_TOUCHED), ('freed', 4 * nodes, tb.N_FREED),
+                ('waiting', edges + observed, tb.N_WAITING),
+                ('log_f', nodes * (tb.NODE_F + tb.SCALE_T + tb.CLIQUE_F)
+                 + edges * (tb.EDGE_F + 2) + observed * tb.OBS_F + tb.N_SCALARS, tb.LOG_F_END),
+                ('log_i', nodes * (tb.NODE_I + tb.CLIQUE_I + 16)
+                 + edges * (tb.EDGE_I + 6) + observed * (tb.OBS_I + 3), tb.LOG_I_END)):
+            memory.ensure(name, needed, keep=int(head[used]))
         memory.ensure('work_i', 4 * nodes)
-        memory.ensure('waiting', edges + observed, keep=int(head[tb.N_WAITING]))
-        memory.ensure('log_f', nodes * (tb.NODE_F + tb.SCALE_T + tb.CLIQUE_F)
-                      + edges * (tb.EDGE_F + 2) + observed * tb.OBS_F + tb.N_SCALARS,
-                      keep=int(head[tb.LOG_F_END]))
-        memory.ensure('log_i', nodes * (tb.NODE_I + tb.CLIQUE_I + 16)
-                      + edges * (tb.EDGE_I + 6) + observed * (tb.OBS_I + 3),
-                      keep=int(head[tb.LOG_I_END]))
         head[tb.NODE_ROOM], head[tb.EDGE_ROOM], head[tb.OBSERVED_ROOM] = nodes, edges, observed
 
-    def set_poses(self, poses: FloatArray) -> None:
+    def set_poses(self, poses: Poses) -> None:
         """
-        Set the estimates of all hidden nodes, shape (N, 3) [m, m, rad]; headings are wrapped.
+        Set the estimates of all hidden nodes; headings are wrapped.
 
         All constraints are linearized there, and the next step eliminates all nodes. A wrong shape
         or a number that is not finite raises GraphUpdateError.
@@ -263,7 +198,7 @@ class Graph(GraphContents):
         self._append('node', GraphUpdate(hidden=rows.poses), rows.node_ids, rows.next_ids.node)
         memory, begin = self.memory, self.n_nodes - len(rows.poses)
         new = memory['node_i'][begin:self.n_nodes]
-        new[:, tb.NODE_TYPE] = type_of(
+        new[:, tb.NODE_TYPE] = checks.node_types(
             rows.node_kind, rows.dimension if rows.dimension is not None else np.where(
                 rows.node_kind == NodeKind.LANDMARK, 2, 3))
         poses = np.flatnonzero(self.is_pose)
@@ -278,7 +213,7 @@ class Graph(GraphContents):
         self, name: str, update: GraphUpdate, ids: IntArray, next_id: int,
     ) -> None:
         """Add new rows of one table with given ids instead of the next ones."""
-        head, n_rows, counter = self.memory.head, *_COUNTERS[name]
+        head, n_rows, counter = self.memory.head, *COUNTERS[name]
         begin, first = int(head[n_rows]), int(head[counter])
         self.apply(update)
         if len(ids) != head[n_rows] - begin or np.any(np.diff(ids, prepend=first - 1) <= 0):
@@ -298,7 +233,7 @@ class Graph(GraphContents):
         if self.memory.head[tb.LOG_I_END] > 0:  # else a step has done so
             transaction_log.commit(self.memory.head)
         self._updating = False
-        return self._compact()
+        return removal.compact(self.memory)
 
     def rollback(self) -> None:
         """Revert all edits and steps since `begin`, bit for bit."""

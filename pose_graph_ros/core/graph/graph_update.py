@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import Edges, NodeKind, ObservedNodes
 from pose_graph_ros.core.graph.priors import Prior
 
@@ -22,74 +22,50 @@ NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
 
 
 class Measured(NamedTuple):
-    """Other measurements of edges that there are; raises GraphUpdateError where invalid."""
+    """Other measurements of edges that there are."""
 
     ids: IntArray
-    """Shape (M,)."""
-    mean: FloatArray
-    """Shape (M, 3)."""
-    information: FloatArray
-    """Shape (M, 3, 3)."""
+    mean: Poses
+    information: FloatArray     # shape (M, 3, 3)
 
 
 class GraphUpdate(NamedTuple):
     """
     An edit of a graph; all nodes and constraints in it are given by their ids.
 
-    New hidden nodes, edges and observed nodes get the next ids (`Graph.next_ids`), in order.
+    New hidden nodes, edges and observed nodes get the next ids (`Graph.next_ids`), in order: first
+    `hidden`, then `biases`, then `landmarks`. New constraints and edits may be on new nodes.
     """
 
-    hidden: FloatArray = NO_POSES
-    """Initial poses of new hidden nodes in the map, shape (N, 3) [m, m, rad]."""
+    hidden: Poses = NO_POSES    # initial poses of new hidden nodes in the map
     edges: Edges = NO_EDGES
-    """New edges, possibly to the new hidden nodes."""
     observed: ObservedNodes = NOTHING_OBSERVED
-    """New observed nodes, possibly on the new hidden nodes."""
-    biases: FloatArray = NO_POSES
-    """
-    Initial values of new biases, shape (S, 3) [sigma, sigma, rad]: hidden nodes that are numbered
-    after those of `hidden`.
-    """
-    dimensions: Sequence[int] = ()
-    """Numbers of coordinates of the new biases, 3 if not given; the others are and stay 0."""
-    landmarks: FloatArray = NO_POINTS
-    """Initial positions of new landmarks in the map, shape (L, 2) [m], numbered after biases."""
-    fix: Sequence[int] = ()
-    """Hidden nodes that keep their pose from now on (the gauge)."""
-    free: Sequence[int] = ()
-    """Hidden nodes that are no longer fixed."""
+    biases: FloatArray = NO_POSES   # initial values of new ones, shape (S, 3) [sigma, sigma, rad]
+    dimensions: Sequence[int] = ()  # of the new biases, by default 3; other coordinates stay 0
+    landmarks: FloatArray = NO_POINTS   # initial positions of new ones, shape (L, 2) [m]
+    fix: Sequence[int] = ()     # hidden nodes that keep their pose from now on (the gauge)
+    free: Sequence[int] = ()    # hidden nodes that are no longer fixed
+    # constraints whose weight becomes 0: they keep row and id, and may get a new weight
     remove_edges: Sequence[int] = ()
-    """
-    Edges whose weight becomes 0: they keep row and id, and `weigh_edges` brings them back.
-    `drop_edges` is for good.
-    """
     remove_observed: Sequence[int] = ()
-    """Observed nodes whose weight becomes 0, as `remove_edges`."""
+    # new weights (factors on the information) of constraints, removed ones included, by id
     weigh_edges: Mapping[int, float] = NO_WEIGHTS
-    """New weights (factors on the information) of edges, by id; removed edges may get one."""
     weigh_observed: Mapping[int, float] = NO_WEIGHTS
-    """New weights of observed nodes, by id."""
+    # hidden nodes that leave the graph for good, with all constraints on them, those with weight 0
+    # included; what they told about the others is lost, see `marginalization`
     remove_nodes: Sequence[int] = ()
-    """
-    Hidden nodes that leave the graph for good, with all constraints on them, those with weight 0
-    included. What they told about the others is lost; see `marginalization`.
-    """
+    # constraints that leave the graph for good
     drop_edges: Sequence[int] = ()
-    """Edges that leave the graph for good."""
     drop_observed: Sequence[int] = ()
-    """Observed nodes that leave the graph for good."""
-    priors: Sequence[Prior] = ()
-    """New dense priors, possibly on the new nodes."""
-    measure_edges: Sequence[Measured] = ()
-    """Edges that get another mean and information; they keep their weights."""
+    priors: Sequence[Prior] = ()    # new dense ones
+    measure_edges: Sequence[Measured] = ()  # new mean and information; edges keep their weights
 
 
 class Left(NamedTuple):
     """Ids of what has left a graph, ascending."""
 
     nodes: IntArray
-    edges: IntArray
-    """With those that were on these nodes, whatever their weight."""
+    edges: IntArray     # with those that were on these nodes, whatever their weight
     observed: IntArray
 
 
@@ -103,11 +79,8 @@ class Energies(NamedTuple):
     """Energies of all constraints: weighted squared errors [sigma^2]."""
 
     edges: FloatArray
-    """Shape (M,)."""
     observed: FloatArray
-    """Shape (K,)."""
     priors: FloatArray
-    """Of the dense priors."""
 
     @property
     def chi2(self) -> float:
@@ -124,36 +97,29 @@ class NextIds(NamedTuple):
 
 
 class GraphRows(NamedTuple):
-    """Copies of all rows of a graph."""
+    """Copies of all rows of a graph; nodes of constraints are ids."""
 
-    poses: FloatArray
-    """Estimates of all hidden nodes, biases included, shape (N, 3) [m, m, rad]."""
-    node_kind: npt.NDArray[Any]
-    """`NodeKind` of the hidden nodes, shape (N,)."""
+    poses: Poses        # estimates of all hidden nodes, biases included
+    node_kind: npt.NDArray[Any]     # `NodeKind` of the hidden nodes
     fixed: BoolArray
     edges: Edges
-    """Their ends are ids."""
     observed: ObservedNodes
-    """Their nodes are ids."""
-    node_ids: IntArray
-    """Ids of the nodes, ascending, shape (N,)."""
+    node_ids: IntArray      # ascending
     edge_ids: IntArray
     observed_ids: IntArray
-    next_ids: NextIds
-    """Ids of the next new rows; at least 1 more than the last."""
+    next_ids: NextIds       # at least 1 more than the last ones
+    # numbers of coordinates of the hidden nodes; by default those usual for their kinds
     dimension: IntArray | None = None
-    """Numbers of coordinates of the hidden nodes; by default those usual for their kinds."""
-    priors: Sequence[Prior] = ()
-    """All dense priors, by ids."""
+    priors: Sequence[Prior] = ()    # all dense ones, by ids
 
     @property
     def is_bias(self) -> BoolArray:
-        """Whether hidden nodes are biases, shape (N,)."""
+        """Whether hidden nodes are biases."""
         return np.asarray(self.node_kind == NodeKind.BIAS)
 
     @property
     def is_pose(self) -> BoolArray:
-        """Whether hidden nodes are poses, shape (N,)."""
+        """Whether hidden nodes are poses."""
         return np.asarray(self.node_kind == NodeKind.POSE)
 
     def rows_of(self, ids: IntArray) -> IntArray:
@@ -161,11 +127,7 @@ class GraphRows(NamedTuple):
         return np.asarray(np.searchsorted(self.node_ids, ids), dtype=np.int64)
 
     def since(self, first: NextIds) -> 'GraphRows':
-        """
-        Return the rows that are new since the next ids were these.
-
-        Priors have no ids, so none of them is among these rows.
-        """
+        """Return the rows that are new since the next ids were these; priors have no ids."""
         nodes, edges, observed = (
             slice(int(np.searchsorted(ids, begin)), None) for ids, begin in zip(
                 (self.node_ids, self.edge_ids, self.observed_ids), first, strict=True))

@@ -15,25 +15,22 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Points
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 
-# Columns of the tables: diagonal of the information, offset or arm with the measured position.
+# Columns of the tables: diagonal of the information, offset with the measured position.
 DIAGONAL = [tb.INFO, tb.INFO + 3, tb.INFO + 5]
 _OFFSET_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
-_ARM_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
 
 
 @dataclass(frozen=True, slots=True)
 class Lines:
     """Constraints as straight lines; the arrays are read-only copies."""
 
-    ends: FloatArray
-    """Both ends of each line in the map, shape (M, 2, 2) [m]."""
-    sigmas: FloatArray
-    """Errors: roots of the unweighted energies per degree of freedom, shape (M,) [sigma]."""
+    ends: FloatArray    # both ends of each line in the map, shape (M, 2, 2) [m]
+    sigmas: FloatArray  # errors [sigma]
 
     def __post_init__(self) -> None:
         self.ends.flags.writeable = self.sigmas.flags.writeable = False
@@ -45,16 +42,13 @@ NO_LINES = Lines(np.empty((0, 2, 2)), np.empty(0))
 class DrawnRows(NamedTuple):
     """Ids of constraints that are drawn in another way, as they are not simply believed."""
 
-    weak: Sequence[int] = ()
-    """Edges between poses in the estimate that little speaks for."""
-    waiting: Sequence[int] = ()
-    """Edges between poses that are not in the estimate yet."""
-    doubted: Sequence[int] = ()
-    """Edges between poses that were left out."""
+    # edges between poses
+    weak: Sequence[int] = ()        # in the estimate, but little speaks for them
+    waiting: Sequence[int] = ()     # not in the estimate yet
+    doubted: Sequence[int] = ()     # left out
+    # measurements in the map that are not in the estimate: edges to biases, observed nodes
     unused_edges: Sequence[int] = ()
-    """Edges to biases of measurements in the map that are not in the estimate."""
     unused_observed: Sequence[int] = ()
-    """Observed nodes that are not in the estimate."""
 
 
 ALL_BELIEVED = DrawnRows()
@@ -64,37 +58,23 @@ ALL_BELIEVED = DrawnRows()
 class GraphView:
     """Immutable view of a graph for display."""
 
-    nodes: FloatArray
-    """Hidden nodes in the map without biases, shape (N, 2) [m], read-only."""
-    odometry: Lines
-    """Edges of odometry, from node to node."""
+    nodes: Points   # hidden nodes in the map without biases, read-only
+    odometry: Lines         # from node to node, as the loop closures
     loop_closures: Lines
-    """Loop closures, from node to node."""
+    # measured positions (of an antenna, or the robot), from the predicted to the measured one
     observed: Lines
-    """Measured positions (of an antenna, or the robot), from the predicted to the measured one."""
+    # loop closures and, of the last ones, odometry, as in `DrawnRows`
     weak: Lines = NO_LINES
-    """Loop closures in the estimate that little speaks for."""
     waiting: Lines = NO_LINES
-    """Loop closures that are not in the estimate yet."""
     doubted: Lines = NO_LINES
-    """Loop closures and odometry that were left out."""
-    unused: Lines = NO_LINES
-    """Measured positions that are not in the estimate, as `observed`."""
+    unused: Lines = NO_LINES    # measured positions that are not in the estimate
 
     def __post_init__(self) -> None:
         self.nodes.flags.writeable = False
 
 
 def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
-    """
-    Return the view of a graph; None if the graph is empty.
-
-    Parameters
-    ----------
-    graph : Graph
-    drawn : DrawnRows, ids of what is not simply believed; those that have left are ignored
-
-    """
+    """Return the view of a graph; None if the graph is empty."""
     if graph.n_nodes == 0:
         return None
     positions, is_bias = graph.poses[:, :2].copy(), ~graph.is_pose
@@ -141,9 +121,8 @@ def _measured(
     edges, observed = tables
     nodes = np.concatenate((
         observed.integers[seen, tb.OBS_NODE], edges.integers[biased, tb.END_I]))
-    offsets, measured = np.concatenate((
-        observed.numbers[seen][:, _OFFSET_AND_MEAN], edges.numbers[biased][:, _ARM_AND_MEAN],
-    )).reshape(-1, 2, 2).swapaxes(0, 1)
+    offsets, measured = np.concatenate((observed.numbers[seen], edges.numbers[biased]))[
+        :, _OFFSET_AND_MEAN].reshape(-1, 2, 2).swapaxes(0, 1)
     predicted = se2.transform(graph.poses[nodes], offsets)
     return Lines(np.stack((predicted, measured), axis=1),
                  np.concatenate((observed.sigmas[seen], edges.sigmas[biased])))
@@ -152,31 +131,28 @@ def _measured(
 class ConstraintTable(NamedTuple):
     """All edges, or all observed nodes: views of the graph's tables, with energies."""
 
-    numbers: FloatArray
-    """Rows of edge_f or observed_f."""
-    integers: IntArray
-    """Rows of edge_i or observed_i."""
-    energies: FloatArray
-    """Unweighted energies, shape (M,) [sigma^2]."""
+    numbers: FloatArray     # rows of edge_f or observed_f
+    integers: IntArray      # rows of edge_i or observed_i
+    energies: FloatArray    # unweighted [sigma^2]
 
     @property
     def weights(self) -> FloatArray:
-        """Factors on the information, shape (M,)."""
+        """Factors on the information."""
         return self.numbers[:, tb.WEIGHT]
 
     @property
     def tells_position(self) -> BoolArray:
-        """Whether constraints measure a position and are not removed, shape (M,)."""
+        """Whether constraints measure a position and are not removed."""
         return (self.numbers[:, tb.INFO] > 0.0) & (self.weights > 0.0)
 
     @property
     def sigmas(self) -> FloatArray:
-        """Roots of the unweighted energies per degree of freedom, shape (M,) [sigma]."""
+        """Roots of the unweighted energies per degree of freedom [sigma]."""
         return np.asarray(np.sqrt(np.maximum(self.energies, 0.0) / np.maximum(self.freedom, 1)))
 
     @property
     def freedom(self) -> IntArray:
-        """Degrees of freedom: how many coordinates each constraint measures, shape (M,)."""
+        """Degrees of freedom: how many coordinates each constraint measures."""
         return np.asarray(np.count_nonzero(self.numbers[:, DIAGONAL] > 0.0, axis=1))
 
 

@@ -9,15 +9,17 @@ blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.factor_types import (
+from pose_graph_ros.core.graph.factors import (
+    BIAS,
     constant,
     factors_of_end,
     frame,
-    is_plain,
+    model,
     OBSERVED,
     ODOMETRY,
+    parts,
+    third,
 )
-from pose_graph_ros.core.graph.factors import model, third
 
 
 @kernel
@@ -35,14 +37,7 @@ def weakest(f):  # type: ignore[no-untyped-def]
 
 @kernel
 def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
-    """
-    Return what `weakest` does, of an information matrix.
-
-    Parameters
-    ----------
-    xx, xy, xt, yy, yt, tt : float, its upper triangle
-
-    """
+    """Return what `weakest` does, of an information matrix."""
     trace, determinant = xx + yy, xx * yy - xy * xy
     if not determinant > 0.0:
         return 0.0, 0.0
@@ -62,8 +57,15 @@ def _turned(f, c, s):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
+def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
+    front[at] += x
+    front[at + 1] += y
+    front[at + 2] += z
+
+
+@kernel(forceinline=True)
 def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-def]
-    """Add a constraint to a front; parameters as for `add_edge`, rows as for `model`."""
+    """Add a constraint to a front; parameters as for `add`, rows as for `model`."""
     c, s = frame(f, kind)
     xx, xy, xt, yy, yt, tt = _turned(f, c, s)
     ft, fth = factors_of_end(f, kind)
@@ -79,9 +81,7 @@ def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-de
     gth = xt * hx + yt * hy + tt * hth
     # block ii is T^T W T
     r = a * ld + a
-    front[r] += xx
-    front[r + 1] += xy
-    front[r + 2] += wx
+    _add_to_row(front, r, xx, xy, wx)
     front[r + ld + 1] += yy
     front[r + ld + 2] += wy
     front[r + 2 * ld + 2] += px * wx + py * wy + wt
@@ -100,35 +100,21 @@ def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-de
     xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
     wx, wy, wt = ft * wx, ft * wy, fth * wt
     r = b * ld + b
-    front[r] += ft * xx
-    front[r + 1] += ft * xy
-    front[r + 2] += ft * xt
+    _add_to_row(front, r, ft * xx, ft * xy, ft * xt)
     front[r + ld + 1] += ft * yy
     front[r + ld + 2] += ft * yt
     front[r + 2 * ld + 2] += fth * fth * tt
     # block ij is -T^T W F, block ji its transpose
     if a < b:
         r = a * ld + b
-        front[r] -= xx
-        front[r + 1] -= xy
-        front[r + 2] -= xt
-        front[r + ld] -= xy
-        front[r + ld + 1] -= yy
-        front[r + ld + 2] -= yt
-        front[r + 2 * ld] -= wx
-        front[r + 2 * ld + 1] -= wy
-        front[r + 2 * ld + 2] -= wt
+        _add_to_row(front, r, -xx, -xy, -xt)
+        _add_to_row(front, r + ld, -xy, -yy, -yt)
+        _add_to_row(front, r + 2 * ld, -wx, -wy, -wt)
     else:
         r = b * ld + a
-        front[r] -= xx
-        front[r + 1] -= xy
-        front[r + 2] -= wx
-        front[r + ld] -= xy
-        front[r + ld + 1] -= yy
-        front[r + ld + 2] -= wy
-        front[r + 2 * ld] -= xt
-        front[r + 2 * ld + 1] -= yt
-        front[r + 2 * ld + 2] -= wt
+        _add_to_row(front, r, -xx, -xy, -wx)
+        _add_to_row(front, r + ld, -xy, -yy, -wy)
+        _add_to_row(front, r + 2 * ld, -xt, -yt, -wt)
 
 
 @kernel
@@ -143,40 +129,18 @@ def _add_third(front, ld, at, factor, of_i, of_j, gth):  # type: ignore[no-untyp
 
 
 @kernel
-def add_edge(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
+def add(head, entry, a, b, k, front, ld):  # type: ignore[no-untyped-def]
     """
-    Add an edge to a front.
+    Add a constraint to a front, in which the blocks of its ends i, j and k begin at a, b and k.
 
-    Parameters
-    ----------
-    e : int
-    a, b, k : int, rows of the front at which the blocks of its ends i, j and k begin; k may be -1
-    front, ld : ndarray, int
-        Upper triangle, stored by rows of `ld` numbers, the last of which is the right-hand side.
-
+    b and k may be -1. The front is an upper triangle, stored by rows of `ld` numbers, the last of
+    which is the right-hand side.
     """
-    node_f, row, f = tb.node_f(head), tb.edge_i(head)[e], tb.edge_f(head)[e]
-    kind, start, end = row[tb.EDGE_KIND], node_f[row[tb.END_I]], node_f[row[tb.END_J]]
-    if is_plain(row):
-        _add(f, ODOMETRY, start, end, a, b, -1, front, ld)
+    node_f, (f, kind, i, j, _) = tb.node_f(head), parts(head, entry)
+    if kind < BIAS:
+        _add(f, ODOMETRY, node_f[i], node_f[j], a, b, -1, front, ld)
     else:
-        _add(f, kind, start, end, a, b, k, front, ld)
-
-
-@kernel
-def add_observed(head, k, a, front, ld):  # type: ignore[no-untyped-def]
-    """
-    Add an observed node to a front.
-
-    Parameters
-    ----------
-    k : int
-    a : int, row of the front at which the block of its hidden node begins
-    front, ld : ndarray, int, as for `add_edge`
-
-    """
-    node = tb.node_f(head)[tb.observed_i(head)[k, tb.OBS_NODE]]
-    _add(tb.observed_f(head)[k], OBSERVED, node, node, a, -1, -1, front, ld)
+        _add(f, kind, node_f[i], node_f[j], a, b, k, front, ld)
 
 
 @kernel(forceinline=True)
@@ -208,40 +172,16 @@ def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-
 
 
 @kernel(forceinline=True)
-def edge_gradient(head, e, right):  # type: ignore[no-untyped-def]
+def gradient(head, entry, right):  # type: ignore[no-untyped-def]
     """
-    Return the energy of an edge and the sums of `_gradient` after adding -b to `right`, (N, 3).
-
-    Parameters
-    ----------
-    e : int
-    right : ndarray
-
+    Return energy and the sums of `_gradient` of a constraint after adding -b to `right`, (N, 3).
     """
-    f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
-    nodes = (row[tb.END_I], row[tb.END_J])
-    if is_plain(row):
-        energy, total, terms, _ = _gradient(f, ODOMETRY, nodes, tb.node_f(head), 0.0, right)
+    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, entry)
+    if kind < BIAS:
+        energy, total, terms, _ = _gradient(f, ODOMETRY, (i, j), node_f, 0.0, right)
         return energy, total, terms
     energy, total, terms, gth = _gradient(
-        f, row[tb.EDGE_KIND], nodes, tb.node_f(head), third(head, e, tb.POSE), right)
-    if row[tb.END_K] >= 0:
-        right[row[tb.END_K], 0] -= f[tb.FACTOR_TH] * gth
-    return energy, total, terms
-
-
-@kernel(forceinline=True)
-def observed_gradient(head, k, right):  # type: ignore[no-untyped-def]
-    """
-    Return energy and sums of an observed node after adding -b to `right`, as `edge_gradient`.
-
-    Parameters
-    ----------
-    k : int
-    right : ndarray
-
-    """
-    v = tb.observed_i(head)[k, tb.OBS_NODE]
-    energy, total, terms, _ = _gradient(
-        tb.observed_f(head)[k], OBSERVED, (v, v), tb.node_f(head), 0.0, right)
+        f, kind, (i, j), node_f, third(node_f, f, k, tb.POSE), right)
+    if k >= 0:
+        right[k, 0] -= f[tb.FACTOR_TH] * gth
     return energy, total, terms

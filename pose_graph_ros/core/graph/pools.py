@@ -22,107 +22,14 @@ def row_start(k, n):  # type: ignore[no-untyped-def]
     Return the index at which column 0 of row k would be in an upper triangle stored by rows.
 
     A row holds its columns from k on, and its right-hand side as column n.
-
-    Parameters
-    ----------
-    k, n : int, row, and number of columns without the right-hand side
-
     """
     return k * n - k * (k - 1) // 2
 
 
 @kernel
 def triangle_size(rows, n):  # type: ignore[no-untyped-def]
-    """
-    Return the number of values in the first rows of an upper triangle with right-hand side.
-
-    Parameters
-    ----------
-    rows, n : int, number of rows, and of columns without the right-hand side
-
-    """
+    """Return the number of values in the first rows of an upper triangle with right-hand side."""
     return rows * (n + 1) - rows * (rows - 1) // 2
-
-
-@kernel
-def size_class(n):  # type: ignore[no-untyped-def]
-    """Return the smallest size class (index in `SIZES`) whose blocks hold n numbers."""
-    if n <= 64:
-        return n
-    low, high = 64, len(_SIZES) - 1
-    while low < high:
-        middle = (low + high) // 2
-        if _SIZES[middle] < n:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@kernel
-def rounded(n):  # type: ignore[no-untyped-def]
-    """Return the size of the block that n numbers take from a pool."""
-    return _SIZES[size_class(n)]
-
-
-@kernel
-def take_values(head, n):  # type: ignore[no-untyped-def]
-    """Take a block for n numbers from pool_f and return its index; the pool must have room."""
-    pool_f = tb.pool_f(head)
-    size = size_class(n)
-    at = head[tb.FREE_F + size]
-    if at >= 0:
-        head[tb.FREE_F + size] = np.int64(pool_f[at])
-        return at
-    at = head[tb.POOL_F_END]
-    head[tb.POOL_F_END] = at + _SIZES[size]
-    return at
-
-
-@kernel
-def give_values(head, at, n):  # type: ignore[no-untyped-def]
-    """
-    Give a block back to pool_f.
-
-    Parameters
-    ----------
-    at, n : int, index of the block, and the number that it was taken for
-
-    """
-    pool_f = tb.pool_f(head)
-    size = size_class(n)
-    pool_f[at] = head[tb.FREE_F + size]
-    head[tb.FREE_F + size] = at
-
-
-@kernel
-def take_nodes(head, n):  # type: ignore[no-untyped-def]
-    """Take a block for n nodes from pool_i and return its index; the pool must have room."""
-    pool_i = tb.pool_i(head)
-    size = size_class(n)
-    at = head[tb.FREE_I + size]
-    if at >= 0:
-        head[tb.FREE_I + size] = pool_i[at]
-        return at
-    at = head[tb.POOL_I_END]
-    head[tb.POOL_I_END] = at + _SIZES[size]
-    return at
-
-
-@kernel
-def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
-    """
-    Give a block back to pool_i.
-
-    Parameters
-    ----------
-    at, n : int, as for `give_values`
-
-    """
-    pool_i = tb.pool_i(head)
-    size = size_class(n)
-    pool_i[at] = head[tb.FREE_I + size]
-    head[tb.FREE_I + size] = at
 
 
 @kernel
@@ -131,12 +38,64 @@ def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
     Return how many numbers a clique holds: rows of R, then the update matrix.
 
     A prior, with no frontal node, has more (see `prior_rows`).
-
-    Parameters
-    ----------
-    n_frontal, n_separator : int, numbers of nodes
-
     """
     rows, rest = 3 * n_frontal, 3 * n_separator
     more = 3 * rest + 1 if n_frontal == 0 else 0
     return triangle_size(rows, rows + rest) + triangle_size(rest, rest) + more
+
+
+@kernel
+def _size_class(n):  # type: ignore[no-untyped-def]
+    """Return the smallest size class (index in `SIZES`) whose blocks hold n numbers."""
+    return n if n <= 64 else np.searchsorted(_SIZES, n)
+
+
+@kernel
+def rounded(n):  # type: ignore[no-untyped-def]
+    """Return the size of the block that n numbers take from a pool."""
+    return _SIZES[_size_class(n)]
+
+
+@kernel
+def _take(head, pool, end, free, n):  # type: ignore[no-untyped-def]
+    """Take a block for n numbers from a pool, given its end and its free lists in the head."""
+    size = _size_class(n)
+    at = head[free + size]
+    if at >= 0:
+        head[free + size] = np.int64(pool[at])
+        return at
+    at = head[end]
+    head[end] = at + _SIZES[size]
+    return at
+
+
+@kernel
+def _give(head, pool, free, at, n):  # type: ignore[no-untyped-def]
+    """Put a block of n numbers into the free list of its size."""
+    size = _size_class(n)
+    pool[at] = head[free + size]
+    head[free + size] = at
+
+
+@kernel
+def take_values(head, n):  # type: ignore[no-untyped-def]
+    """Take a block for n numbers from pool_f and return its index; the pool must have room."""
+    return _take(head, tb.pool_f(head), tb.POOL_F_END, tb.FREE_F, n)
+
+
+@kernel
+def give_values(head, at, n):  # type: ignore[no-untyped-def]
+    """Give a block back to pool_f."""
+    _give(head, tb.pool_f(head), tb.FREE_F, at, n)
+
+
+@kernel
+def take_nodes(head, n):  # type: ignore[no-untyped-def]
+    """Take a block for n nodes from pool_i and return its index; the pool must have room."""
+    return _take(head, tb.pool_i(head), tb.POOL_I_END, tb.FREE_I, n)
+
+
+@kernel
+def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
+    """Give a block back to pool_i."""
+    _give(head, tb.pool_i(head), tb.FREE_I, at, n)

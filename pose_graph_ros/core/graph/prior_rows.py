@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Priors in the tables: cliques without frontal nodes.
+Priors in the tables: cliques without frontal nodes; how they are added and removed.
 
 What is left of a clique whose nodes and constraints have left the graph is its separator and its
 update matrix. So a prior is a leaf of the tree, its update matrix is added to the front of
@@ -14,16 +14,21 @@ A prior that no clique is the parent of is *loose*: it is new, or all cliques we
 nodes are touched, so the next step takes it in.
 """
 
+from collections.abc import Sequence
 import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import FLAG, INTEGERS, kernel, NUMBERS
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
+from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.factors import wrap
-from pose_graph_ros.core.graph.kinds import NodeKind
 from pose_graph_ros.core.graph.normal_equations import weakest_of
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
+from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
+from pose_graph_ros.core.graph.rows import add_to_scale, touch
+from pose_graph_ros.core.graph.transaction_log import copied
 
 # Parent of a prior that this update has removed.
 REMOVED = -2
@@ -44,64 +49,62 @@ def _references(row):  # type: ignore[no-untyped-def]
     return row[tb.VALUES] + triangle_size(n, n)
 
 
+@kernel(inline='always')
+def _nodes(head, c):  # type: ignore[no-untyped-def]
+    """Return the nodes of a prior."""
+    row = tb.clique_i(head)[c]
+    return tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + row[tb.N_SEPARATOR]]
+
+
 @kernel
 def turns(head, c):  # type: ignore[no-untyped-def]
     """Tell whether a prior has a frame that turns with its nodes; see `priors.turns`."""
-    node_i, pool_i, row = tb.node_i(head), tb.pool_i(head), tb.clique_i(head)[c]
-    if row[tb.ANCHORED] == 0:
+    if tb.clique_i(head)[c, tb.ANCHORED] == 0:
         return True
-    for k in range(row[tb.NODES], row[tb.NODES] + row[tb.N_SEPARATOR]):
-        if node_i[pool_i[k], tb.NODE_TYPE] != _POSE:
+    for v in _nodes(head, c):
+        if tb.node_i(head)[v, tb.NODE_TYPE] != _POSE:
             return False
-    return row[tb.N_SEPARATOR] > 1
+    return len(_nodes(head, c)) > 1
 
 
 @kernel
 def mean_turn(head, c):  # type: ignore[no-untyped-def]
     """Return the mean turn of the nodes of a prior from their references [rad]."""
-    node_f, pool_i, row = tb.node_f(head), tb.pool_i(head), tb.clique_i(head)[c]
-    reference = tb.pool_f(head)[_references(row):]
-    begin, n = row[tb.NODES], row[tb.N_SEPARATOR]
-    first = wrap(node_f[pool_i[begin], tb.POSE + 2] - reference[2])
+    node_f, nodes = tb.node_f(head), _nodes(head, c)
+    reference = tb.pool_f(head)[_references(tb.clique_i(head)[c]):]
+    first = wrap(node_f[nodes[0], tb.POSE + 2] - reference[2])
     total = 0.0
-    for k in range(1, n):
-        turn = node_f[pool_i[begin + k], tb.POSE + 2] - reference[3 * k + 2]
-        total += wrap(turn - first)
-    return first + total / n
+    for k in range(1, len(nodes)):
+        total += wrap(node_f[nodes[k], tb.POSE + 2] - reference[3 * k + 2] - first)
+    return first + total / len(nodes)
 
 
 @kernel
 def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     """
-    Write the displacement d of the nodes of a prior, and its derivative r by -phi.
+    Write the displacement d of the nodes of a prior, and its derivative r by -phi; (3k,) each.
 
-    Parameters
-    ----------
-    c : int, row of the prior
-    phi : float, turn of its frame [rad], from `present_frame`
-    d, r : ndarray, shape (3k,), output; r is zero if the prior does not turn
-
+    phi is that of `present_frame`; r is zero if the prior does not turn.
     """
-    node_f, pool_i, row = tb.node_f(head), tb.pool_i(head), tb.clique_i(head)[c]
+    node_f, nodes, row = tb.node_f(head), _nodes(head, c), tb.clique_i(head)[c]
     reference = tb.pool_f(head)[_references(row):]
-    begin, n = row[tb.NODES], row[tb.N_SEPARATOR]
     if not turns(head, c):
-        for k in range(n):
-            f, i = node_f[pool_i[begin + k]], 3 * k
+        for k in range(len(nodes)):
+            f, i = node_f[nodes[k]], 3 * k
             d[i], d[i + 1] = f[tb.POSE] - reference[i], f[tb.POSE + 1] - reference[i + 1]
             d[i + 2] = wrap(f[tb.POSE + 2] - reference[i + 2])
             r[i] = r[i + 1] = r[i + 2] = 0.0
         return
     cos, sin = math.cos(phi), math.sin(phi)
-    first = node_f[pool_i[begin]]
+    first = node_f[nodes[0]]
     turn = wrap(first[tb.POSE + 2] - reference[2])
     anchored = row[tb.ANCHORED] != 0
     # the point about which it turns, and how much of a rigid turn about it is displacement
     px = reference[0] if anchored else first[tb.POSE]
     py = reference[1] if anchored else first[tb.POSE + 1]
     tangent = 1.0 if anchored else 0.0
-    for k in range(n):
-        f, i = node_f[pool_i[begin + k]], 3 * k
+    for k in range(len(nodes)):
+        f, i = node_f[nodes[k]], 3 * k
         dx, dy = f[tb.POSE] - px, f[tb.POSE + 1] - py
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
         rx, ry = reference[i] - reference[0], reference[i + 1] - reference[1]
@@ -113,56 +116,30 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
 
 @kernel
 def keep_linearization(head, c, r):  # type: ignore[no-untyped-def]
-    """
-    Remember where a prior was linearized; a rollback restores the last linearization.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    r : ndarray, shape (3k,), from `displacement`
-
-    """
+    """Remember r (`displacement`) of a new linearization; a rollback restores the last one."""
     row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
     n = 3 * row[tb.N_SEPARATOR]
     at = _references(row) + n + 1
     transaction_log.log_clique(head, c)
     if row[tb.VALUES_BORN] != head[tb.UPDATE]:
         row[tb.VALUES_BORN] = head[tb.UPDATE]
-        for k in range(at, at + n):
-            pool_f[k + n] = pool_f[k]
-    for k in range(n):
-        pool_f[at + k] = r[k]
+        copied(pool_f[at:], pool_f[at + n:at + 2 * n])
+    copied(r, pool_f[at:at + n])
 
 
 @kernel
 def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
-    """
-    Write the change of r since a prior was linearized: S times that of the relative positions.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    r, out : ndarray, shape (3k,); r is the present one
-
-    """
-    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
+    """Write by how much r has changed since the linearization: S times relative positions."""
+    row = tb.clique_i(head)[c]
     n = 3 * row[tb.N_SEPARATOR]
-    at = _references(row) + n + 1
+    before = tb.pool_f(head)[_references(row) + n + 1:]
     for k in range(n):
-        out[k] = r[k] - pool_f[at + k]
+        out[k] = r[k] - before[k]
 
 
 @kernel
 def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
-    """
-    Make r of an anchored prior the derivative of the coordinates in its frame by -phi.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    r : ndarray, shape (3k,), from `displacement`
-
-    """
+    """Make r of an anchored prior the derivative of the coordinates in its frame by -phi."""
     row = tb.clique_i(head)[c]
     reference = tb.pool_f(head)[_references(row):]
     for i in range(0, 3 * row[tb.N_SEPARATOR], 3):
@@ -172,20 +149,12 @@ def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
 
 @kernel
 def product(head, c, x, out):  # type: ignore[no-untyped-def]
-    """
-    Write U x.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    x, out : ndarray, shape (3k,)
-
-    """
-    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
+    """Write U x."""
+    row = tb.clique_i(head)[c]
     n = 3 * row[tb.N_SEPARATOR]
     out[:n] = 0.0
     for i in range(n):
-        u = pool_f[row[tb.VALUES] + row_start(i, n):]
+        u = tb.pool_f(head)[row[tb.VALUES] + row_start(i, n):]
         total = u[i] * x[i]
         for k in range(i + 1, n):
             total += u[k] * x[k]
@@ -196,15 +165,10 @@ def product(head, c, x, out):  # type: ignore[no-untyped-def]
 @kernel
 def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
     """
-    Return the energy of a prior at the present poses.
+    Return the energy of a prior at the present poses, its frame turned by phi.
 
-    Parameters
-    ----------
-    c : int, row of the prior
-    phi : float, turn of its frame [rad], from `present_frame`
-    work : ndarray, work space of 9 numbers for each node
-        Receives the displacement d, half the gradient U d - u in the frame, and r.
-
+    The work space, 9 numbers for each node, receives the displacement d, half the gradient U d - u
+    in the frame, and r.
     """
     row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
     n = 3 * row[tb.N_SEPARATOR]
@@ -228,13 +192,9 @@ def present_frame(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def gradient(head, c, work):  # type: ignore[no-untyped-def]
     """
-    Return the energy of a prior, with half its gradient in map axes.
+    Return the energy of a prior.
 
-    Parameters
-    ----------
-    c : int, row of the prior
-    work : ndarray, work space of 9 numbers for each node; the gradient is `work[3k:6k]`
-
+    Half its gradient in map axes is `work[3k:6k]` of the work space, 9 numbers for each node.
     """
     phi = present_frame(head, c)
     energy = evaluate(head, c, phi, work)
@@ -254,33 +214,24 @@ def gradient(head, c, work):  # type: ignore[no-untyped-def]
 @kernel
 def update_energy(head, c):  # type: ignore[no-untyped-def]
     """Set the energy of a prior to that at the present poses, and correct chi2 by the change."""
-    clique_f, scalars = tb.clique_f(head), tb.scalars(head)
-    energy = evaluate(head, c, present_frame(head, c), tb.work_f(head))
-    scalars[tb.CHI2] += energy - clique_f[c, tb.PRIOR_ENERGY]
-    clique_f[c, tb.PRIOR_ENERGY] = energy
+    f, energy = tb.clique_f(head)[c], evaluate(
+        head, c, present_frame(head, c), tb.work_f(head))
+    tb.scalars(head)[tb.CHI2] += energy - f[tb.PRIOR_ENERGY]
+    f[tb.PRIOR_ENERGY] = energy
 
 
 @kernel
 def add_energies(head):  # type: ignore[no-untyped-def]
     """Evaluate all priors at the present poses and add their energies to chi2."""
-    clique_f = tb.clique_f(head)
     for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
         if is_prior(head, c):
-            clique_f[c, tb.PRIOR_ENERGY] = 0.0
+            tb.clique_f(head)[c, tb.PRIOR_ENERGY] = 0.0
             update_energy(head, c)
 
 
 @kernel
 def diagonal(head, c, k):  # type: ignore[no-untyped-def]
-    """
-    Return the mean information of a prior on the position of a node, and that on its heading.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    k : int, place of the node in it
-
-    """
+    """Return the mean information of a prior on the position of a node, and on its heading."""
     row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
     n, i, at = 3 * row[tb.N_SEPARATOR], 3 * k, row[tb.VALUES]
     position = pool_f[at + row_start(i, n) + i] + pool_f[at + row_start(i + 1, n) + i + 1]
@@ -288,21 +239,24 @@ def diagonal(head, c, k):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def is_in_separator(head, c, v):  # type: ignore[no-untyped-def]
+    """Tell whether a node is in the separator of a clique; a prior is nothing else."""
+    row = tb.clique_i(head)[c]
+    begin = row[tb.NODES] + row[tb.N_FRONTAL]
+    m, end = begin, begin + row[tb.N_SEPARATOR]
+    while m < end and tb.pool_i(head)[m] != v:
+        m += 1
+    return m < end
+
+
+@kernel
 def weakest(head, c, v):  # type: ignore[no-untyped-def]
-    """
-    Return the information of a prior on a node in its weakest direction.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    v : int, node; zeros if it is none of the prior's
-
-    """
-    row, pool_f, pool_i = tb.clique_i(head)[c], tb.pool_f(head), tb.pool_i(head)
-    n = 3 * row[tb.N_SEPARATOR]
-    for k in range(row[tb.N_SEPARATOR]):
-        if pool_i[row[tb.NODES] + k] == v:
-            i, at = 3 * k, row[tb.VALUES]
+    """Return the information of a prior on a node in its weakest direction."""
+    pool_f, nodes, at = tb.pool_f(head), _nodes(head, c), tb.clique_i(head)[c, tb.VALUES]
+    n = 3 * len(nodes)
+    for k in range(len(nodes)):
+        if nodes[k] == v:
+            i = 3 * k
             x, y, th = (at + row_start(i, n) + i, at + row_start(i + 1, n) + i,
                         at + row_start(i + 2, n) + i)
             return weakest_of(pool_f[x], pool_f[x + 1], pool_f[x + 2], pool_f[y + 1],
@@ -312,22 +266,13 @@ def weakest(head, c, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def start(head, c, anchored):  # type: ignore[no-untyped-def]
-    """
-    Initialise the row of a prior whose nodes and numbers are written; add its energy to chi2.
-
-    Parameters
-    ----------
-    c : int, row of the prior
-    anchored : bool
-
-    """
-    node_f, pool_i = tb.node_f(head), tb.pool_i(head)
-    row, f = tb.clique_i(head)[c], tb.clique_f(head)[c]
-    row[tb.ANCHORED] = 1 if anchored else 0
+    """Initialise the row of a prior that has its nodes and numbers; add its energy to chi2."""
+    node_f, nodes, f = tb.node_f(head), _nodes(head, c), tb.clique_f(head)[c]
+    tb.clique_i(head)[c, tb.ANCHORED] = 1 if anchored else 0
     f[tb.TURN_SEEN] = f[tb.DRIFT] = f[tb.PRIOR_ENERGY] = 0.0
-    scale, first = 0.0, node_f[pool_i[row[tb.NODES]]]
-    for k in range(1, row[tb.N_SEPARATOR]):
-        node = node_f[pool_i[row[tb.NODES] + k]]
+    scale, first = 0.0, node_f[nodes[0]]
+    for k in range(1, len(nodes)):
+        node = node_f[nodes[k]]
         position, _ = diagonal(head, c, k)
         scale += 2.0 * position * ((node[tb.POSE] - first[tb.POSE]) ** 2
                                    + (node[tb.POSE + 1] - first[tb.POSE + 1]) ** 2)
@@ -343,61 +288,9 @@ def make_loose(head, c):  # type: ignore[no-untyped-def]
     head[tb.LOOSE] = c
 
 
-@kernel(allocates=True)
-def remove_cliques(head):  # type: ignore[no-untyped-def]
-    """Remove all cliques but the priors, which become loose and take the first rows."""
-    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
-    pool_f, pool_i = tb.pool_f(head), tb.pool_i(head)
-    n_priors, n_nodes, n_values = 0, 0, 0
-    if head[tb.N_PRIORS] > 0:
-        for c in range(head[tb.N_CLIQUES]):
-            if is_prior(head, c):
-                n_priors += 1
-                n_nodes += clique_i[c, tb.N_SEPARATOR]
-                n_values += pools.n_values(0, clique_i[c, tb.N_SEPARATOR])
-    separators, anchored = np.empty(n_priors, np.int64), np.empty(n_priors, np.int64)
-    energy, scale = np.empty(n_priors), np.empty(n_priors)
-    nodes, values = np.empty(n_nodes, np.int32), np.empty(n_values)
-    k = n_nodes = n_values = 0
-    for c in range(head[tb.N_CLIQUES] if n_priors > 0 else 0):
-        if is_prior(head, c):
-            row = clique_i[c]
-            separators[k], anchored[k] = row[tb.N_SEPARATOR], row[tb.ANCHORED]
-            energy[k], scale[k] = clique_f[c, tb.PRIOR_ENERGY], clique_f[c, tb.SLIP_SCALE]
-            for m in range(separators[k]):
-                nodes[n_nodes + m] = pool_i[row[tb.NODES] + m]
-            n_nodes += separators[k]
-            size = pools.n_values(0, separators[k])
-            for m in range(size):
-                values[n_values + m] = pool_f[row[tb.VALUES] + m]
-            n_values += size
-            k += 1
-    head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
-    head[tb.FREE_CLIQUE] = head[tb.LOOSE] = -1
-    head[tb.FREE_F:] = -1
-    head[tb.N_PRIORS] = head[tb.N_FREED] = 0
-    end = head[tb.LOG_I_END]
-    n_nodes = n_values = 0
-    for k in range(n_priors):
-        c = transaction_log.take_clique(head, 0, separators[k])
-        row, f = clique_i[c], clique_f[c]
-        for m in range(separators[k]):
-            pool_i[row[tb.NODES] + m] = nodes[n_nodes + m]
-        n_nodes += separators[k]
-        size = pools.n_values(0, separators[k])
-        for m in range(size):
-            pool_f[row[tb.VALUES] + m] = values[n_values + m]
-        n_values += size
-        row[tb.ANCHORED] = anchored[k]
-        f[tb.TURN_SEEN] = f[tb.DRIFT] = 0.0
-        f[tb.PRIOR_ENERGY], f[tb.SLIP_SCALE] = energy[k], scale[k]
-        make_loose(head, c)
-    head[tb.LOG_I_END] = end    # nothing of this can be rolled back
-
-
-@kernel(allocates=True)
+@kernel(signature=(tb.HEAD,), allocates=True)
 def all_priors(head):  # type: ignore[no-untyped-def]
-    """Return the rows of all priors, ascending."""
+    """Return the rows of all priors in the table of the cliques, ascending."""
     found = np.empty(head[tb.N_PRIORS], np.int32)
     n = 0
     for c in range(head[tb.N_CLIQUES] if len(found) > 0 else 0):
@@ -405,3 +298,143 @@ def all_priors(head):  # type: ignore[no-untyped-def]
             found[n] = c
             n += 1
     return found[:n]
+
+
+@kernel
+def _move(head, row, nodes, values, back):  # type: ignore[no-untyped-def]
+    """Copy nodes and numbers of a prior out of the pools, or back; return how many."""
+    n, size = row[tb.N_SEPARATOR], pools.n_values(0, row[tb.N_SEPARATOR])
+    of_nodes = tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + n]
+    of_values = tb.pool_f(head)[row[tb.VALUES]:row[tb.VALUES] + size]
+    if back:
+        copied(nodes, of_nodes)
+        copied(values, of_values)
+    else:
+        copied(of_nodes, nodes[:n])
+        copied(of_values, values[:size])
+    return n, size
+
+
+@kernel(allocates=True)
+def remove_cliques(head):  # type: ignore[no-untyped-def]
+    """Remove all cliques but the priors, which become loose and take the first rows."""
+    clique_i, clique_f, priors = tb.clique_i(head), tb.clique_f(head), all_priors(head)
+    rows, numbers = clique_i[priors], clique_f[priors]
+    n_nodes = n_values = 0
+    for row in rows:
+        n_nodes += row[tb.N_SEPARATOR]
+        n_values += pools.n_values(0, row[tb.N_SEPARATOR])
+    nodes, values = np.empty(n_nodes, np.int32), np.empty(n_values)
+    n_nodes = n_values = 0
+    for row in rows:
+        n, size = _move(head, row, nodes[n_nodes:], values[n_values:], False)
+        n_nodes, n_values = n_nodes + n, n_values + size
+    head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
+    head[tb.FREE_CLIQUE] = head[tb.LOOSE] = -1
+    head[tb.FREE_F:] = -1
+    head[tb.N_PRIORS] = head[tb.N_FREED] = 0
+    end = head[tb.LOG_I_END]
+    n_nodes = n_values = 0
+    for k in range(len(rows)):
+        c = transaction_log.take_clique(head, 0, rows[k, tb.N_SEPARATOR])
+        n, size = _move(head, clique_i[c], nodes[n_nodes:], values[n_values:], True)
+        n_nodes, n_values = n_nodes + n, n_values + size
+        clique_i[c, tb.ANCHORED] = rows[k, tb.ANCHORED]
+        f, before = clique_f[c], numbers[k]
+        f[tb.TURN_SEEN] = f[tb.DRIFT] = 0.0
+        f[tb.PRIOR_ENERGY], f[tb.SLIP_SCALE] = before[tb.PRIOR_ENERGY], before[tb.SLIP_SCALE]
+        make_loose(head, c)
+    head[tb.LOG_I_END] = end    # nothing of this can be rolled back
+
+
+# --- edits, within an update --------------------------------------------------------------------
+
+@kernel
+def _touch_nodes(head, c, sign):  # type: ignore[no-untyped-def]
+    """Touch the nodes of a prior, and add its information to their scales, or subtract it."""
+    nodes = _nodes(head, c)
+    for k in range(len(nodes)):
+        v = nodes[k]
+        transaction_log.log_node(head, v)
+        position, heading = diagonal(head, c, k)
+        add_to_scale(head, v, sign * position, sign * heading)
+        touch(head, v)
+    head[tb.STRUCTURE] = 1
+
+
+@kernel(signature=(tb.HEAD, INTEGERS, NUMBERS, FLAG))
+def add(head, nodes, values, anchored):  # type: ignore[no-untyped-def]
+    """Add a prior on nodes, by row, with numbers from `priors.packed`; tables have room."""
+    c = transaction_log.take_clique(head, 0, len(nodes))
+    at = tb.clique_i(head)[c, tb.VALUES]
+    copied(nodes, _nodes(head, c))
+    copied(values, tb.pool_f(head)[at:at + len(values)])
+    start(head, c, anchored)
+    make_loose(head, c)
+    _touch_nodes(head, c, 1.0)
+
+
+@kernel
+def _unlink(head, c):  # type: ignore[no-untyped-def]
+    """Take a prior out of the list of its parent's children, or of the loose ones."""
+    clique_i = tb.clique_i(head)
+    parent, after = clique_i[c, tb.PARENT], clique_i[c, tb.SIBLING]
+    before = head[tb.LOOSE] if parent < 0 else clique_i[parent, tb.CHILD]
+    if before == c:
+        if parent < 0:
+            head[tb.LOOSE] = after
+        else:
+            transaction_log.log_clique(head, parent)
+            clique_i[parent, tb.CHILD] = after
+        return
+    while clique_i[before, tb.SIBLING] != c:
+        before = clique_i[before, tb.SIBLING]
+    transaction_log.log_clique(head, before)
+    clique_i[before, tb.SIBLING] = after
+
+
+@kernel
+def remove(head, c):  # type: ignore[no-untyped-def]
+    """Take a prior out of the graph."""
+    transaction_log.log_clique(head, c)
+    _touch_nodes(head, c, -1.0)
+    tb.scalars(head)[tb.CHI2] -= tb.clique_f(head)[c, tb.PRIOR_ENERGY]
+    _unlink(head, c)
+    tb.clique_i(head)[c, tb.PARENT] = REMOVED
+    transaction_log.drop_clique(head, c)
+
+
+@kernel
+def remove_of_node(head, v):  # type: ignore[no-untyped-def]
+    """Take all priors on a node out of the graph."""
+    for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
+        if is_prior(head, c) and is_in_separator(head, c, v):
+            remove(head, c)
+
+
+def add_priors(memory: tb.Memory, priors: Sequence[Prior], rows: Sequence[IntArray]) -> None:
+    """Add priors to the graph, within an update; the other tables have room for them."""
+    head, values = memory.head, [packed(prior) for prior in priors]
+    # a block of a pool is up to an eighth larger than what is in it; r is kept twice
+    for name, end, sizes in (
+            ('pool_f', tb.POOL_F_END, [len(numbers) + 6 * len(nodes) for numbers, nodes in zip(
+                values, rows, strict=True)]),
+            ('pool_i', tb.POOL_I_END, list(map(len, rows)))):
+        room = int(head[end]) + sum(size + size // 8 + 1 for size in sizes)
+        memory.ensure(name, room, keep=int(head[end]))
+    memory.ensure('work_f', 15 * max(map(len, rows)))   # what elimination needs for each node
+    for prior, numbers, nodes in zip(priors, values, rows, strict=True):
+        add(head, nodes, numbers, prior.anchored)
+
+
+def priors_of(memory: tb.Memory, node_ids: IntArray) -> tuple[Prior, ...]:
+    """Return all priors of a graph."""
+    if memory.head[tb.N_PRIORS] == 0:
+        return ()
+    found = []
+    for row in memory['clique_i'][all_priors(memory.head)]:
+        k, nodes = int(row[tb.N_SEPARATOR]), int(row[tb.NODES])
+        found.append(unpacked(
+            node_ids[memory['pool_i'][nodes:nodes + k]], memory['pool_f'][row[tb.VALUES]:],
+            anchored=bool(row[tb.ANCHORED])))
+    return tuple(found)

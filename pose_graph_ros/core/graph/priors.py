@@ -33,63 +33,37 @@ the whole would gain information that nobody measured. It is taken for a single 
 node is no pose.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-
-# How far below zero, with the diagonal scaled to 1, the smallest eigenvalue may be, and how far
-# the triangles may differ.
-_TOLERANCE = 1e-5
-# Numbers on the diagonal below this fraction of the largest may be what rounding leaves of zero.
-_FLOOR = 1e-8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """A quadratic form in the poses of k hidden nodes; see the module."""
 
-    nodes: IntArray
-    """Ids of the nodes, shape (k,)."""
-    reference: FloatArray
-    """Poses from which displacements are counted, shape (k, 3) [m, m, rad]."""
-    information: FloatArray
-    """U, shape (3k, 3k) [1/m^2, 1/(m rad), 1/rad^2]."""
-    vector: FloatArray
-    """u, shape (3k,) [1/m, 1/rad]: minus half the gradient at the reference."""
-    energy: float
-    """c: energy at the reference [sigma^2]."""
-    anchored: bool
-    """Whether it says where its nodes are in the map, and not only in each other."""
+    nodes: IntArray     # ids, shape (k,)
+    reference: FloatArray   # poses from which displacements are counted, shape (k, 3)
+    information: FloatArray     # U, shape (3k, 3k) [1/m^2, 1/(m rad), 1/rad^2]
+    vector: FloatArray  # u, shape (3k,) [1/m, 1/rad]: minus half the gradient at the reference
+    energy: float       # c, at the reference [sigma^2]
+    anchored: bool      # whether it says where its nodes are in the map, not only in each other
 
 
 class PriorModel(NamedTuple):
     """A prior at certain poses of its nodes, for a change of these in map axes."""
 
-    energy: float
-    """[sigma^2]"""
-    gradient: FloatArray
-    """Half the gradient of the energy, shape (3k,)."""
-    information: FloatArray
-    """Shape (3k, 3k)."""
+    energy: float           # [sigma^2]
+    gradient: FloatArray    # half the gradient of the energy, shape (3k,)
+    information: FloatArray     # shape (3k, 3k)
 
 
 def model(prior: Prior, poses: FloatArray, is_pose: BoolArray) -> PriorModel:
-    """
-    Return the energy of a prior at other poses, with its derivatives.
-
-    Parameters
-    ----------
-    prior : Prior
-    poses : ndarray, shape (k, 3), of its nodes [m, m, rad]
-    is_pose : ndarray of bool, shape (k,), which of its nodes are poses
-
-    """
+    """Return the energy of a prior, with its derivatives, at other poses of its nodes, (k, 3)."""
     k, U = len(prior.nodes), prior.information
     turns = se2.wrap(poses[:, 2] - prior.reference[:, 2])
     if prior.anchored and (k == 1 or not np.all(is_pose)):
@@ -119,42 +93,6 @@ def model(prior: Prior, poses: FloatArray, is_pose: BoolArray) -> PriorModel:
         float(flat @ (g - prior.vector) + prior.energy), J.T @ g, J.T @ U @ J)
 
 
-def check_priors(priors: Sequence[Prior], leaving: Sequence[int]) -> None:
-    """
-    Raise GraphUpdateError for wrong shapes and numbers; nodes are not looked up.
-
-    Parameters
-    ----------
-    priors : sequence of Prior
-    leaving : sequence of int, nodes that none of them may have
-
-    """
-    for n, prior in enumerate(priors):
-        k = len(prior.nodes)
-        shapes = [np.shape(part) for part in (prior.reference, prior.information, prior.vector)]
-        if k == 0 or shapes != [(k, 3), (3 * k, 3 * k), (3 * k,)]:
-            raise GraphUpdateError(
-                f'priors[{n}]: expected shapes (k, 3), (3k, 3k) and (3k,) for k = {k} nodes, '
-                f'got {shapes}')
-        if len(np.unique(prior.nodes)) < k:
-            raise GraphUpdateError(
-                f'priors[{n}]: a node is there twice: {np.asarray(prior.nodes).tolist()}')
-        if np.any(np.isin(prior.nodes, np.fromiter(leaving, np.int64))):
-            raise GraphUpdateError(f'priors[{n}]: a node leaves with the same update')
-        if not all(np.all(np.isfinite(part)) for part in (
-                prior.reference, prior.information, prior.vector, prior.energy)):
-            raise GraphUpdateError(f'priors[{n}]: a number is not finite')
-        diagonal = np.diagonal(prior.information)
-        root = np.sqrt(np.maximum(diagonal, max(_FLOOR * np.max(diagonal), 1e-300)))
-        scaled = prior.information / np.outer(root, root)
-        skew = float(np.max(np.abs(scaled - scaled.T)))
-        smallest = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
-        if skew > _TOLERANCE or smallest < -_TOLERANCE:
-            raise GraphUpdateError(
-                f'priors[{n}].information is not symmetric and positive semidefinite: '
-                f'asymmetry {skew:.1e}, smallest eigenvalue {smallest:.1e}')
-
-
 def packed(prior: Prior) -> FloatArray:
     """Return the numbers of a prior as the tables hold them; see `prior_rows`."""
     n = 3 * len(prior.nodes)
@@ -165,16 +103,7 @@ def packed(prior: Prior) -> FloatArray:
 
 
 def unpacked(nodes: IntArray, values: FloatArray, *, anchored: bool) -> Prior:
-    """
-    Return a prior from its numbers in the tables.
-
-    Parameters
-    ----------
-    nodes : ndarray of int, shape (k,), ids
-    values : ndarray, what `packed` has returned
-    anchored : bool
-
-    """
+    """Return a prior on nodes, by id, whose numbers in the tables begin with these."""
     n = 3 * len(nodes)
     rows, at = np.zeros((n, n + 1)), 0
     for k in range(n):

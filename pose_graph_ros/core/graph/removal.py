@@ -1,28 +1,23 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Removal of nodes for good, in two steps.
+Removal of nodes and constraints for good, in two steps.
 
-Within an update they and their constraints leave all lists, and with it the tree, but keep their
-rows, which are logged as any other edit; so a rollback brings them back. After the update
-`compaction` takes the rows out.
+Within an update they leave all lists, and with it the tree, but keep their rows, which are logged
+as any other edit; so a rollback brings them back. After the update `compact` takes the rows out:
+those that stay move up, in their order, and all that refers to a row is rewritten. An edge leaves
+with any of its nodes, an observed node with its hidden node. Cliques keep their rows.
 """
 
+import numpy as np
+import numpy.typing as npt
+
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
-from pose_graph_ros.core.graph import identities, prior_edits, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import touch, weigh_edge, weigh_one_observed
-
-
-@kernel
-def _holds(head, c, v):  # type: ignore[no-untyped-def]
-    """Tell whether a node is in the separator of a clique."""
-    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
-    row = clique_i[c]
-    begin = row[tb.NODES] + row[tb.N_FRONTAL]
-    m, end = begin, begin + row[tb.N_SEPARATOR]
-    while m < end and pool_i[m] != v:
-        m += 1
-    return m < end
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.graph import prior_rows, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.editing import weigh
+from pose_graph_ros.core.graph.graph_update import Left, NOTHING_LEFT
+from pose_graph_ros.core.graph.rows import touch
 
 
 @kernel
@@ -33,15 +28,13 @@ def _touch_cliques_with(head, v):  # type: ignore[no-untyped-def]
     They are a subtree below the clique that it is frontal in. A clique may have it in the
     separator although no constraint below leads to it any more.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    top = node_i[v, tb.CLIQUE]
+    clique_i, top = tb.clique_i(head), tb.node_i(head)[v, tb.CLIQUE]
     if top < 0:
         return
-    c = clique_i[top, tb.CHILD]
-    parent = top
+    parent, c = top, clique_i[top, tb.CHILD]
     while True:
-        if c >= 0 and _holds(head, c, v):
-            u = pool_i[clique_i[c, tb.NODES]]
+        if c >= 0 and prior_rows.is_in_separator(head, c, v):
+            u = tb.pool_i(head)[clique_i[c, tb.NODES]]
             transaction_log.log_node(head, u)
             touch(head, u)
             parent, c = c, clique_i[c, tb.CHILD]
@@ -65,28 +58,103 @@ def _forget_newest(head):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD, INTEGERS))
 def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
-    """
-    Take hidden nodes out of the graph with all their constraints; their rows leave later.
-
-    Parameters
-    ----------
-    nodes : ndarray of int, shape (N,), ids; none that has left
-
-    """
+    """Take hidden nodes, by id, out of the graph with all their constraints; rows leave later."""
     node_i = tb.node_i(head)
     for node in nodes:
-        v = identities.node_row(head, node)
-        prior_edits.remove_of_node(head, v)
+        v = rows.node_row(head, node)
+        prior_rows.remove_of_node(head, v)
         if node_i[v, tb.EDGE_LIST] == tb.LEAVES:
             continue
         transaction_log.log_node(head, v)
         while node_i[v, tb.EDGE_LIST] >= 0:
-            weigh_edge(head, node_i[v, tb.EDGE_LIST] >> 2, 0.0)
+            weigh(head, node_i[v, tb.EDGE_LIST] >> 2, 0.0)
         while node_i[v, tb.OBSERVED_LIST] >= 0:
-            weigh_one_observed(head, node_i[v, tb.OBSERVED_LIST], 0.0)
+            weigh(head, -1 - node_i[v, tb.OBSERVED_LIST], 0.0)
         _touch_cliques_with(head, v)
         touch(head, v)
         node_i[v, tb.EDGE_LIST] = tb.LEAVES
         head[tb.N_LEAVING] += 1
         head[tb.STRUCTURE] = 1
     _forget_newest(head)
+
+
+def compact(memory: tb.Memory) -> Left:
+    """Take out all rows that leave, and return their ids; the update must have been committed."""
+    head = memory.head
+    if head[tb.N_LEAVING] == 0:
+        return NOTHING_LEFT
+    node_i, edge_i, observed_i = _rows_in_use(memory)
+    stays = node_i[:, tb.EDGE_LIST] != tb.LEAVES
+    with_ends = np.append(stays, True)[edge_i[:, tb.END_I:tb.END_K + 1]]  # -1: no third node
+    gone, moved = zip(*(_moved_up(memory, name, counter, which) for name, counter, which in (
+        ('node', tb.N_NODES, stays),
+        ('edge', tb.N_EDGES, (edge_i[:, tb.NEXT_I] != tb.LEAVES) & np.all(with_ends, axis=1)),
+        ('observed', tb.N_OBSERVED, (observed_i[:, tb.OBS_NEXT] != tb.LEAVES)
+         & stays[observed_i[:, tb.OBS_NODE]]))), strict=True)
+    _rewrite_rows(memory, *moved)
+    _rewrite_lists(memory, *moved)
+    head[tb.N_LEAVING] = 0
+    return Left(*gone)
+
+
+def _rows_in_use(memory: tb.Memory) -> tuple[npt.NDArray[np.int32], ...]:
+    return tuple(memory[name][:memory.head[counter]] for name, counter in (
+        ('node_i', tb.N_NODES), ('edge_i', tb.N_EDGES), ('observed_i', tb.N_OBSERVED)))
+
+
+def _moved_up(
+    memory: tb.Memory, name: str, counter: int, stays: BoolArray,
+) -> tuple[IntArray, IntArray]:
+    """Move rows that stay up; return the ids of the others, and where each row is now, or -1."""
+    n, gone = len(stays), memory[f'{name}_id'][:len(stays)][~stays].astype(np.int64)
+    if len(gone) > 0:
+        first, left = int(np.argmin(stays)), n - len(gone)
+        for suffix in ('f', 'i', 'id'):
+            table = memory[f'{name}_{suffix}']
+            table[first:left] = table[first:n][stays[first:]]
+        memory.head[counter] = left
+    # one more, so that -1 stays -1
+    return gone, np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)
+
+
+def _rewrite_rows(
+    memory: tb.Memory, nodes: IntArray, edges: IntArray, observed: IntArray,
+) -> None:
+    """Rewrite ends of constraints and the lists of the constraints of each node."""
+    node_i, edge_i, observed_i = _rows_in_use(memory)
+
+    def entries(old: npt.NDArray[np.int32]) -> IntArray:
+        return np.where(old >= 0, 4 * edges[old >> 2] + (old & 3), -1)
+
+    node_i[:, tb.EDGE_LIST] = entries(node_i[:, tb.EDGE_LIST])
+    node_i[:, tb.OBSERVED_LIST] = observed[node_i[:, tb.OBSERVED_LIST]]
+    ends, after = edge_i[:, tb.END_I:tb.END_K + 1], edge_i[:, tb.NEXT_I:tb.NEXT_K + 1]
+    ends[:] = nodes[ends]
+    observed_i[:, tb.OBS_NODE] = nodes[observed_i[:, tb.OBS_NODE]]
+    # those without a weight are in no list
+    listed = (memory['edge_f'][:len(ends), tb.WEIGHT] > 0.0)[:, None] & (ends >= 0)
+    after[listed] = entries(after[listed])
+    seen = memory['observed_f'][:len(observed_i), tb.WEIGHT] > 0.0
+    observed_i[seen, tb.OBS_NEXT] = observed[observed_i[seen, tb.OBS_NEXT]]
+
+
+def _rewrite_lists(
+    memory: tb.Memory, nodes: IntArray, edges: IntArray, observed: IntArray,
+) -> None:
+    """Rewrite the nodes of cliques, what is touched or waits, and the newest pose."""
+    head, pool_i = memory.head, memory['pool_i']
+    cliques = memory['clique_i'][:head[tb.N_CLIQUES]].astype(np.int64)
+    sizes = np.maximum(cliques[:, tb.N_FRONTAL] + cliques[:, tb.N_SEPARATOR], 0)  # -1 if unused
+    begins = np.cumsum(sizes) - sizes
+    at = np.arange(np.sum(sizes)) + np.repeat(cliques[:, tb.NODES] - begins, sizes)
+    pool_i[at] = nodes[pool_i[at]]
+    touched = nodes[memory['touched'][:head[tb.N_TOUCHED]]]
+    waiting = memory['waiting'][:head[tb.N_WAITING]]
+    rows = np.where(waiting >= 0, edges[np.maximum(waiting, -1)],
+                    observed[np.maximum(-1 - waiting, -1)])
+    for name, counter, entries in (
+            ('touched', tb.N_TOUCHED, touched[touched >= 0]),
+            ('waiting', tb.N_WAITING, np.where(waiting >= 0, rows, -1 - rows)[rows >= 0])):
+        memory[name][:len(entries)] = entries
+        head[counter] = len(entries)
+    head[tb.NEWEST] = nodes[head[tb.NEWEST]]

@@ -1,22 +1,37 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Iteratively reweighted least squares over the constraints of sources with a robust loss.
+Robust losses, and iteratively reweighted least squares over the constraints that have one.
 
+With E = e^T information e the energy, k the threshold of the loss [sigma] and z = E / k^2, the
+cost of a constraint is k^2 rho(z) instead of E, and its weight in H and b is w(z) = rho'(z):
+
+    none                     rho = z                               w = 1
+    Huber                    rho = z up to 1, 2 sqrt(z) - 1        w = 1, then 1 / sqrt(z)
+    Cauchy                   rho = log(1 + z)                      w = 1 / (1 + z)
+    Geman-McClure            rho = z / (1 + z)                     w = 1 / (1 + z)^2
+    DCS                      rho = z up to 1, (3 z - 1) / (1 + z)  w = 1, then 4 / (1 + z)^2
+    Tukey                    rho = (1 - (1 - z)^3) / 3, 1 / 3      w = (1 - z)^2, then 0
+    truncated least squares  rho = z up to 1, 1                    w = 1, then 0
+
+All are concave in z, so each reweighted solution lowers the cost. The last four are bounded: a
+wrong constraint has the same cost however wrong it is, but the result depends on the start.
+
+DCS (dynamic covariance scaling, P. Agarwal et al., ICRA 2013) multiplies the information by s^2,
+s = min(1, 2 k^2 / (k^2 + E)). Its cost is the integral of that weight; the cost of switchable
+constraints, s^2 E + k^2 (1 - s)^2, is constant beyond k for this s.
+
+The weights depend on the estimate and the estimate on the weights, so both are computed in turn.
 At each update the weights of the newest constraints and of some older ones in turn are computed
 anew, so that the work does not grow with the graph. The final optimisation computes all of them
-repeatedly, starting from weights that do not depend on earlier updates.
-
-The *base weight* of a constraint is its weight without the loss: 1, or less where the errors of
-several measurements are correlated.
-
-The weights (see `losses`) depend on the estimate and the estimate on the weights, so both are
-computed in turn.
+repeatedly, starting from weights that do not depend on earlier updates. The *base weight* of a
+constraint is its weight without the loss: 1, or less where the errors of several measurements are
+correlated.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, assert_never, Final
 
 import numpy as np
 
@@ -26,51 +41,82 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.losses import costs_and_weights
 from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
 
-# Number of the newest constraints that are reweighted at each update; as many older ones are, too.
-WINDOW = 200
-# Smallest relative change of a weight that is applied at an update.
-LEAST_CHANGE = 0.005
-# The same of a refinement: number of constraints at a time, and smallest change.
-PART, LEAST_REFINED = 2000, 1e-4
+# New weights of edges and of observed nodes, by id.
+Changes = tuple[Mapping[int, float], Mapping[int, float]]
 
 _LOSSES = tuple(Loss)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tuning:
+    """How much work reweighting is."""
+
+    window: int = 200           # the newest constraints of each kind, and as many older, at a time
+    least_change: float = 0.005     # smallest relative change of a weight that an update applies
+    part: int = 2000            # constraints of each kind that a refinement looks at at a time
+    least_refined: float = 1e-4     # smallest relative change of a weight that it applies
+
+
+TUNING: Final = _Tuning()
+
+
+def costs_and_weights(
+    loss: Loss, energy: FloatArray, threshold: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return costs [sigma^2] and weights for unweighted energies; negative ones count as 0."""
+    square = threshold**2
+    rho, weight = _normalized(loss, np.maximum(energy, 0.0) / square)
+    return square * rho, weight
+
+
+def _normalized(loss: Loss, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rho and its derivative, for z >= 0."""
+    match loss:
+        case Loss.NONE:
+            return z, np.ones_like(z)
+        case Loss.HUBER:
+            root = np.sqrt(np.maximum(z, 1.0))
+            return np.where(z > 1.0, 2.0 * root - 1.0, z), 1.0 / root
+        case Loss.CAUCHY:
+            return np.log1p(z), 1.0 / (1.0 + z)
+        case Loss.GEMAN_MCCLURE:
+            share = 1.0 / (1.0 + z)
+            return z * share, share**2
+        case Loss.DCS:
+            switch = 2.0 / (1.0 + np.maximum(z, 1.0))
+            return np.where(z > 1.0, 3.0 - 2.0 * switch, z), switch**2
+        case Loss.TUKEY:
+            left = 1.0 - np.minimum(z, 1.0)
+            return (1.0 - left**3) / 3.0, left**2
+        case Loss.TRUNCATED:
+            return np.minimum(z, 1.0), np.where(z > 1.0, 0.0, 1.0)
+        case _:
+            assert_never(loss)
 
 
 @dataclass(frozen=True, slots=True)
 class SavedLosses:
     """Saved state of the constraints of one table that have a robust loss."""
 
-    rows: Integers
-    """Ids of the constraints."""
+    rows: Integers      # ids
     losses: Annotated[IntArray, Choices(Loss)]
-    thresholds: Numbers
-    """[sigma]."""
-    shares: Numbers
-    """Base weights."""
-    cursor: int
-    """Index of the older constraint that is reweighted next."""
+    thresholds: Numbers     # [sigma]
+    shares: Numbers     # base weights
+    cursor: int         # index of the older constraint that is reweighted next
 
 
 @dataclass
 class _Rows:
     """Constraints of one table that have a robust loss, in the order in which they were added."""
 
-    edges: bool
-    """Whether they are edges; else they are observed nodes."""
-    ids: GrowingArray = field(default_factory=lambda: GrowingArray((), np.int64))
-    """Ids of the constraints, ascending."""
+    edges: bool     # else they are observed nodes
+    ids: GrowingArray = field(default_factory=lambda: GrowingArray((), np.int64))   # ascending
+    # index of the loss in `Loss`, and its threshold [sigma]
     losses: GrowingArray = field(default_factory=lambda: GrowingArray((2,), np.float64))
-    """Index of the loss in `Loss`, and its threshold [sigma]."""
     base_weights: GrowingArray = field(default_factory=lambda: GrowingArray((), np.float64))
-    cursor: int = 0
-
-    def alike(self, weight: float) -> Mapping[int, float]:
-        """Return the base weights times a weight, by id."""
-        weights = weight * self.base_weights.values
-        return dict(zip(self.ids.values.tolist(), weights.tolist(), strict=True))
+    cursor: int = 0     # index of the older constraint that is reweighted next
 
     def saved(self) -> SavedLosses:
         losses = self.losses.values
@@ -84,13 +130,17 @@ class _Rows:
         self.base_weights.append(saved.shares)
         self.cursor = saved.cursor
 
+    def add(self, number: int, loss: IntArray | tuple[int, float], base_weight: float) -> None:
+        self.ids.append_one(number)
+        self.losses.append_one(loss)
+        self.base_weights.append_one(base_weight)
+
     def index(self, number: int) -> int:
         """Return the index of a constraint by its id, -1 if it was not added."""
         at = int(np.searchsorted(self.ids.values, number))
         return at if at < len(self.ids) and self.ids.values[at] == number else -1
 
     def forget(self, ids: IntArray) -> None:
-        """Forget constraints that have left the graph."""
         gone = np.isin(self.ids.values, ids)
         if not np.any(gone):
             return
@@ -102,10 +152,10 @@ class _Rows:
     def some(self) -> IntArray:
         """Return the indices of the newest ones and, in turn, of some older ones."""
         size = len(self.ids)
-        begin = max(size - WINDOW, 0)
+        begin = max(size - TUNING.window, 0)
         if begin == 0:
             return np.arange(size)
-        older = (self.cursor + np.arange(min(WINDOW, begin))) % begin
+        older = (self.cursor + np.arange(min(TUNING.window, begin))) % begin
         self.cursor = int(older[-1] + 1) % begin
         return np.concatenate((older, np.arange(begin, size)))
 
@@ -131,7 +181,7 @@ class _Rows:
                 for k, (kind, threshold) in enumerate(kinds)]
 
     def energies(self, graph: Graph, ids: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return unweighted energies and weights of constraints, shape (M,) each."""
+        """Return unweighted energies and weights of constraints."""
         some: Edges | ObservedNodes
         if self.edges:
             some = graph.edges_at(ids)
@@ -146,132 +196,73 @@ class Reweighting:
     """Computes the weights of constraints with a robust loss."""
 
     def __init__(self) -> None:
-        self._edges, self._observed = _Rows(edges=True), _Rows(edges=False)
+        self._edges, self._observed = self._tables = _Rows(edges=True), _Rows(edges=False)
 
     def __len__(self) -> int:
-        return len(self._edges.ids) + len(self._observed.ids)
+        return sum(len(table.ids) for table in self._tables)
 
     def forget(self, edges: IntArray, observed: IntArray) -> None:
-        """
-        Forget constraints that have left the graph.
-
-        Parameters
-        ----------
-        edges, observed : ndarray of int64, ids
-
-        """
+        """Forget constraints that have left the graph."""
         self._edges.forget(edges)
         self._observed.forget(observed)
+
+    def _table(self, *, edge: bool) -> _Rows:
+        return self._edges if edge else self._observed
 
     def add(self, number: int, loss: Loss, threshold: float, *, edge: bool) -> None:
         """
         Add an edge or an observed node with the base weight 1; one without a loss is ignored.
 
-        Parameters
-        ----------
-        number : int, id, above those of its kind that were added before
-        loss : Loss
-        threshold : float, threshold of the loss [sigma]
-        edge : bool, whether it is an edge
-
+        Its id must be above those of its kind that were added before.
         """
         if loss is not Loss.NONE:
-            table = self._edges if edge else self._observed
-            table.ids.append_one(number)
-            table.losses.append_one((_LOSSES.index(loss), threshold))
-            table.base_weights.append_one(1.0)
+            self._table(edge=edge).add(number, (_LOSSES.index(loss), threshold), 1.0)
 
     def move(self, number: int, to: int, *, edge: bool, to_edge: bool) -> None:
         """
         Give the loss and the base weight of a constraint to another one that replaces it.
 
         The base weight of the old one becomes 0. Nothing happens if it has no loss.
-
-        Parameters
-        ----------
-        number, to : int, ids; one that is new is above those of its kind before
-        edge, to_edge : bool, whether they are edges
-
         """
-        old, new = (self._edges if which else self._observed for which in (edge, to_edge))
+        old, new = self._table(edge=edge), self._table(edge=to_edge)
         at, at_new = old.index(number), new.index(to)
         if at < 0:
             return
         if at_new < 0:
             at_new = len(new.ids)
-            new.ids.append_one(to)
-            new.losses.append_one(old.losses.values[at])
-            new.base_weights.append_one(0.0)
+            new.add(to, old.losses.values[at], 0.0)
         new.base_weights.values[at_new] = old.base_weights.values[at]
         old.base_weights.values[at] = 0.0
 
     def scale_base_weights(self, ids: IntArray, factor: float) -> None:
-        """
-        Multiply the base weights of edges, where they have a loss.
-
-        Parameters
-        ----------
-        ids : ndarray of int64, of edges
-        factor : float
-
-        """
+        """Multiply the base weights of edges, where they have a loss."""
         table = self._edges
         table.base_weights.values[np.isin(table.ids.values, ids)] *= factor
 
     def knows(self, number: int, *, edge: bool) -> bool:
-        """
-        Tell whether a constraint has a loss.
-
-        Parameters
-        ----------
-        number : int, id
-        edge : bool, whether it is an edge, else an observed node
-
-        """
-        return (self._edges if edge else self._observed).index(number) >= 0
+        """Tell whether a constraint has a loss."""
+        return self._table(edge=edge).index(number) >= 0
 
     def base_weight(self, number: int) -> float | None:
         """Return the base weight of an observed node, by its id; None without a loss."""
-        table = self._observed
-        at = table.index(number)
-        return float(table.base_weights.values[at]) if at >= 0 else None
-
-    def uses(self, number: int, weight: float) -> bool:
-        """
-        Tell whether an observed node is used, even if its loss has left nothing of its weight.
-
-        Parameters
-        ----------
-        number : int, id
-        weight : float, in the graph
-
-        """
-        base = self.base_weight(number)
-        return (weight if base is None else base) > 0.0
+        at = self._observed.index(number)
+        return float(self._observed.base_weights.values[at]) if at >= 0 else None
 
     def set_base_weight(self, number: int, weight: float, *, edge: bool = False) -> None:
-        """
-        Set the base weight of a constraint, if it was added.
-
-        Parameters
-        ----------
-        number : int, id
-        weight : float
-        edge : bool, whether it is an edge, else an observed node
-
-        """
-        table = self._edges if edge else self._observed
+        """Set the base weight of a constraint, if it was added."""
+        table = self._table(edge=edge)
         at = table.index(number)
         if at >= 0:
             table.base_weights.values[at] = weight
 
     def base_weights(self) -> tuple[FloatArray, FloatArray]:
         """Return copies of the base weights of edges and of observed nodes."""
-        return (self._edges.base_weights.values.copy(), self._observed.base_weights.values.copy())
+        edges, observed = (table.base_weights.values.copy() for table in self._tables)
+        return edges, observed
 
     def set_base_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
         """Set what `base_weights` has returned; nothing may have been added in between."""
-        for table, values in zip((self._edges, self._observed), weights, strict=True):
+        for table, values in zip(self._tables, weights, strict=True):
             table.base_weights.values[:] = values
 
     def saved(self) -> tuple[SavedLosses, SavedLosses]:
@@ -279,77 +270,42 @@ class Reweighting:
         return self._edges.saved(), self._observed.saved()
 
     def restore(self, edges: SavedLosses, observed: SavedLosses) -> None:
-        """
-        Restore what `saved` returned; nothing may have been added before.
-
-        Parameters
-        ----------
-        edges, observed : SavedLosses
-
-        """
+        """Restore what `saved` returned; nothing may have been added before."""
         self._edges.restore(edges)
         self._observed.restore(observed)
 
-    def changes(self, graph: Graph) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """
-        Return new weights of edges and of observed nodes, by id, for the next update.
+    def _each(self, changes: Callable[[_Rows], Mapping[int, float]]) -> Changes:
+        return changes(self._edges), changes(self._observed)
 
-        At most 2 `WINDOW` constraints of each kind are considered, and only weights that change
-        by more than the fraction `LEAST_CHANGE` are returned.
-        """
-        return (self._edges.changes(graph, self._edges.some(), least=LEAST_CHANGE),
-                self._observed.changes(graph, self._observed.some(), least=LEAST_CHANGE))
+    def changes(self, graph: Graph) -> Changes:
+        """Return new weights of some constraints, where they change, for the next update."""
+        return self._each(
+            lambda table: table.changes(graph, table.some(), least=TUNING.least_change))
 
-    def changes_of_part(
-        self, graph: Graph, begin: int,
-    ) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """
-        Return new weights of edges and of observed nodes, by id, for a refinement.
+    def changes_of_part(self, graph: Graph, begin: int) -> Changes:
+        """Return new weights for a refinement, of the constraints from an index on."""
+        def of(table: _Rows) -> Mapping[int, float]:
+            size = len(table.ids)
+            part = (begin + np.arange(min(TUNING.part, size))) % max(size, 1)
+            return table.changes(graph, part, least=TUNING.least_refined)
 
-        At most `PART` constraints of each kind are considered, those from an index on, and only
-        weights that change by more than the fraction `LEAST_REFINED` are returned.
+        return self._each(of)
 
-        Parameters
-        ----------
-        graph : Graph
-        begin : int
+    def all_changes(self, graph: Graph, widened: float = 1.0) -> Changes:
+        """Return the new weights of all constraints whose weight changes."""
+        return self._each(lambda table: table.changes(
+            graph, np.arange(len(table.ids)), widened=widened))
 
-        """
-        edges, observed = (
-            table.changes(graph, (begin + np.arange(min(PART, size))) % max(size, 1),
-                          least=LEAST_REFINED)
-            for table in (self._edges, self._observed) for size in (len(table.ids),))
-        return edges, observed
-
-    def all_changes(
-        self, graph: Graph, widened: float = 1.0,
-    ) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """
-        Return the new weights of all edges and observed nodes whose weight changes, by id.
-
-        Parameters
-        ----------
-        graph : Graph
-        widened : float, factor on all thresholds
-
-        """
-        edges, observed = (
-            table.changes(graph, np.arange(len(table.ids)), widened=widened)
-            for table in (self._edges, self._observed))
-        return edges, observed
-
-    def all_alike(self, weight: float) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """
-        Return the base weights of all edges and observed nodes times a weight, by id.
-
-        The weight 1 makes it a plain least-squares problem.
-        """
-        return self._edges.alike(weight), self._observed.alike(weight)
+    def all_alike(self, weight: float) -> Changes:
+        """Return the base weights of all times a weight; 1 makes it plain least squares."""
+        return self._each(lambda table: dict(zip(
+            table.ids.values.tolist(), (weight * table.base_weights.values).tolist(),
+            strict=True)))
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""
         total = 0.0
-        for table in (self._edges, self._observed):
+        for table in self._tables:
             energy, weight = table.energies(graph, table.ids.values)
             for loss, threshold, chosen in table.groups(np.arange(len(table.ids))):
                 costs, _ = costs_and_weights(loss, energy[chosen], threshold)

@@ -1,10 +1,11 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Write new rows behind the ends of the tables, with a quick validation.
+Rows of the tables: found by their ids, marked, and written behind the ends.
 
-A row is *valid* if it passes the quick checks in here. Rows that do not are checked again by
-`constraints.check`, which accepts them or raises an exception with the reason.
+Ids are permanent, and rows are in the order of their ids, so the row of an id is found by
+bisection. A new row is *valid* if it passes the quick checks in here. Those that do not are
+checked again by `checks.check`, which accepts them or raises an exception with the reason.
 """
 
 import math
@@ -12,13 +13,9 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import factors, identities, tables as tb
-from pose_graph_ros.core.graph.factor_types import BIAS
-from pose_graph_ros.core.graph.kinds import FACTORS, NodeKind, ObservedKind
+from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph.constraints import FACTORS, NodeKind, ObservedKind
 
-# Tolerance of the symmetry and the eigenvalues of an information matrix whose diagonal is scaled
-# to 1; a tenth of that in `constraints.check`.
-_TOLERANCE = 1e-6
 # By kind of edges: bits of the kinds of nodes (1 << kind) that its ends may be, END_K also none,
 # and of the rows that its error has.
 _NO_NODE = len(NodeKind)
@@ -27,6 +24,81 @@ _ENDS = np.array([[sum(1 << kind for kind in kinds) for kinds in (factor.i, fact
 _ROWS = np.array([sum(1 << row for row in factor.rows) for factor in FACTORS.values()])
 _OBSERVED_KINDS = tuple(map(int, ObservedKind))
 
+
+@kernel
+def _row(number, ids, n, next_id):  # type: ignore[no-untyped-def]
+    """Return the row of an id among the first n, -1 if it has left; new ones are behind them."""
+    if number >= next_id:
+        return n + number - next_id
+    if next_id == n:    # nothing has left: ids are rows
+        return number
+    low, high = 0, n
+    while low < high:
+        middle = (low + high) // 2
+        if ids[middle] < number:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < n and ids[low] == number else -1
+
+
+@kernel
+def node_row(head, node):  # type: ignore[no-untyped-def]
+    """
+    Return the row of a hidden node, negative if it has left the graph.
+
+    The next new ids have the rows behind the last, so those of an update that is being added are
+    found as well.
+    """
+    return _row(node, tb.node_id(head), head[tb.N_NODES], head[tb.NEXT_NODE])
+
+
+@kernel
+def entry_of(head, number, is_edge):  # type: ignore[no-untyped-def]
+    """Return the entry of an edge or an observed node that is in the graph, by its id."""
+    if is_edge:
+        return _row(number, tb.edge_id(head), head[tb.N_EDGES], head[tb.NEXT_EDGE])
+    return -1 - _row(
+        number, tb.observed_id(head), head[tb.N_OBSERVED], head[tb.NEXT_OBSERVED])
+
+
+@kernel
+def touch(head, v):  # type: ignore[no-untyped-def]
+    """Mark a node for elimination in the next iteration; the caller has logged its row."""
+    node_i, touched = tb.node_i(head), tb.touched(head)
+    if node_i[v, tb.TOUCHED] == 0:
+        node_i[v, tb.TOUCHED] = 1
+        touched[head[tb.N_TOUCHED]] = v
+        head[tb.N_TOUCHED] += 1
+
+
+# --- diagonal scales: the information that the constraints of each node have on it alone --------
+
+@kernel
+def add_to_scale(head, v, position, heading):  # type: ignore[no-untyped-def]
+    """Add information [1/m^2, 1/rad^2], or its change, to the squared scales of a node."""
+    f = tb.node_f(head)[v]
+    f[tb.SCALE_T] = math.sqrt(max(f[tb.SCALE_T] * f[tb.SCALE_T] + position, 0.0))
+    f[tb.SCALE_R] = math.sqrt(max(f[tb.SCALE_R] * f[tb.SCALE_R] + heading, 0.0))
+
+
+@kernel
+def scale_by(head, entry, weight):  # type: ignore[no-untyped-def]
+    """Add the information of a constraint with a weight to the diagonal scales of its ends."""
+    f, kind, i, j, k = factors.parts(head, entry)
+    position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
+    heading = weight * f[tb.INFO + 5]
+    # of a relative error the length of the mean, of others that of the offset
+    arm2 = f[tb.OWN] * f[tb.OWN] + f[tb.OWN + 1] * f[tb.OWN + 1]
+    add_to_scale(head, i, position, heading + position * arm2)
+    if entry >= 0:
+        ft, fth = factors.factors_of_end(f, kind)
+        add_to_scale(head, j, ft * ft * position, fth * fth * heading)
+    if k >= 0:
+        add_to_scale(head, k, heading * (f[tb.FACTOR_TH] * f[tb.FACTOR_TH]), 0.0)
+
+
+# --- new rows -----------------------------------------------------------------------------------
 
 @kernel
 def _is_finite(x):  # type: ignore[no-untyped-def]
@@ -41,6 +113,8 @@ def _pack_information(to, w):  # type: ignore[no-untyped-def]
 
     Return whether the matrix is finite, symmetric, positive semidefinite and not zero.
     """
+    # for symmetry and eigenvalues with the diagonal scaled to 1; a tenth of that in `checks.check`
+    tolerance = 1e-6
     at = tb.INFO
     xx, yy, tt = w[0, 0], w[1, 1], w[2, 2]
     xy, xt, yt = 0.5 * (w[0, 1] + w[1, 0]), 0.5 * (w[0, 2] + w[2, 0]), 0.5 * (w[1, 2] + w[2, 1])
@@ -50,16 +124,16 @@ def _pack_information(to, w):  # type: ignore[no-untyped-def]
     if not (_is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
         return False
     sx, sy, st = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
-    skew = max(abs(w[0, 1] - w[1, 0]) - _TOLERANCE * sx * sy,
-               abs(w[0, 2] - w[2, 0]) - _TOLERANCE * sx * st,
-               abs(w[1, 2] - w[2, 1]) - _TOLERANCE * sy * st)
+    skew = max(abs(w[0, 1] - w[1, 0]) - tolerance * sx * sy,
+               abs(w[0, 2] - w[2, 0]) - tolerance * sx * st,
+               abs(w[1, 2] - w[2, 1]) - tolerance * sy * st)
     if not skew <= 0.0:
         return False
     # leading minors of the correlation matrix, with the tolerance added to its diagonal
     a = xy / (sx * sy) if xy != 0.0 else 0.0
     b = xt / (sx * st) if xt != 0.0 else 0.0
     c = yt / (sy * st) if yt != 0.0 else 0.0
-    d = 1.0 + _TOLERANCE
+    d = 1.0 + tolerance
     return (d * d - a * a > 0.0
             and d * (d * d - c * c) - a * (a * d - b * c) + b * (a * c - b * d) > 0.0)
 
@@ -80,17 +154,8 @@ def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
 
 @kernel
 def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
-    """
-    Return whether an edge is valid after writing it; its nodes, kind and bias are not checked.
-
-    Parameters
-    ----------
-    e : int, row
-    i, j, mean, information, kind, weight : int, ndarray or float, values of the columns of `Edges`
-
-    """
-    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
-    f, row = edge_f[e], edge_i[e]
+    """Write an edge; return whether it is valid, its nodes, kind and bias apart."""
+    f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
     row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.EDGE_KIND] = i, j, -1, kind
     f[tb.WEIGHT] = weight
     valid = _is_finite(weight) and weight >= 0.0 and i != j
@@ -98,56 +163,19 @@ def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[
 
 
 @kernel
-def write_observed(  # type: ignore[no-untyped-def]
-    head, k, node, offset, mean, information, kind, weight,
-):
-    """
-    Return whether an observed node is valid after writing it; its node and kind are not checked.
-
-    Parameters
-    ----------
-    k : int, row
-    node, offset, mean, information, kind, weight : int, ndarray or float
-        Values of the columns of `ObservedNodes`.
-
-    """
-    observed_f, observed_i = tb.observed_f(head), tb.observed_i(head)
-    f, row = observed_f[k], observed_i[k]
-    row[tb.OBS_NODE], row[tb.OBS_KIND] = node, kind
-    f[tb.WEIGHT] = weight
-    valid = _copy_pose(f, tb.MEAN, mean) and _is_finite(weight) and weight >= 0.0
-    valid = _copy_pose(f, tb.OFFSET, offset) and valid
-    return _pack_information(f, information) and valid
-
-
-@kernel
 def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
-    """
-    Return whether the poses of new hidden nodes are finite after writing them, headings wrapped.
-
-    Parameters
-    ----------
-    first : int, first row
-    poses : ndarray, shape (N, 3) [m, m, rad]
-
-    """
-    node_f = tb.node_f(head)
+    """Write poses of new hidden nodes, headings wrapped; return whether all are finite."""
     valid = True
     for k in range(len(poses)):
-        f = node_f[first + k]
-        if not _copy_pose(f, tb.POSE, poses[k]):
-            valid = False
+        f = tb.node_f(head)[first + k]
+        valid = _copy_pose(f, tb.POSE, poses[k]) and valid
         f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2])
     return valid
 
 
 @kernel
 def _node(head, v, first_other, types):  # type: ignore[no-untyped-def]
-    """
-    Return kind and dimension of a node, _NO_NODE and 0 for -1.
-
-    Parameters as for `write_edges`.
-    """
+    """Return kind and dimension of a node, new ones as in `write_edges`; _NO_NODE, 0 for -1."""
     if v < 0:
         return _NO_NODE, 0
     if v < head[tb.N_NODES]:
@@ -172,28 +200,21 @@ def write_edges(  # type: ignore[no-untyped-def]
     head, n_nodes, first_other, types, i, j, mean, information, kind, weight, bias, third,
 ):
     """
-    Return whether new edges are all valid after writing them behind the last row.
+    Write new edges behind the last row; return whether all are valid.
 
-    Parameters
-    ----------
-    n_nodes : int, number of hidden nodes, with the new ones
-    first_other : int, first row of the new nodes that are no poses
-    types : ndarray, NODE_TYPE of these
-    i, j, mean, information, kind, weight, bias, third : ndarray, columns of `Edges`
-
+    The graph will have n_nodes nodes, those from row `first_other` on with these NODE_TYPEs.
     """
-    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
     valid = True
     for k in range(len(i)):
         e = head[tb.N_EDGES] + k
-        a, b, c = identities.node_row(head, i[k]), identities.node_row(head, j[k]), -1
+        a, b, c = node_row(head, i[k]), node_row(head, j[k]), -1
         if third[k] != -1:
-            c = identities.node_row(head, third[k])
+            c = node_row(head, third[k])
             valid = valid and c >= 0
         valid = write_edge(
             head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
-        f = edge_f[e]
-        edge_i[e, tb.END_K] = c
+        f = tb.edge_f(head)[e]
+        tb.edge_i(head)[e, tb.END_K] = c
         f[tb.OFFSET], f[tb.OFFSET + 1] = bias[k, 0], bias[k, 1]
         f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
         for m in range(4):
@@ -205,36 +226,29 @@ def write_edges(  # type: ignore[no-untyped-def]
                     _node(head, c, first_other, types))
             for m in range(3):
                 valid = valid and (_ENDS[kind[k], m] >> ends[m][0]) & 1 == 1
-            if kind[k] == BIAS:     # of the rows that both nodes have
+            if kind[k] == factors.BIAS:     # of the rows that both nodes have
                 valid = valid and _has_rows_only(
                     f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
-            elif kind[k] > BIAS:
+            elif kind[k] > factors.BIAS:
                 valid = valid and _has_rows_only(f, _ROWS[kind[k]], True)
     return valid
 
 
 @kernel
-def write_all_observed(  # type: ignore[no-untyped-def]
+def write_observed(  # type: ignore[no-untyped-def]
     head, n_nodes, first_other, types, node, offset, mean, information, kind, weight,
 ):
-    """
-    Return whether new observed nodes are all valid after writing them behind the last row.
-
-    Parameters
-    ----------
-    n_nodes, first_other, types : int or ndarray, as for `write_edges`
-    node, offset, mean, information, kind, weight : ndarray, columns of `ObservedNodes`
-
-    """
+    """Write new observed nodes behind the last row, as `write_edges`."""
     valid = True
     for k in range(len(node)):
-        row = head[tb.N_OBSERVED] + k
-        v = identities.node_row(head, node[k])
-        valid = write_observed(head, row, v, offset[k], mean[k], information[k], kind[k],
-                               weight[k]) and valid
-        valid = valid and 0 <= v < n_nodes and kind[k] in _OBSERVED_KINDS
+        at, v = head[tb.N_OBSERVED] + k, node_row(head, node[k])
+        f, row = tb.observed_f(head)[at], tb.observed_i(head)[at]
+        row[tb.OBS_NODE], row[tb.OBS_KIND], f[tb.WEIGHT] = v, kind[k], weight[k]
+        valid = _copy_pose(f, tb.OFFSET, offset[k]) and valid
+        valid = write_measurement(f, mean[k], information[k]) and valid
+        valid = (valid and _is_finite(weight[k]) and weight[k] >= 0.0 and 0 <= v < n_nodes
+                 and kind[k] in _OBSERVED_KINDS)
         if valid:
             dimension = _node(head, v, first_other, types)[1]
-            valid = dimension == 3 or _has_rows_only(
-                tb.observed_f(head)[row], (1 << dimension) - 1, False)
+            valid = dimension == 3 or _has_rows_only(f, (1 << dimension) - 1, False)
     return valid

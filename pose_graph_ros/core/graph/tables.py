@@ -49,7 +49,7 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 # node_i
 #   CLIQUE: row of the clique that the node is frontal in
 #   EDGE_LIST: head of the list of its edges with a weight above 0; an entry is 4 * edge + side
-#       (0: END_I, 1: END_J, 2: END_K); LEAVES if `compaction` takes the node out after the update
+#       (0: END_I, 1: END_J, 2: END_K); LEAVES if `removal.compact` takes the node out later
 #   OBSERVED_LIST: head of the list of its observed nodes with a weight above 0
 #   FIXED: 1 if the node keeps its pose
 #   TOUCHED: 1 if the node is in the table `touched`
@@ -84,7 +84,7 @@ OFFSET, FACTOR_T, FACTOR_TH = OWN, LIN_COS, LIN_SIN
 #   END_I, END_J: nodes that the edge starts from and leads to
 #   END_K: third node, or -1
 #   NEXT_I, NEXT_J, NEXT_K: next entries of the edge lists of END_I, END_J and END_K; NEXT_I:
-#       LEAVES if `compaction` takes the edge out, as it does all edges of nodes that leave
+#       LEAVES if `removal.compact` takes the edge out, as it does all edges of nodes that leave
 #   EDGE_KIND: `EdgeKind`
 #   EDGE_CHECKED: stamp (ITERATION) of the last check of the linearization
 #   EDGE_WAITS: 1 if the edge is in the table `waiting`
@@ -99,7 +99,7 @@ OFFSET, FACTOR_T, FACTOR_TH = OWN, LIN_COS, LIN_SIN
 OBS_F = EDGE_F
 # observed_i
 #   OBS_NODE: hidden node that is observed
-#   OBS_NEXT: next entry of its list of observed nodes; LEAVES if `compaction` takes it out
+#   OBS_NEXT: next entry of its list of observed nodes; LEAVES if `removal.compact` takes it out
 #   OBS_KIND: `ObservedKind`
 #   OBS_WAITS, OBS_LOGGED: as EDGE_WAITS and EDGE_LOGGED
 OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = range(6)
@@ -175,7 +175,7 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #   ROUND: number of iterations of the refinement so far
 #   INTERRUPT: set to 1 by another thread to end a refinement
 #   NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED: ids of the next new rows
-#   N_LEAVING: number of rows that `compaction` takes out after the update, without those that
+#   N_LEAVING: number of rows that `removal.compact` takes out after the update, without those that
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 (N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
@@ -217,10 +217,6 @@ STAMPS: Final = {
     'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_LOGGED),
 }
 
-# Size from which on a table gets memory pages of its own [bytes]. Unused pages cost address space
-# only, so tables grow by a large factor and are rarely copied.
-OWN_PAGES: Final = 2**18
-GROWTH: Final = 4
 # Capacity of a new table [rows]; rows never written to take no memory.
 FIRST_ROWS: Final = 1024
 
@@ -283,12 +279,11 @@ def _pages(shape: int | tuple[int, int], dtype: type[np.generic]) -> npt.NDArray
     """
     Return an array of zeros; a large one has pages of its own, which take memory when written to.
 
-    NumPy would allocate huge pages and keep them in the process after a table has grown out of
-    them, which would double the memory of the tables. The pages are private: a process that is
-    forked from this one gets copies of those that it writes to.
+    NumPy would allocate huge pages and keep them after a table has grown out of them. The pages
+    are private: a process that is forked from this one gets copies of those that it writes to.
     """
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    if size < OWN_PAGES:
+    if size < 2**18:
         return np.zeros(shape, dtype)
     pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with contextlib.suppress(OSError):  # a kernel without huge pages
@@ -305,9 +300,7 @@ class Memory:
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:
-            self.ensure(name, FIRST_ROWS)
-        self.ensure('pool_f', 32 * FIRST_ROWS)
-        self.ensure('pool_i', 4 * FIRST_ROWS)
+            self.ensure(name, {'pool_f': 32, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
         self.ensure('work_f', 256)  # for `chain` and `relinearization`; fronts ask for more
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
@@ -315,22 +308,14 @@ class Memory:
         return self._tables[name]
 
     def ensure(self, name: str, rows: int, *, keep: int = 0) -> None:
-        """
-        Make a table grow to at least a given number of rows.
-
-        Parameters
-        ----------
-        name : str
-        rows : int
-        keep : int, rows in use, which are copied; the rows after them may be lost
-
-        """
+        """Make a table grow to at least a given number of rows."""
         at = 2 * NAMES.index(name)
         if name in self._tables and rows <= self.head[at + 1]:
             return
         columns = FLOAT_TABLES.get(name, 0) or INT_TABLES[name]
         dtype = np.float64 if name in FLOAT_TABLES else np.int32
-        capacity = max(rows, GROWTH * int(self.head[at + 1]))
+        # unused pages cost address space only, so tables grow fast and are rarely copied
+        capacity = max(rows, 4 * int(self.head[at + 1]))
         grown = _pages(capacity if columns == 1 else (capacity, columns), dtype)
         if keep > 0:
             grown[:keep] = self._tables[name][:keep]

@@ -30,9 +30,9 @@ edge between consecutive ids is read as odometry, any other as a loop closure. O
 matrix the upper triangle is written.
 
 The tags `VERTEX2` and `EDGE2` are used by two formats with different numbers: TORO orders the
-information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22 R23 R33. The
-caller has to say which of them a file has. `VERTEX` and `EDGE` are TORO's old tags, `ODOMETRY` is
-another one of iSAM's for `EDGE2`. iSAM's `LANDMARK i l x y R11 R12 R22` is read as
+information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22 R23 R33.
+`read_guessed` finds out which of them a file has. `VERTEX` and `EDGE` are TORO's old tags,
+`ODOMETRY` is another one of iSAM's for `EDGE2`. iSAM's `LANDMARK i l x y R11 R12 R22` is read as
 `EDGE_SE2_XY`, with the square root of the information (M. Kaess, iSAM 1.7, `Loader.cpp`).
 Landmarks have their own numbers there, so they get others if a pose has one of these.
 
@@ -44,19 +44,30 @@ are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge
 connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
+from bisect import bisect_left
+from dataclasses import dataclass
+import functools
 from functools import cached_property
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError, GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import check, Edges, ObservedNodes
+from pose_graph_ros.core.graph.checks import check
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    Edges,
+    FACTORS,
+    NodeKind,
+    ObservedKind,
+    ObservedNodes,
+)
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
-from pose_graph_ros.core.graph.kinds import EdgeKind, FACTORS, NodeKind, ObservedKind
 from pose_graph_ros.core.io.g2o_text import (
     AMBIGUOUS,
     GraphText,
@@ -81,33 +92,15 @@ _EDGES = ('EDGE_SE2', 'EDGE', *AMBIGUOUS, *OWN_TAGS.values())
 _OBSERVED = ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET')
 
 
+@dataclass
 class GraphFile:
-    """
-    A graph that was read from a file.
+    """A graph that was read from a file."""
 
-    Parameters
-    ----------
-    rows : GraphRows
-    ids : ndarray of int, shape (N,), id in the file of each hidden node, increasing
-    has_start : bool
-    skipped : dict of str to int
-    notes : tuple of str
-
-    """
-
-    def __init__(
-        self, rows: GraphRows, ids: IntArray, has_start: bool, skipped: dict[str, int],
-        notes: tuple[str, ...] = (),
-    ) -> None:
-        self.rows = rows
-        """The graph as it was read."""
-        self.ids = ids
-        self.has_start = has_start
-        """Whether the file has the poses of all nodes; else missing ones were composed."""
-        self.skipped = skipped
-        """Number of lines that were skipped, by their tag."""
-        self.notes = notes
-        """Sentences about what was read otherwise than it is in the file."""
+    rows: GraphRows
+    ids: IntArray  # id in the file of each hidden node, increasing
+    has_start: bool  # whether the file has the poses of all nodes; else missing ones were composed
+    skipped: dict[str, int]  # number of lines that were skipped, by their tag
+    notes: tuple[str, ...] = ()  # sentences about what was read otherwise than it is in the file
 
     @cached_property
     def graph(self) -> 'Graph':
@@ -127,11 +120,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     without `VERTEX_SE2` is composed from edges, breadth-first from the nodes with a pose, else
     from the smallest id. Lines with tags that are not known are skipped. If the file is not such
     a graph, a FileFormatError names the file and the line, what was expected and what was found.
-
-    Parameters
-    ----------
-    edge2_order : {'toro', 'isam'}, optional, format of `EDGE2` in this file, else ValueError
-
+    `edge2_order` is the format of `EDGE2` in this file, one of `EDGE2_ORDERS`.
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
@@ -139,15 +128,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
 
 def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
-    """
-    Return the graph in the lines of a file, as `read_g2o` does.
-
-    Parameters
-    ----------
-    text : GraphText
-    edge2_order : {'toro', 'isam'}, optional
-
-    """
+    """Return the graph in the lines of a file, as `read_g2o` does."""
     ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if tag in text.tags]
     if edge2_order is None and len(ambiguous) > 0:
         line, tag = min(ambiguous)
@@ -281,12 +262,7 @@ def compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
     """
     Set the poses of the nodes that are not known by composing edges, breadth-first.
 
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), is changed in place [m, m, rad]
-    known : ndarray of bool, shape (N,); in a part without any, its first node stays
-    edges : Edges
-
+    In a part without any that is known, its first node stays.
     """
     neighbours: dict[int, list[tuple[int, list[float]]]] = {}
     placing = edges.rows(np.isin(edges.kind, _PLACING))
@@ -344,18 +320,95 @@ def _first_refused(
         lines = rows[tag].rows(np.argsort(rows[tag].lines, kind='stable'))
         table = (_edges(tag, lines, ids, edge2_order) if tag in _EDGES
                  else _observed(tag, lines, ids))
-        # the rows before `low` are valid, one of those up to `high` is not
-        low, high, reason = 0, len(lines), None
-        while low < high:
-            middle = (low + high) // 2
-            try:
-                check(table.rows(slice(low, middle + 1)), kind)
-                low = middle + 1
-            except GraphUpdateError as error:
-                high, reason = middle, error
-        if reason is not None and low < len(lines):
-            found.append((int(lines.lines[low]), reason))
+        refused = functools.partial(_is_refused, table, kind)
+        n = bisect_left(range(len(lines)), True, key=refused)
+        if n < len(lines) and (reason := _refusal(table.rows(slice(n, n + 1)), kind)) is not None:
+            found.append((int(lines.lines[n]), reason))
     if len(found) == 0:
         return None
     line, reason = min(found, key=lambda each: each[0])
     return text.where(line), reason
+
+
+def _is_refused(table: Edges | ObservedNodes, kind: IntArray, last: int) -> bool:
+    return _refusal(table.rows(slice(0, last + 1)), kind) is not None
+
+
+def _refusal(table: Edges | ObservedNodes, kind: IntArray) -> GraphUpdateError | None:
+    try:
+        check(table, kind)
+    except GraphUpdateError as error:
+        return error
+    return None
+
+
+class Guess(NamedTuple):
+    """A graph that was read, with what was guessed of its format."""
+
+    file: GraphFile
+    order: str | None  # of `EDGE2_ORDERS`; None if the file has no tag with two meanings
+    reason: str  # why this order; empty without a guess
+
+
+def read_guessed(path: Path) -> Guess:
+    """
+    Return the planar graph in a file as `read_g2o` does, its order found out if need be.
+
+    Read in the other's order, a file without correlations has the number for one coordinate in the
+    place of a correlation, so that a matrix is singular or indefinite. If all matrices are
+    positive definite in both orders, the graph is optimised with each. Then the one is kept with
+    which energies differ less, as measured by the mean over the median, whatever the unit of the
+    information is. Raises FileFormatError, with what is wrong in TORO's order, if neither can be
+    read.
+    """
+    text = read_lines(path)
+    if text.tags.isdisjoint(AMBIGUOUS):
+        return Guess(graph_of(text), None, '')
+    files: dict[str, GraphFile] = {}
+    errors: dict[str, FileFormatError] = {}
+    for order in EDGE2_ORDERS:
+        try:
+            files[order] = graph_of(text, order)
+        except FileFormatError as error:
+            errors[order] = error
+    if len(files) == 0:
+        raise errors[EDGE2_ORDERS[0]]
+    if 'LANDMARK' in text.tags and 'isam' in files:
+        return Guess(files['isam'], 'isam', 'LANDMARK is a tag of iSAM')
+    worst = {order: _smallest(file.rows) for order, file in files.items()}
+    definite = [order for order, value in worst.items() if value > 1e-9]
+    if len(definite) == 1:
+        other = next(order for order in EDGE2_ORDERS if order != definite[0])
+        return Guess(files[definite[0]], definite[0], (
+            f'in the order of {other} not all information matrices are positive definite'))
+    if len(files) == 1:
+        order, = files
+        return Guess(files[order], order, 'the other order is refused')
+    spread = {order: _spread(file.rows) for order, file in files.items()}
+    order = min(EDGE2_ORDERS, key=lambda each: spread[each])
+    other = next(each for each in EDGE2_ORDERS if each != order)
+    return Guess(files[order], order, (
+        f'at the optimum the mean energy of an edge is {spread[order]:.3g} times the median, in '
+        f'the order of {other} {spread[other]:.3g} times'))
+
+
+def _smallest(rows: GraphRows) -> float:
+    """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
+    information = rows.edges.information
+    root = np.sqrt(np.maximum(np.einsum('mii->mi', information), np.finfo(float).tiny))
+    scaled = information / root[:, :, None] / root[:, None, :]
+    return float(np.min(np.linalg.eigvalsh(scaled), initial=1.0))
+
+
+def _spread(rows: GraphRows) -> float:
+    """Return the mean over the median of the energies of edges at the optimum."""
+    # loads the compiled kernels
+    from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start  # noqa: PLC0415
+    from pose_graph_ros.core.graph.graph import Graph  # noqa: PLC0415
+
+    copy = Graph()
+    copy.fill(rows)
+    optimize_from_linear_start(copy, SolverConfig())
+    energies = copy.energies().edges
+    median = float(np.median(energies))
+    return float(np.mean(energies)) / median if median > 0.0 else np.inf

@@ -8,7 +8,7 @@ number of the first line that is wrong and the reason.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import NoReturn
@@ -17,7 +17,7 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.kinds import EdgeKind, FACTORS
+from pose_graph_ros.core.graph.constraints import EdgeKind, FACTORS
 
 # Tags with the format that the caller names, see `edge2_order`.
 AMBIGUOUS = ('EDGE2', 'ODOMETRY')
@@ -49,12 +49,9 @@ _GZIP = b'\x1f\x8b'
 class Lines:
     """The lines with one tag."""
 
-    ids: IntArray
-    """Shape (K, number of ids)."""
-    numbers: FloatArray
-    """Shape (K, number of values)."""
-    lines: IntArray
-    """Numbers of the lines in the file, from 1 on, shape (K,)."""
+    ids: IntArray  # shape (K, number of ids)
+    numbers: FloatArray  # shape (K, number of values)
+    lines: IntArray  # numbers of the lines in the file, from 1 on
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -77,16 +74,10 @@ class GraphText:
     """A file as columns of numbers."""
 
     path: Path
-    rows: dict[str, Lines]
-    """By tag, for all of `LAYOUT`."""
-    fixes: Lines
-    """Ids behind `FIX`, one a row."""
-    skipped: dict[str, int]
-    """Number of lines with other tags."""
-    switchable: int = 0
-    """Number of loop closures with a switch, among those of `EDGE_SE2`."""
-    tags: frozenset[str] = field(default=frozenset())
-    """All tags of `LAYOUT` that are in the file."""
+    rows: dict[str, Lines]  # by tag, for all of `LAYOUT`
+    fixes: Lines  # ids behind `FIX`, one a row
+    skipped: dict[str, int]  # number of lines with other tags
+    tags: frozenset[str]  # all of `LAYOUT` that are in the file
 
     def where(self, line: int) -> str:
         """Return the name of the file with that of a line."""
@@ -111,7 +102,6 @@ def read_lines(path: Path) -> GraphText:
     found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in LAYOUT}
     fixes: tuple[list[list[str]], list[int]] = ([], [])
     skipped: dict[str, list[list[str]]] = {}
-    switchable = 0
     for line, content in enumerate(read_text(path).splitlines(), 1):
         words = content.split()
         if len(words) == 0 or words[0][0] == '#':
@@ -119,7 +109,6 @@ def read_lines(path: Path) -> GraphText:
         tag = words[0]
         if tag == 'EDGE_SE2_SWITCHABLE':
             tag, words = 'EDGE_SE2', ['EDGE_SE2', *words[1:3], *words[4:]]
-            switchable += 1
         if tag in found:
             rows, lines = found[tag]
             rows.append(words)
@@ -139,7 +128,7 @@ def read_lines(path: Path) -> GraphText:
     except (ValueError, OverflowError):
         _raise_first(path, {**found, 'FIX': fixes})
     return GraphText(path, tables, fixed, {tag: len(each) for tag, each in skipped.items()},
-                     switchable, frozenset(tag for tag, table in tables.items() if len(table) > 0))
+                     frozenset(tag for tag, table in tables.items() if len(table) > 0))
 
 
 def _lines(words: list[list[str]], lines: list[int], n_ids: int, n_numbers: int) -> Lines:
@@ -161,20 +150,16 @@ def _raise_first(path: Path, found: dict[str, tuple[list[list[str]], list[int]]]
     """Raise FileFormatError for the first line that is malformed."""
     for line, words in sorted((line, words) for rows, lines in found.values()
                               for line, words in zip(lines, rows, strict=True)):
-        tag, where = words[0], f'{path}:{line}'
-        n_ids, n_numbers = LAYOUT.get(tag, (1, 0))
-        if len(words) - 1 != n_ids + n_numbers:
-            raise FileFormatError(
-                f'{where}: {tag} is followed by {n_ids + n_numbers} numbers, got {len(words) - 1}')
+        tag = words[0]
+        layout = LAYOUT.get(tag, (1, 0))
         try:
-            for word in words[1:1 + n_ids]:
-                if not -2**63 <= int(word) < 2**63:
-                    raise ValueError(f'expected ids of at most 64 bits, got {word}')
-            numbers = [float(word) for word in words[1 + n_ids:]]
-        except ValueError as error:
-            raise FileFormatError(f'{where}: {tag}: {error}') from error
-        if not np.all(np.isfinite(numbers)):
-            raise FileFormatError(f'{where}: {tag} holds a number that is not finite')
+            _lines([words], [line], *layout)
+        except (ValueError, OverflowError) as error:
+            raise FileFormatError(
+                f'{path}:{line}: {tag} is followed by {sum(layout)} numbers, got '
+                f'{len(words) - 1}: {" ".join(words[1:])}; ids are integers of 64 bits, the '
+                f'others finite'
+            ) from error
     raise AssertionError('no line is malformed')
 
 

@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes, upper
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, FACTORS, ObservedNodes, upper
 from pose_graph_ros.core.graph.graph_update import GraphRows
-from pose_graph_ros.core.graph.kinds import FACTORS
+from pose_graph_ros.core.graph.priors import model
 from pose_graph_ros.core.io.g2o import UPPER
 
 NOT_USED = '# not used '
@@ -27,10 +27,7 @@ def write_g2o(graph: _HasRows, path: Path, ids: IntArray | None = None) -> None:
     """
     Write a graph so that its numbers read back bit for bit.
 
-    Parameters
-    ----------
-    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
-
+    `ids` are numbers of the hidden nodes, by default their ids.
     """
     path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
 
@@ -39,12 +36,8 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     """
     Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
 
-    Edges and observed nodes that tell about the same as dense priors are the last lines.
-
-    Parameters
-    ----------
-    ids : ndarray, shape (N,), optional, number of each hidden node; by default its id
-
+    Edges and observed nodes that tell about the same as dense priors are the last lines. `ids` are
+    numbers of the hidden nodes, by default their ids.
     """
     ids = rows.node_ids if ids is None else ids
     edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
@@ -72,9 +65,6 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
 
 
 def _lines_for_priors(rows: GraphRows, ids: IntArray) -> list[str]:
-    # not needed for files, and takes long to load
-    from pose_graph_ros.core.io.saved_priors import standing_for  # noqa: PLC0415
-
     edges, observed = standing_for(rows)
     edges, observed = edges.renumbered(rows.rows_of), observed.renumbered(rows.rows_of)
     lines = [*_edge_lines(edges, ids),
@@ -141,3 +131,30 @@ def _texts(rows: FloatArray) -> list[str]:
     """Return the numbers of each row with the digits needed to read them back bit for bit."""
     # the text of a list is made at once
     return [repr(row)[1:-1].replace(',', '') for row in rows.tolist()]
+
+
+def standing_for(rows: GraphRows) -> tuple[Edges, ObservedNodes]:
+    """
+    Return edges and observed nodes that tell no more of the poses than the priors of a graph.
+
+    They have the minimum of the priors, linear at the present poses, and their ends are ids.
+    Biases and landmarks in priors are marginalised out.
+    """
+    # takes long to load, and most graphs have none
+    from pose_graph_ros.core.marginalization.marginalize import schur_complement  # noqa: PLC0415
+    from pose_graph_ros.core.marginalization.sparsification import sparsify  # noqa: PLC0415
+
+    edges, observed = [], []
+    for prior in rows.priors:
+        at = rows.rows_of(prior.nodes)
+        is_pose = rows.is_pose[at]
+        linear = model(prior, rows.poses[at], is_pose)
+        if not np.any(is_pose):
+            continue
+        U, u = schur_complement(
+            linear.information, -linear.gradient, np.repeat(~is_pose, 3))
+        sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
+                          anchored=prior.anchored)
+        edges.append(sparse.edges)
+        observed.append(sparse.observed)
+    return Edges.joined(edges), ObservedNodes.joined(observed)

@@ -9,7 +9,7 @@ SHA-256 of all that follows in it. Both are read back bit for bit, or refused. T
 the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 import hashlib
 import json
@@ -28,6 +28,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import (
     EdgeKinds,
     Edges,
+    FACTORS,
     full,
     NodeKind,
     ObservedKinds,
@@ -35,7 +36,7 @@ from pose_graph_ros.core.graph.constraints import (
     upper,
 )
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
-from pose_graph_ros.core.graph.kinds import FACTORS
+from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o_text import LAYOUT
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
@@ -48,8 +49,7 @@ from pose_graph_ros.core.io.old_versions import (
 )
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.io.saved_priors import restored_priors, saved_priors, SavedPriors
-from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows4, Rows6
+from pose_graph_ros.core.saved_columns import Flags, Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'
 VERSION = 5
@@ -64,44 +64,49 @@ _OBSERVED = {'OBSERVED_SE2_OFFSET': range(13), 'EDGE_PRIOR_SE2': (0, *range(4, 1
 
 
 @dataclass(frozen=True, slots=True)
+class SavedPriors:
+    """Dense priors, one behind the other."""
+
+    # number k of nodes of each prior
+    sizes: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    anchored: Flags = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    # ids of the nodes of all priors
+    nodes: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    # of each prior the upper triangle of its information row by row, each row followed by the
+    # number of the vector, then the reference poses and the energy
+    numbers: Numbers = field(default_factory=lambda: np.empty(0))
+
+
+@dataclass(frozen=True, slots=True)
 class SavedRows:
     """What the g2o file lacks of the rows of a graph."""
 
-    fixed: Integers
-    """Ids of the fixed hidden nodes."""
-    biases: Integers
-    """Ids of the hidden nodes that are no poses (biases, landmarks); poses are in the g2o file."""
+    fixed: Integers  # ids of the fixed hidden nodes
+    biases: Integers  # ids of the hidden nodes that are no poses; poses are in the g2o file
     bias_values: Rows3
-    edge_kind: EdgeKinds
-    """Of all edges. Those of `IN_G2O` are read from the g2o file, others are given here."""
+    edge_kind: EdgeKinds  # of all edges; those of `IN_G2O` are in the g2o file, others here
     edge_weight: Numbers
     bias_edge_i: Integers
     bias_edge_j: Integers
     bias_edge_mean: Rows3
     bias_edge_information: Rows6
     bias_edge_bias: Rows4
-    observed_kind: ObservedKinds
-    """Of all observed nodes. Those on biases are given here, others in the g2o file."""
+    observed_kind: ObservedKinds  # of all; those on biases are given here, others in the g2o file
     observed_weight: Numbers
-    observed_on_bias: Integers
-    """Rows of the observed nodes on biases."""
+    observed_on_bias: Integers  # rows of the observed nodes on biases
     bias_observed_node: Integers
     bias_observed_offset: Rows3
     bias_observed_mean: Rows3
     bias_observed_information: Rows6
+    # ids of all, in order; None where they are 0, 1 and so on, without a gap
     node_ids: Integers | None = None
-    """Ids of all hidden nodes, in order; None where they are 0, 1 and so on, without a gap."""
     edge_ids: Integers | None = None
     observed_ids: Integers | None = None
-    next_ids: NextIds | None = None
-    """Ids of the next new rows; None where they follow on the last ones."""
+    next_ids: NextIds | None = None  # of the next new rows; None where they follow on the last
     priors: SavedPriors = field(default_factory=SavedPriors)
-    bias_edge_k: Integers | None = None
-    """Third nodes of the edges that are given here, -1 without; None if no edge has one."""
-    bias_dimensions: Integers | None = None
-    """Numbers of coordinates of `biases`; None if all have 3."""
-    landmarks: Integers | None = None
-    """Ids of those of `biases` that are landmarks; None without."""
+    bias_edge_k: Integers | None = None  # third nodes of the edges given here, -1 without one
+    bias_dimensions: Integers | None = None  # of `biases`; None if all have 3 coordinates
+    landmarks: Integers | None = None  # ids of those of `biases` that are landmarks
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -115,13 +120,9 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     """
     Return the paths of the g2o, JSON and TUM file of a saved graph, written all or none.
 
+    `path` is that of the g2o file, with or without suffix; the other files are beside it.
     Missing folders are created. If that fails, or the path is a folder, a FileWriteError is
     raised, and previous files are unchanged.
-
-    Parameters
-    ----------
-    path : Path, path of the g2o file, with or without suffix; the other files are beside it
-
     """
     if path.name == '' or os.path.isdir(path):
         raise FileWriteError(f'{path}: is a folder, expected the name of a file')
@@ -254,7 +255,7 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
         upper(edges.information), edges.bias, rows.observed.kind.astype(np.int64),
         rows.observed.weight, on_bias, observed.node, observed.offset, observed.mean,
         upper(observed.information), node_ids, edge_ids, observed_ids, rows.next_ids,
-        saved_priors(rows.priors), edges.k if np.any(edges.k >= 0) else None,
+        _saved_priors(rows.priors), edges.k if np.any(edges.k >= 0) else None,
         None if dimensions is None or np.all(dimensions == 3) else dimensions,
         landmarks if len(landmarks) > 0 else None)
 
@@ -284,7 +285,7 @@ def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
     return GraphRows(
         poses, kind, fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')), _observed(rows, lines),
         node_ids, edge_ids, observed_ids, next_ids, dimension,
-        restored_priors(rows.priors))
+        _restored_priors(rows.priors))
 
 
 def _kinds_and_dimensions(
@@ -370,3 +371,29 @@ def _weights(weight: FloatArray, size: int) -> FloatArray:
     if len(weight) != size:
         raise ValueError(f'graph: expected {size} weights, got {len(weight)}')
     return weight
+
+
+def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:
+    """Return priors as columns."""
+    if len(priors) == 0:
+        return SavedPriors()
+    return SavedPriors(
+        np.array([len(prior.nodes) for prior in priors], dtype=np.int64),
+        np.array([prior.anchored for prior in priors], dtype=np.bool_),
+        np.concatenate([prior.nodes for prior in priors]).astype(np.int64),
+        np.concatenate([packed(prior) for prior in priors]))
+
+
+def _restored_priors(saved: SavedPriors) -> tuple[Prior, ...]:
+    """Return saved priors; raise ValueError if the lengths of the columns do not fit."""
+    sizes = saved.sizes
+    counts = 3 * sizes * (3 * sizes + 3) // 2 + 3 * sizes + 1
+    if (np.any(sizes < 1) or len(saved.anchored) != len(sizes)
+            or len(saved.nodes) != np.sum(sizes) or len(saved.numbers) != np.sum(counts)):
+        raise ValueError('graph.priors: expected columns whose lengths fit the sizes of the '
+                         'priors')
+    of_nodes, of_numbers = np.cumsum(sizes)[:-1], np.cumsum(counts)[:-1]
+    return tuple(unpacked(nodes, numbers, anchored=anchored) for nodes, numbers, anchored in zip(
+        np.split(saved.nodes, of_nodes) if len(sizes) > 0 else (),
+        np.split(saved.numbers, of_numbers) if len(sizes) > 0 else (),
+        saved.anchored.tolist(), strict=True))

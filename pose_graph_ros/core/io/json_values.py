@@ -23,14 +23,7 @@ _KINDS = {int: ('i', np.int64), float: ('fi', np.float64), bool: ('b', np.bool_)
 
 
 def encoded(value: Any, kind: Any = None) -> Any:
-    """
-    Return a value as lists, dictionaries, strings and numbers.
-
-    Parameters
-    ----------
-    kind : type, optional, annotation of the value
-
-    """
+    """Return a value as lists, dictionaries, strings and numbers."""
     if _has_fields(type(value)):
         return {name: encoded(getattr(value, name), hint)
                 for name, hint in annotations(type(value)).items()}
@@ -57,13 +50,6 @@ def decoded(kind: Any, plain: Any, where: str) -> Any:
     Return the value that `encoded` was given, or raise ValueError if it is not of its kind.
 
     The message names the place, what was expected and what was found.
-
-    Parameters
-    ----------
-    kind : type, annotation of the value
-    plain : object, value of the JSON file
-    where : str, name of the value in error messages
-
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:

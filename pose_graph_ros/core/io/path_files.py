@@ -10,12 +10,10 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
-COLUMNS = 'stamp,x,y,yaw,xx,xy,xyaw,yy,yyaw,yawyaw'
-NANOSECONDS = 1_000_000_000
-PART = 10_000
+PART = 10_000  # rows that are written at once
 _XML = '<?xml version="1.0" encoding="UTF-8"?>'
 CREATOR = 'pose_graph_ros'
 
@@ -29,17 +27,13 @@ def kitti_lines(path: Trajectory) -> Iterator[str]:
             yield f'{c!r} {-s!r} 0 {x!r} {s!r} {c!r} 0 {y!r} 0 0 1 0'
 
 
-def csv_lines(path: Trajectory, covariances: FloatArray) -> Iterator[str]:
+def csv_lines(path: Trajectory, covariances: Covariances) -> Iterator[str]:
     """
     Yield a header and a row for each pose: stamp [s], pose, upper triangle of its covariance.
 
-    Parameters
-    ----------
-    covariances : ndarray, shape (N, 3, 3)
-        In map axes [m, m, rad]; their cells are empty where they are NaN.
-
+    Covariances are in map axes; their cells are empty where they are NaN.
     """
-    yield COLUMNS
+    yield 'stamp,x,y,yaw,xx,xy,xyaw,yy,yyaw,yawyaw'
     rows, columns = np.triu_indices(3)
     for begin in range(0, len(path), PART):
         part = slice(begin, begin + PART)
@@ -75,7 +69,7 @@ def _lines(trajectory: Trajectory) -> Iterator[str]:
 
 def seconds_text(stamp_ns: int) -> str:
     """Return a stamp [ns] in seconds, with all its digits."""
-    seconds, nanoseconds = divmod(abs(stamp_ns), NANOSECONDS)
+    seconds, nanoseconds = divmod(abs(stamp_ns), 1_000_000_000)
     return f'{"-" if stamp_ns < 0 else ""}{seconds}.{nanoseconds:09d}'
 
 
@@ -90,16 +84,7 @@ def _points(stamps_ns: IntArray, places: FloatArray) -> Iterator[tuple[str, str,
 
 
 def gpx_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterator[str]:
-    """
-    Yield the lines of a GPX file with one track.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (N,) [ns]
-    places : ndarray, shape (N, 2), latitude and longitude [degrees]
-    name : str, of the track
-
-    """
+    """Yield the lines of a GPX file with one track, given latitudes and longitudes [degrees]."""
     yield _XML
     yield (f'<gpx version="1.1" creator="{CREATOR}" '
            'xmlns="http://www.topografix.com/GPX/1/1">')
@@ -110,14 +95,7 @@ def gpx_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterator[st
 
 
 def kml_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterator[str]:
-    """
-    Yield the lines of a KML file with one line on the ground and its time span.
-
-    Parameters
-    ----------
-    stamps_ns, places, name : as for `gpx_lines`; at least one point
-
-    """
+    """Yield the lines of a KML file: one line on the ground through all points, its time span."""
     begin, end = (next(_points(stamps_ns[k:], places[k:]))[2] for k in (0, len(stamps_ns) - 1))
     yield _XML
     yield '<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
@@ -130,14 +108,7 @@ def kml_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterator[st
 
 
 def geojson_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterator[str]:
-    """
-    Yield the lines of a GeoJSON file: one LineString with the time of each position.
-
-    Parameters
-    ----------
-    stamps_ns, places, name : as for `gpx_lines`; of a single point two equal ones are made
-
-    """
+    """Yield the lines of a GeoJSON file: one LineString with the time of each position."""
     if len(stamps_ns) == 1:  # a LineString has at least two
         stamps_ns, places = np.repeat(stamps_ns, 2), np.repeat(places, 2, axis=0)
     yield '{"type": "FeatureCollection", "features": [{"type": "Feature",'

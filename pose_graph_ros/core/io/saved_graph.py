@@ -3,38 +3,32 @@
 """
 The whole state of an engine as a value, for files.
 
-`capture` makes it from the parts of the engine and restores them from it; `graph_files` writes and
-reads it. Settings are not part of it: a loaded graph has those of the engine that loads it.
+`core.parts` makes it from the parts of the engine and restores them from it; `graph_files` writes
+and reads it. Settings are not part of it: a loaded graph has those of the engine that loads it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState, SavedAlignment
-from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, wrap
-from pose_graph_ros.core.graph.constraints import check as check_table, EdgeKind, KindArray
+from pose_graph_ros.core.graph.checks import check as check_table, check_priors, Ids
+from pose_graph_ros.core.graph.constraints import EdgeKind, KindArray
 from pose_graph_ros.core.graph.graph import GraphRows
-from pose_graph_ros.core.graph.ids import Ids
-from pose_graph_ros.core.graph.priors import check_priors
 from pose_graph_ros.core.graph.reweighting import SavedLosses
-from pose_graph_ros.core.judgement.closure_states import SavedClosures
-from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.judge import SavedJudgement
-from pose_graph_ros.core.judgement.odometry_states import SavedOdometry
-from pose_graph_ros.core.judgement.verdicts import Decision, State
-from pose_graph_ros.core.odometry.saved_nodes import SavedNodes
+from pose_graph_ros.core.odometry.node_table import SavedNodes
 from pose_graph_ros.core.odometry.turns import SavedGyro
 from pose_graph_ros.core.saved_columns import Matrix
-from pose_graph_ros.core.sources.constraint_queue import SavedEdges
 from pose_graph_ros.core.sources.gauss_markov import NO_TRANSITION
 from pose_graph_ros.core.sources.gyro_bias import SavedGyroBias
-from pose_graph_ros.core.sources.source_constraints import SavedSource
+from pose_graph_ros.core.sources.source_constraints import SavedEdges, SavedSource
 
 # Tolerances within which a datum equals that of the saved graph [m], [rad].
 SAME_PLACE = 0.01
@@ -54,25 +48,17 @@ class SavedGraph:
     edge_losses: SavedLosses
     observed_losses: SavedLosses
     alignment: SavedAlignment
-    waiting: SavedEdges
-    """Edges for the next update."""
-    set_aside: SavedEdges
-    """Edges set aside after a failed solve, for the next full optimisation."""
-    judgement: SavedJudgement
-    """What is believed, and who has decided so."""
+    waiting: SavedEdges  # edges for the next update
+    set_aside: SavedEdges  # after a failed solve, for the next full optimisation
+    judgement: SavedJudgement  # what is believed, and who has decided so
+    # the same for people, of all closures and all that is not believed: a sentence by id
     verdicts: Mapping[str, str]
-    """The same for people, of all closures and all that is not believed: a sentence by id."""
-    newest_covariance: Matrix
-    """Covariance of the newest hidden node, in map axes."""
+    newest_covariance: Matrix  # of the newest hidden node, in map axes
     chi2: float
-    n_left_out: int
-    """Number of received measurements that are neither in the graph nor saved."""
-    datum: MapOrigin | None
-    """Datum of the map, if it has one."""
+    n_left_out: int  # received measurements that are neither in the graph nor saved
+    datum: MapOrigin | None  # of the map, if it has one
     gyros: Mapping[str, SavedGyro] = field(default_factory=dict)
-    """Gyroscopes by name."""
     gyro_biases: Mapping[str, SavedGyroBias] = field(default_factory=dict)
-    """The states of their biases in the graph."""
 
     @property
     def path(self) -> FloatArray:
@@ -92,59 +78,67 @@ class SavedGraph:
                             Ids.of(rows.next_ids.node, rows.node_ids))
         ids = {'nodes': rows.node_ids, 'edges': rows.edge_ids, 'observed': rows.observed_ids}
         for (name, present), end in zip(ids.items(), rows.next_ids, strict=True):
-            _increasing(f'graph.{name}', np.concatenate(([-1], present, [end])))
+            numbers = np.concatenate(([-1], present, [end]))
+            _require(np.diff(numbers) > 0, f'graph.{name}: expected increasing numbers')
         check_priors(rows.priors, ())
         for prior in rows.priors:
             _in_graph('graph.priors', prior.nodes, rows.node_ids)
-        self._check_nodes()
-        self._check_odometry()
-        self._check_gyros()
         if self.datum is not None:
             TangentPlane(*self.datum)   # raises if it is no point on the Earth
+        for place, names in _SAME_LENGTH:
+            for where, value in _found(self, place):
+                lengths = {name: len(getattr(value, name)) for name in names.split()}
+                _require(len(set(lengths.values())) == 1,
+                         f'{where}: expected equal lengths, got {lengths}')
+        for expected, holds, places in _NUMBERS:
+            for where, numbers in chain(*(_found(self, place) for place in places.split())):
+                _require(holds(np.asarray(numbers)), f'{where}: expected {expected}')
+        biases = rows.node_ids[rows.is_bias]
+        known = ids | {'hidden': nodes.ids, 'biases': biases}
+        for name, places in _IDS.items():
+            for where, numbers in chain(*(_found(self, place) for place in places.split())):
+                _in_graph(where, numbers, known[name])
+        self._check_nodes()
+        self._check_odometry()
+        self._check_judgement(ids)
+        self._check_gyros(biases)
         for name, source in self.sources.items():
             self._check_source(f'sources.{name}', source, ids)
-        for name, losses in (('edges', self.edge_losses), ('observed', self.observed_losses)):
-            where = f'{name} losses'
-            _same_length(where, losses, 'rows', 'losses', 'thresholds', 'shares')
-            _in_graph(where, losses.rows, ids[name])
-            _increasing(where, losses.rows)
-            _inside(where, losses.losses, len(Loss))
-            _require(np.all(losses.thresholds > 0.0) and losses.cursor >= 0,
-                     f'{where}: expected positive thresholds and a cursor')
-        alignment = self.alignment
-        _same_length('alignment', alignment, 'source', 'stamps_ns', 'node', 'offset', 'mean',
-                     'information', 'kind')
-        _inside('alignment.source', alignment.source, len(alignment.sources))
-        _inside('alignment.kind', alignment.kind, 3)
-        _require(np.isin(alignment.node, nodes.ids), 'alignment.node: expected hidden nodes')
+
+    def _check_judgement(self, ids: Mapping[str, IntArray]) -> None:
+        closures, fixes, alignment = self.judgement.closures, self.judgement.fixes, self.alignment
         _require(alignment.state in STATES, f'alignment.state: expected one of {STATES}')
-        _require(alignment.next_verdict > 0, 'alignment.next_verdict: expected a positive number')
-        self._check_judgement(self.judgement.closures)
-        self._check_fixes(self.judgement.fixes, ids)
-        self._check_doubts(self.judgement.odometry)
-        for name, edges in (('waiting', self.waiting), ('set_aside', self.set_aside)):
-            _same_length(name, edges, 'sources', 'i', 'j', 'mean', 'information', 'kind',
-                         'stamps_ns')
-            _inside(name, edges.kind, EdgeKind.BIAS)
-            _require(np.isin((edges.i, edges.j), nodes.ids),
-                     f'{name}: expected edges between hidden nodes')
+        for where, table in (('alignment', alignment), ('closures', closures), ('fixes', fixes)):
+            _require((table.source >= 0) & (table.source < len(table.sources)),
+                     f'{where}.source: expected indices of sources')
+        _require(self._kinds(closures.rows) == EdgeKind.LOOP_CLOSURE,
+                 'judgement.closures: expected rows of loop closures')
+        _in_graph('judgement.fixes', fixes.observed[fixes.observed != -1], ids['observed'])
+        for kind, name in enumerate(('observed', 'edges')):
+            _in_graph('judgement.fixes', fixes.rows[fixes.edges == kind], ids[name])
+
+    def _check_gyros(self, biases: IntArray) -> None:
+        for name, gyro in self.gyros.items():
+            _require(gyro.next_node <= len(self.nodes.ids),
+                     f'gyros.{name}: expected a hidden node')
+            _require((gyro.waiting[:, 1] > 0.0) & np.all(gyro.waiting[:, (2, 4)] >= 0.0, axis=1),
+                     f'gyros.{name}.waiting: expected times and variances')
+        for name, bias in self.gyro_biases.items():
+            where, (edges, states) = f'gyro_biases.{name}.edges', bias.edges.T
+            _in_graph(where, edges, self.rows.edge_ids)
+            _in_graph(where, states, biases)
+            _require(np.all(np.diff(edges) > 0) & (self._kinds(edges) == EdgeKind.TURN),
+                     f'{where}: expected increasing edges of rotations')
 
     def _check_nodes(self) -> None:
         rows, nodes, thinned = self.rows, self.nodes, self.nodes.thinned
         n, n_frozen = len(nodes.ids), len(nodes.frozen)
-        _require(n > 0, 'nodes: expected at least one')
-        _same_length('nodes', nodes, 'stamps_ns', 'ids')
         _require(n_frozen + len(nodes.odometry) == n and n_frozen < n,
                  'nodes: expected a frozen pose or an odometry pose of each, got '
                  f'{n_frozen} and {len(nodes.odometry)} for {n} nodes')
-        _require(_are_odometry_errors(nodes.errors),
-                 'nodes.errors: expected two positive numbers and two others')
-        _require(np.all((nodes.relocated > 0) & (nodes.relocated < n)),
+        _check_odometry_errors('nodes.errors', nodes.errors)
+        _require((nodes.relocated > 0) & (nodes.relocated < n),
                  f'nodes.relocated: expected numbers in 1..{n - 1}')
-        _increasing('nodes.stamps_ns', nodes.stamps_ns)
-        _increasing('nodes.ids', nodes.ids)
-        _same_length('nodes.thinned', thinned, 'numbers', 'anchors', 'relative', 'noise')
-        _increasing('nodes.thinned.numbers', thinned.numbers)
         kept = np.setdiff1d(np.arange(n_frozen, n), thinned.numbers)
         _require(np.isin(thinned.anchors, kept) & (thinned.numbers >= n_frozen)
                  & (thinned.numbers < n),
@@ -157,7 +151,6 @@ class SavedGraph:
 
     def _check_odometry(self) -> None:
         nodes = self.nodes
-        _same_length('nodes', nodes, 'leads', 'leads_after_ns')
         _require(len(nodes.leads) > 0 and nodes.leads_after_ns[0] < nodes.stamps_ns[0],
                  'nodes.leads: expected at least one source, since before the first node')
         for name in nodes.leads:
@@ -165,12 +158,12 @@ class SavedGraph:
                      f'nodes.leads: there is no odometry of {name!r}')
         for name, stream in nodes.streams.items():
             where = f'nodes.streams.{name}'
-            _same_length(where, stream, 'stamps_ns', 'samples', 'dense')
-            _same_length(where, stream, 'waiting_ns', 'waiting', *(
-                ('waiting_twists',) if len(stream.waiting_twists) > 0 else ()))
-            _increasing(where, np.append(stream.stamps_ns, stream.waiting_ns))
-            _require(all(-1 <= k <= len(nodes.ids) for k in (stream.tied, stream.next_to_tie))
-                     and stream.tied < len(nodes.ids) and stream.next_to_tie >= 0,
+            _require(len(stream.waiting_twists) in (0, len(stream.waiting)),
+                     f'{where}.waiting_twists: expected none, or as many as there are samples')
+            _require(np.diff(np.append(stream.stamps_ns, stream.waiting_ns)) > 0,
+                     f'{where}: expected increasing stamps')
+            _require(-1 <= stream.tied < len(nodes.ids)
+                     and 0 <= stream.next_to_tie <= len(nodes.ids),
                      f'{where}: expected nodes for its edges')
             _require((stream.last is not None) == (len(stream.stamps_ns) > 0),
                      f'{where}: expected the state at the newest sample, if there is one')
@@ -182,88 +175,21 @@ class SavedGraph:
         _require(covered[0] <= nodes.base_ns <= covered[-1],
                  'nodes.base_ns: expected an instant that the primary odometry covers')
 
-    def _check_gyros(self) -> None:
-        rows = self.rows
-        biases = rows.node_ids[rows.is_bias]
-        for name, gyro in self.gyros.items():
-            where = f'gyros.{name}'
-            _same_length(f'{where}.rates', gyro.rates, 'stamps_ns', 'rates')
-            _increasing(f'{where}.rates.stamps_ns', gyro.rates.stamps_ns)
-            _require(0 < gyro.next_node <= len(self.nodes.ids),
-                     f'{where}.next_node: expected a hidden node')
-            _same_length(where, gyro, 'waiting_ns', 'waiting_ends', 'waiting')
-            _require(gyro.waiting[:, 1] > 0.0, f'{where}.waiting: expected positive variances')
-            _require(gyro.waiting[:, (2, 4)] >= 0.0,
-                     f'{where}.waiting: expected times and variances')
-            _require(np.isin(gyro.waiting_ends, self.nodes.ids),
-                     f'{where}.waiting_ends: expected hidden nodes')
-        for name, bias in self.gyro_biases.items():
-            where = f'gyro_biases.{name}'
-            _same_length(where, bias, 'numbers', 'ids')
-            _increasing(f'{where}.numbers', bias.numbers)
-            _increasing(f'{where}.ids', bias.ids)
-            _in_graph(f'{where}.ids', bias.ids, biases)
-            edges, states = bias.edges.T
-            _in_graph(f'{where}.edges', edges, rows.edge_ids)
-            _in_graph(f'{where}.edges', states, biases)
-            _increasing(f'{where}.edges', edges)
-            _require(self._kinds(edges) == EdgeKind.TURN,
-                     f'{where}.edges: expected edges of rotations')
-            _require(bias.width_ns > 0, f'{where}.width_ns: expected a positive number')
-
-    def _check_judgement(self, closures: SavedClosures) -> None:
-        where = 'judgement.closures'
-        _same_length(where, closures, 'rows', 'source', 'stamps_ns', 'state', 'since_ns',
-                     'decision', 'distance')
-        _same_length(where, closures, 'sources', 'scales')
-        _in_graph(where, closures.rows, self.rows.edge_ids)
-        _inside(where, closures.source, len(closures.sources))
-        _inside(where, closures.state, len(State))
-        _inside(where, closures.decision, len(Decision))
-        _require(self._kinds(closures.rows) == EdgeKind.LOOP_CLOSURE,
-                 f'{where}: expected rows of loop closures')
-        _require(closures.scales > 0.0, f'{where}: expected positive scales')
-
-    def _check_fixes(self, fixes: SavedFixes, ids: Mapping[str, IntArray]) -> None:
-        where = 'judgement.fixes'
-        _same_length(where, fixes, 'rows', 'edges', 'source', 'stamps_ns', 'believed', 'since_ns',
-                     'decision', 'observed', 'distance')
-        _in_graph(where, fixes.observed[fixes.observed != -1], ids['observed'])
-        _same_length(where, fixes, 'loosened', 'weights')
-        _inside(where, fixes.edges, 2)
-        _inside(where, fixes.believed, 2)
-        for kind, table in enumerate(('observed', 'edges')):
-            _in_graph(where, fixes.rows[fixes.edges == kind], ids[table])
-        _inside(where, fixes.source, len(fixes.sources))
-        _inside(where, fixes.decision, len(Decision))
-        _in_graph(where, fixes.loosened, ids['edges'])
-        _require(fixes.weights > 0.0, f'{where}: expected positive weights')
-
-    def _check_doubts(self, odometry: SavedOdometry) -> None:
-        where = 'judgement.odometry'
-        _same_length(where, odometry, 'left_sources', 'left')
-
     def _check_source(
         self, where: str, source: SavedSource, ids: Mapping[str, IntArray],
     ) -> None:
-        _same_length(where, source, 'seen_ns', 'seen_references')
+        n, constraints, bins = len(source.rows), source.rows[:, 1], source.bins
         _require(np.diff(source.seen_ns) >= 0, f'{where}.seen_ns: must not decrease')
-        _require(source.n_otherwise >= 0, f'{where}.n_otherwise: expected a count')
-        _in_graph(f'{where}.ties', source.ties, ids['edges'])
-        constraints = source.rows[:, 1]
-        as_edges = source.bins is not None and source.errors is None
+        _require(len(source.noise) in (0, n) and len(source.edges) in (0, n)
+                 and np.all(source.edges >= -1), f'{where}: expected no noise and edges, or {n}')
+        _check_odometry_errors(f'{where}.odometry', source.odometry)
+        as_edges = bins is not None and source.errors is None
         _in_graph(f'{where}.rows', constraints, ids['edges' if as_edges else 'observed'])
-        self._check_errors(where, source)
-        if source.bins is None:
+        if bins is None:
             return
-        bins, rows = source.bins, self.rows
         held = constraints if as_edges else source.edges
         _in_graph(f'{where}.edges', held, ids['edges'])
-        _require(self._kinds(held) == EdgeKind.BIAS,
-                 f'{where}: expected edges to biases')
-        _same_length(f'{where}.bins', bins, 'numbers', 'rows', 'ties')
-        _increasing(f'{where}.bins.numbers', bins.numbers)
-        _in_graph(f'{where}.bins.rows', bins.rows, ids['nodes'])
+        _require(self._kinds(held) == EdgeKind.BIAS, f'{where}: expected edges to biases')
         has_prior = bins.ties == NO_TRANSITION
         _require(np.count_nonzero(has_prior) <= 1,
                  f'{where}.bins.ties: expected at most one {NO_TRANSITION}')
@@ -271,34 +197,78 @@ class SavedGraph:
             _in_graph(f'{where}.bins.ties', bins.ties[:1], ids['observed'])
             has_prior[:1] = True
         _in_graph(f'{where}.bins.ties', bins.ties[~has_prior], ids['edges'])
-        _require(bins.width_ns > 0 and np.all(
-            rows.is_bias[rows.rows_of(bins.rows)]),
-                 f'{where}.bins: expected biases, and a width')
 
     def _kinds(self, edges: IntArray) -> KindArray:
         """Return the kinds of edges that are in the graph, by id."""
         return self.rows.edges.kind[np.searchsorted(self.rows.edge_ids, edges)]
 
-    def _check_errors(self, where: str, source: SavedSource) -> None:
-        """Check what was estimated of the errors of a source."""
-        n = len(source.rows)
-        _require(len(source.noise) in (0, n) and np.all(source.noise >= 0.0),
-                 f'{where}.noise: expected no rows, or {n} that are not negative')
-        _require(len(source.edges) in (0, n) and np.all(source.edges >= -1),
-                 f'{where}.edges: expected no rows, or {n}')
-        _require(source.next_estimate > 0, f'{where}.next_estimate: expected a positive number')
-        _require(source.odometry_scale > 0.0,
-                 f'{where}.odometry_scale: expected a positive number')
-        _require(_are_odometry_errors(source.odometry),
-                 f'{where}.odometry: expected two positive numbers and two others')
-        _require(source.errors is None or min(source.errors) > 0.0,
-                 f'{where}.errors: expected positive numbers')
+
+# Columns of equal lengths, and what else is asked of numbers, by places in a `SavedGraph`.
+_EDGES = 'sources i j mean information kind stamps_ns'
+_LOSSES = 'rows losses thresholds shares'
+_SAME_LENGTH = (
+    ('nodes', 'stamps_ns ids'), ('nodes', 'leads leads_after_ns'),
+    ('nodes.thinned', 'numbers anchors relative noise'),
+    ('nodes.streams.*', 'stamps_ns samples dense'), ('nodes.streams.*', 'waiting_ns waiting'),
+    ('sources.*', 'seen_ns seen_references'), ('sources.*.bins', 'numbers rows ties'),
+    ('edge_losses', _LOSSES), ('observed_losses', _LOSSES),
+    ('alignment', 'source stamps_ns node offset mean information kind'),
+    ('waiting', _EDGES), ('set_aside', _EDGES),
+    ('judgement.closures', 'rows source stamps_ns state since_ns decision distance'),
+    ('judgement.closures', 'sources scales'),
+    ('judgement.fixes',
+     'rows edges source stamps_ns believed since_ns decision observed distance'),
+    ('judgement.fixes', 'loosened weights'), ('judgement.odometry', 'left_sources left'),
+    ('gyros.*.rates', 'stamps_ns rates'), ('gyros.*', 'waiting_ns waiting_ends waiting'),
+    ('gyro_biases.*', 'numbers ids'))
+_NUMBERS: tuple[tuple[str, Callable[[npt.NDArray[Any]], npt.ArrayLike], str], ...] = (
+    ('increasing numbers', lambda numbers: np.diff(numbers) > 0,
+     'nodes.stamps_ns nodes.ids nodes.thinned.numbers edge_losses.rows observed_losses.rows '
+     'sources.*.bins.numbers gyros.*.rates.stamps_ns gyro_biases.*.numbers gyro_biases.*.ids'),
+    ('nothing below 0', lambda numbers: numbers >= 0,
+     'edge_losses.cursor observed_losses.cursor sources.*.n_otherwise sources.*.noise'),
+    ('positive numbers', lambda numbers: numbers > 0,
+     'edge_losses.thresholds observed_losses.thresholds alignment.next_verdict '
+     'judgement.closures.scales judgement.fixes.weights gyros.*.next_node '
+     'gyro_biases.*.width_ns sources.*.next_estimate sources.*.odometry_scale sources.*.errors '
+     'sources.*.bins.width_ns'),
+    ('0 or 1', lambda numbers: np.isin(numbers, (0, 1)),
+     'judgement.fixes.edges judgement.fixes.believed'),
+    ('edges between poses', lambda numbers: numbers < EdgeKind.BIAS,
+     'waiting.kind set_aside.kind'))
+# What ids are of.
+_IDS = {
+    'hidden': 'alignment.node waiting.i waiting.j set_aside.i set_aside.j gyros.*.waiting_ends',
+    'biases': 'gyro_biases.*.ids sources.*.bins.rows',
+    'edges': 'edge_losses.rows judgement.closures.rows judgement.fixes.loosened sources.*.ties',
+    'observed': 'observed_losses.rows'}
 
 
-def _are_odometry_errors(numbers: FloatArray) -> bool:
-    return len(numbers) == 0 or (
-        len(numbers) == 4 and bool(np.all(np.isfinite(numbers))) and min(numbers[:2]) > 0.0
-        and numbers[3] > -1.0)
+def _found(value: Any, place: str, where: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield what is at a place, with its name: none where it is None, each item for a star."""
+    name, _, rest = place.partition('.')
+    if place == '':
+        yield where[1:], value
+    elif value is not None:
+        for key, each in value.items() if name == '*' else ((name, getattr(value, name)),):
+            if each is not None:
+                yield from _found(each, rest, f'{where}.{key}')
+
+
+def _require(valid: npt.ArrayLike, reason: str) -> None:
+    if not np.all(valid):
+        raise ValueError(reason)
+
+
+def _in_graph(where: str, ids: IntArray, present: IntArray) -> None:
+    missing = ids[~np.isin(ids, present)]
+    _require(len(missing) == 0, f'{where}: {missing[:1]} is not in the graph')
+
+
+def _check_odometry_errors(where: str, numbers: FloatArray) -> None:
+    _require(len(numbers) == 0 or (len(numbers) == 4 and np.all(np.isfinite(numbers))
+                                   and min(numbers[:2]) > 0.0 and numbers[3] > -1.0),
+             f'{where}: expected two positive numbers and two others')
 
 
 def site_refusal(
@@ -307,14 +277,8 @@ def site_refusal(
     """
     Return why a saved graph cannot belong to the site of the robot; None if it can.
 
-    Parameters
-    ----------
-    datum : MapOrigin, optional
-        The current datum, if the user has set it. It must equal that of the saved graph, except
-        for the altitude.
-    fix : MapOrigin, optional
-        The fix that the current datum comes from, or any other. It must be near the saved graph.
-
+    A datum that the user has set must equal that of the saved graph, except for the altitude. A
+    fix, the one that the current datum comes from or any other, must be near the saved graph.
     """
     if saved.datum is None:
         return None
@@ -329,14 +293,7 @@ def site_refusal(
 
 
 def datum_refusal(saved: MapOrigin, datum: MapOrigin) -> str | None:
-    """
-    Return why the datum of a saved graph is not the one that was set; None if it is.
-
-    Parameters
-    ----------
-    saved, datum : MapOrigin, they must be equal except for the altitude
-
-    """
+    """Return why the datum of a saved graph is not the one that was set; None if it is."""
     metres = float(distances(saved, datum.latitude, datum.longitude)[0])
     turned = abs(wrap(datum.yaw - saved.yaw))
     if metres <= SAME_PLACE and turned <= SAME_YAW:
@@ -353,26 +310,3 @@ def _distance_to(saved: SavedGraph, fix: MapOrigin) -> float:
         return least  # the nodes are not in the map
     points = TangentPlane(*saved.datum).to_geodetic(saved.path[:, :2])
     return min(least, float(np.min(distances(fix, points[:, 0], points[:, 1]))))
-
-
-def _require(valid: npt.ArrayLike, reason: str) -> None:
-    if not np.all(valid):
-        raise ValueError(reason)
-
-
-def _same_length(where: str, value: Any, *names: str) -> None:
-    lengths = {name: len(getattr(value, name)) for name in names}
-    _require(len(set(lengths.values())) == 1, f'{where}: expected equal lengths, got {lengths}')
-
-
-def _increasing(where: str, numbers: IntArray) -> None:
-    _require(numbers[1:] > numbers[:-1], f'{where}: expected increasing numbers')
-
-
-def _in_graph(where: str, ids: IntArray, present: IntArray) -> None:
-    missing = ids[~np.isin(ids, present)]
-    _require(len(missing) == 0, f'{where}: {missing[:1]} is not in the graph')
-
-
-def _inside(where: str, numbers: IntArray, size: int) -> None:
-    _require((numbers >= 0) & (numbers < size), f'{where}: expected indices in 0..{size - 1}')

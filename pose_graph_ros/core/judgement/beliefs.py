@@ -1,50 +1,162 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What is believed of the loop closures, as states, as weights of the graph and as announcements.
+Which of the loop closures that have passed the gate are believed, and when one is tested again.
 
-Some beliefs cannot be changed in the time of an update, as its iterations diverge with them. They
-are tried on a copy, part by part (`closure_trial`), and kept if they fit there.
+`BeliefRule` chooses; `Beliefs` changes states and weights together. Some changes cannot be made in
+the time of an update, as its iterations diverge with them: these are tried by `closure_trial`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement.closure_reports import ClosureReports
 from pose_graph_ros.core.judgement.closure_states import (
-    AUTO,
     ClosureStates,
-    DECISIONS,
     DOUBTED,
+    OUT,
     STATES,
     USED,
 )
-from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
-from pose_graph_ros.core.judgement.closures import claims, ClosureTable
-from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
-from pose_graph_ros.core.judgement.swaps import Found
-from pose_graph_ros.core.judgement.texts import sentence, unknown
-from pose_graph_ros.core.judgement.verdicts import Decision, State
-from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import DIVERGED
+from pose_graph_ros.core.judgement.closure_trial import ClosureTrial, Found
+from pose_graph_ros.core.judgement.closures import ClosureTable
+from pose_graph_ros.core.judgement.settings import BELIEF
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
+
+_NEVER = -1
+
+
+class Retests:
+    """
+    Of each closure, by number, what its next test waits for.
+
+    Closures are tested again whenever more or less is believed. But those that contradict one
+    another could take turns in the graph for ever, so one that was thrown out a few times waits
+    for the next closure to come. And the iterations of an update diverge with some: these wait
+    until the graph has grown, twice as long after each failure, so that all failures together take
+    a time in proportion to the drive.
+    """
+
+    def __init__(self) -> None:
+        self._round, self._turns, self._failures, self._resting = self._columns = tuple(
+            GrowingArray((), np.int64) for _ in range(4))
+
+    def append(self, count: int) -> None:
+        for column, value in zip(self._columns, (_NEVER, 0, 0, 0), strict=True):
+            column.append(np.full(count, value))
+
+    def truncate(self, size: int) -> None:
+        for column in self._columns:
+            column.truncate(size)
+
+    def select(self, kept: IntArray) -> None:
+        for column in self._columns:
+            column.select(kept)
+
+    def due(self, now: int, next_node: int, *, failed: bool = True) -> BoolArray:
+        """Return which closures may be tested, shape (M,)."""
+        return np.asarray((self._round.values < now) & (self._turns.values < BELIEF.most_turns)
+                          & ~self.resting(next_node) & (failed | (self._failures.values == 0)))
+
+    def resting(self, next_node: int) -> BoolArray:
+        """Return which closures wait for a node with an id from this on, shape (M,)."""
+        return np.asarray(self._resting.values > next_node)
+
+    def failures(self, numbers: IntArray) -> IntArray:
+        """Return with how many updates some closures have failed."""
+        return np.asarray(self._failures.values[numbers])
+
+    def tested(self, numbers: IntArray | slice, now: int) -> None:
+        self._round.values[numbers] = now
+
+    def again(self, numbers: Iterable[int] | slice) -> None:
+        """Have closures tested, whatever was found before."""
+        chosen = numbers if isinstance(numbers, slice) else [*numbers]
+        self._round.values[chosen], self._resting.values[chosen] = _NEVER, 0
+
+    def thrown_out(self, numbers: IntArray) -> None:
+        self._turns.values[numbers] += 1
+
+    def failed(self, numbers: Iterable[int], n_nodes: int, next_node: int) -> None:
+        """Let closures rest, as the iterations diverge where their belief is changed."""
+        chosen = [*numbers]
+        doublings = np.minimum(self._failures.values[chosen], BELIEF.rest_doublings)
+        self._failures.values[chosen] += 1
+        self._round.values[chosen] = _NEVER
+        self._resting.values[chosen] = next_node + np.maximum(
+            (BELIEF.rest_share * n_nodes * 2.0**doublings).astype(np.int64), BELIEF.least_rest)
+
+    def begin_turns(self) -> None:
+        """Let all closures in again that have taken turns, as another one has come."""
+        self._turns.values[:] = 0
+
+
+
+
+class BeliefRule:
+    """
+    Chooses what is believed; it changes nothing.
+
+    A closure is believed if a clique of closures that agree along the path supports it, or if a
+    random one of its source would hardly pass: q p is small against 1 - q, with p the chance to
+    pass and q the share of its source that is doubted. If p is large, only the record q of the
+    source speaks for it: it is believed weakly.
+    """
+
+    def __init__(self, states: ClosureStates, table: ClosureTable, retests: Retests) -> None:
+        self._states, self._table, self._retests = states, table, retests
+
+    def choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
+        """Return what to believe of closures that have passed; of wide gates only one."""
+        chosen: dict[int, State] = {}
+        failures = self._retests.failures(passed)
+        for k in np.lexsort((chance, failures)).tolist():
+            if (chance[k] > BELIEF.narrow_chance or failures[k] > 0) and len(chosen) > 0:
+                break
+            state = self._belief(int(passed[k]), float(chance[k]))
+            if state.in_graph:
+                chosen[int(passed[k])] = state
+        return chosen
+
+    def _belief(self, number: int, chance: float) -> State:
+        good, bad = self._states.record(int(self._states.source[number]))
+        alone = (bad + 1.0) * chance < BELIEF.wrong_odds * (good + 1.0)
+        if (alone and chance <= BELIEF.weak_chance) or self.is_corroborated(
+                number, self._states.decision != OUT):
+            return State.BELIEVED
+        return State.WEAKLY_BELIEVED if alone else State.WAITING
+
+    def is_corroborated(self, number: int, usable: BoolArray) -> bool:
+        """Tell whether a clique of closures that agree along the path supports one."""
+        support = self._table.support(number, usable)
+        return len(support.clique) >= BELIEF.clique and support.travel >= BELIEF.clique_travel
+
+
+@dataclass(slots=True)
+class ScaleLeft:
+    """A factor on sigmas, and how many closures that have left have shown it."""
+
+    n: int = 0
+    scale: float = 1.0
+
+    def add(self, n: int, scale: float) -> None:
+        """Add closures."""
+        self.n += n
+        if n > 0:
+            part = n / min(self.n, BELIEF.most_counted)
+            self.scale *= (scale / self.scale)**min(part, 1.0)
 
 
 class Beliefs:
-    """
-    Changes states and weights of closures together.
-
-    Parameters
-    ----------
-    reweighting : Reweighting, of its constraints with a robust loss
-
-    """
+    """Changes states and weights of closures together."""
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, states: ClosureStates,
@@ -52,17 +164,15 @@ class Beliefs:
     ) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self._states, self._table = states, table
-        self.scales: list[float] = []
-        """Of each source, the factor on its sigmas in the graph."""
+        self.scales: list[float] = []  # of each source, the factor on its sigmas in the graph
+        # increases when more or less is believed, so that those that wait are tested again
         self.round = 0
-        """Increases when more or less is believed, so that those that wait are tested again."""
         self.now_ns = 0
         self.trial = ClosureTrial(smoother)
+        # of each source, what its closures have shown that have left the graph
         self.scales_left: list[ScaleLeft] = []
-        """Of each source, what its closures have shown that have left the graph."""
 
     def weights(self, numbers: IntArray) -> FloatArray:
-        """Return the weights of closures by their states."""
         scales = np.array(self.scales)[self._states.source[numbers]]
         return np.where(self._states.in_graph[numbers], 1.0 / np.square(scales), 0.0)
 
@@ -72,16 +182,7 @@ class Beliefs:
             self._reweighting.set_base_weight(int(self._states.edge[number]), weight, edge=True)
 
     def apply(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
-        """
-        Return whether states and weights could be changed; else nothing has.
-
-        If its iterations diverge, they are tried on a copy later, or solved for at once.
-
-        Parameters
-        ----------
-        changes : mapping, new states by the numbers of closures
-
-        """
+        """Tell whether states and weights were changed; if not, they may be tried later."""
         weights = self.weights_with(changes)
         result = self._smoother.update(GraphUpdate(weigh_edges=weights), fall_back=at_once)
         if result.status is Status.FAILED:
@@ -93,15 +194,7 @@ class Beliefs:
         return True
 
     def change_to(self, inside: BoolArray, poses: FloatArray) -> bool:
-        """
-        Return whether another set could be believed, at the poses of its solution.
-
-        Parameters
-        ----------
-        inside : ndarray of bool, shape (M,), which closures are believed
-        poses : ndarray, shape (N, 3)
-
-        """
+        """Return whether another set could be believed, at the poses of its solution."""
         graph = self._smoother.graph
         before = graph.poses.copy()
         graph.set_poses(continued(graph, poses))
@@ -109,24 +202,16 @@ class Beliefs:
         if not done:
             graph.set_poses(before)
             self._smoother.update(GraphUpdate())
-        self._table.forget_spread()
+        self._table.spread[:] = 0.0
         return done
 
     def try_set(self, found: Found) -> None:
-        """Try another set of closures on a copy."""
         changes, graph = self._states.changes_to(found.inside), self._smoother.graph
         self.trial.begin(changes, self.weights_with(changes),
                          continued(graph, found.poses, found.nodes))
 
     def weights_with(self, changes: Mapping[int, State]) -> dict[int, float]:
-        """
-        Return the weights of edges, by id, after a change of states.
-
-        Parameters
-        ----------
-        changes : as in `apply`
-
-        """
+        """Return the weights of edges, by id, after a change of states."""
         numbers = np.array(sorted(changes), dtype=np.int64)
         before = self._states.state[numbers].copy()
         self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
@@ -144,11 +229,7 @@ class Beliefs:
         self.round += 1
 
     def try_part(self) -> list[int] | None:
-        """
-        Do a part of a trial, and keep what fits; None if there is none.
-
-        Returns closures that are to be tested again.
-        """
+        """Do a part of a trial; return what is to be tested again, None without a trial."""
         trial, states = self.trial, self._states
         if not trial.work():
             return None
@@ -177,37 +258,3 @@ class Beliefs:
         for source in np.unique(states.source[numbers]).tolist():
             used = USED[states.state[numbers]] & (states.source[numbers] == source)
             self.scales_left[source].add(int(np.count_nonzero(used)), self.scales[source])
-
-
-def decide(
-    name: str, decision: Decision, closures: tuple[ClosureStates, ClosureTable, Beliefs],
-    reports: ClosureReports, graph: Graph,
-) -> Answer:
-    """
-    Return the answer to a decision, which is applied at once; see `ClosureJudge.decide`.
-
-    Parameters
-    ----------
-    name : str, `Verdict.id`
-    closures : tuple, what is known and believed of all closures
-
-    """
-    states, table, beliefs = closures
-    number = states.find(name)
-    if number < 0:
-        return unknown(name, has_left=states.has_left(name))
-    before = int(states.decision[number])
-    state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
-             Decision.AUTO: State.WAITING}[decision]
-    forced = decision is not Decision.AUTO or before != AUTO
-    states.decision[number] = DECISIONS.index(decision)
-    if states.forgotten[number]:
-        states.forgotten[number] = False
-        table.bring_back(
-            np.array([number]), claims(graph.edges_at(states.edge[number:number + 1])))
-    if forced and not beliefs.apply({number: state}, at_once=True):
-        states.decision[number] = before
-        return rejected('failed', 'the solver failed with it')
-    beliefs.round += 1
-    verdict, = reports.of(graph, [number])
-    return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')

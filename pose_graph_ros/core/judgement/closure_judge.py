@@ -17,23 +17,24 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import beliefs, final, relative
-from pose_graph_ros.core.judgement.belief_rule import BeliefRule, MOST_TURNS, Retests
-from pose_graph_ros.core.judgement.beliefs import Beliefs
-from pose_graph_ros.core.judgement.closure_reports import ClosureReports
+from pose_graph_ros.core.judgement import closures, final
+from pose_graph_ros.core.judgement.beliefs import BeliefRule, Beliefs, Retests, ScaleLeft
 from pose_graph_ros.core.judgement.closure_states import (
+    AUTO,
+    ClosureReports,
     ClosureStates,
+    DECISIONS,
     DOUBTED,
     SavedClosures,
     STATES,
     WAITING,
 )
-from pose_graph_ros.core.judgement.closure_trial import ClosureTrial
+from pose_graph_ros.core.judgement.closure_trial import ClosureTrial, SetSearch
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.residual_scale import ScaleLeft
-from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
-from pose_graph_ros.core.judgement.swaps import SetSearch
+from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
+from pose_graph_ros.core.judgement.settings import BELIEF
+from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     MOST_OTHERS,
@@ -41,34 +42,12 @@ from pose_graph_ros.core.judgement.verdicts import (
     State,
     Verdict,
 )
-from pose_graph_ros.core.measurements import Answer
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.constraint_queue import NewConstraint
-
-# Numbers of new closures that are tested before an update, and of those that are tested later: in
-# an update, and in a part of the work. Without closures the tree is as deep as the path is long,
-# and so is what a test has to solve for; the last is the limit of nodes times tests in a part.
-MOST_NEW, IN_UPDATE, IN_PART, NODES_IN_PART = 32, 16, 32, 160_000
-# Number of nodes above which an update adds closures with weight 0 and leaves all tests to the
-# work after it, so that it has nothing to solve for but what is new.
-LARGE = 500
-# A test, a change and a trial for each turn of a closure, and searches of other sets, each some
-# hundred iterations of a copy: no work that leads anywhere has more parts.
-PARTS_OF_EACH, PARTS = 3 * MOST_TURNS, 3000
-# Rounds of tests of closures that leave the graph.
-MOST_ROUNDS = 4
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 
 class ClosureJudge:
-    """
-    Judges the loop closures of a graph.
-
-    Parameters
-    ----------
-    smoother, reweighting : as in `Judge`
-
-    """
-
     def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self.chain = self._chain = OdometryChain()
@@ -77,11 +56,10 @@ class ClosureJudge:
         self.reports = ClosureReports(self._states, self._table)
         self._retests = Retests()
         self._rule = BeliefRule(self._states, self._table, self._retests)
-        self._final = (0, 0, 0, -1)
-        """Next ids of the graph and round at the last final decision."""
+        self._final = (0, 0, 0, -1)  # next ids of the graph and round at the last final decision
         self._n_staged = 0
+        # whether a clique of closures outside of the graph supports one that is doubted
         self._corroborated = GrowingArray((), np.bool_)
-        """Whether a clique of closures outside of the graph supports one that is doubted."""
         self._search = SetSearch(self._states, self._table)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
@@ -89,16 +67,7 @@ class ClosureJudge:
     def before(
         self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
     ) -> FloatArray:
-        """
-        Return the weights with which closures are to be added, shape (M,).
-
-        Parameters
-        ----------
-        new : sequence of NewConstraint, M closures
-        edges : Edges, of the closures
-        now_ns : int, stamp of the newest odometry
-
-        """
+        """Return the weights with which closures are to be added, shape (M,)."""
         begin, n = len(self._states), len(new)
         self._beliefs.now_ns, self._n_staged = now_ns, n
         self._chain.extend(self._smoother.graph)
@@ -107,16 +76,13 @@ class ClosureJudge:
         self._append_unknown(n)
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
-            for number, state in self._rule.choose(*self._test(numbers[:MOST_NEW])).items():
+            chosen = self._rule.choose(*self._test(numbers[:BELIEF.tests_of_new]))
+            for number, state in chosen.items():
                 self._states.state[number] = STATES.index(state)
         return self._beliefs.weights(numbers)
 
     def withhold(self) -> FloatArray | None:
-        """
-        Return the weights of the last `before` without belief; None if nothing was believed.
-
-        The closures are tested again later: with them the iterations of the update diverge.
-        """
+        """Return the weights of the last `before` without belief; None if they had none."""
         numbers = np.arange(len(self._states) - self._n_staged, len(self._states))
         if not np.any(self._states.in_graph[numbers]):
             return None
@@ -126,21 +92,18 @@ class ClosureJudge:
 
     @property
     def trial(self) -> ClosureTrial:
-        """What is solved for between two updates, as these diverge with it."""
         return self._beliefs.trial
 
     @property
     def _is_large(self) -> bool:
-        return self._smoother.graph.n_nodes > LARGE
+        return self._smoother.graph.n_nodes > BELIEF.large
 
     def _append_unknown(self, n: int) -> None:
-        """Append n closures that were not tested yet."""
         self._retests.append(n)
         self._corroborated.append(np.zeros(n, dtype=bool))
         self._scales.add_sources()
 
     def rollback(self) -> None:
-        """Forget the closures of the last `before`."""
         self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
@@ -149,16 +112,13 @@ class ClosureJudge:
         self._n_staged = 0
 
     def commit(self) -> None:
-        """Keep the closures of the last `before`."""
         begin, self._n_staged = len(self._states) - self._n_staged, 0
         if begin < len(self._states):
             self._retests.begin_turns()
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
-            gone = self._states.forget(source, self._corroborated.values)
-            if len(gone) > 0:
-                self._table.forget(gone)
+            self._table.forget(self._states.forget(source, self._corroborated.values).tolist())
         if np.any(self._states.in_graph[begin:]):
             self._beliefs.round += 1
             self._beliefs.set_base_weights(np.arange(begin, len(self._states)))
@@ -166,10 +126,10 @@ class ClosureJudge:
     def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
         """Test closures that are not in the graph; return those that pass, and their chances."""
         some, n = self._table.rows(numbers), len(numbers)
-        errors, spread = self._smoother.edge_innovations(relative.as_edges(some))
+        errors, spread = self._smoother.edge_innovations(closures.as_edges(some))
         total, distance = spread + some.noise, np.empty(n)
-        relative.distances(errors, total, distance)
-        self._table.set_spread(numbers, spread)
+        closures.distances(errors, total, distance)
+        self._table.spread[numbers] = spread
         self._states.distance[numbers] = distance
         self._retests.tested(numbers, self._beliefs.round)
         passes = distance < GATE
@@ -187,10 +147,9 @@ class ClosureJudge:
     def after(self) -> None:
         """Judge again, within bounds, after an update of a graph that is not large."""
         if not self._is_large:
-            self._part(IN_UPDATE)
+            self._part(BELIEF.tests_in_update)
 
     def work(self) -> bool:
-        """Do a bounded part of what is left; tell whether there is more."""
         return not self._smoother.graph.has_touched and (
             self._part(self._most) or self._try() or self._scales.learn()
             or self._look_for_another_set())
@@ -202,21 +161,20 @@ class ClosureJudge:
     @property
     def most_parts(self) -> int:
         """Parts of the work that end it unless beliefs go round in a circle."""
-        return PARTS + PARTS_OF_EACH * len(self._states)
+        return BELIEF.parts + BELIEF.parts_of_each * len(self._states)
 
     @property
     def _most(self) -> int:
-        """Number of tests in a part of the work."""
-        return max(min(IN_PART, NODES_IN_PART // max(self._smoother.graph.n_nodes, 1)), 1)
+        by_size = BELIEF.nodes_in_part // max(self._smoother.graph.n_nodes, 1)
+        return max(min(BELIEF.tests_in_part, by_size), 1)
 
     def _try(self) -> bool:
-        """Do a part of a trial; tell whether there is any."""
         before, again = self._beliefs.round, self._beliefs.try_part()
         if again is None:
             return False
         self._retests.again(again)
         if self._beliefs.round > before:
-            self._table.forget_spread()
+            self._table.spread[:] = 0.0
         return True
 
     def _part(self, most: int) -> bool:
@@ -234,15 +192,15 @@ class ClosureJudge:
     def _throw_out_of(self, inside: IntArray) -> bool:
         """Take those of some closures out of the graph that do not fit; tell if there was any."""
         # the smoother knows the energies; raised covariances make the residuals only smaller
-        inside = inside[relative.are_above(
+        inside = inside[closures.are_above(
             self._smoother.graph, self._states.edge[inside], 0.5 * GATE)]
-        fit = relative.residuals(self._smoother.graph, self._table.rows(inside))
+        fit = closures.residuals(self._smoother.graph, self._table.rows(inside))
         bad = inside[fit > GATE]
         if not self._change(dict.fromkeys(bad.tolist(), State.DOUBTED)):
             return False
         self._retests.thrown_out(bad)
         # without them the graph is less certain
-        self._table.forget_spread()
+        self._table.spread[:] = 0.0
         return True
 
     def _test_again(self, most: int) -> bool:
@@ -256,10 +214,10 @@ class ClosureJudge:
         if len(waiting) == 0:
             return False
         some = self._table.rows(waiting)
-        errors = relative.errors_of(self._smoother.graph, some)
+        errors = closures.errors_of(self._smoother.graph, some)
         # covariances only shrink while more is believed, so this is a lower bound
-        spread, least = self._table.spread(waiting), np.empty(len(waiting))
-        relative.distances(errors, spread + some.noise, least)
+        spread, least = self._table.spread[waiting], np.empty(len(waiting))
+        closures.distances(errors, spread + some.noise, least)
         known = spread[:, 0, 0] > 0.0
         hopeless = known & ~(least < GATE)
         self._retests.tested(waiting[hopeless], self._beliefs.round)
@@ -288,14 +246,7 @@ class ClosureJudge:
 
     def decide_leaving(self, edges: IntArray) -> list[Verdict]:
         """
-        Decide on closures that are about to leave the graph, with what is known now.
-
-        What is believed then stays as it is weighted. Returns the verdicts on all others.
-
-        Parameters
-        ----------
-        edges : ndarray of int, ids of all edges that leave
-
+        Decide on closures that are about to leave the graph; return the verdicts on those unused.
         """
         states, graph = self._states, self._smoother.graph
         self._chain.extend(graph)
@@ -305,27 +256,18 @@ class ClosureJudge:
         judged = leaving[states.judged[leaving]]
         if not graph.has_touched:
             self._throw_out_of(judged[states.in_graph[judged]])
-            for _ in range(MOST_ROUNDS):
+            for _ in range(BELIEF.leaving_rounds):
                 due = self._retests.due(self._beliefs.round, graph.next_ids.node)
                 waiting = judged[~states.in_graph[judged] & due[judged]]
                 if len(waiting) == 0 or graph.has_touched:
                     break
-                self._change(self._rule.choose(*self._test(waiting[:IN_UPDATE])))
+                self._change(self._rule.choose(*self._test(waiting[:BELIEF.tests_in_update])))
         return self.reports.of(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:].tolist())
 
     def forget(self, nodes: IntArray, edges: IntArray) -> None:
-        """
-        Forget all closures that have left the graph.
-
-        Parameters
-        ----------
-        nodes, edges : ndarray of int, ids
-
-        """
         states, gone = self._states, self._states.numbers(edges)
         self._beliefs.trial.forget(set(edges.tolist()), set(gone.tolist()))
         if len(gone) > 0:
-            self._table.forget(gone[~states.forgotten[gone]])
             self._beliefs.closures_left(gone)
             # all others get other numbers
             kept = np.setdiff1d(np.arange(len(states)), gone)
@@ -336,11 +278,7 @@ class ClosureJudge:
         self._chain.forget(nodes)
 
     def decide_finally(self) -> None:
-        """
-        Decide on all closures anew, by the graph alone; see `final`.
-
-        Without a solution, or if nothing has changed since the last time, nothing is done.
-        """
+        """Decide on all closures anew, by the graph alone, if anything has changed since."""
         smoother, states = self._smoother, self._states
         graph, judged = smoother.graph, np.flatnonzero(states.judged)
         present = *graph.next_ids, self._beliefs.round
@@ -363,15 +301,15 @@ class ClosureJudge:
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no closure is added."""
-        states, scales = self._states.state_of_all(), self._scales.state()
+        states_back, scales = self._states.snapshot(), self._scales.state()
 
         def bring_back() -> None:
-            self._states.set_state_of_all(*states)
+            states_back()
             self._scales.set_state(*scales)
             self._search = SetSearch(self._states, self._table)
             self._beliefs.trial.end()
             self._retests.again(slice(None))
-            self._table.forget_spread()
+            self._table.spread[:] = 0.0
         return bring_back
 
     def _look_for_another_set(self) -> bool:
@@ -383,18 +321,9 @@ class ClosureJudge:
         return more
 
     def saved(self) -> SavedClosures:
-        """Return the state; what is left to be tested is not part of it."""
         return self._states.saved(self._beliefs.scales)
 
     def restore(self, saved: SavedClosures, now_ns: int) -> None:
-        """
-        Restore what `saved` has returned, for the same graph.
-
-        Parameters
-        ----------
-        now_ns : int, stamp of the newest hidden node
-
-        """
         self._beliefs.now_ns = now_ns
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
@@ -405,20 +334,27 @@ class ClosureJudge:
         self._append_unknown(len(saved.rows))
 
     def totals(self) -> dict[str, SourceVerdicts]:
-        """Return what is believed of each source."""
         return self.reports.totals(self._beliefs.scales)
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
-        Return the answer to a person's decision on a closure, which is applied at once.
-
-        A closure that had been forced in waits when that is taken back, as the graph it is judged
-        by must be one without it.
-
-        Parameters
-        ----------
-        name : str, `Verdict.id`
-
+        Apply a decision at once; a closure that had been forced in waits when that is taken back.
         """
-        return beliefs.decide(name, decision, (self._states, self._table, self._beliefs),
-                                self.reports, self._smoother.graph)
+        states = self._states
+        number = states.find(name)
+        if number < 0:
+            return unknown(name, has_left=states.has_left(name))
+        before = int(states.decision[number])
+        state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
+                 Decision.AUTO: State.WAITING}[decision]
+        forced = decision is not Decision.AUTO or before != AUTO
+        states.decision[number] = DECISIONS.index(decision)
+        if states.forgotten[number]:
+            states.forgotten[number] = False
+            self._table.bring_back([number])
+        if forced and not self._beliefs.apply({number: state}, at_once=True):
+            states.decision[number] = before
+            return rejected('failed', 'the solver failed with it')
+        self._beliefs.round += 1
+        verdict, = self.reports.of(self._smoother.graph, [number])
+        return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')

@@ -1,71 +1,66 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Beliefs that an update cannot change in its time, as its iterations diverge with them.
+Beliefs that are tried on a copy of the graph, part by part, between the updates.
 
-The graph is solved with them as a copy, part by part, between the updates (`smoother/trial.py`).
-The result is adopted if they fit there. Trials that follow one another, with no update between
-that could do without, have longer and longer pauses: also where nothing else succeeds any more,
-they take a time in proportion to the drive.
+`ClosureTrial` tries changes with which the iterations of an update diverge, `SetSearch` whole
+other sets. In a copy nodes and constraints are numbered by their rows; only its result has ids
+again.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Generator, Mapping
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 
+from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.judgement import relative
-from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.error_functions import energies
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate, NextIds
+from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement.closure_states import ClosureStates
+from pose_graph_ros.core.judgement.closures import ClosureTable, GATE, residuals
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import Trial
 
-# Number of updates that diverge without a pause. After each further one the graph has to grow by
-# this share of its size until the next trial, doubled so many times; so many updates that do not
-# diverge make up for one.
-WITHOUT_PAUSE, PAUSE, MOST_DOUBLINGS, MAKE_UP = 3, 0.01, 4, 3
-# Number of nodes up to which there are no pauses, as solving for all takes a few milliseconds.
-SMALL = 100
-
 
 class ClosureTrial:
-    """One trial at a time, and the closures that have to wait for its end."""
+    """
+    One trial at a time, and the closures that have to wait for its end.
+
+    The result is adopted if the beliefs fit there. Trials that follow one another, with no update
+    between that could do without, have longer and longer pauses: also where nothing else succeeds
+    any more, they take a time in proportion to the drive.
+    """
 
     def __init__(self, smoother: IncrementalSmoother) -> None:
         self._smoother = smoother
         self._trial: Trial | None = None
+        # the states that are tried, by the numbers of closures
         self.changes: dict[int, State] = {}
-        """The states that are tried, by the numbers of closures."""
-        self.weights: dict[int, float] = {}
-        """The weights that are tried, by the ids of edges."""
-        self._is_set = False
-        """Whether it is a whole set, whose residuals were compared already."""
+        self.weights: dict[int, float] = {}  # the weights that are tried, by the ids of edges
+        self._is_set = False  # whether it is a whole set, whose residuals were compared already
+        # numbers of closures that another update has diverged with meanwhile
         self.later: set[int] = set()
-        """Numbers of closures that another update has diverged with meanwhile."""
+        # updates that have diverged, times `make_up`, less those that have not
         self._n_diverged = 0
-        """Updates that have diverged, times `MAKE_UP`, less those that have not."""
-        self._next_at = 0
-        """Next id of a node from which on there may be another trial."""
+        self._next_at = 0  # next id of a node from which on there may be another trial
 
     def begin(
         self, changes: Mapping[int, State], weights: Mapping[int, float],
         poses: FloatArray | None = None, observed: Mapping[int, float] | None = None,
     ) -> None:
         """
-        Begin a trial, but during a pause; that of a whole set does not wait for its end.
+        Begin a trial, but during a pause; that of a whole set, with poses, does not wait for it.
 
-        While another trial goes on, the closures are only noted for later.
-
-        Parameters
-        ----------
-        changes : mapping, the states of closures that are tried, by number
-        weights : mapping, the weights of their edges, by id
-        poses : ndarray, shape (N, 3), optional, where it starts
-        observed : mapping, optional, the weights of observed nodes that are tried, by id
-
+        While another trial goes on, the closures are only noted for later. Changes are by the
+        numbers of closures; weights of edges and of observed nodes by their ids.
         """
         if self._trial is not None:
             self.later.update(changes)
@@ -79,13 +74,14 @@ class ClosureTrial:
 
     def may_solve(self) -> bool:
         """Tell whether all may be solved for now that an update has diverged, or in a pause."""
-        self._n_diverged = min(
-            self._n_diverged + MAKE_UP, MAKE_UP * (WITHOUT_PAUSE + MOST_DOUBLINGS))
+        most = BELIEF.make_up * (BELIEF.without_pause + BELIEF.pause_doublings)
+        self._n_diverged = min(self._n_diverged + BELIEF.make_up, most)
         if self.is_pausing:
             return False
         graph = self._smoother.graph
-        doublings = max(self._n_diverged // MAKE_UP - WITHOUT_PAUSE, 0)
-        self._next_at = graph.next_ids.node + math.ceil(PAUSE * graph.n_nodes * 2**doublings)
+        doublings = max(self._n_diverged // BELIEF.make_up - BELIEF.without_pause, 0)
+        growth = math.ceil(BELIEF.pause * graph.n_nodes * 2**doublings)
+        self._next_at = graph.next_ids.node + growth
         return True
 
     @property
@@ -97,8 +93,8 @@ class ClosureTrial:
     def is_pausing(self) -> bool:
         """Whether the graph has to grow until the next trial, as too many updates diverge."""
         graph = self._smoother.graph
-        return (self._n_diverged >= MAKE_UP * WITHOUT_PAUSE and graph.n_nodes > SMALL
-                and graph.next_ids.node < self._next_at)
+        return (self._n_diverged >= BELIEF.make_up * BELIEF.without_pause
+                and graph.n_nodes > BELIEF.small and graph.next_ids.node < self._next_at)
 
     def was_not_needed(self) -> None:
         """Shorten the next pause, as an update has changed beliefs without a trial."""
@@ -110,7 +106,6 @@ class ClosureTrial:
         return len(self.later) > 0
 
     def work(self) -> bool:
-        """Do a part; tell whether there was any."""
         if self._trial is None:
             return False
         self._trial.work()
@@ -134,24 +129,15 @@ class ClosureTrial:
             return []
         wanted = np.array(
             [k for k, state in self.changes.items() if state.in_graph], dtype=np.int64)
-        fit = relative.residuals(self._trial.graph, table.rows(wanted))
+        fit = residuals(self._trial.graph, table.rows(wanted))
         return list(map(int, wanted[~(fit <= GATE)]))
 
     def adopt(self) -> bool:
-        """Replace the graph by the copy; tell whether that was possible."""
         assert self._trial is not None
         return self._smoother.adopt(self._trial).status is not Status.FAILED
 
     def forget(self, edges: Collection[int], numbers: Collection[int]) -> None:
-        """
-        Try no longer what has left the graph.
-
-        Parameters
-        ----------
-        edges : collection of int, ids
-        numbers : collection of int, closures
-
-        """
+        """Try no longer what has left the graph."""
         self.weights = {edge: weight for edge, weight in self.weights.items()
                         if edge not in edges}
         self.changes = {k: state for k, state in self.changes.items() if k not in numbers}
@@ -163,5 +149,139 @@ class ClosureTrial:
         self.later = {int(new[k]) for k in self.later}
 
     def end(self) -> None:
-        """Forget the trial, and who has waited."""
         self._trial, self.later = None, set()
+
+
+def copied_rows(graph: Graph) -> GraphRows:
+    """Return copies of all rows of a graph, with rows in place of ids."""
+    rows = graph.rows()
+    observed = rows.observed
+    n_nodes, n_edges, n_observed = len(rows.poses), len(rows.edges), len(observed)
+    return rows._replace(
+        edges=rows.edges.renumbered(graph.node_rows), observed=ObservedNodes(
+            graph.node_rows(observed.node), *observed.columns[1:]),
+        node_ids=np.arange(n_nodes), edge_ids=np.arange(n_edges),
+        observed_ids=np.arange(n_observed), next_ids=NextIds(n_nodes, n_edges, n_observed),
+        priors=[replace(prior, nodes=graph.node_rows(prior.nodes)) for prior in rows.priors])
+
+
+def losses_in_rows(graph: Graph, reweighting: Reweighting) -> Reweighting:
+    """Return a copy of the losses of a graph, by row instead of by id."""
+    edges, observed = reweighting.saved()
+    copy = Reweighting()
+    copy.restore(replace(edges, rows=graph.edge_rows(edges.rows)),
+                 replace(observed, rows=graph.observed_rows(observed.rows)))
+    return copy
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    inside: BoolArray  # which closures are in it, shape (M,)
+    nodes: IntArray  # ids of the hidden nodes of the copy, shape (N,)
+    poses: FloatArray  # their poses, shape (N, 3)
+
+
+def better_set(
+    graph: Graph, closures: Edges, ids: IntArray, inside: BoolArray, *, free: BoolArray,
+    clique: IntArray,
+) -> Generator[None, None, Found | None]:
+    """
+    Return a better set of closures than `inside`, if one is found by starting with a clique.
+
+    Closures that agree with one another and not with the graph may be right, and others that came
+    before them wrong. The copy is optimised with a clique of them forced in. Then all that are
+    `free` are chosen anew by their residuals, with a limit that narrows. Sets are compared by the
+    truncated cost: chi2 of all that is not judged, and min(r^2, limit) of each closure, with r^2
+    by the floored covariances. Each step fills the copy or does one iteration.
+    """
+    rows, closures = graph.edge_rows(ids), closures.renumbered(graph.node_rows)
+    others = np.ones(graph.n_edges, dtype=bool)
+    others[rows] = False
+    before, nodes, copied, copy = inside, graph.node_ids.copy(), copied_rows(graph), Graph()
+    columns = (*closures.columns[:5], inside.astype(np.float64))
+    for column, values in zip(copied.edges.columns, columns, strict=False):
+        column[rows] = values
+    copy.fill(copied)
+    yield
+    found, lowest, config = None, np.inf, SolverConfig(max_iterations=20, step_tolerance=1e-3)
+    for n, factor in enumerate((np.inf, *BELIEF.narrowing)):
+        result = yield from optimizer.in_parts(copy, config)
+        if result.status is Status.FAILED:
+            break
+        residual = energies(copy.edge_errors(closures), closures.information)
+        rest = copy.energies()
+        cost = (float(np.sum(rest.edges[others]) + np.sum(rest.observed))
+                + float(np.sum(np.minimum(residual[free], GATE)))
+                + float(np.sum(residual[~free & before])))
+        if n == 0:
+            lowest = cost
+        elif factor <= 1.0 and cost < lowest - GATE:
+            found, lowest = Found(inside, nodes, copy.poses.copy()), cost
+        chosen = np.where(free, before if n == 0 else residual < GATE * factor, before)
+        if n < BELIEF.forced_rounds:
+            chosen[clique] = True
+        changed = np.flatnonzero(chosen != inside)
+        if factor <= 1.0 and len(changed) == 0:
+            break
+        inside = chosen
+        copy.apply(GraphUpdate(weigh_edges=dict(zip(
+            rows[changed].tolist(), inside[changed].astype(float).tolist(), strict=True))))
+        yield
+    return found
+
+
+class SetSearch:
+    """Tries other sets, one bounded part at each call."""
+
+    def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
+        self._states, self._table = states, table
+        self._next = BELIEF.more_corroborated
+        self._parts: Generator[None, None, Found | None] | None = None  # the trial that goes on
+        self._began = 0
+        self.found: Found | None = None  # what the last part has ended with
+
+    def work(self, graph: Graph, corroborated: BoolArray, now: int) -> bool:
+        """Go on with a trial, or begin one if enough speaks for it; tell if there was any."""
+        self.found = None
+        if self._parts is not None and self._began != now:
+            self._parts = None
+            return True
+        if self._parts is None:
+            against = np.flatnonzero(
+                corroborated & ~self._states.in_graph & self._states.judged)
+            if len(against) < self._next:
+                return False
+            self._next = max(len(against) + BELIEF.more_corroborated,
+                             math.ceil(1.5 * len(against)))
+            self._parts = self._trial(graph, self._states.edge[against[-BELIEF.most_seeds:]])
+            self._began = now
+        try:
+            next(self._parts)
+        except StopIteration as end:
+            self._parts, self.found = None, end.value
+        return True
+
+    def _trial(self, graph: Graph, seeds: IntArray) -> Generator[None, None, Found | None]:
+        """Return a better set, part by part; closures are ids of edges, as some may leave."""
+        states, clique = self._states, seeds[:0]
+        for edge in seeds.tolist():
+            for number in states.numbers(np.array([edge])).tolist():
+                if states.judged[number]:
+                    other = self._table.support(number, ~states.in_graph & states.judged).clique
+                    clique = states.edge[other] if len(other) > len(clique) else clique
+            yield
+        known = np.flatnonzero(~states.forgotten)
+        edges = states.edge[known]
+        clique = np.flatnonzero(np.isin(edges, clique))
+        some = self._table.rows(known)
+        closures = Edges(some.i, some.j, some.mean, np.linalg.inv(some.noise),
+                         graph.edges_at(edges).kind, np.ones(len(known)))
+        found = yield from better_set(
+            graph, closures, edges, states.in_graph[known], free=states.judged[known],
+            clique=clique)
+        if found is None:
+            return None
+        # edges are in the order of their addition
+        inside = np.zeros(len(states), dtype=bool)
+        inside[states.numbers(edges)] = found.inside[np.isin(edges, states.edge)]
+        return Found(inside, found.nodes, found.poses)

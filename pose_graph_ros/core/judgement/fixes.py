@@ -18,11 +18,11 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import fix_states as fs, fix_verdicts
-from pose_graph_ros.core.judgement.decision_cost import decision_cost
+from pose_graph_ros.core.judgement import fix_states as fs
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.run_set import NOWHERE, RunSet, Turn
+from pose_graph_ros.core.judgement.run_set import decision_cost, RunSet, Turn
 from pose_graph_ros.core.judgement.runs import odometry_between
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.tracks import (
     biased_observations,
@@ -39,10 +39,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
 )
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.constraint_queue import NewConstraint
-
-# Largest number of measurements that are all judged again at the end of a stream.
-MOST_AGAIN = 100_000
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 
 class _Before(NamedTuple):
@@ -54,39 +51,27 @@ class _Before(NamedTuple):
 
 
 class _Decided(NamedTuple):
-    """A decision on all measurements."""
-
     run: IntArray
-    believed: IntArray
-    """Of each record, both of shape (M,)."""
+    believed: IntArray  # of each record, both of shape (M,)
     runs: RunSet
     loosened: dict[int, float]
 
 
 class FixJudge:
-    """
-    Judges positions and poses in the map; see the module.
-
-    Parameters
-    ----------
-    smoother, reweighting, config : as in `Judge`
-
-    """
-
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
     ) -> None:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self.states = self._states = fs.FixStates()
         self._runs = RunSet()
+        # weights of odometry edges by id; replaced, never changed, so that it is not copied
         self._loosened: dict[int, float] = {}
-        """Weights of odometry edges by id; replaced, never changed, so that it is not copied."""
         self._restore: _Before | None = None
         self._decided: _Decided | None = None
+        # stamp [ns] of the newest believed measurement that has left, and where the robot was
         self._cut: tuple[int, Track] | None = None
-        """Stamp [ns] of the newest believed measurement that has left, and where the robot was."""
+        # newest stamp of odometry, and the record that is judged again, -1 for a new one
         self._now_ns, self._again = -1, -1
-        """Newest stamp of odometry, and the record that is judged again, -1 for a new one."""
 
     @property
     def loosened(self) -> Mapping[int, float]:
@@ -94,22 +79,12 @@ class FixJudge:
         return self._loosened
 
     def configure(self, config: BackendConfig) -> None:
-        """Set the settings for later measurements."""
         self._config = config
 
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
     ) -> GraphUpdate:
-        """
-        Return an update in which all rows have the weights that the new ones make right.
-
-        Parameters
-        ----------
-        new : sequence of NewConstraint, what the new rows were made from, in the order of stamps
-        change : GraphUpdate, that adds them
-        now_ns : int, stamp of the newest odometry
-
-        """
+        """Return an update in which all rows have the weights that the new ones make right."""
         judged = [one for one in new if one.kind not in (LoopClosure, HeadingOnly)
                   and self._config.measurement_source(one.source, one.kind).robust
                   is Robust.JUDGED]
@@ -139,18 +114,13 @@ class FixJudge:
         edges, observed = self._states.weights(first, self._reweighting)
         for edge in () if loosened is self._loosened else {*loosened, *self._loosened}:
             if loosened.get(edge) != self._loosened.get(edge):
-                edges[edge] = self.weight_of_odometry(edge)
+                edges[edge] = self._loosened.get(edge, 1.0)
         return change._replace(weigh_edges={**change.weigh_edges, **edges},
                                weigh_observed={**change.weigh_observed, **observed})
 
     @property
     def chain(self) -> OdometryChain:
-        """The odometry between hidden nodes, as the judge knows it."""
         return self._runs.chain
-
-    def weight_of_odometry(self, edge: int) -> float:
-        """Return the weight that an odometry edge has, by its id, as far as fixes know."""
-        return self._loosened.get(edge, 1.0)
 
     def _begin(self) -> None:
         self._restore, self._decided = self._copy(), None
@@ -159,18 +129,16 @@ class FixJudge:
         return _Before(len(self._states), self._runs.copy(), self._loosened)
 
     def commit(self) -> None:
-        """Keep what the last `before` has decided, after its update has succeeded."""
         if self._restore is None:
             return
         self._states.set_base_weights(self._restore.size, self._reweighting)
         for number, before in self._states.changed.items():
-            if before != bool(self._states.records[number, fs.BELIEVED]):
+            if before != bool(self._states.records['believed'][number]):
                 self._states.announce(number, State.BELIEVED if before else State.DOUBTED)
         self._states.forget()
         self._restore = None
 
     def rollback(self) -> None:
-        """Forget the last `before`, as its update has failed."""
         if self._restore is not None:
             self._states.undo(self._restore.size)
             self._set(self._restore)
@@ -180,10 +148,10 @@ class FixJudge:
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no measurement is added."""
-        before, records = self._copy(), self._states.state()
+        before, records_back = self._copy(), self._states.snapshot()
 
         def bring_back() -> None:
-            self._states.set_state(*records)
+            records_back()
             self._set(before)
         return bring_back
 
@@ -193,7 +161,7 @@ class FixJudge:
         if seen is None:
             return      # a heading alone
         states = self._states
-        source = (states.sources[states.records[self._again, fs.SOURCE]]
+        source = (states.sources[states.records['source'][self._again]]
                   if one is None else one.source)
         begun = not np.any(self._smoother.graph.fixed)
         given = self._runs.judge(
@@ -203,8 +171,8 @@ class FixJudge:
             states.append(one, run=given.run, believed=given.believed,
                           distance=math.sqrt(given.d2), now_ns=self._now_ns)
         else:
-            states.records[self._again, fs.RUN] = given.run
-            if bool(states.records[self._again, fs.BELIEVED]) != given.believed:
+            states.records['run'][self._again] = given.run
+            if bool(states.records['believed'][self._again]) != given.believed:
                 states.believe(
                     np.array((self._again,)), believed=given.believed, now_ns=self._now_ns)
         if given.turn is not None:
@@ -221,24 +189,20 @@ class FixJudge:
         """Believe and doubt the members of runs, and the odometry between them."""
         records = self._states.records
         for number, rest, stamp_ns in turn.cuts:
-            after = np.flatnonzero((records[:, fs.RUN] == number)
-                                   & (records[:, fs.STAMP] >= stamp_ns))
+            after = np.flatnonzero((records['run'] == number)
+                                   & (records['stamp_ns'] >= stamp_ns))
             self._states.keep(after)
             self._states.believe(after, believed=False, now_ns=self._now_ns)
-            records[after, fs.RUN] = rest
+            records['run'][after] = rest
         for number, believed in turn.runs:
-            self._states.believe(np.flatnonzero(records[:, fs.RUN] == number),
+            self._states.believe(np.flatnonzero(records['run'] == number),
                                  believed=believed, now_ns=self._now_ns)
         self._loosened = {
             edge: 1.0 / scale for begin, end, scale in turn.jumps
             for edge in odometry_between(self._smoother.graph, begin, end).tolist()}
 
     def finish(self) -> None:
-        """
-        Judge all measurements again in the order of their stamps, by odometry alone.
-
-        What `final_weights` has decided since the last measurement came is not decided twice.
-        """
+        """Judge all again by odometry alone, unless `final_weights` has just decided it."""
         loosened, states, decided = self._loosened, self._states, self._decided
         if not self._can_judge_all():
             return
@@ -249,7 +213,7 @@ class FixJudge:
         else:
             self._use(decided)
         states.changed = {number: before for number, before in sorted(states.changed.items())
-                          if before != bool(states.records[number, fs.BELIEVED])}
+                          if before != bool(states.records['believed'][number])}
         change = self._with_weights(GraphUpdate(), len(states), loosened)
         if (len(change.weigh_edges) + len(change.weigh_observed) > 0
                 and self._smoother.update(change).reason != ''):
@@ -268,8 +232,8 @@ class FixJudge:
         self._judge_all()
         for kind, table, row_of in ((1, weights[0], graph.edge_rows),
                                     (0, weights[1], graph.observed_rows)):
-            some = records[records[:, fs.EDGE] == kind]
-            table[row_of(some[:, fs.HELD])] = some[:, fs.BELIEVED]
+            some = records[records['edge'] == kind]
+            table[row_of(some['held'])] = some['believed']
         decided = self._decision()
         self.rollback()
         self._decided = decided
@@ -277,40 +241,37 @@ class FixJudge:
 
     def _decision(self) -> _Decided:
         records = self._states.records
-        return _Decided(records[:, fs.RUN].copy(), records[:, fs.BELIEVED].copy(),
+        return _Decided(records['run'].copy(), records['believed'].copy(),
                         self._runs, self._loosened)
 
     def _use(self, decided: _Decided) -> None:
         self._runs, self._loosened = decided.runs, decided.loosened
-        self._states.records[:, fs.RUN] = decided.run
+        self._states.records['run'] = decided.run
         for believed in (False, True):
             self._states.believe(np.flatnonzero(decided.believed == believed), believed=believed,
                                  now_ns=self._now_ns)
 
     def _can_judge_all(self) -> bool:
-        return 0 < len(self._states) <= MOST_AGAIN and not self._smoother.graph.has_touched
+        return 0 < len(self._states) <= BELIEF.most_again and not self._smoother.graph.has_touched
 
     def _judge_all(self) -> None:
-        """
-        Judge all measurements again, and keep the present decision if it is the cheaper one.
-
-        Their errors are taken to be as stated, whatever was found since they came.
-        """
+        """Judge all again, with the errors that they state; the cheaper decision is kept."""
         graph, states, present = self._smoother.graph, self._states, self._decision()
         self._runs, self._loosened = self._runs.empty(), {}
         self._runs.chain.extend(graph)
         if self._cut is not None:
             self._runs.begin_with(*self._cut)
-        states.records[:, fs.RUN] = fs.LONE
+        states.records['run'] = fs.LONE
         order = states.by_stamp()
-        held, observed, stamps_ns = states.records[order][:, (fs.HELD, fs.OBSERVED, fs.STAMP)].T
+        held, observed, stamps_ns = (
+            states.records[name][order] for name in ('held', 'observed', 'stamp_ns'))
         is_edge = observed < 0
         seen = _both(graph.edges_at(held[is_edge]), graph.observed_at(observed[~is_edge]), is_edge)
         for self._again, stamp_ns, one in zip(
                 order.tolist(), stamps_ns.tolist(), seen, strict=True):
             self._judge(stamp_ns, one, None)
         self._again = -1
-        if np.array_equal(present.believed, states.records[:, fs.BELIEVED]):
+        if np.array_equal(present.believed, states.records['believed']):
             return
         begin = None if self._cut is None else self._cut[1]
         now, before = (decision_cost(
@@ -324,35 +285,27 @@ class FixJudge:
     def decide_leaving(
         self, edges: IntArray, observed: IntArray,
     ) -> tuple[list[Verdict], tuple[int, Track] | None]:
-        """
-        Return the verdicts on measurements that are about to leave the graph unused.
-
-        With them comes where the robot was at the newest one that is believed, for `forget`.
-
-        Parameters
-        ----------
-        edges, observed : ndarray of int, ids of what leaves
-
-        """
+        """Return the verdicts on what leaves unused, and where the robot was, for `forget`."""
         graph, states = self._smoother.graph, self._states
         self._runs.chain.extend(graph)
         leaving = states.leaving(edges, observed)
         unused = np.flatnonzero(leaving & ~states.believed)
-        return (fix_verdicts.verdicts_on(states, graph, unused[-MOST_OTHERS:]),
+        return (fs.verdicts_on(states, graph, unused[-MOST_OTHERS:]),
                 self._after(np.flatnonzero(leaving & states.believed)))
 
     def _after(self, numbers: IntArray) -> tuple[int, Track] | None:
         """Return where the robot was after some believed measurements, by what was before."""
         graph, chain, cut = self._smoother.graph, self._runs.chain, self._cut
         records = self._states.records[numbers]
-        records = records[np.argsort(records[:, fs.STAMP], kind='stable')]
-        is_edge = records[:, fs.OBSERVED] < 0
-        seen = _both(graph.edges_at(records[is_edge, fs.HELD]),
-                     graph.observed_at(records[~is_edge, fs.OBSERVED]), is_edge)
-        for stamp_ns, one in zip(records[:, fs.STAMP].tolist(), seen, strict=True):
+        records = records[np.argsort(records['stamp_ns'], kind='stable')]
+        is_edge = records['observed'] < 0
+        seen = _both(graph.edges_at(records['held'][is_edge]),
+                     graph.observed_at(records['observed'][~is_edge]), is_edge)
+        for stamp_ns, one in zip(records['stamp_ns'].tolist(), seen, strict=True):
             if one is None or (cut is not None and one.node < cut[1].node):
                 continue
-            track = Track(one.node, graph.poses_of(one.node), np.diag((NOWHERE, NOWHERE, 0.3**2)))
+            track = Track(one.node, graph.poses_of(one.node),
+                          np.diag((BELIEF.nowhere, BELIEF.nowhere, 0.3**2)))
             if cut is not None:
                 track = cut[1].moved(chain, one.node)
             cut = stamp_ns, track.updated(track.innovation(one))
@@ -362,15 +315,6 @@ class FixJudge:
         self, nodes: IntArray, edges: IntArray, observed: IntArray,
         last: tuple[int, Track] | None,
     ) -> None:
-        """
-        Forget measurements that have left the graph, and the path there.
-
-        Parameters
-        ----------
-        nodes, edges, observed : ndarray of int, ids
-        last : tuple, optional, the second result of `decide_leaving`, if a measurement has left
-
-        """
         self._states.leave(self._states.leaving(edges, observed))
         self._cut, self._decided = last or self._cut, None
         if self._cut is not None:
@@ -382,23 +326,16 @@ class FixJudge:
                               if edge not in gone}
 
     def decide(self, name: str, decision: Decision) -> Answer:
-        """
-        Return the answer to a person's decision on a measurement, which is applied at once.
-
-        Parameters
-        ----------
-        name : str, `Verdict.id`
-
-        """
+        """Return the answer to a person's decision on a measurement, which is applied at once."""
         number = self._states.find(name)
         if number < 0:
             return unknown(name, has_left=self._states.has_left(name))
         record = self._states.records[number]
         believed = decision is Decision.IN or (
-            decision is Decision.AUTO and self._runs.believes(int(record[fs.RUN])))
+            decision is Decision.AUTO and self._runs.believes(int(record['run'])))
         self._begin()
         self._states.keep(np.array((number,)))
-        record[fs.DECISION] = fs.AUTO
+        record['decision'] = fs.AUTO
         self._states.believe(np.array((number,)), believed=believed, now_ns=self._now_ns)
         change = self._with_weights(GraphUpdate(), len(self._states), self._loosened)
         if len(self._states.changed) > 0:
@@ -407,24 +344,15 @@ class FixJudge:
                 self.rollback()
                 return rejected('failed', 'the solver failed with it')
         self.commit()
-        self._states.records[number, fs.DECISION] = fs.DECISIONS.index(decision)
-        verdict, = fix_verdicts.verdicts_on(
+        self._states.records['decision'][number] = fs.DECISIONS.index(decision)
+        verdict, = fs.verdicts_on(
             self._states, self._smoother.graph, np.array((number,)))
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
 
     def saved(self) -> fs.SavedFixes:
-        """Return the state; the runs are not part of it."""
         return self._states.saved(self._loosened)
 
     def restore(self, saved: fs.SavedFixes, now_ns: int) -> None:
-        """
-        Restore what `saved` has returned, for the same graph.
-
-        Parameters
-        ----------
-        now_ns : int, stamp of the newest hidden node
-
-        """
         self._now_ns = now_ns
         self._states.restore(saved)
         self._loosened = dict(zip(saved.loosened.tolist(), saved.weights.tolist(), strict=True))

@@ -23,12 +23,13 @@ from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import fix_verdicts
-from pose_graph_ros.core.judgement.closure_judge import ClosureJudge, LARGE
+from pose_graph_ros.core.judgement import fix_states as fs
+from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.closure_states import SavedClosures
 from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
@@ -39,17 +40,13 @@ from pose_graph_ros.core.judgement.verdicts import (
 )
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import DIVERGED, UpdateResult
-from pose_graph_ros.core.sources.constraint_queue import NewConstraint
-from pose_graph_ros.core.sources.source_constraints import Held
+from pose_graph_ros.core.odometry.motion import OdometryErrors
+from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
+from pose_graph_ros.core.sources.source_constraints import Held, NewConstraint
 
 
 @dataclass(frozen=True, slots=True)
 class SavedJudgement:
-    """Saved state of the judgement."""
-
     closures: SavedClosures
     fixes: SavedFixes
     odometry: SavedOdometry
@@ -58,22 +55,13 @@ class SavedJudgement:
 class Leaving(NamedTuple):
     """What is decided on constraints that are about to leave the graph."""
 
-    unused: list[Verdict]
-    """On those that are not believed."""
+    unused: list[Verdict]  # on those that are not believed
+    # stamp [ns] of the newest believed measurement in the map, and where the robot was
     last: tuple[int, Track] | None
-    """Stamp [ns] of the newest believed measurement in the map, and where the robot was."""
 
 
 class Judge:
-    """
-    Judges the constraints of a graph; it knows no clock, and nothing of how they arrived.
-
-    Parameters
-    ----------
-    reweighting : Reweighting, of its constraints with a robust loss
-    nodes : HiddenNodes, with the stamps and the sources of the odometry
-
-    """
+    """Judges the constraints of a graph; it knows no clock, and nothing of how they arrived."""
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
@@ -84,31 +72,20 @@ class Judge:
         self._fixes = FixJudge(smoother, reweighting, config)
         self._odometry = OdometryStates(nodes)
         self._closures = ClosureJudge(smoother, reweighting)
+        # the judged closures of the last `before`, by their numbers among its edges
         self._staged = np.empty(0, dtype=np.int64)
-        """The judged closures of the last `before`, by their numbers among its edges."""
-        self._new: Sequence[NewConstraint] = ()
-        """All constraints of the last `before`."""
+        self._new: Sequence[NewConstraint] = ()  # all constraints of the last `before`
+        # on the newest constraints that have left the graph unused
         self._left: deque[Verdict] = deque(maxlen=MOST_OTHERS)
-        """On the newest constraints that have left the graph unused."""
 
     def configure(self, config: BackendConfig) -> None:
-        """Set the settings for later constraints."""
         self._config = config
         self._fixes.configure(config)
 
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
     ) -> GraphUpdate:
-        """
-        Return an update in which the new rows have the weights that they begin with.
-
-        Parameters
-        ----------
-        new : sequence of NewConstraint, what the new rows were made from
-        change : GraphUpdate, that adds them
-        now_ns : int, stamp of the newest odometry
-
-        """
+        """Return an update in which the new rows have the weights that they begin with."""
         self._new = new
         change = self._fixes.before(new, change, now_ns)
         first = self._smoother.graph.next_ids.edge
@@ -184,23 +161,15 @@ class Judge:
     def may_solve(self) -> bool:
         """Tell whether an update that has diverged may solve for all at once."""
         trial = self._closures.trial
-        is_large = self._smoother.graph.n_nodes > LARGE
+        is_large = self._smoother.graph.n_nodes > BELIEF.large
         return not (is_large or trial.is_due_or_pausing) and trial.may_solve()
 
     def solve_later(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
-        """
-        Solve the graph with some weights as a copy between the updates, as these diverge.
-
-        Parameters
-        ----------
-        edges, observed : mapping, new weights by id
-
-        """
+        """Solve the graph with some weights as a copy between the updates, as these diverge."""
         self._closures.trial.begin({}, edges, observed=observed)
 
     @property
     def solves_later(self) -> bool:
-        """Whether that goes on, or has to wait until the graph has grown."""
         return self._closures.trial.is_due_or_pausing
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
@@ -212,7 +181,6 @@ class Judge:
                     one.source, LoopClosure).robust is Robust.JUDGED)
 
     def commit(self) -> None:
-        """Keep what the last `before` has decided, after its update has succeeded."""
         self._closures.commit()
         self._fixes.commit()
         self._keep_gaps()
@@ -222,20 +190,16 @@ class Judge:
             self._fixes.loosened, self._smoother.graph, self._nodes.newest_ns)
 
     def rollback(self) -> None:
-        """Forget the constraints of the last `before`, as their update has failed."""
         self._closures.rollback()
         self._fixes.rollback()
 
     def after(self) -> None:
-        """Judge again what an update may have changed, in bounded time."""
         self._closures.after()
 
     def test(self) -> bool:
-        """Do a bounded part of the tests of closures that wait; tell whether there was any."""
         return self._closures.test()
 
     def work(self) -> bool:
-        """Do a bounded part of what is left to be judged; tell whether there is more."""
         return self._closures.work()
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
@@ -243,7 +207,7 @@ class Judge:
         graph = self._smoother.graph
         return [*self._closures.reports.verdicts(graph, most_believed),
                 *self._odometry.verdicts(graph, self._believed_after),
-                *fix_verdicts.verdicts(self._fixes.states, graph, most_believed), *self._left]
+                *fs.verdicts(self._fixes.states, graph, most_believed), *self._left]
 
     def closures(self) -> tuple[IntArray, IntArray]:
         """Return the edges of judged loop closures, and stamps of their ends [ns], (L, 2)."""
@@ -260,24 +224,15 @@ class Judge:
             weak, waiting, doubted, edges, graph.observed_rows(unused[~is_edge]).tolist())
 
     def changes(self) -> list[Change]:
-        """Return the changes of verdicts since the last call."""
         return [*self._closures.states.take_changes(), *self._odometry.take_changes(),
                 *self._fixes.states.take_changes()]
 
     def totals(self) -> Mapping[str, SourceVerdicts]:
-        """Return what is believed of each source, as a whole."""
         return {**self._odometry.totals(), **self._closures.totals(),
                 **self._fixes.states.totals()}
 
     def decide(self, name: str, decision: Decision) -> Answer:
-        """
-        Return the answer to a person's decision on a constraint, which is applied at once.
-
-        Parameters
-        ----------
-        name : str, `Verdict.id`
-
-        """
+        """Return the answer to a person's decision on a constraint, which is applied at once."""
         fixes = self._fixes.states
         is_fix = fixes.find(name) >= 0 or fixes.has_left(name)
         judge = self._fixes if is_fix else self._closures
@@ -286,14 +241,6 @@ class Judge:
     def decide_leaving(self, edges: IntArray, observed: IntArray) -> Leaving:
         """
         Return what is decided on constraints that are about to leave the graph, for `forget`.
-
-        What is believed then stays as it is weighted; all else leaves unused. Nothing is on record
-        before they have left.
-
-        Parameters
-        ----------
-        edges, observed : ndarray of int, ids
-
         """
         graph = self._smoother.graph
         closures = self._closures.decide_leaving(edges)
@@ -306,15 +253,6 @@ class Judge:
     def forget(
         self, nodes: IntArray, edges: IntArray, observed: IntArray, leaving: Leaving | None,
     ) -> None:
-        """
-        Forget what has left the graph.
-
-        Parameters
-        ----------
-        nodes, edges, observed : ndarray of int, ids
-        leaving : Leaving, optional, what was decided on it; None if nothing of it is judged
-
-        """
         self._closures.forget(nodes, edges)
         self._fixes.forget(nodes, edges, observed, leaving and leaving.last)
         self._odometry.forget(self._smoother.graph, edges, self._fixes.loosened)
@@ -322,22 +260,13 @@ class Judge:
             self._left.extend(leaving.unused)
 
     def _believed_after(self, stamp_ns: int) -> tuple[str, ...]:
-        return fix_verdicts.believed_after(self._fixes.states, stamp_ns)
+        return fs.believed_after(self._fixes.states, stamp_ns)
 
     def saved(self) -> SavedJudgement:
-        """Return the state; what is left to be done is not part of it."""
         return SavedJudgement(
             self._closures.saved(), self._fixes.saved(), self._odometry.saved())
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
-        """
-        Restore what `saved` has returned, for the same graph.
-
-        Parameters
-        ----------
-        now_ns : int, stamp of the newest hidden node
-
-        """
         self._closures.restore(saved.closures, now_ns)
         self._fixes.restore(saved.fixes, now_ns)
         self._odometry.restore(saved.odometry)
@@ -353,23 +282,11 @@ class Judge:
                 ~np.isin(chain.nodes[1:], self._nodes.relocated_ids))
 
     def moved(self, before: Held, after: Held) -> None:
-        """
-        Follow measurements that others hold now, with the same weights.
-
-        Parameters
-        ----------
-        before, after : Held, of the same measurements
-
-        """
+        """Follow measurements that others hold now, with the same weights."""
         self._fixes.states.moved(before, after)
 
     def final_weights(self) -> tuple[FloatArray, FloatArray]:
-        """
-        Return weights of edges and observed nodes by which the errors of sources are estimated.
-
-        Measurements in the map have those that the end gives them, which do not depend on what was
-        decided before.
-        """
+        """Return the weights of edges and observed nodes that the end would give."""
         return self._fixes.final_weights()
 
     def finish(self) -> Callable[[], None]:

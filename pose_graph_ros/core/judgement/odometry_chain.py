@@ -18,10 +18,9 @@ from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, full, upper
+from pose_graph_ros.core.graph.constraints import EdgeKind, full, NodeKind, upper
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.kinds import NodeKind
-from pose_graph_ros.core.odometry.odometry_errors import OdometryErrors
+from pose_graph_ros.core.odometry.motion import OdometryErrors
 
 # Weight that one of 0 counts as.
 _LEAST_WEIGHT = 1e-9
@@ -46,18 +45,10 @@ class OdometryChain:
     """
     The hidden nodes of a graph, chained by the odometry edge that each was made with.
 
-    Where nodes have left the graph before the chain was begun, their odometry is not known any
-    more. Then the chain goes on with where the next node is by the graph, and with the noise of
-    default odometry.
-
-    Parameters
-    ----------
-    weighted : bool
-        Whether an edge counts with its present weight; by default it counts with the information
-        that odometry claims.
-    by_row : bool
-        Whether nodes are given by row instead of by id, as long as none leaves the graph.
-
+    An edge counts with the information that odometry claims, or `weighted` with its present
+    weight. Where nodes have left the graph before the chain was begun, their odometry is not known
+    any more: the chain goes on with where the next node is by the graph, and the noise of default
+    odometry.
     """
 
     def __init__(self, *, weighted: bool = False, by_row: bool = False) -> None:
@@ -66,19 +57,16 @@ class OdometryChain:
         self._poses = GrowingArray((3,), np.float64)
         self._sums = GrowingArray((6,), np.float64)
         self._travel = GrowingArray((), np.float64)
-        self._next_edge = 0
-        """Id of the first edge that was not looked at."""
+        self._next_edge = 0  # id of the first edge that was not looked at
+        # number of nodes that were forgotten since the poses were made relative to the first
         self._n_gone = 0
-        """Number of nodes that were forgotten since the poses were made relative to the first."""
-        self.noise_factor = 1.0
-        """On the covariances of odometry."""
+        self.noise_factor = 1.0  # on the covariances of odometry
 
     def __len__(self) -> int:
         return len(self._nodes)
 
     @property
     def nodes(self) -> IntArray:
-        """Ids of the nodes, in their order."""
         return self._nodes.values
 
     @property
@@ -131,16 +119,7 @@ class OdometryChain:
         self, before: OdometryErrors, after: OdometryErrors, stamps_ns: IntArray,
         by_odometry: BoolArray,
     ) -> None:
-        """
-        Follow the edges, which know of other errors of odometry now.
-
-        Parameters
-        ----------
-        before, after : OdometryErrors
-        stamps_ns : ndarray of int, shape (M,), of the nodes of the chain
-        by_odometry : ndarray of bool, shape (M - 1,), which steps have such edges
-
-        """
+        """Follow edges that know of other errors now; `by_odometry` tells which steps do."""
         if len(self) < 2:
             return
         poses, sums = self._poses.values, full(self._sums.values)
@@ -189,25 +168,13 @@ class OdometryChain:
 
     @property
     def travelled(self) -> FloatArray:
-        """Lengths of the path to them by odometry, shape (M,) [m]."""
         return self._travel.values
 
     def travel(self, nodes: IntArray) -> FloatArray:
-        """Return the lengths of the path to nodes by odometry, shape (M,) [m]."""
         return np.asarray(self._travel.values[self.places(nodes)])
 
     def between(self, i: IntArray, j: IntArray) -> tuple[FloatArray, FloatArray]:
-        """
-        Return the poses of nodes j in nodes i by odometry, and their covariances.
-
-        Poses have the shape (M, 3) [m, m, rad], covariances the shape (M, 3, 3), in the frames of
-        j. Raises KeyError if a node is not in the chain.
-
-        Parameters
-        ----------
-        i, j : ndarray of int, shape (M,), ids, in any order
-
-        """
+        """Return the poses of nodes j in i by odometry, and their covariances, in j."""
         at_i, at_j = self.places(i), self.places(j)
         for at in (at_i, at_j):
             if np.any(at < 0):
@@ -237,7 +204,6 @@ def _first(graph: Graph) -> IntArray:
 
 
 def _has_left(graph: Graph) -> bool:
-    """Tell whether nodes have left the graph, with their odometry."""
     return graph.n_priors > 0 or bool(np.any(
         graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.PRIOR))
 
@@ -251,14 +217,9 @@ def _extend(  # type: ignore[no-untyped-def]
     """
     Return the number of nodes that were appended to a chain.
 
-    Parameters
-    ----------
-    edges : ndarray of int, odometry edges by the rows of their later ends
-    last, pose, before : int, ndarray, ndarray, row, pose and prefix sum of the last node
-    weighted : bool, whether to divide covariances by the weights of the edges
-    over_gaps : bool, whether a pose without odometry from the one before is appended
-    rows, poses, sums, travel : ndarray, output; the travel from the last node
-
+    Edges are the rows of odometry, by their later ends; `last`, `pose` and `before` are row, pose
+    and prefix sum of the last node. With `over_gaps` a pose without odometry is appended as well.
+    Rows, poses, sums, and travel since the last node are written.
     """
     edge_f, edge_i, node_i = tb.edge_f(head), tb.edge_i(head), tb.node_i(head)
     n, m, length = 0, 0, 0.0
@@ -338,13 +299,6 @@ def _inverse(m):  # type: ignore[no-untyped-def]
 
 @kernel
 def composed(a, b):  # type: ignore[no-untyped-def]
-    """
-    Return the composition of two poses.
-
-    Parameters
-    ----------
-    a, b : tuple of float, (x, y, theta) [m, m, rad]
-
-    """
+    """Return the composition of two poses, as tuples of numbers."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], factors.wrap(a[2] + b[2])

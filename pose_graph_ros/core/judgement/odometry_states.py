@@ -18,6 +18,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
     Decision,
@@ -29,92 +30,49 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import Integers
 
-# Factor on the weights of odometry below which a gap between fixes is told as doubted.
-MUCH_LESS = 0.25
-
 
 @dataclass(frozen=True, slots=True)
 class SavedOdometry:
     """Saved counts of doubted odometry; which is doubted now follows from the saved fixes."""
 
     left_sources: tuple[str, ...] = ()
+    # number of edges of each of these sources that have left the graph doubted
     left: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """Number of edges of each of these sources that have left the graph doubted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Doubted odometry."""
-
-    edges: tuple[int, ...]
-    """Ids of those that are believed less."""
-    ends: tuple[int, int]
-    """Nodes between which odometry is wrong; which edge it is cannot be told."""
+    edges: tuple[int, ...]  # ids of those that are believed less
+    ends: tuple[int, int]  # nodes between which odometry is wrong; which edge it is cannot be told
     since_ns: int
 
 
 class OdometryStates:
-    """
-    The doubted edges of odometry.
-
-    Parameters
-    ----------
-    nodes : HiddenNodes, with the stamps and the name of the odometry
-
-    """
-
     def __init__(self, nodes: HiddenNodes) -> None:
         self._nodes = nodes
-        self._gaps: dict[int, Doubt] = {}
-        """By the id of the first edge, ascending."""
+        self._gaps: dict[int, Doubt] = {}  # by the id of the first edge, ascending
         self._loosened: Mapping[int, float] = {}
         self._changes: list[Change] = []
+        # number of edges of each source that have left the graph doubted
         self._left = Counter[str]()
-        """Number of edges of each source that have left the graph doubted."""
 
     def decide_leaving(
         self, graph: Graph, edges: IntArray, fixes: Callable[[int], tuple[str, ...]],
     ) -> list[Verdict]:
-        """
-        Return the verdicts on doubted odometry that is about to leave the graph.
-
-        Parameters
-        ----------
-        edges : ndarray of int, ids of what leaves
-        fixes : callable, as in `verdicts`
-
-        """
+        """Return the verdicts on doubted odometry that is about to leave the graph."""
         gone = {*edges.tolist()}
         if gone.isdisjoint(self._gaps):
             return []
         return [each for each in self.verdicts(graph, fixes) if each.number in gone]
 
     def forget(self, graph: Graph, edges: IntArray, loosened: Mapping[int, float]) -> None:
-        """
-        Forget edges that have left the graph.
-
-        Parameters
-        ----------
-        graph : Graph, without them
-        edges : ndarray of int, ids
-        loosened : mapping, as in `keep_gaps`
-
-        """
         gone, self._loosened = {*edges.tolist()}, loosened
         for doubt in self._gaps.values():
             self._left[self._source(doubt.ends[1])] += len(gone.intersection(doubt.edges))
         self._gaps = self._found_gaps(graph, self._nodes.newest_ns)
 
     def keep_gaps(self, loosened: Mapping[int, float], graph: Graph, now_ns: int) -> None:
-        """
-        Follow which odometry is believed less because of fixes, and note what has changed.
-
-        Parameters
-        ----------
-        loosened : mapping, factors on weights by id; another one after each change
-        now_ns : int, stamp of the newest odometry
-
-        """
+        """Follow which odometry is believed less because of fixes, and note what has changed."""
         if loosened is self._loosened:
             return
         before, self._loosened = self._gaps, loosened
@@ -125,7 +83,7 @@ class OdometryStates:
         """Return the stretches of odometry that is believed much less, by their first edges."""
         since_ns = {edge: doubt.since_ns for doubt in self._gaps.values() for edge in doubt.edges}
         ids = np.array(sorted(edge for edge, factor in self._loosened.items()
-                              if factor < MUCH_LESS), dtype=np.int64)
+                              if factor < BELIEF.much_less), dtype=np.int64)
         edges = graph.edges_at(ids)
         cuts = np.flatnonzero(edges.i[1:] != edges.j[:-1]) + 1
         gaps = {}
@@ -148,7 +106,6 @@ class OdometryStates:
                 old, new))
 
     def take_changes(self) -> list[Change]:
-        """Return the changes since the last call."""
         changes, self._changes = self._changes, []
         return changes
 
@@ -163,14 +120,7 @@ class OdometryStates:
         return bring_back
 
     def name(self, graph: Graph, edge: int) -> str:
-        """
-        Return the name of an edge: edges are counted along the path.
-
-        Parameters
-        ----------
-        edge : int, id
-
-        """
+        """Return the name of an edge: edges are counted along the path."""
         end = int(graph.edges_at(np.array([edge])).j[0])
         return f'{self._source(end)}/{np.searchsorted(self._nodes.ids, end) - 1}'
 
@@ -178,20 +128,11 @@ class OdometryStates:
         return int(self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, node)])
 
     def _source(self, node: int) -> str:
-        """Return the source of the odometry that has led to a node."""
         return self._nodes.primary_at(self._stamp_ns(node))
 
     def verdicts(
         self, graph: Graph, fixes: Callable[[int], tuple[str, ...]],
     ) -> list[Verdict]:
-        """
-        Return the verdicts on doubted odometry.
-
-        Parameters
-        ----------
-        fixes : callable, returns the ids of the first fixes that are believed after a stamp
-
-        """
         verdicts = []
         for edge, doubt in self._gaps.items():
             edges = graph.edges_at(np.array(doubt.edges))
@@ -211,25 +152,21 @@ class OdometryStates:
 
     @property
     def doubted_edges(self) -> list[int]:
-        """Ids of all edges that are doubted."""
         return [edge for doubt in self._gaps.values() for edge in doubt.edges]
 
     def totals(self) -> dict[str, SourceVerdicts]:
-        """Return how many edges of each source are doubted."""
         counts = Counter[str]()
         for doubt in self._gaps.values():
             counts[self._source(doubt.ends[1])] += len(doubt.edges)
-        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.table.thinned)
+        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
         return {source: SourceVerdicts(
             {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]}, 1.0,
             doubting=False, n_left=n_left, n_left_unused=self._left[source])
             for source in (counts | self._left)}
 
     def saved(self) -> SavedOdometry:
-        """Return how much has left the graph doubted."""
         return SavedOdometry(
             tuple(self._left), np.array([*self._left.values()], dtype=np.int64))
 
     def restore(self, saved: SavedOdometry) -> None:
-        """Restore what `saved` has returned."""
         self._left.update(dict(zip(saved.left_sources, saved.left.tolist(), strict=True)))

@@ -3,13 +3,15 @@
 """
 The factor on the sigmas of a source of closures that its believed closures show, in three ways.
 
+All are too small if anything, so the largest one counts.
+
 By their *residuals*: that of a constraint in the graph has the covariance `s^2 R - C`, with R the
-claimed one, s the factor and `C = J P J^T` its part that the estimate has followed. So
-`e^T R^-1 e / s^2` is expected to be its redundancy, `r = 3 - tr(R^-1 C) / s^2`, and s^2 is the sum
-of all squares over that of the redundancies, the estimate of a variance component by restricted
-maximum likelihood (K.-R. Koch, "Parameter estimation and hypothesis testing in linear models",
-1999, section 3.6). A square counts up to where 99 % of them are, so that one wrong closure does
-not decide. But closures that the graph follows have no residuals left.
+claimed one, s the factor and `C = J P J^T` its part that the estimate has followed. So `e^T R^-1 e
+/ s^2` is expected to be its redundancy, `r = 3 - tr(R^-1 C) / s^2`, and s^2 is the sum of all
+squares over that of the redundancies, the estimate of a variance component by restricted maximum
+likelihood (K.-R. Koch, "Parameter estimation and hypothesis testing in linear models", 1999,
+section 3.6). A square counts up to where 99 % of them are, so that one wrong closure does not
+decide. But closures that the graph follows have no residuals left.
 
 By the residuals of *groups*: closures of one place often share an error, as the same view is
 recognised again. The mean of a group, weighted by information, is a constraint with the sum of the
@@ -21,11 +23,8 @@ By their *agreement*: neighbours differ by their own errors and by the odometry 
 between them, whatever the graph does. With these covariances `s^2 (R_a + R_b) + Q`, the median of
 the squared distances is that of chi2 for the right s. But what neighbours have in common is not
 seen.
-
-All are too small if anything, so the largest one counts.
 """
 
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -36,57 +35,16 @@ from pose_graph_ros.core.batch.truncated import CONFIG
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE
-from pose_graph_ros.core.judgement.consistency import squared_distances
+from pose_graph_ros.core.judgement.beliefs import Beliefs, ScaleLeft
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
+from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE, squared_distances
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.smoother import innovations
+from pose_graph_ros.core.judgement.settings import BELIEF
+from pose_graph_ros.core.smoother.covariances import innovations
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
-# Median of chi2 with three degrees of freedom.
-MEDIAN = 2.366
-# Largest number of closures that count of those that have left the graph.
-MOST_COUNTED = 100
-# Smallest number of closures, or sum of their redundancies, that says anything.
-LEAST = 10
 # What is left of the mean of chi2 with three degrees of freedom that counts up to `GATE`.
 LEFT = float(gammainc(2.5, GATE / 2.0) + GATE / 3.0 * gammaincc(1.5, GATE / 2.0))
-# Number of neighbours that a closure is compared with.
-NEIGHBOURS = 3
-# A factor of 1 is believed as much as this number of closures.
-PRIOR = 10.0
-# Most closures that are looked at.
-MOST = 100
-# Largest number of steps to the limits of squares, and of rounds of a whole graph.
-STEPS, ROUNDS = 50, 6
-# Closures whose ends are both in one stretch of the path of this length are of one place [m].
-STRETCH = 2.0
-# Added to an information, relative to its largest entry, before equations with it are solved.
-_SINGULAR = 1e-12
-# Largest factor, and the ratio of successive ones: few values, so that closures are rarely weighed
-# anew, and the factor does not depend on rounding.
-LARGEST, RATIO = 10.0, 1.2
-
-
-@dataclass(slots=True)
-class ScaleLeft:
-    """A factor on sigmas, and how many closures that have left have shown it."""
-
-    n: int = 0
-    scale: float = 1.0
-
-    def add(self, n: int, scale: float) -> None:
-        """
-        Add closures.
-
-        Parameters
-        ----------
-        n : int
-        scale : float, factor that they were used with
-
-        """
-        self.n += n
-        if n > 0:
-            part = n / min(self.n, MOST_COUNTED)
-            self.scale *= (scale / self.scale)**min(part, 1.0)
 
 
 def give_scale(graph: Graph, closures: IntArray) -> float:
@@ -95,12 +53,6 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
 
     All of them are believed; their weights are set to 1 / factor^2. Where odometry does not join
     all nodes, nobody knows which closures are neighbours, and the factor is 1.
-
-    Parameters
-    ----------
-    graph : Graph, near its optimum
-    closures : ndarray of int, shape (M,), rows of its edges
-
     """
     chain, scale = OdometryChain(), 1.0
     chain.extend(graph)
@@ -111,10 +63,10 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
     table.append(claims(edges))
     group = places(table, edges)
     agreement = agreement_scale(table, np.arange(len(closures)), inside, edges)
-    for _ in range(ROUNDS):
+    for _ in range(BELIEF.scale_rounds):
         if optimize(graph, CONFIG).status is Status.FAILED:
             break
-        errors, covariances = innovations.at_estimate(graph.memory.head, edges)
+        errors, covariances = innovations(graph.memory.head, edges)
         shown = max(agreement, residual_scale(
             errors, covariances, edges.information, group, scale))
         if shown <= scale:
@@ -125,17 +77,9 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
 
 
 def places(table: ClosureTable, edges: Edges) -> IntArray:
-    """
-    Return to which place closures belong, numbers from 0, shape (M,).
-
-    Parameters
-    ----------
-    table : ClosureTable, which knows the path
-    edges : Edges, M closures
-
-    """
+    """Return to which place closures belong, numbers from 0, shape (M,)."""
     stretch = np.floor(np.column_stack(
-        [table.chain.travel(nodes) for nodes in (edges.j, edges.i)]) / STRETCH)
+        [table.chain.travel(nodes) for nodes in (edges.j, edges.i)]) / BELIEF.place_length)
     _, place = np.unique(stretch, axis=0, return_inverse=True)
     return np.asarray(place.ravel())
 
@@ -145,16 +89,11 @@ def residual_scale(
     scale: float,
 ) -> float:
     """
-    Return the factor on the sigmas of a source, at least 1.
+    Return the factor on the sigmas of a source, at least 1, given the present one.
 
-    Parameters
-    ----------
-    errors : ndarray, shape (M, 3), residuals of believed closures
-    covariances : ndarray, shape (M, 3, 3), C, with the closures in the graph
-    information : ndarray, shape (M, 3, 3), claimed
-    group : ndarray of int, shape (M,), from 0, of closures of one place
-    scale : float, the present factor
-
+    Errors are the residuals of believed closures, shape (M, 3), covariances their C with the
+    closures in the graph, information what is claimed; `group` numbers closures of one place from
+    0.
     """
     size = np.bincount(group)
     total, common = np.zeros((len(size), 3, 3)), np.zeros((len(size), 3, 3))
@@ -164,7 +103,7 @@ def residual_scale(
     np.add.at(weighted, group, np.einsum('mij,mj->mi', information, errors))
     # what no closure of a group measures stays at 0
     largest = np.max(np.abs(total), axis=(1, 2))[:, None, None]
-    mean = np.linalg.solve(total + _SINGULAR * largest * np.eye(3), weighted[:, :, None])[:, :, 0]
+    mean = np.linalg.solve(total + 1e-12 * largest * np.eye(3), weighted[:, :, None])[:, :, 0]
     return max(_shown(errors, covariances, information, scale),
                _shown(mean, common / size[:, None, None], total, scale))
 
@@ -172,16 +111,15 @@ def residual_scale(
 def _shown(
     errors: FloatArray, covariances: FloatArray, information: FloatArray, scale: float,
 ) -> float:
-    """Return the factor that residuals show; the parameters are those of `residual_scale`."""
     trace = np.einsum('mij,mji->m', information, covariances)
     rank = np.count_nonzero(np.einsum('mii->mi', information) > 0.0, axis=1)
     redundancy = np.maximum(rank - trace / scale**2, 0.0) / 3.0
     n = float(np.sum(redundancy))
-    if n < LEAST:
+    if n < BELIEF.least_shown:
         return scale
     squares = np.einsum('mi,mij,mj->m', errors, information, errors)
     shown = math.sqrt(float(np.sum(squares)) / (3.0 * n))
-    for _ in range(STEPS):
+    for _ in range(BELIEF.scale_steps):
         # from above, as the sum of what counts shrinks with its limits
         counted = np.minimum(squares, GATE * shown**2 * redundancy)
         shown, before = math.sqrt(float(np.sum(counted)) / (3.0 * LEFT * n)), shown
@@ -195,22 +133,15 @@ def agreement_scale(
 ) -> float:
     """
     Return the factor on the sigmas of a source, at least 1, by the neighbours of its closures.
-
-    Parameters
-    ----------
-    numbers : ndarray of int, shape (K,), believed closures
-    inside : ndarray of bool, shape (M,), which closures of the source are believed
-    edges : Edges, those of `inside` with the claimed information
-
     """
     place = np.cumsum(inside) - 1    # among those of `inside`
     first, second = list[int](), list[int]()
     for number in numbers.tolist():
         agree, _ = table.neighbours(number)
-        others = place[agree[inside[agree]]][:NEIGHBOURS].tolist()
+        others = place[agree[inside[agree]]][:BELIEF.neighbours].tolist()
         first += [int(place[number])] * len(others)
         second += others
-    if len(set(first)) < LEAST:
+    if len(set(first)) < BELIEF.least_shown:
         return 1.0
     claimed, pairs = claims(edges, np.zeros(3)), (np.array(first), np.array(second))
 
@@ -218,32 +149,127 @@ def agreement_scale(
         return float(np.median(squared_distances(
             table.chain, claimed._replace(noise=factor**2 * claimed.noise), *pairs)))
 
-    scale, share = 1.0, math.log(distance(1.0) / distance(RATIO)) / (2.0 * math.log(RATIO))
-    while scale < LARGEST and distance(scale) > MEDIAN:
-        scale *= RATIO
+    scale, ratio = 1.0, BELIEF.scale_ratio
+    share = math.log(distance(1.0) / distance(ratio)) / (2.0 * math.log(ratio))
+    # up to the median of chi2 with three degrees of freedom
+    while scale < BELIEF.largest_scale and distance(scale) > 2.366:
+        scale *= ratio
     # where odometry makes most of the distance, it tells little of closures
     return _believed(scale, share * len(set(first)))
 
 
 def _believed(shown: float, n: float) -> float:
     """Return the factor to use if n closures show one."""
-    steps = round(math.log(max(shown, 1e-3)) * n / (n + PRIOR) / math.log(RATIO))
-    return min(RATIO ** max(steps, 0), LARGEST)
+    return _stepped(math.log(max(shown, 1e-3)) * n / (n + BELIEF.prior_closures))
+
+
+def _stepped(logarithm: float) -> float:
+    """Return the nearest of the factors that are used, by its logarithm."""
+    steps = round(logarithm / math.log(BELIEF.scale_ratio))
+    return min(BELIEF.scale_ratio ** max(steps, 0), BELIEF.largest_scale)
 
 
 def together(shown: float, n: float, left: ScaleLeft) -> float:
-    """
-    Return the factor that closures in the graph and those that have left it show.
-
-    Parameters
-    ----------
-    shown : float, by those in the graph
-    n : float, their number
-
-    """
-    n_left = min(left.n, MOST_COUNTED)
+    """Return the factor that closures in the graph and those that have left it show."""
+    n_left = min(left.n, BELIEF.most_counted)
     if n_left == 0:
         return shown
-    logarithm = ((n + PRIOR) * math.log(shown) + n_left * math.log(left.scale)) / (
-        n + (PRIOR if n > 0.0 else 0.0) + n_left)
-    return min(RATIO ** max(round(logarithm / math.log(RATIO)), 0), LARGEST)
+    prior = BELIEF.prior_closures
+    return _stepped(((n + prior) * math.log(shown) + n_left * math.log(left.scale)) / (
+        n + (prior if n > 0.0 else 0.0) + n_left))
+
+
+
+
+class ScaleLearner:
+    def __init__(
+        self, smoother: IncrementalSmoother, states: ClosureStates, table: ClosureTable,
+        beliefs: Beliefs,
+    ) -> None:
+        self._smoother, self._states, self._table = smoother, states, table
+        self._beliefs = beliefs
+        # number of believed closures of each source when its factor was learnt
+        self._learnt_from: list[int] = []
+
+    def add_sources(self) -> None:
+        """Give new sources the factor that closures have shown that have left, or 1."""
+        for source in range(len(self._learnt_from), len(self._states.sources)):
+            if source == len(self._beliefs.scales_left):
+                self._beliefs.scales_left.append(ScaleLeft())
+            self._beliefs.scales.append(
+                together(1.0, 0.0, self._beliefs.scales_left[source]))
+            self._learnt_from.append(0)
+
+    def begin(self) -> None:
+        """Forget what was learnt from closures that are in the graph."""
+        self._beliefs.scales.clear()
+        self._learnt_from.clear()
+        self.add_sources()
+
+    def state(self) -> tuple[list[float], list[int]]:
+        return [*self._beliefs.scales], [*self._learnt_from]
+
+    def set_state(self, scales: list[float], learnt_from: list[int]) -> None:
+        self._beliefs.scales[:], self._learnt_from[:] = scales, learnt_from
+
+    def learn(self) -> bool:
+        """Learn the factor of a source with many more closures; tell whether one has changed."""
+        for source in range(len(self._states.sources)):
+            n_believed, before = int(np.sum(self._of(source))), self._learnt_from[source]
+            n = n_believed + self._beliefs.scales_left[source].n
+            if n_believed >= BELIEF.and_more_believed and n - before >= (
+                    BELIEF.more_believed * min(n_believed, before) + BELIEF.and_more_believed):
+                self._learnt_from[source] = n
+                if self._learn(source):
+                    return True
+        return False
+
+    def learn_all(self) -> None:
+        """Learn all factors from 1, until the residuals show none that is larger."""
+        for source in range(len(self._states.sources)):
+            n_believed = int(np.sum(self._of(source)))
+            self._learnt_from[source] = n_believed + self._beliefs.scales_left[source].n
+            if n_believed >= BELIEF.and_more_believed:
+                for _ in range(BELIEF.scale_rounds):
+                    if not self._learn(source, larger=True):
+                        break
+
+    def _of(self, source: int) -> BoolArray:
+        return np.asarray(self._states.in_graph & (self._states.source == source))
+
+    def _learn(self, source: int, *, larger: bool = False) -> bool:
+        """Learn the factor of a source, if it is a `larger` one; tell whether it has changed."""
+        before = self._beliefs.scales[source]
+        numbers = np.flatnonzero(self._of(source))
+        most = BELIEF.most_looked_at_at_end if larger else BELIEF.most_looked_at
+        scale = self._shown(source, numbers, most)
+        if scale == before or (larger and scale < before):
+            return False
+        self._beliefs.scales[source] = scale
+        if self._beliefs.apply({k: STATES[self._states.state[k]] for k in numbers.tolist()}):
+            self._table.spread[:] = 0.0
+            return True
+        self._beliefs.scales[source] = before
+        return not larger
+
+    def _shown(self, source: int, numbers: IntArray, most: int) -> float:
+        states, graph = self._states, self._smoother.graph
+        some, group = self._sample(numbers, most)
+        edges, inside = graph.edges_at(states.edge[some]), self._of(source)
+        return together(max(
+            residual_scale(*self._smoother.edge_innovations(edges), edges.information, group,
+                           self._beliefs.scales[source]),
+            agreement_scale(self._table, some, inside, graph.edges_at(states.edge[inside]))),
+            float(len(some)), self._beliefs.scales_left[source])
+
+    def _sample(self, numbers: IntArray, most: int) -> tuple[IntArray, IntArray]:
+        """Return at most so many closures, from all along the path, and the group of each."""
+        group = places(self._table, self._smoother.graph.edges_at(self._states.edge[numbers]))
+        n_groups = int(group.max()) + 1
+        n_chosen = min(max(n_groups * most // len(numbers), 1), n_groups)
+        chosen = np.linspace(0, n_groups - 1, n_chosen).astype(np.int64)
+        some = np.flatnonzero(np.isin(group, chosen))
+        # by their stamps, as numbers depend on the order of arrival
+        some = some[np.lexsort((*self._states.stamps_ns[numbers[some]].T, group[some]))][:most]
+        _, of_each = np.unique(group[some], return_inverse=True)
+        return numbers[some], of_each.ravel()

@@ -8,7 +8,7 @@ member of the newest run that is believed; what does not, of another run that it
 begins one. `runs` has the prices by which it is decided which of them to believe.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 import math
 from typing import NamedTuple
@@ -18,101 +18,45 @@ import numpy as np
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.judgement.fix_states import LONE
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.runs import EVENT, LEAST_MEMBERS, Run, Transition
+from pose_graph_ros.core.judgement.runs import Run, slip_price, Transition
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import Innovation, Observation, Track
 
-# More of the squared distance for a pose than for a position, so that as few are in doubt.
-MORE_OF_POSE = 2.5
-# A prediction with this many times the variance of the measurement begins a new run.
-WIDE = 9.0
-# Sigma of the heading at the beginning of a run, if it is not known better [rad], and variance of
-# the position before the first measurement [m^2].
-BEGIN_HEADING = 0.2
-NOWHERE = 1e6
-# Factor on the sigmas of odometry while fixes are judged, as those that are stated are often too
-# small. What sources show of them is not used: it depends on the fixes that are believed.
-ODOMETRY_SCALE = 2.0
-# Change of the logarithm of the factor of a source by one measurement, and the largest factor. Its
-# memory is about a hundred measurements, so that a fault of a minute hardly changes it.
-STEP, MOST = 0.03, 4.0
 # Median of chi2 with 2 and 3 degrees of freedom.
 MEDIAN = {2: 1.386, 3: 2.366}
-# How long what is in the graph before the first measurement counts as a run [s].
-KNOWN_BEFORE = 100.0
 
 
 class Turn(NamedTuple):
     """What a decision changes."""
 
+    # runs whose members from a stamp on are doubted: number, that of a new run with these, and the
+    # stamp [ns]
     cuts: list[tuple[int, int, int]]
-    """Runs whose members from a stamp on are doubted: number, that of a new run with these, and
-    the stamp [ns]."""
-    runs: list[tuple[int, bool]]
-    """Numbers of other runs that are believed now, or not any more."""
+    runs: list[tuple[int, bool]]  # numbers of other runs that are believed now, or not any more
+    # all jumps of odometry that are believed: the nodes between which one is, and the factor on
+    # the covariance of the odometry between them that makes it one of 1 sigma
     jumps: list[tuple[int, int, float]]
-    """
-    All jumps of odometry that are believed: the nodes between which one is, and the factor on the
-    covariance of the odometry between them that makes it one of 1 sigma.
-    """
 
 
 class Given(NamedTuple):
     """The run that a measurement was given to."""
 
     run: int
-    believed: bool
-    """Whether that is believed, before `turn`."""
-    d2: float
-    """Squared Mahalanobis distance from what is believed."""
-    turn: Turn | None = None
-    """What is decided anew by the measurement."""
-
-
-class StatedNoise:
-    """
-    Factors on the covariances that sources state, at least 1, while measurements are judged.
-
-    Each follows the median of the squared distances of those that are believed.
-    """
-
-    def __init__(self) -> None:
-        self._factors: dict[str, float] = {}
-
-    def factor(self, source: str) -> float:
-        """Return the factor of a source."""
-        return self._factors.get(source, 1.0)
-
-    def note(self, source: str, d2: float, size: int) -> None:
-        """
-        Note the squared distance of a measurement that is believed.
-
-        Parameters
-        ----------
-        d2 : float, by the covariance with the factor
-        size : int, 2 of a position, 3 of a pose
-
-        """
-        factor = self.factor(source) * math.exp(STEP if d2 > MEDIAN[size] else -STEP)
-        self._factors[source] = min(max(factor, 1.0), MOST)
-
-    def copy(self) -> 'StatedNoise':
-        """Return a copy that does not change with this one."""
-        other = StatedNoise()
-        other._factors = self._factors.copy()
-        return other
+    believed: bool  # whether that is believed, before `turn`
+    d2: float  # squared Mahalanobis distance from what is believed
+    turn: Turn | None = None  # what is decided anew by the measurement
 
 
 class RunSet:
-    """All runs that are remembered; see the module."""
-
     def __init__(self) -> None:
         self.chain = OdometryChain()
-        self.chain.noise_factor = ODOMETRY_SCALE**2
+        self.chain.noise_factor = BELIEF.odometry_scale**2
         self._runs: list[Run] = []
-        self._main: Run | None = None
-        """The newest run that is believed."""
+        self._main: Run | None = None  # the newest run that is believed
         self._n_runs = 0
-        self._noise = StatedNoise()
+        # Factors on the covariances that sources state, at least 1, while measurements are judged:
+        # each follows the median of the squared distances of those that are believed.
+        self._noise: dict[str, float] = {}
 
     def __iter__(self) -> Iterator[Run]:
         return iter(self._runs)
@@ -124,7 +68,7 @@ class RunSet:
         other.chain, other._n_runs = self.chain, self._n_runs
         other._runs = list(runs.values())
         other._main = None if self._main is None else runs.get(self._main.number)
-        other._noise = self._noise.copy()
+        other._noise = dict(self._noise)
         return other
 
     def empty(self) -> 'RunSet':
@@ -134,42 +78,31 @@ class RunSet:
         return other
 
     def believes(self, number: int) -> bool:
-        """Return whether a run is remembered and believed."""
         return any(run.believed for run in self._runs if run.number == number)
 
     def judge(
         self, stamp_ns: int, seen: Observation, source: str, of_graph: Track, *, solved: bool,
         begun: bool,
     ) -> Given:
-        """
-        Return the run that a measurement is given to, and what is decided anew on all runs.
-
-        Parameters
-        ----------
-        seen : Observation, with the covariance that is stated
-        of_graph : Track, pose of its node in the graph
-        solved : bool, whether the graph is solved, so that the covariance of that is known
-        begun : bool, whether what is in the graph before the first measurement counts as a run
-
-        """
-        seen = seen._replace(noise=self._noise.factor(source) * seen.noise)
+        """Return the run that a measurement is given to, and what is decided anew on all runs."""
+        seen = seen._replace(noise=self._noise.get(source, 1.0) * seen.noise)
         if self._main is None and solved and begun:
             self._main = Run(self._next_number(), stamp_ns, of_graph, believed=True)
-            self._main.seconds = KNOWN_BEFORE
+            self._main.seconds = BELIEF.known_before
             self._runs.append(self._main)
         predicted = self._predicted(seen.node, of_graph if solved else None)
         main = self._main
         if main is None or predicted is None:
-            prior = of_graph._replace(cov=np.diag((NOWHERE, NOWHERE, 0.3**2)))
+            prior = of_graph._replace(cov=np.diag((BELIEF.nowhere, BELIEF.nowhere, 0.3**2)))
             return Given(self._begin_run(stamp_ns, seen, prior, believed=True).number, True, 0.0)
         mine = predicted.innovation(seen)
         fits = mine.d2 <= gate(seen.size)
         late = stamp_ns < main.end_ns
         cov, noise = predicted.cov, seen.noise
-        wide = cov[0, 0] + cov[1, 1] >= WIDE * (noise[0, 0] + noise[1, 1])
+        wide = cov[0, 0] + cov[1, 1] >= BELIEF.wide_prediction * (noise[0, 0] + noise[1, 1])
         run = None if late else self._join_other(stamp_ns, seen, mine if fits else None, wide=wide)
         if run is None and fits and (not wide or late):
-            self._noise.note(source, mine.d2, seen.size)
+            self._note_noise(source, mine.d2, seen.size)
             main.n += 1
             if not late:
                 self._go_on(main, stamp_ns, predicted, mine)
@@ -180,8 +113,12 @@ class RunSet:
             run = self._begin_run(stamp_ns, seen, predicted, believed=fits)
         return self._decided(Given(run.number, run.believed, mine.d2), stamp_ns)
 
+    def _note_noise(self, source: str, d2: float, size: int) -> None:
+        step = BELIEF.noise_step if d2 > MEDIAN[size] else -BELIEF.noise_step
+        factor = self._noise.get(source, 1.0) * math.exp(step)
+        self._noise[source] = min(max(factor, 1.0), BELIEF.most_noise)
+
     def _go_on(self, main: Run, stamp_ns: int, predicted: Track, mine: Innovation) -> None:
-        """Let the run that is believed go on with a measurement that fits."""
         main.note_state(stamp_ns, predicted)
         main.count_time(stamp_ns)
         main.track = predicted.updated(mine)
@@ -189,12 +126,7 @@ class RunSet:
             other.contradicted = other.contradicted or not other.believed
 
     def _predicted(self, node: int, of_graph: Track | None) -> Track | None:
-        """
-        Return where the robot is at a node by what is believed.
-
-        The track of the main run knows nothing of loop closures, and the graph takes the errors
-        of all measurements in it for independent; the one that knows more is returned.
-        """
+        """Return where the robot is by what is believed: by the main run or the graph."""
         main = self._main
         if main is None:
             return None
@@ -239,8 +171,8 @@ class RunSet:
     def _begin_run(
         self, stamp_ns: int, seen: Observation, predicted: Track, *, believed: bool,
     ) -> Run:
-        heading = max(float(predicted.cov[2, 2]), BEGIN_HEADING**2)
-        alone = predicted._replace(cov=np.diag((NOWHERE, NOWHERE, heading)))
+        heading = max(float(predicted.cov[2, 2]), BELIEF.begin_heading**2)
+        alone = predicted._replace(cov=np.diag((BELIEF.nowhere, BELIEF.nowhere, heading)))
         first = alone.updated(alone.innovation(seen))
         track = predicted.updated(predicted.innovation(seen)) if believed else first
         run = Run(self._next_number(), stamp_ns, track, believed=believed)
@@ -293,20 +225,12 @@ class RunSet:
         self.chain.forget(nodes)
 
     def begin_with(self, stamp_ns: int, track: Track) -> None:
-        """
-        Begin with where the robot is by measurements that have left the graph.
-
-        Parameters
-        ----------
-        stamp_ns : int, of the newest of these
-
-        """
+        """Begin with where the robot is by measurements that have left the graph."""
         self._main = Run(self._next_number(), stamp_ns, track, believed=True)
-        self._main.seconds = KNOWN_BEFORE
+        self._main.seconds = BELIEF.known_before
         self._runs.append(self._main)
 
     def _cut(self, run: Run, state: int) -> tuple[int, int, int]:
-        """Doubt the members of a run after a state."""
         stamp_ns = run.states[state][0]
         rest = run.cut_after(state, self._next_number())
         self._runs.append(rest)
@@ -317,25 +241,13 @@ class RunSet:
 
 def gate(size: int) -> float:
     """Return the squared distance beyond which a measurement of 2 or 3 numbers is in doubt."""
-    return EVENT + MORE_OF_POSE * (size - 2)
+    return BELIEF.event + BELIEF.more_of_pose * (size - 2)
 
 
-# Number of runs that are remembered; time after which those of few members are forgotten [ns].
-MOST_RUNS = 24
-SHORT_LIVED_NS = 30_000_000_000
-# Excess of the price of a believed run over that of a hopeless one.
-HOPELESS = 50.0
 
 
 def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transition]]:
-    """
-    Return the runs to believe, in the order of time, each with the way from the one before.
-
-    Parameters
-    ----------
-    runs : list of Run, at least one
-
-    """
+    """Return the runs to believe, in the order of time, each with the way from the one before."""
     ordered = sorted(runs, key=lambda run: (run.begin_ns, run.number))
     total: list[float] = []
     before: list[tuple[int, Transition]] = []
@@ -348,7 +260,8 @@ def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transiti
                     lasted = (other.end_ns - other.states[way.cut][0]) * 1e-9
                     if not any(wrong.n > 1 and wrong.seconds >= lasted
                                for wrong in ordered[m + 1:k]):
-                        price += EVENT  # no wrong run follows that they could be the beginning of
+                        # no wrong run follows that they could be the beginning of
+                        price += BELIEF.event
                 if price < cost:
                     cost, best = price, (m, way)
         total.append(cost - run.price)
@@ -361,19 +274,12 @@ def best_runs(runs: list[Run], chain: OdometryChain) -> list[tuple[Run, Transiti
 
 
 def remembered(runs: list[Run], stamp_ns: int) -> list[Run]:
-    """
-    Return the runs without those that cannot win any more, and at most `MOST_RUNS` of them.
-
-    Parameters
-    ----------
-    stamp_ns : int, of the newest measurement
-
-    """
+    """Return the runs without those that cannot win any more, and at most `most_runs` of them."""
     price = max((run.price for run in runs if run.believed), default=0.0)
     runs = [run for run in runs if run.believed or not (
-        (run.n < LEAST_MEMBERS and stamp_ns - run.end_ns > SHORT_LIVED_NS)
-        or (run.contradicted and price > run.price + HOPELESS))]
-    while len(runs) > MOST_RUNS:
+        (run.n < BELIEF.least_members and stamp_ns - run.end_ns > BELIEF.short_lived_ns)
+        or (run.contradicted and price > run.price + BELIEF.hopeless_run))]
+    while len(runs) > BELIEF.most_runs:
         doubted = [run for run in runs if not run.believed]
         runs.remove(min(doubted, key=lambda run: run.seconds) if len(doubted) > 0
                     else min(runs, key=lambda run: run.begin_ns))
@@ -382,15 +288,7 @@ def remembered(runs: list[Run], stamp_ns: int) -> list[Run]:
 
 def without_old(runs: list[Run], node: int, kept: Run | None, chain: OdometryChain) -> list[Run]:
     """
-    Return the runs without those that ended before a node; their prices pass on to those after.
-
-    The rest of the shortest path through all of them stays the same.
-
-    Parameters
-    ----------
-    node : int, id of the first node that stays in the graph
-    kept : Run, optional, that stays
-
+    Return the runs without those that ended before a node, whose prices pass on to those after.
     """
     left = sorted(runs, key=lambda run: (run.begin_ns, run.number))
     for old in [run for run in left if run.track.node < node and run is not kept]:
@@ -404,3 +302,50 @@ def without_old(runs: list[Run], node: int, kept: Run | None, chain: OdometryCha
                     run.jumps_before = old.jumps_before + ((jump,) if way.scale > 1.0 else ())
             run.prices.pop(old.number, None)
     return [run for run in runs if run in left]
+
+
+def decision_cost(
+    decided: Iterable[tuple[int, Observation, int, bool]], begin: Track | None,
+    chain: OdometryChain,
+) -> float:
+    """
+    Return the sum of the squared distances of all measurements and the prices of what is wrong.
+
+    The decision has stamp [ns], observation, number of its run, and whether it is believed, by
+    stamp; `begin` is where the robot is by what is not among them.
+    """
+    total, main = 0.0, begin
+    wrong: dict[int, tuple[int, Track]] = {}
+    for stamp_ns, seen, run, believed in decided:
+        before_ns, before = (stamp_ns, main) if believed else wrong.get(run, (stamp_ns, None))
+        if not believed:
+            total += BELIEF.event if before is None else BELIEF.wrong_rate * min(
+                (stamp_ns - before_ns) * 1e-9, BELIEF.longest_wrong)
+        if before is None:
+            known = seen.mean if main is None else main.moved(chain, seen.node).pose
+            after = Track(seen.node, known, np.diag(
+                (BELIEF.nowhere, BELIEF.nowhere, BELIEF.begin_heading**2)))
+        else:
+            after = before.moved(chain, seen.node).bent(before.pose)
+            d2, most = after.innovation(seen).d2, gate(seen.size)
+            total += min(d2, most)
+            if believed and d2 > most:
+                price, after = _slipped(before, after, seen, chain)
+                total += min(price, d2 - most)
+        after = after.updated(after.innovation(seen))
+        if believed:
+            main = after
+        elif run != LONE:
+            wrong[run] = stamp_ns, after
+    return total
+
+
+def _slipped(
+    before: Track, after: Track, seen: Observation, chain: OdometryChain,
+) -> tuple[float, Track]:
+    error, _, cov, _, _ = after.innovation(seen)
+    size = math.hypot(error[0], error[1])
+    way = float(np.diff(chain.travel(np.array((before.node, seen.node))))[0])
+    slip = np.diag((*2 * ((BELIEF.slip**2 + size**2) / 3.0,), BELIEF.slip_heading**2))
+    price = slip_price(size, 0.5 * float(cov[0, 0] + cov[1, 1]), way)
+    return price, after._replace(cov=after.cov + slip)

@@ -6,10 +6,10 @@ Runs of measurements that agree with one another by odometry, and which runs to 
 Where consecutive fixes do not agree, either some of them are wrong, or odometry is. Each has a
 price in units of chi2:
 
-- a run of wrong measurements costs `EVENT`, and `RATE` for each second that it lasts: errors live
+- a run of wrong measurements costs `event`, and `rate` for each second that it lasts: errors live
   for seconds to minutes, so a hundred fixes within one correlation time count as one;
 - two runs that are believed one after the other cost the squared Mahalanobis distance between
-  them, or, if odometry has slipped in between, `EVENT` and as much as a slip of this size is less
+  them, or, if odometry has slipped in between, `event` and as much as a slip of this size is less
   likely than a fault of the receiver: slips are rarer and go less far, mostly not beyond the way.
 
 `run_choice` finds the set of runs with the lowest price.
@@ -28,123 +28,64 @@ from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import Innovation, Observation, Track
-
-# Price of one run of wrong measurements, or of one fault of odometry; a single measurement is in
-# doubt beyond this squared distance (chi2 with 2 degrees of freedom, 99.9 %).
-EVENT = 13.8
-# Price of a second of wrong measurements [1/s], and the longest time that one of them counts [s].
-RATE = 0.25
-LONGEST = 10.0
-# How far a receiver in a fault is off, about, and how far a slip of odometry goes [m]; the heading
-# that it leaves unknown [rad].
-FAULT, SLIP, SLIP_HEADING = 20.0, 1.0, 0.3
-# Time between two slips of odometry in units of that between two faults of a receiver, hours to
-# minutes.
-SLIPS_RARER = 30.0
-# Wheels that spin make the way too long: that the robot moved without them is less likely by so
-# much, once it would be by so far [m].
-UNMOVED, UNMOVED_WAY = 14.0, 5.0
-# Time between the states that a run notes [ns]; one is dropped when its neighbours' ages differ by
-# less than this factor; the newest so many are kept, which reach back about 7 minutes.
-NOTED_EVERY_NS, NOTED_RATIO, NOTED = 3_000_000_000, 1.4, 20
-# Price of a transition above which the earlier run may have ended with wrong members.
-CUT_ABOVE = 6.0
-# Squared sigmas that the direction of a run may be off for nothing, and the highest price of it.
-TURN_ALLOWED, MOST_OF_TURN = 9.0, 40.0
-# Time for which a run must keep its direction for that, as errors drift as well [s].
-TURN_AFTER = 30.0
-# Least number of measurements of a run that can show a fault of odometry.
-LEAST_MEMBERS = 3
-# Number of the first members of a run that may tell its heading anew, and highest squared
-# deviation of them from odometry, in units of their variance, for each of them.
-FITTED_MEMBERS, FITTED_D2 = 10, 2.5
-# Largest sigma of a heading that is told so [rad].
-FITTED_HEADING = 0.4
-# Number of measurements, and way [m], from which the pose at the beginning of a run is estimated.
-BEGIN_MEMBERS, BEGIN_WAY = 40, 50.0
 
 NO_OFFSET = np.zeros(3)
 
 
 class Transition(NamedTuple):
-    """What it takes to believe one run after another."""
-
     price: float
+    # factor on the covariance of the odometry in between that explains the jump
     scale: float = 1.0
-    """Factor on the covariance of the odometry in between that explains the jump."""
+    # index of the state of the earlier run after which its members are wrong; -1 for none
     cut: int = -1
-    """Index of the state of the earlier run after which its members are wrong; -1 for none."""
 
 
 class Run:
-    """
-    Measurements that agree with one another, one after the other.
-
-    Parameters
-    ----------
-    number : int, counts the runs
-    stamp_ns : int, of the first member [ns]
-    track : Track, with the first member
-
-    """
+    """Measurements that agree with one another, one after the other."""
 
     def __init__(self, number: int, stamp_ns: int, track: Track, *, believed: bool) -> None:
-        self.number = number
-        """Counts the runs."""
+        self.number = number  # counts the runs
         self.believed = believed
-        self.track = track
-        """By the newest member."""
+        self.track = track  # by the newest member
+        # heading at the first member without the run, and its variance; None if it is a pose
         self.expected: tuple[float, float] | None = None
-        """Heading at the first member without the run, and its variance; None if it is a pose."""
+        # the ways to believe it after an earlier run, by the number of that
         self.prices: dict[int, list[Transition]] = {}
-        """The ways to believe it after an earlier run, by the number of that."""
+        # stamps [ns] and tracks at some earlier times, the newest last
         self.states: list[tuple[int, Track]] = []
-        """Stamps [ns] and tracks at some earlier times, the newest last."""
+        # the first ones, while they may tell the heading
         self.members: tuple[Observation, ...] = ()
-        """The first ones, while they may tell the heading."""
-        self.before = 0.0
-        """Price of what is believed before it, of runs that have left the graph."""
+        self.before = 0.0  # price of what is believed before it, of runs that have left the graph
+        # jumps of odometry up to it with these; see `run_set.Turn`
         self.jumps_before: tuple[tuple[int, int, float], ...] = ()
-        """Jumps of odometry up to it with these; see `run_set.Turn`."""
+        # price of its direction, once its first member has left the graph
         self._turned: float | None = None
-        """Price of its direction, once its first member has left the graph."""
         self.restart(stamp_ns)
 
     def restart(self, stamp_ns: int) -> None:
         """Begin with the newest member, as something else was believed since the others."""
         self.begin_ns = self.end_ns = stamp_ns
-        self.first = self.track
-        """Pose at the first member, by the members after it as well."""
+        self.first = self.track  # pose at the first member, by the members after it as well
         self.n = 1
-        self.seconds = 0.0
-        """How long it has lasted, without gaps [s]."""
-        self.contradicted = False
-        """Whether something else was believed since its newest member."""
+        self.seconds = 0.0  # how long it has lasted, without gaps [s]
+        self.contradicted = False  # whether something else was believed since its newest member
         self.prices.clear()
         self.members = ()
 
     def copy(self) -> 'Run':
-        """Return a copy that does not change with this one."""
         other = copy.copy(self)
         other.prices = dict(self.prices)
         return other
 
     def add(self, stamp_ns: int, seen: Observation, track: Track, chain: OdometryChain) -> None:
-        """
-        Take in a measurement that is not older than the others.
-
-        Parameters
-        ----------
-        track : Track, with the measurement
-
-        """
-        if len(self.members) == self.n < FITTED_MEMBERS:
+        if len(self.members) == self.n < BELIEF.fitted_members:
             self.members += (seen,)
         self.n += 1
         self.count_time(stamp_ns)
         self.track = track
-        if self.n <= BEGIN_MEMBERS and not self.believed:
+        if self.n <= BELIEF.begin_members and not self.believed:
             self._improve_begin(seen, chain)
 
     def predicted(self, seen: Observation, chain: OdometryChain) -> tuple[Track, Track, float]:
@@ -156,7 +97,7 @@ class Run:
         """
         end = self.track.moved(chain, seen.node)
         if (len(self.members) != self.n or self.expected is None or seen.size == 3
-                or end.innovation(seen).d2 <= EVENT):
+                or end.innovation(seen).d2 <= BELIEF.event):
             return self.first, end, 0.0
         begin = fitted((*self.members, seen), chain)
         if begin is None:
@@ -165,16 +106,15 @@ class Run:
         for member in self.members[1:]:
             end = end.moved(chain, member.node)
             end = end.updated(end.innovation(member))
-        return begin, end.moved(chain, seen.node), EVENT
+        return begin, end.moved(chain, seen.node), BELIEF.event
 
     def count_time(self, stamp_ns: int) -> None:
-        """Let the run last until a stamp [ns]."""
         if stamp_ns > self.end_ns:
-            self.seconds += min((stamp_ns - self.end_ns) * 1e-9, LONGEST)
+            self.seconds += min((stamp_ns - self.end_ns) * 1e-9, BELIEF.longest_wrong)
             self.end_ns = stamp_ns
 
     def _improve_begin(self, seen: Observation, chain: OdometryChain) -> None:
-        if _way(chain, self.first.node, seen.node) > BEGIN_WAY:
+        if _way(chain, self.first.node, seen.node) > BELIEF.begin_way:
             return
         begin = self.first
         end = begin.moved(chain, seen.node)
@@ -189,38 +129,26 @@ class Run:
     @property
     def price(self) -> float:
         """What it costs if its measurements are wrong."""
-        return EVENT + RATE * self.seconds + self.turned
+        return BELIEF.event + BELIEF.wrong_rate * self.seconds + self.turned
 
     @property
     def turned(self) -> float:
-        """
-        Price of a path that is turned against that of odometry, if it is wrong.
-
-        Positions that are off by the same vector keep the direction of the path.
-        """
+        """Price of a wrong path that is turned; an offset by one vector keeps its direction."""
         if self._turned is not None:
             return self._turned
-        if self.expected is None or self.seconds < TURN_AFTER:
+        if self.expected is None or self.seconds < BELIEF.turn_after:
             return 0.0
         heading, variance = self.expected
         turn = float(se2.wrap(self.first.pose[2] - heading))
         d2 = turn**2 / (variance + float(self.first.cov[2, 2]))
-        return min(max(d2 - TURN_ALLOWED, 0.0), MOST_OF_TURN)
+        return min(max(d2 - BELIEF.turn_allowed, 0.0), BELIEF.most_of_turn)
 
     def note_state(self, stamp_ns: int, track: Track) -> None:
-        """
-        Note where the robot was, if it was not noted lately, and fewer of the older times.
-
-        Parameters
-        ----------
-        track : Track, by the members before
-
-        """
-        if len(self.states) == 0 or stamp_ns - self.states[-1][0] >= NOTED_EVERY_NS:
-            self.states = [*_thinned(self.states, stamp_ns)[1 - NOTED:], (stamp_ns, track)]
+        """Note where the robot was, if it was not noted lately, and fewer of the older times."""
+        if len(self.states) == 0 or stamp_ns - self.states[-1][0] >= BELIEF.noted_every_ns:
+            self.states = [*_thinned(self.states, stamp_ns)[1 - BELIEF.noted:], (stamp_ns, track)]
 
     def ways_after(self, other: 'Run', chain: OdometryChain) -> Sequence[Transition]:
-        """Return the ways to believe this run after an earlier one."""
         if other.end_ns > self.begin_ns or (
                 other.number not in self.prices and self.first.node < other.track.node):
             return ()
@@ -230,15 +158,15 @@ class Run:
 
     def _ways_after(self, other: 'Run', chain: OdometryChain) -> list[Transition]:
         ways = [self._price_of_jump(other.track, chain)]
-        if ways[0].price <= CUT_ABOVE or self.n < LEAST_MEMBERS:
+        if ways[0].price <= BELIEF.cut_above or self.n < BELIEF.least_members:
             return ways
         # the last members may be the beginning of an error that grows
         cuts = []
         for cut, (stamp_ns, track) in enumerate(other.states):
             d2 = self._jump(track, chain).d2
-            if d2 <= EVENT:
+            if d2 <= BELIEF.event:
                 cuts.append(Transition(
-                    d2 + RATE * (other.end_ns - stamp_ns) * 1e-9, 1.0, cut))
+                    d2 + BELIEF.wrong_rate * (other.end_ns - stamp_ns) * 1e-9, 1.0, cut))
         return [*ways, min(cuts)] if len(cuts) > 0 else ways
 
     def _jump(self, track: Track, chain: OdometryChain) -> Innovation:
@@ -248,27 +176,17 @@ class Run:
 
     def _price_of_jump(self, track: Track, chain: OdometryChain) -> Transition:
         jump, _, cov, d2, _ = self._jump(track, chain)
-        if d2 <= EVENT:
+        if d2 <= BELIEF.event:
             return Transition(d2)
-        if self.n < LEAST_MEMBERS:
+        if self.n < BELIEF.least_members:
             return Transition(math.inf)
         way = _way(chain, track.node, self.first.node)
         price = slip_price(math.hypot(jump[0], jump[1]), 0.5 * float(cov[0, 0] + cov[1, 1]), way)
-        turn2 = float(jump[2]**2 / (cov[2, 2] + SLIP_HEADING**2))
-        return Transition(min(EVENT + price + turn2, d2), self._scale(track, jump, chain))
+        turn2 = float(jump[2]**2 / (cov[2, 2] + BELIEF.slip_heading**2))
+        return Transition(min(BELIEF.event + price + turn2, d2), self._scale(track, jump, chain))
 
     def carry(self, chain: OdometryChain, nodes: IntArray) -> dict[int, int]:
-        """
-        Return the new indices of states by the old ones, after nodes have left the graph.
-
-        Poses there are taken to the next nodes that stay; the states there are lost.
-
-        Parameters
-        ----------
-        chain : OdometryChain, with the nodes that leave
-        nodes : ndarray of int, ids of these
-
-        """
+        """Take poses to nodes that stay; return new indices of the states left by old ones."""
         gone = {*nodes.tolist()}
         kept = [k for k, state in enumerate(self.states) if state[1].node not in gone]
         self.states = [self.states[k] for k in kept]
@@ -290,12 +208,6 @@ class Run:
     def cut_after(self, state: int, number: int) -> 'Run':
         """
         Return a run of the members after a noted state, after taking them away from this one.
-
-        Parameters
-        ----------
-        state : int, index of the state
-        number : int, of the new run
-
         """
         stamp_ns, track = self.states[state]
         rest = Run(number, stamp_ns, track, believed=False)
@@ -322,22 +234,13 @@ def _thinned(states: list[tuple[int, Track]], now_ns: int) -> list[tuple[int, Tr
     for k, state in enumerate(states):
         after = states[k + 1][0] if k + 1 < len(states) else now_ns
         before = kept[-1][0] if len(kept) > 0 else None
-        if before is None or now_ns - before > NOTED_RATIO * (now_ns - after):
+        if before is None or now_ns - before > BELIEF.noted_ratio * (now_ns - after):
             kept.append(state)
     return kept
 
 
 def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
-    """
-    Return the pose at the first of some positions that puts odometry on them; None if none does.
-
-    The motion is rigid and least squares, as Umeyama (1991) has it, in closed form.
-
-    Parameters
-    ----------
-    seen : sequence of Observation, at least two positions
-
-    """
+    """Return the pose at the first position that puts odometry on all (Umeyama, 1991), or None."""
     begin = Track(seen[0].node, np.zeros(3), np.zeros((3, 3)))
     here = np.array([se2.transform(
         begin.moved(chain, each.node).pose[None], each.offset[None, :2])[0] for each in seen])
@@ -345,12 +248,12 @@ def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
     variance = float(np.mean([np.trace(each.noise) for each in seen])) / 2.0
     a, b = here - here.mean(axis=0), there - there.mean(axis=0)
     spread = float(np.sum(a**2))
-    if variance > FITTED_HEADING**2 * spread:
+    if variance > BELIEF.fitted_heading**2 * spread:
         return None
     theta = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
     pose = np.array((0.0, 0.0, theta))
     off = b - se2.transform(pose[None], a)
-    if float(np.sum(off**2)) > FITTED_D2 * len(seen) * variance:
+    if float(np.sum(off**2)) > BELIEF.fitted_d2 * len(seen) * variance:
         return None
     pose[:2] = there.mean(axis=0) - se2.transform(pose[None], here.mean(axis=0)[None])[0]
     lever = float(np.sum(here.mean(axis=0)**2)) / spread
@@ -362,19 +265,13 @@ def slip_price(size: float, variance: float, way: float) -> float:
     """
     Return how much less likely a slip of odometry is than a fault of a receiver, as twice the log.
 
-    Both have sizes with a Cauchy density in the plane, broadened by what is not known.
-
-    Parameters
-    ----------
-    size : float, how far the positions are off [m]
-    variance : float, of a coordinate of what odometry predicts [m^2]
-    way : float, by odometry [m]
-
+    Both have sizes [m] with a Cauchy density in the plane, broadened by the variance of a
+    coordinate of what odometry predicts over a way [m].
     """
     slip, fault = (0.5 * math.log(scale**2 + variance) - 1.5 * math.log(
-        scale**2 + variance + size**2) for scale in (SLIP, FAULT))
-    unmoved = min(max((size - way) / UNMOVED_WAY, 0.0), 1.0)
-    return max(2.0 * (math.log(SLIPS_RARER) + fault - slip) + UNMOVED * unmoved, 0.0)
+        scale**2 + variance + size**2) for scale in (BELIEF.slip, BELIEF.fault))
+    unmoved = min(max((size - way) / BELIEF.unmoved_way, 0.0), 1.0)
+    return max(2.0 * (math.log(BELIEF.slips_rarer) + fault - slip) + BELIEF.unmoved * unmoved, 0.0)
 
 
 def _way(chain: OdometryChain, begin: int, end: int) -> float:
@@ -385,11 +282,6 @@ def _way(chain: OdometryChain, begin: int, end: int) -> float:
 def odometry_between(graph: Graph, begin: int, end: int) -> IntArray:
     """
     Return the ids of odometry edges between two nodes, or of those around them if they are one.
-
-    Parameters
-    ----------
-    begin, end : int, ids of the nodes, `end` not before `begin`; either may have left the graph
-
     """
     ends = graph.memory['edge_i'][:graph.n_edges]
     odometry = np.flatnonzero(ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)

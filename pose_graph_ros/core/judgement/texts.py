@@ -17,26 +17,18 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.measurements import Answer, rejected
 
 NANOSECONDS = 1_000_000_000
+# what stands for the path without a constraint among those that contradict it
 ODOMETRY = 'odometry'
-"""What stands for the path without a constraint among those that contradict it."""
-PLAUSIBLE = 3.37
-"""Distance up to which a pose may be right: 99 % of right ones are nearer [sigma]."""
+PLAUSIBLE = 3.37  # distance up to which a pose may be right: 99 % of right ones are nearer [sigma]
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
 PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
            Judged.ODOMETRY: 'odometry edges'}
+# states in the order in which people want to read of them
 ORDER = (State.DOUBTED, State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED)
-"""States in the order in which people want to read of them."""
 
 
 def seconds(stamp_ns: int, digits: int = 3) -> str:
-    """
-    Return a stamp in seconds, rounded down.
-
-    Parameters
-    ----------
-    digits : int, after the point; all are 9
-
-    """
+    """Return a stamp in seconds, rounded down."""
     whole, rest = divmod(stamp_ns, NANOSECONDS)
     return f'{whole}.{f"{rest:09d}"[:digits]}'
 
@@ -44,12 +36,6 @@ def seconds(stamp_ns: int, digits: int = 3) -> str:
 def short(value: float, digits: int = 2) -> str:
     """
     Return a number for people: with so many significant digits, but all those before the point.
-
-    Parameters
-    ----------
-    value : float
-    digits : int
-
     """
     rounded = float(f'{value:.{digits}g}')
     if not 1e-4 <= abs(rounded) < 1e9:
@@ -65,14 +51,7 @@ def nanoseconds(text: str) -> int:
 
 
 def number_of(n: int, kind: Judged) -> str:
-    """
-    Return `1 closure` or `2 closures`.
-
-    Parameters
-    ----------
-    n : int
-
-    """
+    """Return `1 closure` or `2 closures`."""
     return f'{n} {NOUNS[kind] if n == 1 else PLURALS[kind]}'
 
 
@@ -86,13 +65,7 @@ def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
     """
     Return state and reason of a verdict as a sentence.
 
-    Parameters
-    ----------
-    verdict : Verdict
-    start_ns : int, optional
-        Start of a drive that is over [ns]: its times are since then, `12.3 s`; else they are
-        stamps.
-
+    Of a drive that is over, its start [ns] is given: times are since then, `12.3 s`, else stamps.
     """
     since, far = _time(verdict.since_ns, start_ns), _far(verdict.distance)
     reason = _jump(verdict, start_ns) or _doubt(verdict.distance)
@@ -155,15 +128,6 @@ def _doubt(distance: float) -> str:
 
 
 def unknown(name: str, *, has_left: bool) -> Answer:
-    """
-    Return the answer to a decision on a constraint that is not in the graph.
-
-    Parameters
-    ----------
-    name : str, `Verdict.id`, or anything else
-    has_left : bool, whether it was in the graph
-
-    """
     if has_left:
         return rejected('left_window', f'{name} has left the window of the graph, so nothing can '
                                        'be decided on it any more')
@@ -174,7 +138,6 @@ def unknown(name: str, *, has_left: bool) -> Answer:
 
 
 def details(verdict: Verdict) -> dict[str, str]:
-    """Return all that is known of a verdict, by key."""
     reference = verdict.reference_ns
     return {
         'kind': verdict.kind.value, 'stamp': seconds(verdict.stamp_ns, 9),
@@ -192,7 +155,6 @@ def is_notable(verdict: Verdict) -> bool:
 
 
 def as_json(verdict: Verdict) -> dict[str, object]:
-    """Return all that is known of a verdict as plain values, stamps in seconds."""
     far = verdict.distance
     return {
         'id': verdict.id, 'source': verdict.source, **details(verdict),
@@ -235,10 +197,8 @@ def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
     return values
 
 
-Key = tuple[str, int, int | None]
-"""Source, stamp and stamp of the other end of a measurement [ns]."""
+Key = tuple[str, int, int | None]  # source, stamp and stamp of the other end of a measurement [ns]
 
 
 def states_by_stamps(verdicts: Iterable[Verdict]) -> dict[Key, State]:
-    """Return the states of measurements by their sources and stamps."""
     return {(each.source, each.stamp_ns, each.reference_ns): each.state for each in verdicts}

@@ -18,65 +18,45 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
 
 # Least sigmas of a measurement while it is judged, and a factor on its covariance: what is stated
 # is often too small [m], [rad].
 LEAST_SIGMA = (0.3, 0.05)
-STATED = 2.0
 
 
 class Observation(NamedTuple):
     """A position or a pose in the map, as it is judged."""
 
-    node: int
-    """Id of the hidden node before it."""
-    offset: FloatArray
-    """Pose of what was measured in the node, shape (3,) [m, m, rad]."""
-    mean: FloatArray
-    """Shape (3,) [m, m, rad]; of a position, the heading is 0."""
-    noise: FloatArray
-    """Covariance in map axes, shape (2, 2) of a position, (3, 3) of a pose."""
+    node: int  # id of the hidden node before it
+    offset: FloatArray  # pose of what was measured in the node, shape (3,) [m, m, rad]
+    mean: FloatArray  # shape (3,) [m, m, rad]; of a position, the heading is 0
+    noise: FloatArray  # covariance in map axes, shape (2, 2) of a position, (3, 3) of a pose
 
     @property
     def size(self) -> int:
-        """2 for a position, 3 for a pose."""
         return len(self.noise)
 
 
 class Innovation(NamedTuple):
     """Difference of an observation from what a track predicts."""
 
-    error: FloatArray
-    """In map axes, shape (2,) or (3,) [m, m, rad]."""
-    jacobian: FloatArray
-    """Of the prediction by the pose in map axes, shape (2, 3) or (3, 3)."""
-    cov: FloatArray
-    """Covariance of the error."""
-    d2: float
-    """Squared Mahalanobis distance."""
-    spread: float
-    """Logarithm of the determinant of `cov`."""
+    error: FloatArray  # in map axes, shape (2,) or (3,) [m, m, rad]
+    jacobian: FloatArray  # of the prediction by the pose in map axes, shape (2, 3) or (3, 3)
+    cov: FloatArray  # covariance of the error
+    d2: float  # squared Mahalanobis distance
+    spread: float  # logarithm of the determinant of `cov`
 
 
 class Track(NamedTuple):
     """The pose of the robot at a hidden node, by what is believed up to there."""
 
     node: int
-    pose: FloatArray
-    """Shape (3,), in the map [m, m, rad]."""
-    cov: FloatArray
-    """In map axes, shape (3, 3)."""
+    pose: FloatArray  # shape (3,), in the map [m, m, rad]
+    cov: FloatArray  # in map axes, shape (3, 3)
 
     def moved(self, chain: OdometryChain, node: int) -> 'Track':
-        """
-        Return the track at a later hidden node.
-
-        Parameters
-        ----------
-        node : int, id of the node
-
-        """
         if node == self.node:
             return self
         pose, cov = np.empty(3), np.empty((3, 3))
@@ -86,15 +66,7 @@ class Track(NamedTuple):
         return Track(node, pose, cov)
 
     def carried(self, chain: OdometryChain, nodes: IntArray) -> 'Track':
-        """
-        Return the track at the next node that stays, if its own leaves the graph.
-
-        Parameters
-        ----------
-        chain : OdometryChain, with the nodes that leave
-        nodes : ndarray of int, ids of these
-
-        """
+        """Return the track at the next node that stays, if its own leaves the graph."""
         if self.node not in nodes:
             return self
         later = chain.nodes[np.searchsorted(chain.nodes, self.node):]
@@ -102,9 +74,7 @@ class Track(NamedTuple):
 
     def bent(self, begin: FloatArray) -> 'Track':
         """
-        Return the track with the variance of a path that is bent, which has no linear part.
-
-        `begin` is the pose where it was last measured, shape (3,).
+        Return the track with the variance of a path that is bent since the pose measured last.
         """
         x, y, _ = (self.pose - begin).tolist()
         more = 0.25 * (x * x + y * y) * min(float(self.cov[2, 2]), 1.0)**2
@@ -114,7 +84,6 @@ class Track(NamedTuple):
         return Track(self.node, self.pose, cov)
 
     def innovation(self, seen: Observation) -> Innovation:
-        """Return the innovation of an observation at the node of the track."""
         size = len(seen.noise)
         error, jacobian, cov = np.empty(size), np.empty((size, 3)), np.empty((size, size))
         d2, spread = _innovate(self.pose, self.cov, seen.offset, seen.mean, seen.noise,
@@ -122,7 +91,6 @@ class Track(NamedTuple):
         return Innovation(error, jacobian, cov, d2, spread)
 
     def updated(self, innovation: Innovation) -> 'Track':
-        """Return the track after taking in an observation."""
         pose, cov = np.empty(3), np.empty((3, 3))
         _update(self.pose, self.cov, innovation.error, innovation.jacobian, innovation.cov,
                 pose, cov)
@@ -135,7 +103,7 @@ def observations(observed: ObservedNodes) -> list[Observation]:
     noises = {}
     for n in np.unique(size).tolist():
         of_size = size == n
-        noise = STATED * np.linalg.inv(observed.information[of_size, :n, :n])
+        noise = BELIEF.stated * np.linalg.inv(observed.information[of_size, :n, :n])
         noises[n] = iter(_floored(_turned(noise, observed.mean[of_size, 2])))
     return [Observation(node, offset, mean, next(noises[n])) for node, offset, mean, n in zip(
         observed.node.tolist(), observed.offset, observed.mean, size.tolist(), strict=True)]
@@ -196,15 +164,6 @@ def _move(  # type: ignore[no-untyped-def]
     Move a pose and its covariance in map axes along odometry; return whether both nodes are in it.
 
     As `covariance.propagated` does, with what `OdometryChain.between` returns.
-
-    Parameters
-    ----------
-    rows, poses, sums : ndarray, nodes, poses and prefix sums of the covariances of the chain
-    begin, end : int, nodes
-    factor : float, on the covariance of odometry
-    pose, cov : ndarray, at the first node
-    pose_out, cov_out : ndarray, output
-
     """
     i, j = _place(rows, begin), _place(rows, end)
     if i < 0 or j < 0:
@@ -257,16 +216,7 @@ def _factor(cov, n):  # type: ignore[no-untyped-def]
 def _innovate(  # type: ignore[no-untyped-def]
     pose, cov, offset, mean, noise, error, jacobian, cov_out,
 ):
-    """
-    Write an innovation; return its squared Mahalanobis distance and log determinant.
-
-    Parameters
-    ----------
-    pose, cov : ndarray, of the track
-    offset, mean, noise : ndarray, of the observation
-    error, jacobian, cov_out : ndarray, output
-
-    """
+    """Write an innovation; return its squared Mahalanobis distance and log determinant."""
     n = len(noise)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     rx, ry = c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]
@@ -305,16 +255,7 @@ def _innovate(  # type: ignore[no-untyped-def]
 def _update(  # type: ignore[no-untyped-def]
     pose, cov, error, jacobian, innovation, pose_out, cov_out,
 ):
-    """
-    Write the pose and the covariance after taking in an observation, as a Kalman filter.
-
-    Parameters
-    ----------
-    pose, cov : ndarray, before it
-    error, jacobian, innovation : ndarray, of the innovation; the last is its covariance
-    pose_out, cov_out : ndarray, output
-
-    """
+    """Write the pose and the covariance after taking in an observation, as a Kalman filter."""
     n = len(error)
     l10, l20, l21, d0, d1, d2 = _factor(innovation, n)
     for i in range(3):

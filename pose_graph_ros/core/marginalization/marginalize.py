@@ -26,12 +26,9 @@ from pose_graph_ros.core.graph import normal_equations, tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
+from pose_graph_ros.core.marginalization.sparsification import edges_between, turned
+from pose_graph_ros.core.sparse import components
 
-# Smallest eigenvalue of a pivot that counts, as a fraction of what the constraints of its node add
-# to it: smaller ones are what rounding leaves of zero.
-LEAST_PIVOT = 1e-13
-# A marginal with a diagonal below this fraction of what was added to it says nothing.
-_NOTHING = 1e-14
 # Kinds of edges that turn with their poses.
 _RELATIVE = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
 # Those to landmarks turn with poses and landmarks; a prior does with poses alone.
@@ -42,24 +39,17 @@ class Cut(NamedTuple):
     """An edge that is left out, and what is taken off its leaving end for that."""
 
     edge: int
-    """Id of the edge."""
-    node: int
-    """Id of the end that leaves."""
-    information: FloatArray
-    """What is taken off, shape (3, 3), in map axes; less than what else is known of the node."""
-    vector: FloatArray
-    """Shape (3,)."""
+    node: int   # the end that leaves
+    information: FloatArray     # (3, 3) in map axes; less than what else is known of the node
+    vector: FloatArray  # (3,)
 
 
 class Marginal(NamedTuple):
     """What constraints that leave a graph say about the nodes that remain."""
 
-    prior: Prior | None
-    """On all nodes that remain, at their present poses; None if there is no information."""
-    edges: IntArray
-    """Ids of the edges in it."""
-    observed: IntArray
-    """Ids of the observed nodes in it."""
+    prior: Prior | None     # on all nodes that remain, at their present poses
+    edges: IntArray     # ids of those in it
+    observed: IntArray  # ids of those in it
 
 
 def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
@@ -71,12 +61,6 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
     in it knows where they are in the map, an observed node on a single pose, else a `Prior`.
     Constraints with weight 0 just leave. The graph does not change. Raises GraphUpdateError for a
     node that is not in the graph.
-
-    Parameters
-    ----------
-    graph : Graph
-    nodes : collection of int, ids of hidden nodes
-
     """
     edges, observed, priors = [], [], []
     leaving = _checked(graph, nodes)
@@ -104,14 +88,7 @@ def marginal(
     """
     Return what all constraints of leaving nodes, and further ones, say about the other nodes.
 
-    Parameters
-    ----------
-    graph : Graph
-    nodes : collection of int, ids of the leaving nodes; raises as `marginalize`
-    edges, observed : collection of int
-        Ids of constraints that go as well; their nodes remain unless they leave.
-    cuts : sequence of Cut, edges that are left out, and what is taken off instead
-
+    The nodes of the further ones remain unless they leave. Raises as `marginalize` does.
     """
     leaving = _checked(graph, nodes)
     part = _part(graph, leaving, list(edges), list(observed), [cut.edge for cut in cuts])
@@ -130,7 +107,7 @@ def marginal(
     kept = np.flatnonzero(~inside)
     columns = _columns(kept)
     U, u = H[np.ix_(columns, columns)], b[columns]
-    tiny = np.diagonal(U) <= _NOTHING * scale[columns]
+    tiny = np.diagonal(U) <= 1e-14 * scale[columns]     # what rounding leaves of zero
     U[tiny], U[:, tiny], u[tiny] = 0.0, 0.0, 0.0
     # the nodes about which it says anything
     kept = kept[np.any(np.any(U != 0.0, axis=1).reshape(-1, 3), axis=1)]
@@ -146,15 +123,7 @@ def marginal(
 def schur_complement(
     H: FloatArray, b: FloatArray, leaves: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """
-    Return a system of equations without some of its coordinates, which take their best values.
-
-    Parameters
-    ----------
-    H, b : ndarray, shapes (n, n) and (n,), positive semidefinite
-    leaves : ndarray of bool, shape (n,), which coordinates leave
-
-    """
+    """Return a semidefinite system without some coordinates, which take their best values."""
     if not np.any(leaves):
         return H, b
     gain = H[np.ix_(~leaves, leaves)] @ _pseudo_inverse(H[np.ix_(leaves, leaves)])
@@ -165,18 +134,13 @@ def schur_complement(
 def as_edge(prior: Prior) -> Edges:
     """Return an edge between the two poses of a relative prior, with its gradient and Hessian."""
     first, second = np.argsort(prior.nodes)
-    start, end = prior.reference[first], prior.reference[second]
     at = slice(3 * second, 3 * second + 3)
     information = _semidefinite(prior.information[at, at])
-    # the error in map axes at the reference
-    h = -_pseudo_inverse(information) @ prior.vector[at]
-    turn = se2.wrap(end[2] - start[2] - h[2])
-    c, s = np.cos(start[2]), np.sin(start[2])
-    d = end[:2] - start[:2] - h[:2]
-    mean = np.array((c * d[0] + s * d[1], c * d[1] - s * d[0], turn))
-    R = _rotation(start[2] + turn)
-    return Edges([prior.nodes[first]], [prior.nodes[second]], mean[None],
-                 _symmetric(R.T @ information @ R)[None], [EdgeKind.PRIOR])
+    delta = np.zeros((2, 3))
+    delta[second] = _pseudo_inverse(information) @ prior.vector[at]
+    return edges_between(
+        prior.nodes, (prior.reference, delta), np.array([first]), np.array([second]),
+        information[None])
 
 
 def as_observed(prior: Prior) -> ObservedNodes:
@@ -185,10 +149,8 @@ def as_observed(prior: Prior) -> ObservedNodes:
     mean = prior.reference[0] + _pseudo_inverse(information) @ prior.vector
     # without information on the heading the error is in map axes, as that of a position
     mean[2] = se2.wrap(mean[2]) if np.any(information[2]) else 0.0
-    R = _rotation(mean[2])
-    return ObservedNodes(prior.nodes, mean=mean[None],
-                         information=_symmetric(R.T @ information @ R)[None],
-                         kind=[ObservedKind.PRIOR])
+    return ObservedNodes(prior.nodes, mean=mean[None], kind=[ObservedKind.PRIOR],
+                         information=turned(information[None], mean[2:]))
 
 
 def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
@@ -202,26 +164,17 @@ def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
 
 def _parts(graph: Graph, leaving: IntArray) -> Iterator[IntArray]:
     """Yield the connected parts of the leaving nodes, each ascending."""
-    root = {node: node for node in leaving.tolist()}
-
-    def find(node: int) -> int:
-        while root[node] != node:
-            root[node] = root[root[node]]
-            node = root[node]
-        return node
-
     edges = graph.edges
-    groups = _ends(edges.rows(edges.weight > 0.0)).T.tolist()
-    groups += [prior.nodes.tolist() for prior in graph.priors]
-    for group in groups:
-        inside = [find(node) for node in group if node in root]
-        for node in inside[1:]:
-            root[find(node)] = find(inside[0])
-    parts: dict[int, list[int]] = {}
-    for node in leaving.tolist():
-        parts.setdefault(find(node), []).append(node)
-    for members in parts.values():
-        yield np.array(members)
+    ends = _ends(edges.rows(edges.weight > 0.0))
+    pairs = [ends[[0, 1]], ends[[0, 2]], ends[[1, 2]]]
+    for prior in graph.priors:
+        inside = prior.nodes[np.isin(prior.nodes, leaving)]
+        pairs.append(np.stack((inside[:-1], inside[1:])))
+    joined = np.hstack(pairs)
+    i, j = np.searchsorted(leaving, joined[:, np.all(np.isin(joined, leaving), axis=0)])
+    part = components(i, j, len(leaving))
+    for first in np.unique(part):
+        yield leaving[part == first]
 
 
 def _ends(edges: Edges) -> IntArray:
@@ -281,42 +234,28 @@ def equations(graph: Graph) -> tuple[FloatArray, FloatArray]:
 
 @kernel(signature=(tb.HEAD, ROWS))
 def assemble(head, front):  # type: ignore[no-untyped-def]
-    """
-    Add all constraints of a graph to the equations of all its nodes.
-
-    Parameters
-    ----------
-    front : ndarray, shape (3N, 3N + 1)
-        Receives the upper triangle of H and, in the last column, b.
-
-    """
+    """Add all constraints to H, of which (3N, 3N + 1) has the upper triangle, and last to b."""
     edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
     edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     flat, ld = front.reshape(front.size), front.shape[1]
     for e in range(head[tb.N_EDGES]):
         if edge_f[e, tb.WEIGHT] > 0.0:
             third = edge_i[e, tb.END_K]
-            normal_equations.add_edge(head, e, 3 * edge_i[e, tb.END_I], 3 * edge_i[e, tb.END_J],
+            normal_equations.add(head, e, 3 * edge_i[e, tb.END_I], 3 * edge_i[e, tb.END_J],
                              3 * third if third >= 0 else -1, flat, ld)
     for k in range(head[tb.N_OBSERVED]):
         if observed_f[k, tb.WEIGHT] > 0.0:
-            normal_equations.add_observed(head, k, 3 * observed_i[k, tb.OBS_NODE], flat, ld)
+            normal_equations.add(
+                head, -1 - k, 3 * observed_i[k, tb.OBS_NODE], -1, -1, flat, ld)
 
 
 def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:
     """
     Return b_m^T H_mm^+ b_m after eliminating nodes in place, those with few neighbours first.
 
-    Parameters
-    ----------
-    H, b : ndarray, shapes (3N, 3N) and (3N,)
-    nodes : ndarray of int, rows of the nodes
-    scale : ndarray, shape (3N,), what the constraints have added to the diagonal
-
+    The scale, shape (3N,), is what the constraints have added to the diagonal.
     """
     left, decrease = set(nodes.tolist()), 0.0
-    if len(left) == 0:
-        return decrease
     linked = np.any(H.reshape(len(H) // 3, 3, -1, 3) != 0.0, axis=(1, 3))
     while left:
         v = min(left, key=lambda node: (int(np.count_nonzero(linked[node])), node))
@@ -335,19 +274,11 @@ def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) 
 
 
 def _pseudo_inverse(matrix: FloatArray, scale: FloatArray | None = None) -> FloatArray:
-    """
-    Return the pseudo-inverse of a positive semidefinite matrix, shape (n, n).
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n)
-    scale : ndarray, shape (n,), optional, size of its diagonal before cancellation
-
-    """
+    """Return that of a semidefinite matrix; `scale` is its diagonal before cancellation."""
     diagonal = np.diagonal(matrix) if scale is None else scale
     root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(_symmetric(matrix / np.outer(root, root)))
-    good = values > LEAST_PIVOT
+    good = values > 1e-13   # smaller ones are what rounding leaves of zero
     half = vectors[:, good] / np.sqrt(values[good]) / root[:, None]
     return np.asarray(half @ half.T)
 
@@ -371,9 +302,3 @@ def _columns(rows: IntArray) -> IntArray:
 
 def _symmetric(matrix: FloatArray) -> FloatArray:
     return 0.5 * (matrix + matrix.T)
-
-
-def _rotation(angle: float) -> FloatArray:
-    """Return the matrix that rotates the axes of a pose."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))

@@ -17,10 +17,13 @@ All is linear in map axes at the reference poses. With d = t_j - t_i, an edge me
 
 for displacements h of the poses, and an observed node measures h_i. Directions that the prior
 tells nothing of (rounding apart) get no information: a prior without absolute information becomes
-edges alone. A bias becomes a prior on it and one pose. docs/solver.md has the derivation.
+edges alone. docs/solver.md has the derivation.
+
+A bias becomes a prior on it and one pose: given the displacements h of the pose, those b of the
+bias have the best linear prediction C h. So `b - C h` is measured, with the covariance that it has
+by the prior, by the pose with which that is smallest.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,18 +33,14 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization import conservative
-from pose_graph_ros.core.marginalization.sparse_biases import of_bias, OfBias, on_bias, SEEN
 
 # Eigenvalues of the scaled information below this part of the largest one are rounding. The second
 # one is for priors whose covariances are singular in double precision with the first one.
 _RANK, _SURER_RANK = 1e-10, 1e-7
 # What is known no better than that is in these units: its own ones would make much of rounding.
 _LEAST_KNOWN = np.array((1e4, 1e4, 10.0))
-# The minimum of a prior has headings at most so far from the reference [rad]. A direction that is
-# next to unknown may have it turns away, where the linear model is meaningless.
-_MOST_TURNED = 0.5
-# What an undetermined direction counts in the weight of a tree: more than any covariance.
-_UNDETERMINED = 1e3
+# A measurement sees an undetermined direction if it is above this part of its size.
+_SEEN = 1e-6
 
 
 class SparsePrior(NamedTuple):
@@ -49,24 +48,27 @@ class SparsePrior(NamedTuple):
 
     edges: Edges
     observed: ObservedNodes
-    divergence: float
-    """Kullback-Leibler divergence of the constraints from the prior [nats]."""
-    priors: tuple[Prior, ...] = ()
-    """Of each bias, on it and a pose."""
+    divergence: float   # of Kullback and Leibler, of the constraints from the prior [nats]
+    priors: tuple[Prior, ...] = ()  # of each bias, on it and a pose
 
 
 class _Candidates(NamedTuple):
     """Measurements between pairs of poses, and of poses in the map (node k)."""
 
-    i: IntArray
-    """Shape (C,); k stands for the map."""
+    i: IntArray     # (C,); k stands for the map
     j: IntArray
-    rows: FloatArray
-    """In coordinates where the prior is I, and with covariance I, shape (C, 3, r)."""
-    roots: FloatArray
-    """Turn information for `rows` into information in map axes, shape (C, 3, 3)."""
-    weights: FloatArray
-    """`log det` of the covariance, shape (C,)."""
+    rows: FloatArray    # (C, 3, r) where the prior is I, and with covariance I
+    roots: FloatArray   # (C, 3, 3) turn information for `rows` into that in map axes
+    weights: FloatArray     # (C,) `log det` of the covariance
+
+
+class _OfBias(NamedTuple):
+    """The measurement of a bias that is most certain: its difference from what a pose tells."""
+
+    pose: int
+    gain: FloatArray    # (3, 3) what displacements of the pose tell of the bias
+    rows: FloatArray    # (3, r) and
+    root: FloatArray    # (3, 3), as of candidates
 
 
 def sparsify(
@@ -76,24 +78,13 @@ def sparsify(
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
 
-    Raises LinAlgError if the prior is too stiff for double precision, or if what it does not tell
-    of a bias is not that of a pose.
-
-    They have their minimum where the prior has it, in the linear model at the reference poses, or
-    nearer where that is out of its reach (`_minimum`).
-
-    Parameters
-    ----------
-    nodes : ndarray of int, shape (k,), the hidden nodes
-    poses : ndarray, shape (k, 3), reference poses in the map [m, m, rad]
-    information : ndarray, shape (3 k, 3 k), positive semidefinite, in map axes
-    vector : ndarray, shape (3 k,), b: the prior's minimum is at `information @ delta = b`
-    anchored : bool, whether the prior tells of the map; if not, its null space is that of motions
-        of all poses as one body
-    n_extra : int, most edges beyond the tree; they are added as many as there are nodes at a time
-    enough : float, divergence from which on none is added [nats]
-    n_biases : int, how many of the nodes, the last ones, are biases; then the prior is anchored
-
+    They have their minimum where the prior has it, `information @ delta = vector` in map axes at
+    the reference poses, or nearer where that is out of its reach (`_minimum`). Without an anchor
+    the null space is that of motions of all poses as one body. At most `n_extra` edges beyond the
+    tree are added, as many as there are nodes at a time, until the divergence is `enough` [nats].
+    The last `n_biases` nodes are biases; then the prior is anchored. Raises LinAlgError if the
+    prior is too stiff for double precision, or if what it does not tell of a bias is not that of a
+    pose.
     """
     k = len(nodes) - n_biases
     basis, free = _basis(poses, information, anchored)
@@ -105,7 +96,7 @@ def sparsify(
     delta = _minimum(basis, vector, k)
     # a bias of less than three coordinates is padded, which rounding is not to tell of
     basis[3 * k:][np.diagonal(information)[3 * k:] == 0.0] = 0.0
-    of_biases = [of_bias(basis, free, k, row) for row in range(k, k + n_biases)]
+    of_biases = [_of_bias(basis, free, k, row) for row in range(k, k + n_biases)]
     found = _with_biases(found, of_biases, k)
     chosen = _spanning_tree(found, k + n_biases + (1 if anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
@@ -126,15 +117,12 @@ def sparsify(
     i, j = found.i[chosen], found.j[chosen]
     is_edge, is_seen = (i < k) & (j < k), i == k
     displaced = poses, delta.reshape(-1, 3)
-    edges = _edges(*displaced, (i[is_edge], j[is_edge]), in_map[is_edge])
-    seen = _observed(*displaced, j[is_seen], in_map[is_seen])
+    edges = edges_between(nodes, displaced, i[is_edge], j[is_edge], in_map[is_edge])
+    seen = _observed(nodes, displaced, j[is_seen], in_map[is_seen])
     priors = tuple(
-        on_bias(nodes, displaced, (of.pose, int(row) - 1), of.gain, in_map[at])
+        _on_bias(nodes, displaced, (of.pose, int(row) - 1), of.gain, in_map[at])
         for at, row in enumerate(j) if row > k for of in (of_biases[row - k - 1],))
-    kinds = np.full(len(edges), EdgeKind.PRIOR, dtype=np.uint8)
-    return SparsePrior(
-        replace(edges, i=nodes[edges.i], j=nodes[edges.j], kind=kinds),
-        replace(seen, node=nodes[seen.node]), distance, priors)
+    return SparsePrior(edges, seen, distance, priors)
 
 
 def _basis(
@@ -171,20 +159,14 @@ def _minimum(basis: FloatArray, vector: FloatArray, n_poses: int) -> FloatArray:
     Where they turn a pose by more than the linear model bears, the headings are damped as in
     D. Marquardt ("An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11,
     1963), just so much that they do not. That concerns directions that are next to unknown first.
-
-    Parameters
-    ----------
-    basis : ndarray, shape (3 k, r), as returned by `_basis`
-    vector : ndarray, shape (3 k,)
-    n_poses : int, number of the first nodes, which are poses
-
     """
     wanted = basis.T @ vector
     at = slice(2, 3 * n_poses, 3)
     delta, headings = basis @ wanted, basis[at]
     left, sigmas, _ = np.linalg.svd(headings.T, full_matrices=False)
     damping = 1.0 / max(float(np.max(sigmas, initial=0.0))**2, 1e-300)
-    while np.max(np.abs(delta[at]), initial=0.0) > _MOST_TURNED:
+    # a direction that is next to unknown may have it turns away, where the model is meaningless
+    while np.max(np.abs(delta[at]), initial=0.0) > 0.5:
         # (I + damping H^T H)^-1, with the rows H of the headings
         gain = damping * sigmas**2 / (1.0 + damping * sigmas**2)
         delta = basis @ (wanted - left @ (gain * (left.T @ wanted)))
@@ -243,8 +225,9 @@ def _partly_determined(
         size = np.sqrt(np.sum(row**2, axis=1) + np.sum(undetermined**2, axis=1))
         size[size == 0.0] = 1.0
         left, values, _ = np.linalg.svd(undetermined / size[:, None])
-        n_seen = np.count_nonzero(values > SEEN)
-        weights[m] = n_seen * _UNDETERMINED + 2.0 * np.sum(np.log(size))
+        n_seen = np.count_nonzero(values > _SEEN)
+        # undetermined directions count more than any covariance
+        weights[m] = 1e3 * n_seen + 2.0 * np.sum(np.log(size))
         if n_seen < 3:
             known = left[:, n_seen:] / size[:, None]    # (3, d)
             reduced = known.T @ row
@@ -256,17 +239,8 @@ def _partly_determined(
     return _Candidates(i, j, whitened, roots, weights)
 
 
-def _with_biases(found: _Candidates, of_biases: list[OfBias], n_poses: int) -> _Candidates:
-    """
-    Return candidates with one for each bias, whose ends are a pose and n_poses + 1 and so on.
-
-    Parameters
-    ----------
-    found : _Candidates, of poses and, as node n_poses, the map
-    of_biases : list of OfBias
-    n_poses : int
-
-    """
+def _with_biases(found: _Candidates, of_biases: list[_OfBias], n_poses: int) -> _Candidates:
+    """Return candidates with one for each bias; their ends are a pose and n_poses + 1 and on."""
     if not of_biases:
         return found
     return _Candidates(
@@ -310,33 +284,84 @@ def _overestimated(
     return others[np.argsort(-gain, kind='stable')]
 
 
-def _edges(
-    poses: FloatArray, delta: FloatArray, ends: tuple[IntArray, IntArray], in_map: FloatArray,
+def _of_bias(basis: FloatArray, free: FloatArray, n_poses: int, row: int) -> _OfBias:
+    """
+    Return the measurement `b - gain h` of a bias with the least `log det` of all poses.
+
+    Its gain is such that it sees nothing undetermined; `row` is that of the bias.
+    """
+    at = slice(3 * row, 3 * row + 3)
+    used = np.any(basis[at] != 0.0, axis=1)
+    own, undetermined = basis[at] * used[:, None], free[at] * used[:, None]
+    best, least = None, np.inf
+    for pose in range(n_poses):
+        rows, of_pose = (each[3 * pose:3 * pose + 3] for each in (basis, free))
+        left, values, right = np.linalg.svd(of_pose, full_matrices=True)
+        n_seen = np.count_nonzero(values > _SEEN * np.max(np.abs(rows), initial=0.0))
+        gain = undetermined @ right[:n_seen].T / values[:n_seen] @ left[:, :n_seen].T
+        if np.max(np.abs(undetermined - gain @ of_pose), initial=0.0) > _SEEN * np.max(
+                np.abs(own), initial=0.0):
+            continue
+        known = left[:, n_seen:].T @ rows
+        rest = (own - gain @ rows) @ known.T
+        gain = gain + np.linalg.solve(known @ known.T, rest.T).T @ left[:, n_seen:].T
+        rows = (own - gain @ rows) * used[:, None]
+        covariance = rows @ rows.T + np.diag(~used)
+        weight = np.linalg.slogdet(covariance)[1]
+        if weight < least:
+            least, best = weight, (pose, gain, rows, covariance)
+    if best is None:
+        raise np.linalg.LinAlgError('a bias is not determined by any pose')
+    pose, gain, rows, covariance = best
+    inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+    return _OfBias(pose, gain * used[:, None], inverse @ rows, inverse.T * used[:, None])
+
+
+def _on_bias(
+    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], rows: tuple[int, int],
+    gain: FloatArray, information: FloatArray,
+) -> Prior:
+    """Return the prior that a measurement of a bias is, given rows of the pose and the bias."""
+    poses, delta = displaced
+    jacobian, at = np.hstack((-gain, np.eye(3))), np.array(rows)
+    whole = jacobian.T @ information @ jacobian
+    whole = 0.5 * (whole + whole.T)
+    return Prior(nodes[at], poses[at].copy(), whole, whole @ delta[at].ravel(), 0.0, True)
+
+
+def edges_between(
+    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], start: IntArray, end: IntArray,
+    in_map: FloatArray,
 ) -> Edges:
-    """Return edges with information in map axes whose minimum is at displacements delta."""
-    start, end = ends
+    """
+    Return edges with information in map axes whose minimum is at displacements of poses.
+
+    Start and end are rows of nodes, poses and displacements.
+    """
+    poses, delta = displaced
     moved = _relative(poses, delta[:, :, None], start, end)[:, :, 0]
     mean, turn = se2.between(poses[start], poses[end]), poses[start, 2]
     # (3.48) is linear in the measured pose, but for its axes
     mean[:, :2] += np.einsum('mji,mj->mi', se2.rotation(turn), moved[:, :2])
     mean[:, 2] = se2.wrap(mean[:, 2] + moved[:, 2])
-    return Edges(start, end, mean, _turned(in_map, turn + mean[:, 2]),
-                 np.zeros(len(start), dtype=np.uint8))
+    return Edges(nodes[start], nodes[end], mean, turned(in_map, turn + mean[:, 2]),
+                 np.full(len(start), EdgeKind.PRIOR, dtype=np.uint8))
 
 
 def _observed(
-    poses: FloatArray, delta: FloatArray, node: IntArray, in_map: FloatArray,
+    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], rows: IntArray, in_map: FloatArray,
 ) -> ObservedNodes:
     """Return observed nodes with information in map axes."""
-    mean = se2.wrapped(poses[node] + delta[node])
+    poses, delta = displaced
+    mean = se2.wrapped(poses[rows] + delta[rows])
     return ObservedNodes(
-        node, mean=mean, information=_turned(in_map, mean[:, 2]),
-        kind=np.full(len(node), ObservedKind.PRIOR, dtype=np.uint8))
+        nodes[rows], mean=mean, information=turned(in_map, mean[:, 2]),
+        kind=np.full(len(rows), ObservedKind.PRIOR, dtype=np.uint8))
 
 
-def _turned(information: FloatArray, theta: FloatArray) -> FloatArray:
+def turned(information: FloatArray, theta: FloatArray) -> FloatArray:
     """Return symmetric information in axes turned by angles, shape (M, 3, 3)."""
     axes = np.zeros((len(theta), 3, 3))
     axes[:, :2, :2], axes[:, 2, 2] = se2.rotation(theta), 1.0
-    turned = np.matmul(np.matmul(np.swapaxes(axes, 1, 2), information), axes)
-    return np.asarray(0.5 * (turned + np.swapaxes(turned, 1, 2)))
+    rotated = np.matmul(np.matmul(np.swapaxes(axes, 1, 2), information), axes)
+    return np.asarray(0.5 * (rotated + np.swapaxes(rotated, 1, 2)))

@@ -8,27 +8,20 @@ rate is w + b + n: w the true one, b the bias, which is estimated in the graph, 
 """
 
 import bisect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core.config import GyroSource, RateNoise
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.gyro_config import GyroSource, RateNoise
-from pose_graph_ros.core.measurements import (
-    ACCEPTED,
-    Answer,
-    LARGEST_STAMP,
-    rejected,
-    YawRate,
-)
-from pose_graph_ros.core.odometry.stream import FAR_AHEAD_NS, MANY_BEHIND
+from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
+from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_defect, stamp_of
+from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.saved_columns import Integers, Rows2
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
 LARGEST_RATE = 1000.0
-# Samples that wait for odometry; beyond, the oldest are dropped.
-MOST_SAMPLES = 100_000
 # Change of the rate that the polygon must allow for [rad/s^2]: an acceleration that is not uniform
 # during a step h leaves an error of h^2 / 12 times its change.
 UNIFORM_WITHIN = 0.5
@@ -38,47 +31,28 @@ UNIFORM_WITHIN = 0.5
 class SavedRates:
     """Saved samples of a gyroscope from the last node on that was reached."""
 
-    stamps_ns: Integers
-    """Shape (S,) [ns]."""
-    rates: Rows2
-    """Rate and its variance, shape (S, 2) [rad/s, rad^2/s^2]."""
+    stamps_ns: Integers  # shape (S,) [ns]
+    rates: Rows2  # rate and its variance, shape (S, 2) [rad/s, rad^2/s^2]
 
 
 class Rotation(NamedTuple):
     """What a gyroscope has measured during some time."""
 
-    angle: float
-    """Integral of the rate, with the bias, not wrapped [rad]."""
-    variance: float
-    """By the white noise and the error of the scale [rad^2]."""
+    angle: float  # integral of the rate, with the bias, not wrapped [rad]
+    variance: float  # by the white noise and the error of the scale [rad^2]
     seconds: float
-    """The time [s]."""
 
     def without(self, part: 'Rotation') -> 'Rotation':
         """Return the rotation during the rest of the time."""
         return Rotation(*(whole - less for whole, less in zip(self, part, strict=True)))
 
 
-class GyroStream:
-    """
-    The samples of a gyroscope, sorted by stamp.
-
-    A sample is settled when it is older than the newest one by the reorder window; older samples
-    are rejected then.
-    """
+class GyroStream(ReorderBuffer[YawRate]):
+    """The samples of a gyroscope, sorted by stamp."""
 
     def __init__(self, source: GyroSource) -> None:
-        self.n_sorted = 0
-        """Number of samples that were received after newer ones and sorted in before them."""
-        self.n_dropped = 0
-        """Number of accepted samples that were dropped later as their stamps were far ahead."""
-        self._stamps: list[int] = []
-        self._rates: list[tuple[float, float]] = []
-        """Rate and its variance [rad/s, rad^2/s^2]."""
-        self._n_settled = 0
-        """Number of these samples that are settled, the oldest ones."""
-        self._n_behind = 0
-        """Number of consecutive received samples that are far behind the newest one."""
+        super().__init__('a rate')
+        self._settled: list[YawRate] = []
         self.configure(source)
 
     def configure(self, source: GyroSource) -> None:
@@ -89,129 +63,102 @@ class GyroStream:
 
     @property
     def first_ns(self) -> int:
-        """Stamp of the oldest sample that is still here [ns]; -1 without."""
-        return self._stamps[0] if self._stamps else -1
+        """Stamp of the oldest settled sample that is still here [ns]; -1 without."""
+        return self._settled[0].stamp_ns if self._settled else -1
 
     @property
     def settled_ns(self) -> int:
         """Stamp of the newest settled sample [ns]; -1 before the first."""
-        return self._stamps[self._n_settled - 1] if self._n_settled > 0 else -1
+        return self._settled[-1].stamp_ns if self._settled else -1
+
+    def _was_settled(self, stamp_ns: int) -> bool:
+        at = bisect.bisect_left(self._settled, stamp_ns, key=stamp_of)
+        return at < len(self._settled) and self._settled[at].stamp_ns == stamp_ns
 
     def add(self, sample: YawRate) -> Answer:
         """Add a sample; return whether it is accepted, or the reason for its rejection."""
-        stamp_ns, rate = sample.stamp_ns, sample.rate
-        if not 0 < stamp_ns <= LARGEST_STAMP:
-            return rejected('zero_stamp' if stamp_ns <= 0 else 'no_stamp',
-                            f'expected a stamp above 0, got {stamp_ns} ns')
-        if not abs(rate) <= LARGEST_RATE:
-            return rejected('too_large' if abs(rate) > LARGEST_RATE else 'not_finite',
-                            f'yaw rate {rate} rad/s')
-        at, stamps = len(self._stamps), self._stamps
-        if at > 0 and stamp_ns <= stamps[-1]:
-            at = bisect.bisect_left(stamps, stamp_ns)
-            if stamps[at] == stamp_ns:
-                return rejected(
-                    'duplicate_stamp', f'a rate at {1e-9 * stamp_ns:.3f} s came before')
-            if at < self._n_settled:
-                return rejected('out_of_order', f'a rate at {1e-9 * stamp_ns:.3f} s after '
-                                                f'{1e-9 * self.settled_ns:.3f} s')
-            self.n_sorted += 1
-        known = 0.0 < sample.variance < LARGEST_RATE**2
-        stamps.insert(at, stamp_ns)
-        self._rates.insert(at, (rate, sample.variance if known else 0.0))
-        behind = stamps[-1] - stamp_ns > FAR_AHEAD_NS + self._window_ns
-        self._n_behind = self._n_behind + 1 if behind else 0
-        if self._n_behind >= MANY_BEHIND:
-            kept = bisect.bisect_right(stamps, stamp_ns + FAR_AHEAD_NS + self._window_ns)
-            self.n_dropped += len(stamps) - kept
-            del stamps[kept:], self._rates[kept:]
-            self._n_behind = 0
-        self.settle(stamps[-1] - self._window_ns)
-        self._drop(len(stamps) - MOST_SAMPLES)
+        if (defect := stamp_defect(sample.stamp_ns)) is not None:
+            return defect
+        if not abs(sample.rate) <= LARGEST_RATE:
+            return rejected('too_large' if abs(sample.rate) > LARGEST_RATE else 'not_finite',
+                            f'yaw rate {sample.rate} rad/s')
+        if not 0.0 < sample.variance < LARGEST_RATE**2:
+            sample = replace(sample, variance=0.0)
+        at = self._insert(sample)
+        if isinstance(at, Answer):
+            return at
+        self.settle(self._waiting[-1].stamp_ns - self._window_ns)
         return ACCEPTED
 
     def settle(self, until_ns: int | None = None) -> None:
         """Settle the samples up to a stamp [ns], by default all."""
-        stamps, at = self._stamps, self._n_settled
-        while at < len(stamps) and (until_ns is None or stamps[at] <= until_ns):
-            at += 1
-        self._n_settled = at
+        n = len(self._waiting) if until_ns is None else bisect.bisect_right(
+            self._waiting, until_ns, key=stamp_of)
+        self._settled += self._waiting[:n]
+        # without odometry the oldest are dropped
+        del self._waiting[:n], self._settled[:-100_000]
 
     def forget_before(self, stamp_ns: int) -> None:
         """Forget the samples that rates from a stamp [ns] on do not need."""
-        self._drop(bisect.bisect_right(self._stamps, stamp_ns) - 1)
+        n = bisect.bisect_right(self._settled, stamp_ns, key=stamp_of) - 1
+        del self._settled[:max(n, 0)]
 
-    def _drop(self, n: int) -> None:
-        if n > 0:
-            del self._stamps[:n], self._rates[:n]
-            self._n_settled = max(self._n_settled - n, 0)
-
-    def integral(self, start_ns: int, end_ns: int) -> 'RateIntegral | None':
-        """
-        Return the integral of the rate; None if samples do not cover the time, or with a gap.
-
-        Parameters
-        ----------
-        start_ns, end_ns : int, stamps [ns]
-
-        """
-        stamps = self._stamps
-        begin = bisect.bisect_right(stamps, start_ns) - 1
-        end = bisect.bisect_left(stamps, end_ns) + 1
-        if begin < 0 or end > len(stamps):
+    def integral(self, start_ns: StampNs, end_ns: StampNs) -> 'RateIntegral | None':
+        """Return the integral of the rate; None if samples do not cover the time without a gap."""
+        begin, end = _around(self._settled, start_ns, end_ns)
+        if begin < 0 or end > len(self._settled):
             return None
-        times_ns = np.array(stamps[begin:end], dtype=np.int64)
-        if len(times_ns) < 2 or np.max(np.diff(times_ns)) > self._gap_ns:
-            return None
-        return RateIntegral(times_ns, np.array(self._rates[begin:end]), self._source)
+        return self._integrated(self._settled[begin:end])
 
-    def newest(self, start_ns: int, end_ns: int) -> 'Rotation | None':
+    def newest(self, start_ns: StampNs, end_ns: StampNs) -> 'Rotation | None':
         """
         Return the rotation between two instants, by samples that need not be settled.
 
         The newest rate is taken to last until the end, if that is no gap. None as for `integral`.
-
-        Parameters
-        ----------
-        start_ns, end_ns : int, stamps [ns]
-
         """
-        stamps, rates = self._stamps, self._rates
-        begin = bisect.bisect_right(stamps, start_ns) - 1
+        every = self._settled + self._waiting
+        begin, end = _around(every, start_ns, end_ns)
         if begin < 0 or end_ns - start_ns <= 0:
             return None
-        end = bisect.bisect_left(stamps, end_ns) + 1
-        times, values = stamps[begin:end], rates[begin:end]
-        if end > len(stamps):
-            times, values = [*times, end_ns], [*values, rates[-1]]
-        times_ns = np.array(times, dtype=np.int64)
-        if np.max(np.diff(times_ns)) > self._gap_ns:
+        samples = every[begin:end]
+        if end > len(every):
+            samples.append(replace(every[-1], stamp_ns=end_ns))
+        integral = self._integrated(samples)
+        return None if integral is None else integral.between(start_ns, end_ns)
+
+    def _integrated(self, samples: list[YawRate]) -> 'RateIntegral | None':
+        stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
+        if len(stamps_ns) < 2 or np.max(np.diff(stamps_ns)) > self._gap_ns:
             return None
-        return RateIntegral(times_ns, np.array(values), self._source).between(start_ns, end_ns)
+        return RateIntegral(stamps_ns, _rates(samples), self._source)
 
     def saved(self) -> SavedRates:
         """Return the samples that are still here."""
-        return SavedRates(np.array(self._stamps, dtype=np.int64),
-                          np.array(self._rates).reshape(-1, 2))
+        every = self._settled + self._waiting
+        return SavedRates(np.array([each.stamp_ns for each in every], dtype=np.int64),
+                          _rates(every))
 
     def restore(self, saved: SavedRates) -> None:
         """Fill this empty stream with saved samples."""
-        self._stamps = saved.stamps_ns.tolist()
-        self._rates = [(rate, variance) for rate, variance in saved.rates.tolist()]
-        if self._stamps:
-            self.settle(self._stamps[-1] - self._window_ns)
+        self._waiting = [YawRate(stamp_ns, *rate) for stamp_ns, rate in zip(
+            saved.stamps_ns.tolist(), saved.rates.tolist(), strict=True)]
+        if self._waiting:
+            self.settle(self._waiting[-1].stamp_ns - self._window_ns)
+
+
+def _around(samples: list[YawRate], start_ns: StampNs, end_ns: StampNs) -> tuple[int, int]:
+    """Return the range of samples that cover a time; it may begin at -1 or end too late."""
+    return (bisect.bisect_right(samples, start_ns, key=stamp_of) - 1,
+            bisect.bisect_left(samples, end_ns, key=stamp_of) + 1)
+
+
+def _rates(samples: list[YawRate]) -> FloatArray:
+    """Return rates and their variances, shape (S, 2)."""
+    return np.array([(each.rate, each.variance) for each in samples]).reshape(-1, 2)
 
 
 class RateIntegral:
-    """
-    The integral of the polygon through some samples.
-
-    Parameters
-    ----------
-    stamps_ns : ndarray of int64, shape (S,), ascending, S >= 2 [ns]
-    rates : ndarray, shape (S, 2), rates and their variances, 0 for unknown [rad/s, rad^2/s^2]
-
-    """
+    """The integral of the polygon through at least two samples, given by rates and variances."""
 
     def __init__(self, stamps_ns: IntArray, rates: FloatArray, source: GyroSource) -> None:
         self._begin_ns, self.scale = int(stamps_ns[0]), source.covariance_scale
@@ -234,15 +181,8 @@ class RateIntegral:
         """Return the rate at an instant [rad/s]."""
         return float(np.interp((stamp_ns - self._begin_ns) * 1e-9, self._times, self.rates))
 
-    def between(self, start_ns: int, end_ns: int) -> Rotation:
-        """
-        Return the rotation between two instants that the samples cover.
-
-        Parameters
-        ----------
-        start_ns, end_ns : int, stamps [ns]
-
-        """
+    def between(self, start_ns: StampNs, end_ns: StampNs) -> Rotation:
+        """Return the rotation between two instants that the samples cover."""
         (begin, begin_variance), (end, end_variance) = self._at(start_ns), self._at(end_ns)
         return Rotation(end - begin, self.scale * (end_variance - begin_variance),
                         (end_ns - start_ns) * 1e-9)

@@ -9,119 +9,74 @@ import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses, wrap_one
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
-from pose_graph_ros.core.odometry.gaps import gap_motion
-from pose_graph_ros.core.odometry.motion import Attachment, Motion
-from pose_graph_ros.core.odometry.node_table import NodeTable
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
-from pose_graph_ros.core.odometry.primary_source import (
+from pose_graph_ros.core.odometry.jumps import gap_motion
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
+from pose_graph_ros.core.odometry.node_table import NodeTable, SavedNodes, SavedSpan
+from pose_graph_ros.core.odometry.several_sources import (
     choose_first,
     find_silence,
     first_with_sample,
-    in_order_of_preference,
+    SecondaryEdges,
     Silence,
 )
-from pose_graph_ros.core.odometry.saved_nodes import SavedNodes, SavedSpan
-from pose_graph_ros.core.odometry.secondary_edges import SecondaryEdges
 from pose_graph_ros.core.odometry.stream import OdometryStream
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 from pose_graph_ros.core.saved_columns import as_matrix, as_pose
 
 
-class HiddenNodes:
+class HiddenNodes(NodeTable):
     """
     The hidden nodes by stamp, and the odometry that makes them.
 
-    A settled sample of the primary source (`primary_source`) makes a node if one is due by the
-    node policy, with an edge from the node before. The other sources add edges between the nodes
-    (`secondary_edges`).
+    A settled sample of the primary source (`several_sources`) makes a node if one is due by the
+    node policy, with an edge from the node before. The other sources add edges between them.
 
-    Parameters
-    ----------
-    make_node : callable
-        Takes the mean of the edge to a new node, shape (3,), its information, shape (3, 3), and
-        the name of the source; for the first node its pose and None. Returns the id of the node
-        in the graph, or -1 if there is none: it is then tried again at the next sample.
-
+    `make_node` takes the mean of the edge to a new node, its information, and the name of the
+    source; for the first node its pose and None. It returns the id of the node in the graph, or -1
+    if there is none: it is then tried again at the next sample.
     """
 
     def __init__(
         self, config: BackendConfig,
         make_node: Callable[[FloatArray, FloatArray | None, str], int],
     ) -> None:
+        super().__init__()
         self._config = config
         self._make_node = make_node
-        self.table = NodeTable()
-        """All nodes; only this object edits it."""
-        self.streams: dict[str, OdometryStream] = {}
-        """By the name of the source."""
+        self.streams: dict[str, OdometryStream] = {}  # by the name of the source
+        # stamp after which a source is the primary one [ns], and its name, by stamp
         self._primaries: list[tuple[int, str]] = []
-        """Stamp after which a source is the primary one [ns], and its name, by stamp."""
         self._n_forgotten_primaries = 0
+        # stamp of the newest sample of the primary source that was checked for a node [ns]: up to
+        # there everything is settled; -1 before the first odometry
         self.covered_ns = -1
-        """
-        Stamp of the newest sample of the primary source that was checked for a node [ns]: up to
-        there everything is settled; -1 before the first odometry.
-        """
+        # stamp and odometry pose from which the motion to the next node is measured
         self._base_ns, self._base = -1, (0.0, 0.0, 0.0)
-        """Stamp and odometry pose from which the motion to the next node is measured."""
+        # motion from the newest node to `_base_ns`, shape (3,), and covariance, shape (3, 3),
+        # where the primary source has no sample as old as that node; else None
         self._span: tuple[FloatArray, FloatArray] | None = None
-        """
-        Motion from the newest node to `_base_ns`, shape (3,), and covariance, shape (3, 3), where
-        the primary source has no sample as old as that node; else None.
-        """
         self._secondary = SecondaryEdges()
+        # stamp before which samples may have been dropped as nodes were thinned out [ns]
         self._samples_since_ns = -1
-        """Stamp before which samples may have been dropped as nodes were thinned out [ns]."""
-        self.errors = AS_CLAIMED
-        """Of the primary odometry, which the edges to new nodes know of."""
-        self.relocated: set[int] = set()
-        """Numbers of the nodes at which the robot was put by hand."""
-
-    def __len__(self) -> int:
-        return len(self.table)
+        self.errors = AS_CLAIMED  # of the primary odometry, which the edges to new nodes know of
+        self.relocated: set[int] = set()  # numbers of the nodes at which the robot was put by hand
 
     @property
     def relocated_ids(self) -> IntArray:
         """Ids of the nodes at which the robot was put by hand; no odometry leads to them."""
         return self.ids[np.array(sorted(self.relocated), dtype=np.int64)]
 
-    @property
-    def stamps_ns(self) -> IntArray:
-        """Stamps of all hidden nodes [ns], shape (N,), a read-only view."""
-        return self.table.stamps_ns
+    def poses(self, graph: Graph) -> Poses:
+        """Return the poses of all hidden nodes: frozen ones, then the graph's."""
+        return np.concatenate((self.frozen, self.recent_poses(graph)))
 
-    @property
-    def ids(self) -> IntArray:
-        """Ids of all hidden nodes in the graph, shape (N,), a read-only view."""
-        return self.table.ids
-
-    @property
-    def n_frozen(self) -> int:
-        """Number of nodes that have left the graph: the first ones."""
-        return self.table.n_frozen
-
-    @property
-    def odometry(self) -> FloatArray:
-        """Poses of the nodes in the graph by odometry alone, shape (N - F, 3), read-only."""
-        return self.table.odometry
-
-    def poses(self, graph: Graph) -> FloatArray:
-        """Return the poses of all hidden nodes, shape (N, 3): frozen ones, then the graph's."""
-        return self.table.poses(graph.poses[graph.node_rows(self.ids[self.n_frozen:])])
-
-    def recent_poses(self, graph: Graph) -> FloatArray:
-        """Return the poses of the hidden nodes that are not frozen, shape (N - F, 3)."""
-        return self.table.recent_poses(graph.poses[graph.node_rows(self.ids[self.n_frozen:])])
-
-    @property
-    def last_frozen_ns(self) -> int:
-        """Stamp of the newest node that has left the graph [ns]; -1 if none has."""
-        return int(self.stamps_ns[self.n_frozen - 1]) if self.n_frozen > 0 else -1
+    def recent_poses(self, graph: Graph) -> Poses:
+        """Return the poses of the hidden nodes that are not frozen."""
+        return self.placed(graph.poses[graph.node_rows(self.ids[self.n_frozen:])])
 
     @property
     def primary(self) -> str:
@@ -150,7 +105,9 @@ class HiddenNodes:
 
     @property
     def _names(self) -> list[str]:
-        return in_order_of_preference(self.streams, self._config.odometry)
+        """Names of all sources: those that are configured in their order, then the others."""
+        named = [name for name in self._config.odometry if name in self.streams]
+        return named + [name for name in self.streams if name not in named]
 
     def add_sample(self, sample: OdometrySample, source: str) -> Answer:
         """Return the answer to a sample of a source, after making what is due."""
@@ -279,7 +236,7 @@ class HiddenNodes:
             self._extend(stamp_ns, (x, y, theta))
 
     def _append(self, stamp_ns: int, node: int, base: Pose, odometry: FloatArray) -> None:
-        self.table.append(stamp_ns, node, odometry)
+        self.append(stamp_ns, node, odometry)
         self._base_ns, self._base, self._span = stamp_ns, base, None
         self._secondary.skip_to(self.primary, len(self) - 1, reached=True)
 
@@ -350,7 +307,7 @@ class HiddenNodes:
         stream = self.streams[self.primary_at(max(stamp_ns, node_ns))]
         if node_ns <= stamp_ns < self._samples_since_ns:
             motion = self._between_nodes(node, stamp_ns)
-            return self.table.attachment(
+            return self.attachment(
                 node, motion.increment, stream.covariance(motion, floor=False))
         if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
             return None
@@ -359,7 +316,7 @@ class HiddenNodes:
         if stamp_ns < node_ns:
             adjoint = se2.adjoint(mean)
             mean, noise = se2.inverse(mean), adjoint @ noise @ adjoint.T
-        return self.table.attachment(node, mean, noise)
+        return self.attachment(node, mean, noise)
 
     def attach_ahead(self, stamp_ns: int) -> Attachment | None:
         """Return the newest node and the motion to a later stamp [ns], settled or not."""
@@ -383,7 +340,7 @@ class HiddenNodes:
 
         The motion from an older node is interpolated between that node and the next one.
         """
-        if len(self.table.thinned) == 0 or len(self) - newest <= self.n_frozen:
+        if len(self.thinned) == 0 or len(self) - newest <= self.n_frozen:
             return
         since_ns = int(self.stamps_ns[-newest])
         for source, stream in self.streams.items():
@@ -395,7 +352,7 @@ class HiddenNodes:
 
     def forget(self, poses: FloatArray) -> None:
         """Freeze the oldest nodes at poses, shape (M, 3), as they have left; drop their past."""
-        self.table.freeze(poses)
+        self.freeze(poses)
         first, last_ns = self.n_frozen, self.last_frozen_ns
         for source, stream in self.streams.items():
             stream.forget(last_ns)
@@ -429,12 +386,12 @@ class HiddenNodes:
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
             {name: stream.saved(needed_ns, self._secondary.progress[name])
              for name, stream in self.streams.items()},
-            self.table.frozen.copy(), float(self.table.travelled[0]), self.table.thinned.saved(),
+            self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
             np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
-        saved.fill(self.table)
+        self.fill(saved)
         self._primaries = list(zip(saved.leads_after_ns.tolist(), saved.leads, strict=True))
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
         if saved.bridge is not None:
@@ -445,5 +402,5 @@ class HiddenNodes:
         self.relocated = {*saved.relocated.tolist()}
         if len(saved.errors) > 0:
             self.errors = OdometryErrors(*saved.errors.tolist())
-        if len(self.table.thinned) > 0:
+        if len(self.thinned) > 0:
             self._samples_since_ns = int(self.streams[self.primary].timeline.stamps_ns[0])

@@ -1,8 +1,17 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The motion between two instants by odometry, and its covariance."""
+"""
+The motion between two instants by odometry, its covariance, and what errors do to both.
+
+Measurements in the map show errors of odometry (`OdometryErrors`). The noise of a motion has a
+part that no error of a heading makes, that of the way: the covariance of its position where the
+turn is known. It and all the rest, which errors of headings make, have a factor each. An error of
+the yaw rate and of the scale that stay the same are taken out of the motion itself. Both can be
+done to edges with any errors in use, and undone, without loss.
+"""
 
 from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +20,7 @@ from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
-# Largest variance of a twist that is used; those beyond, and zero, stand for unknown
-# [m^2/s^2, rad^2/s^2].
-LARGEST_TWIST_VARIANCE = 1e4
-Variances = tuple[float, float, float]
-"""Of (x, y, theta) [m^2, m^2, rad^2], or of a twist."""
+Variances = tuple[float, float, float]  # of (x, y, theta) [m^2, m^2, rad^2], or of a twist
 NO_VARIANCE: FloatArray = np.zeros(3)
 NO_VARIANCE.flags.writeable = False
 
@@ -23,17 +28,13 @@ NO_VARIANCE.flags.writeable = False
 class Motion(NamedTuple):
     """Motion between two instants."""
 
+    # pose at the later instant seen from the earlier one, shape (3,) [m, m, rad]
     increment: FloatArray
-    """Pose at the later instant seen from the earlier one, shape (3,) [m, m, rad]."""
-    distance: float
-    """Length of the path in between [m]."""
-    turn: float
-    """Sum of the absolute turns in between [rad]."""
+    distance: float  # length of the path in between [m]
+    turn: float  # sum of the absolute turns in between [rad]
+    # variance of (x, y, theta) in addition to the noise by path and turns, shape (3,): noise by
+    # the twist, jumps, interpolation [m^2, m^2, rad^2]
     variance: FloatArray = NO_VARIANCE
-    """
-    Variance of (x, y, theta) in addition to the noise by path and turns, shape (3,): noise by the
-    twist, jumps, interpolation [m^2, m^2, rad^2].
-    """
 
 
 NO_MOTION = Motion(np.zeros(3), 0.0, 0.0)
@@ -43,12 +44,10 @@ NO_MOTION = Motion(np.zeros(3), 0.0, 0.0)
 class Attachment:
     """An instant, given by the last hidden node before it and the motion since."""
 
-    node: int
-    """Id of the node in the graph."""
+    node: int  # id of the node in the graph
+    # `T_at`, pose at the instant in the frame of the node, shape (3,) [m, m, rad]
     motion: FloatArray
-    """`T_at`, pose at the instant in the frame of the node, shape (3,) [m, m, rad]."""
-    noise: FloatArray
-    """Covariance of the motion in the frame at the instant, shape (3, 3)."""
+    noise: FloatArray  # covariance of the motion in the frame at the instant, shape (3, 3)
 
 
 def step_variance(
@@ -57,12 +56,7 @@ def step_variance(
     """
     Return the variance of (x, y, theta) of a short motion in the robot's frame, but its scale.
 
-    Parameters
-    ----------
-    twist : tuple, optional, variance of the twist in its message; None if it has none
-    step : tuple, length and absolute turn of the motion [m, rad]
-    elapsed : float, time of the motion [s]
-
+    `twist` is the variance of the twist in its message, `step` length and absolute turn.
     """
     noise = source.noise
     by_model = (noise.sigma_distance**2 * step[0], noise.sigma_lateral**2 * step[0],
@@ -70,7 +64,8 @@ def step_variance(
     if source.noise_from is not NoiseFrom.TWIST or twist is None:
         return by_model
     x, y, theta = (
-        variance * elapsed if 0.0 < variance <= LARGEST_TWIST_VARIANCE else instead
+        # larger ones, and zero, stand for unknown
+        variance * elapsed if 0.0 < variance <= 1e4 else instead
         for variance, instead in zip(twist, by_model, strict=True))
     return x, y, theta
 
@@ -85,12 +80,6 @@ def odometry_covariance(
     path. With c the chord in the frame at the end, n = c turned by 90 degrees, and q the variance
     of the heading, this adds q n n^T / 3 to the covariance of the position and gives it the
     covariance q n / 2 with the heading.
-
-    Parameters
-    ----------
-    noise : OdometryNoise, noise per path length and turn; it is added to `motion.variance`
-    floor : bool, whether to add the floors of the noise, which every increment has once
-
     """
     increment, distance, turn, variance = motion
     # the variance of a heading is at most that of the uniform distribution
@@ -110,3 +99,76 @@ def odometry_covariance(
         covariance[1, 1] += noise.sigma_floor_position**2
         covariance[2, 2] += noise.sigma_floor_heading**2
     return covariance
+
+
+class OdometryErrors(NamedTuple):
+    """Errors of the primary odometry, in units of what it claims and as constants."""
+
+    way: float = 1.0  # factor on the part of the variances that no error of a heading makes
+    turn: float = 1.0  # factor on the rest
+    rate: float = 0.0  # what the yaw rate is larger than odometry says [rad/s]
+    scale: float = 0.0  # by which part the way is longer than odometry says
+
+    @classmethod
+    def scaled(cls, sigmas: float) -> 'OdometryErrors':
+        """Return errors with all sigmas times a factor."""
+        return cls(sigmas**2, sigmas**2)
+
+    def motions(self, means: FloatArray, seconds: FloatArray) -> FloatArray:
+        """Return motions, as odometry says them, without their constant errors."""
+        # at a constant rate the chord turns by half of what the end turns by
+        c, s = np.cos(0.5 * self.rate * seconds), np.sin(0.5 * self.rate * seconds)
+        x, y, length = means[:, 0], means[:, 1], 1.0 + self.scale
+        return np.column_stack((length * (c * x - s * y), length * (s * x + c * y),
+                                means[:, 2] + self.rate * seconds))
+
+    def as_odometry_says(self, means: FloatArray, seconds: FloatArray) -> FloatArray:
+        """Undo `motions`."""
+        c, s = np.cos(0.5 * self.rate * seconds), np.sin(0.5 * self.rate * seconds)
+        x, y, length = means[:, 0], means[:, 1], 1.0 / (1.0 + self.scale)
+        return np.column_stack((length * (c * x + s * y), length * (c * y - s * x),
+                                means[:, 2] - self.rate * seconds))
+
+    def covariances(self, claimed: FloatArray) -> FloatArray:
+        """Return covariances of motions, shape (M, 3, 3), from those that odometry claims."""
+        heading = np.where(claimed[:, 2:, 2:] > 0.0, claimed[:, 2:, 2:], np.inf)
+        by_turn = claimed[:, :, 2:] @ claimed[:, 2:, :] / heading
+        return np.asarray(self.turn * by_turn + self.way * (claimed - by_turn))
+
+    def informations(self, claimed: FloatArray) -> FloatArray:
+        """Return the inverses of `covariances` from those of what is claimed, as accurately."""
+        result = claimed / self.way
+        position = claimed[:, :2, :2]
+        turn = claimed[:, 2, 2] - np.einsum(
+            'mi,mi->m', claimed[:, 2, :2], np.linalg.solve(
+                position, claimed[:, :2, 2:])[..., 0])
+        result[:, 2, 2] += turn * (1.0 / self.turn - 1.0 / self.way)
+        return np.asarray(result)
+
+    @property
+    def inverse_noise(self) -> 'OdometryErrors':
+        """What undoes the factors of the noise, without constant errors."""
+        return OdometryErrors(1.0 / self.way, 1.0 / self.turn)
+
+    @property
+    def mean_sigma(self) -> float:
+        """Factor on the sigmas of an edge, in the geometric mean."""
+        return float((self.way**2 * self.turn)**(1.0 / 6.0))
+
+    def is_close(self, other: 'OdometryErrors') -> bool:
+        """Tell whether the numbers are those of others, but for rounding."""
+        return all(math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
+                   for a, b in zip(self, other, strict=True))
+
+
+AS_CLAIMED = OdometryErrors()
+
+
+def changed(
+    means: FloatArray, informations: FloatArray, seconds: FloatArray, before: OdometryErrors,
+    after: OdometryErrors,
+) -> tuple[FloatArray, FloatArray]:
+    """Return means and informations of edges with other errors than those that they have."""
+    claimed = before.inverse_noise.informations(informations)
+    return (after.motions(before.as_odometry_says(means, seconds), seconds),
+            after.informations(claimed))

@@ -2,15 +2,207 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import (
+    Covariance,
+    Covariances,
+    FloatArray,
+    IntArray,
+    Pose,
+    Poses,
+    PoseVector,
+)
+from pose_graph_ros.core.graph.constraints import full
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.odometry.thinned_nodes import ThinnedNodes
+from pose_graph_ros.core.odometry.stream import SavedStream
+from pose_graph_ros.core.quantities import StampsNs
+from pose_graph_ros.core.saved_columns import Integers, Matrix, Numbers, Rows3, Rows6
+
+
+def _no_integers() -> IntArray:
+    return np.empty(0, dtype=np.int64)
+
+
+class Place(NamedTuple):
+    """Where a node is relative to another one."""
+
+    anchor: int  # number of the node that stands for it
+    mean: PoseVector  # pose in the anchor
+    noise: Covariance  # of that pose, in the frame of the node
+
+
+@dataclass(frozen=True, slots=True)
+class ThinnedPlaces:
+    """Nodes that have left although older ones stay, each with its place relative to another."""
+
+    numbers: Integers = field(default_factory=_no_integers)  # of the nodes, ascending
+    anchors: Integers = field(default_factory=_no_integers)  # numbers of those beside them
+    relative: Rows3 = field(default_factory=lambda: np.empty((0, 3)))  # poses in the anchors
+    # upper triangles of the covariances of these poses, in the frames of the nodes
+    noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
+
+
+class ThinnedNodes:
+    """
+    Nodes by number, each with its place relative to another one, its anchor.
+
+    The poses of these nodes move with the graph, and what concerns them later is attached to their
+    anchors. If an anchor leaves as well, the nodes that were attached to it are passed on to its
+    own anchor once all places are asked for, so that it costs the same to add a node however many
+    have left. A node takes 40 bytes.
+    """
+
+    def __init__(self) -> None:
+        # by number, from the first node that is not frozen on; -1 for nodes that are in the graph
+        self._first, self._size = 0, 0
+        self._anchors = GrowingArray((), np.int32)
+        self._relative = GrowingArray((3,), np.float32)
+        self._noise = GrowingArray((6,), np.float32)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def add(
+        self, numbers: IntArray, anchors: IntArray, relative: Poses, noise: Covariances,
+    ) -> None:
+        """Add nodes."""
+        if len(numbers) == 0:
+            return
+        rows = numbers - self._first
+        more = int(np.max(rows)) + 1 - len(self._anchors)
+        if more > 0:
+            self._anchors.append(np.full(more, -1))
+            self._relative.append(np.zeros((more, 3)))
+            self._noise.append(np.zeros((more, 6)))
+        self._anchors.values[rows] = anchors
+        self._relative.values[rows], self._noise.values[rows] = relative, _upper(noise)
+        self._size += len(rows)
+
+    def place(self, number: int) -> Place | None:
+        """Return the place of a node; None if it is not among these."""
+        anchor = self._anchor(number)
+        if anchor < 0:
+            return None
+        mean, noise = self._stored(number)
+        while (further := self._anchor(anchor)) >= 0:
+            before, noise_before = self._stored(anchor)
+            noise = _passed_on(mean, noise_before, noise)
+            mean, anchor = se2.compose(before, mean), further
+        return Place(anchor, mean, noise)
+
+    def _anchor(self, number: int) -> int:
+        row = number - self._first
+        return int(self._anchors.values[row]) if 0 <= row < len(self._anchors) else -1
+
+    def _stored(self, number: int) -> tuple[PoseVector, Covariance]:
+        row = number - self._first
+        return (self._relative.values[row].astype(np.float64),
+                _full(self._noise.values[row:row + 1])[0])
+
+    def places(self) -> ThinnedPlaces:
+        """Return the places of all nodes, relative to nodes that are in the graph."""
+        anchors, relative, noise = (
+            array.values for array in (self._anchors, self._relative, self._noise))
+        rows = np.flatnonzero(anchors >= 0)
+        passed = rows
+        while len(passed) > 0:
+            by = anchors[passed] - self._first
+            further = np.zeros(len(passed), dtype=bool)
+            inside = by < len(anchors)
+            further[inside] = anchors[by[inside]] >= 0
+            passed, by = passed[further], by[further]
+            mean = relative[passed].astype(np.float64)
+            noise[passed] = _upper(_passed_on(mean, _full(noise[by]), _full(noise[passed])))
+            relative[passed] = se2.compose(relative[by].astype(np.float64), mean)
+            anchors[passed] = anchors[by]
+        return ThinnedPlaces(
+            rows + self._first, anchors[rows].astype(np.int64),
+            relative[rows].astype(np.float64), noise[rows].astype(np.float64))
+
+    def drop_before(self, number: int) -> None:
+        """
+        Drop the nodes before a number, whose poses are frozen with those of the oldest nodes.
+
+        The anchors of the others must not be before it.
+        """
+        self.places()
+        n = min(number - self._first, len(self._anchors))
+        self._size -= int(np.count_nonzero(self._anchors.values[:n] >= 0))
+        for array in (self._anchors, self._relative, self._noise):
+            array.drop_first(n)
+        self._first = number
+
+    def restore(self, saved: ThinnedPlaces, first: int) -> None:
+        """Fill this empty object; `first` is the number of the first node that is not frozen."""
+        self._first = first
+        self.add(saved.numbers, saved.anchors, saved.relative, _full(saved.noise))
+
+
+def _passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
+    """
+    Return the covariances of motions to some places and on from there, in the frames at the end.
+
+    `mean` are the second motions, `first` and `then` the covariances of both.
+    """
+    adjoint = se2.adjoint(se2.inverse(mean))
+    return np.asarray(adjoint @ first @ np.swapaxes(adjoint, -1, -2) + then)
+
+
+def _upper(matrices: Covariances) -> FloatArray:
+    return matrices[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
+
+
+def _full(triangles: FloatArray) -> Covariances:
+    return full(triangles.astype(np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSpan:
+    """Saved motion from the newest node to the first stamp of a new primary source."""
+
+    mean: Pose
+    covariance: Matrix  # in the frame at its end
+
+
+@dataclass(frozen=True, slots=True)
+class SavedNodes:
+    """Saved hidden nodes, and the state of the odometry sources."""
+
+    stamps_ns: Integers
+    ids: Integers  # ascending
+    odometry: Rows3  # poses by odometry alone of the nodes after the frozen ones
+    leads: tuple[str, ...]  # primary sources one after the other
+    leads_after_ns: Integers  # stamps after which each of them is the primary source
+    lead_ns: int  # stamp up to which everything is settled
+    base_ns: int  # stamp from which the motion to the next node is measured
+    base: Pose  # pose of the primary source at `base_ns`
+    # motion from the newest node to `base_ns`; None if that is the stamp of the node
+    bridge: SavedSpan | None
+    streams: Mapping[str, SavedStream]  # by the name of the source
+    # poses of the first nodes, which have left the graph
+    frozen: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    travelled: float = 0.0  # path length up to the first node in the graph [m]
+    thinned: ThinnedPlaces = field(default_factory=ThinnedPlaces)
+    # `OdometryErrors` that the edges know of; empty in files of older versions, in which weights
+    # of the edges stand for them
+    errors: Numbers = field(default_factory=lambda: np.empty(0))
+    # numbers of the nodes at which the robot was put by hand; empty in older files
+    relocated: Integers = field(default_factory=_no_integers)
+
+    def poses(self, node_ids: IntArray, poses: Poses) -> Poses:
+        """Return the poses of all nodes."""
+        table = NodeTable()
+        table.fill(self)
+        at = np.searchsorted(node_ids, self.ids[table.n_frozen:])
+        return np.concatenate((self.frozen, table.placed(poses[np.minimum(at, len(poses) - 1)])))
 
 
 class NodeTable:
@@ -20,7 +212,7 @@ class NodeTable:
     The first `n_frozen` of them have left the graph: their poses do not change any more, but for
     motions of the whole map, and a node takes 40 bytes. The number of a node, such as 42 of x42,
     is its index among all of them, and never changes. Of the others, too, some may have left
-    (`thinned`); their poses move with those of other nodes.
+    (`thinned`); their poses move with those of other nodes. All arrays are read-only views.
     """
 
     def __init__(self) -> None:
@@ -30,51 +222,47 @@ class NodeTable:
         self._odometry = GrowingArray((3,), np.float64)
         self._travelled = GrowingArray((), np.float64)
         self.thinned = ThinnedNodes()
-        """Nodes that have left although older ones stay; by number."""
 
     def __len__(self) -> int:
         return len(self._stamps)
 
     @property
-    def stamps_ns(self) -> IntArray:
-        """Stamps of all nodes [ns], shape (N,), a read-only view."""
+    def stamps_ns(self) -> StampsNs:
+        """Stamps of all nodes."""
         return self._stamps.read_only
 
     @property
     def ids(self) -> IntArray:
-        """Ids of all nodes in the graph, shape (N,), a read-only view."""
+        """Ids of all nodes in the graph."""
         return self._ids.read_only
 
     @property
     def n_frozen(self) -> int:
-        """Number of nodes that have left the graph."""
+        """Number of nodes that have left the graph: the first ones."""
         return len(self._frozen)
 
     @property
-    def frozen(self) -> FloatArray:
-        """Poses of the nodes that have left, in the map, shape (F, 3), a read-only view."""
+    def last_frozen_ns(self) -> int:
+        """Stamp of the newest of these [ns]; -1 if there is none."""
+        return int(self.stamps_ns[self.n_frozen - 1]) if self.n_frozen > 0 else -1
+
+    @property
+    def frozen(self) -> Poses:
+        """Poses of the nodes that have left, in the map."""
         return self._frozen.read_only
 
     @property
-    def odometry(self) -> FloatArray:
-        """Poses of the nodes in the graph by odometry alone, shape (N - F, 3), read-only."""
+    def odometry(self) -> Poses:
+        """Poses of the nodes after the frozen ones by odometry alone."""
         return self._odometry.read_only
 
     @property
     def travelled(self) -> FloatArray:
-        """Path lengths up to the nodes in the graph, shape (N - F,) [m], read-only."""
+        """Path lengths up to the nodes after the frozen ones [m]."""
         return self._travelled.read_only
 
-    def append(self, stamp_ns: int, node: int, odometry: FloatArray) -> None:
-        """
-        Append a node.
-
-        Parameters
-        ----------
-        node : int, its id in the graph
-        odometry : ndarray, shape (3,), its pose by odometry alone [m, m, rad]
-
-        """
+    def append(self, stamp_ns: int, node: int, odometry: PoseVector) -> None:
+        """Append a node."""
         travelled = 0.0
         if len(self._odometry) > 0:
             step = odometry - self._odometry.values[-1]
@@ -84,96 +272,56 @@ class NodeTable:
         self._odometry.append_one(odometry)
         self._travelled.append_one(travelled)
 
-    def freeze(self, poses: FloatArray) -> None:
-        """Freeze the oldest nodes in the graph at the given poses, shape (M, 3)."""
+    def freeze(self, poses: Poses) -> None:
+        """Freeze the oldest nodes in the graph at the given poses."""
         self._frozen.append(poses)
         self._odometry.drop_first(len(poses))
         self._travelled.drop_first(len(poses))
         self.thinned.drop_before(self.n_frozen)
 
-    def poses(self, present: FloatArray) -> FloatArray:
-        """Return the poses of all nodes, shape (N, 3); `present` as for `recent_poses`."""
-        recent = self.recent_poses(present)
-        return recent if self.n_frozen == 0 else np.concatenate((self.frozen, recent))
-
-    def recent_poses(self, present: FloatArray) -> FloatArray:
-        """
-        Return the poses of the nodes that are not frozen, shape (N - F, 3) [m, m, rad].
-
-        They are given, but overwritten where a node was thinned out.
-        """
+    def placed(self, present: Poses) -> Poses:
+        """Return poses of the nodes that are not frozen, overwritten where one was thinned out."""
         if len(self.thinned) > 0:
             thinned, first = self.thinned.places(), self.n_frozen
             present[thinned.numbers - first] = se2.compose(
-                present[thinned.anchors - first], thinned.relative.astype(np.float64))
+                present[thinned.anchors - first], thinned.relative)
         return present
 
-    def attachment(self, number: int, mean: FloatArray, noise: FloatArray) -> Attachment:
-        """
-        Return the attachment of a motion from a node, or from the one that stands for it.
-
-        Parameters
-        ----------
-        number : int, of the node
-        mean : ndarray, shape (3,), the motion [m, m, rad]
-        noise : ndarray, shape (3, 3), its covariance, in the frame at its end
-
-        """
+    def attachment(self, number: int, mean: PoseVector, noise: Covariance) -> Attachment:
+        """Return the attachment of a motion from a node, or from the one that stands for it."""
         place = self.thinned.place(number)
         if place is None:
             return Attachment(int(self.ids[number]), mean, noise)
-        adjoint = se2.adjoint(se2.inverse(mean))
         return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
-                          adjoint @ place.noise @ adjoint.T + noise)
+                          _passed_on(mean, place.noise, noise))
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""
         return number < self.n_frozen or self.thinned.place(number) is not None
 
     def thin(
-        self, ids: IntArray, anchors: IntArray, relative: FloatArray, noise: FloatArray,
+        self, ids: IntArray, anchors: IntArray, relative: Poses, noise: Covariances,
     ) -> None:
-        """
-        Let nodes leave, each with its place relative to a node that stays.
-
-        Parameters
-        ----------
-        ids, anchors : ndarray of int, shape (L,), of nodes that leave and of those that stay
-        relative : ndarray, shape (L, 3), poses in the anchors [m, m, rad]
-        noise : ndarray, shape (L, 3, 3), covariances of these, in the frames of the nodes
-
-        """
+        """Let nodes leave, each with its place relative to a node that stays."""
         self.thinned.add(
             np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors), relative, noise)
 
-    def move_frozen(self, T: FloatArray) -> None:
-        """Move the frozen poses by a rigid motion of the map, shape (3,) [m, m, rad]."""
+    def move_frozen(self, T: PoseVector) -> None:
+        """Move the frozen poses by a rigid motion of the map."""
         if self.n_frozen > 0:
-            self._frozen.values[:] = se2.compose(T, self._frozen.values)
+            self.set_frozen(se2.compose(T, self._frozen.values))
 
-    def set_frozen(self, poses: FloatArray) -> None:
-        """Set the frozen poses, shape (F, 3), to what they were before a motion."""
+    def set_frozen(self, poses: Poses) -> None:
+        """Set the frozen poses."""
         self._frozen.values[:] = poses
 
-    def restore(
-        self, stamps_ns: IntArray, ids: IntArray, odometry: FloatArray, frozen: FloatArray,
-        travelled: float,
-    ) -> None:
-        """
-        Fill this empty table.
-
-        Parameters
-        ----------
-        stamps_ns, ids : ndarray of int64, shape (N,)
-        odometry : ndarray, shape (N - F, 3), of the nodes in the graph
-        frozen : ndarray, shape (F, 3), poses of the others
-        travelled : float, path length up to the first node in the graph [m]
-
-        """
-        self._stamps.append(stamps_ns)
-        self._ids.append(ids)
-        self._odometry.append(odometry)
-        self._frozen.append(frozen)
-        steps = np.diff(odometry[:, :2], axis=0)
+    def fill(self, saved: SavedNodes) -> None:
+        """Fill this empty table."""
+        self._stamps.append(saved.stamps_ns)
+        self._ids.append(saved.ids)
+        self._odometry.append(saved.odometry)
+        self._frozen.append(saved.frozen)
+        steps = np.diff(saved.odometry[:, :2], axis=0)
         lengths = [math.hypot(x, y) for x, y in steps.tolist()]
-        self._travelled.append(np.cumsum([travelled, *lengths]))
+        self._travelled.append(np.cumsum([saved.travelled, *lengths]))
+        self.thinned.restore(saved.thinned, self.n_frozen)

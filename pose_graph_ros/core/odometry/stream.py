@@ -4,59 +4,92 @@
 
 import bisect
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.scalar_se2 import (
+from pose_graph_ros.core.geometry.se2 import (
     between_one,
     compose_one,
     exp_one,
+    FloatArray,
     Pose,
     wrap_one,
 )
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.gyro_config import Integrate
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
     LARGEST_COORDINATE,
-    LARGEST_STAMP,
     OdometrySample,
     rejected,
     value_defect,
 )
-from pose_graph_ros.core.odometry.gaps import (
+from pose_graph_ros.core.odometry.jumps import (
+    is_jump,
     JUMP_SIGMA,
+    MEMORY_TIME,
     RESTART_VARIANCE,
     RESUMED_WITHIN,
     SPEED_TIME_NS,
+    Speeds,
+    SpeedWindow,
+    UNKNOWN,
 )
-from pose_graph_ros.core.odometry.jumps import is_jump, MEMORY_TIME, Speeds, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.motion import (
     Motion,
     odometry_covariance,
     step_variance,
     Variances,
 )
-from pose_graph_ros.core.odometry.saved_stream import NO_TWIST, SavedInstant, SavedStream
+from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_defect, stamp_of
 from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
+from pose_graph_ros.core.quantities import StampsNs
+from pose_graph_ros.core.saved_columns import Flags, Integers, Rows3, Rows7, Rows8
 
-# A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
-# stamps of this number of consecutive samples that came after it.
-FAR_AHEAD_NS = 10_000_000_000
-MANY_BEHIND = 5
-# Longest time over which twists are integrated; a longer one is a gap [s].
-LONGEST_TWIST = 1.0
-# Largest number of a twist [m/s, rad/s].
-LARGEST_TWIST = 1e4
-# Time before the newest sample whose samples are all saved with a graph, for measurements that
-# come late [ns].
-RECENT_NS = 60_000_000_000
+NO_TWIST: Pose = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class SavedInstant:
+    """Saved state of a source at its newest settled sample, see `Row` and `SpeedWindow`."""
+
+    raw: Pose  # pose as received [m, m, rad]
+    # pose of the odometry frame in the frame without jumps; None before the first jump
+    offset: Pose | None
+    counted: Pose
+    counted_ns: int
+    held: Pose
+    # velocity, recent and greatest speeds; None before they are known
+    rate: tuple[float, float, float, float, float, float, float] | None
+    since_ns: int
+    since: Pose
+    way: tuple[float, float]  # path length [m] and sum of absolute turns [rad] since then
+    jumped: bool  # whether odometry jumped to this sample
+    twist: Pose = NO_TWIST  # as `_Sample.twist`
+
+
+@dataclass(frozen=True, slots=True)
+class SavedStream:
+    """Saved odometry source: its samples next to the hidden nodes, and its newest ones."""
+
+    stamps_ns: Integers  # stamps of settled samples, shape (T,) [ns]
+    samples: Rows8  # their rows, as returned by `OdometryTimeline.thinned`, shape (T, 8)
+    dense: Flags  # as `OdometryTimeline.dense`, shape (T,)
+    resting: bool  # as `OdometryTimeline.resting`
+    last: SavedInstant | None
+    waiting_ns: Integers  # stamps of samples that are not settled, shape (W,) [ns]
+    # as received: pose, speed, variances of the twist (zero where unknown), shape (W, 7)
+    waiting: Rows7
+    restarted_ns: int  # as `OdometryStream.restarted_ns`
+    # newest node that the samples cover, where the next secondary edge begins; -1 for none
+    tied: int
+    next_to_tie: int  # next node to check for a secondary edge
+    # twists of samples that are not settled, shape (W, 3); empty if they are not integrated
+    waiting_twists: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
 
 
 class _Sample(NamedTuple):
@@ -66,62 +99,42 @@ class _Sample(NamedTuple):
     pose: Pose
     speed: float
     variance: Variances | None
-    twist: Pose = NO_TWIST
-    """(v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated."""
+    twist: Pose = NO_TWIST  # (v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated
 
 
 class _Instant(NamedTuple):
     """The state of a source at a sample."""
 
-    raw: Pose
-    """Pose as received [m, m, rad]."""
-    row: Row
-    """The sample in a frame without jumps, with its sums."""
+    raw: Pose  # pose as received [m, m, rad]
+    row: Row  # the sample in a frame without jumps, with its sums
+    # pose of the odometry frame in the frame without jumps; None before the first jump
     offset: Pose | None
-    """Pose of the odometry frame in the frame without jumps; None before the first jump."""
-    window: SpeedWindow
-    """Speeds of the robot by this odometry."""
-    jumped: bool
-    """Whether odometry jumped to this sample."""
-    restarted: bool = False
-    """Whether odometry restarted at this sample, after a graph was loaded."""
-    twist: Pose = NO_TWIST
-    """As `_Sample.twist`."""
+    window: SpeedWindow  # speeds of the robot by this odometry
+    jumped: bool  # whether odometry jumped to this sample
+    restarted: bool = False  # whether odometry restarted at this sample, after a graph was loaded
+    twist: Pose = NO_TWIST  # as `_Sample.twist`
 
 
-class OdometryStream:
+class OdometryStream(ReorderBuffer[_Sample]):
     """
     The samples of one source of odometry.
 
-    A sample is settled when it is older than the newest one by the reorder window; older samples
-    are rejected then. Where odometry jumps farther than the robot can have moved, it was reset:
+    Where odometry jumps farther than the robot can have moved, it was reset:
     the motion of that step is predicted from the speeds before, with a large covariance, and the
     later samples are appended to the predicted pose.
     """
 
     def __init__(self, source: OdometrySource) -> None:
-        self.timeline = OdometryTimeline()
-        """Settled samples, in a frame without jumps."""
-        self.n_jumps = 0
-        """Number of jumps among the settled samples."""
-        self.jump = ''
-        """When and how far odometry jumped last, in words."""
-        self.n_sorted = 0
-        """Number of samples that were received after newer ones and sorted in before them."""
-        self.n_dropped = 0
-        """Number of accepted samples that were dropped later as their stamps were far ahead."""
-        self._waiting: list[_Sample] = []
-        """Samples that are not settled, by stamp."""
-        self._ahead: list[_Instant] = []
-        """States at the first of them, computed in advance."""
-        self._last: _Instant | None = None
-        """State at the newest settled sample."""
-        self._n_behind = 0
-        """Number of consecutive received samples that are far behind the newest one."""
+        super().__init__('odometry')
+        self.timeline = OdometryTimeline()  # settled samples, in a frame without jumps
+        self.n_jumps = 0  # number of jumps among the settled samples
+        self.jump = ''  # when and how far odometry jumped last, in words
+        self._ahead: list[_Instant] = []  # states at the first samples that wait
+        self._last: _Instant | None = None  # state at the newest settled sample
+        # stamp of the newest sample of a graph that was loaded; -1 if none was [ns]
         self.saved_ns = -1
-        """Stamp of the newest sample of a graph that was loaded; -1 if none was [ns]."""
+        # stamp at which odometry restarted after a graph was loaded; -1 if it did not [ns]
         self.restarted_ns = -1
-        """Stamp at which odometry restarted after a graph was loaded; -1 if it did not [ns]."""
         self.configure(source)
 
     def configure(self, source: OdometrySource) -> None:
@@ -158,52 +171,29 @@ class OdometryStream:
 
     def add(self, sample: OdometrySample) -> Answer:
         """Add a sample; return whether it is accepted, or the reason for its rejection."""
-        if not 0 < sample.stamp_ns <= LARGEST_STAMP:
-            return rejected('zero_stamp' if sample.stamp_ns <= 0 else 'no_stamp',
-                            f'expected a stamp above 0, got {sample.stamp_ns} ns')
+        if (defect := stamp_defect(sample.stamp_ns)) is not None:
+            return defect
         x, y, theta = sample.pose.tolist()
         if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE
                 and abs(theta) <= LARGEST_COORDINATE):
             return rejected(value_defect(sample.pose) or '', f'odometry pose {[x, y, theta]}')
         twist = sample.twist or NO_TWIST
-        if not all(abs(value) <= LARGEST_TWIST for value in twist):
+        if not all(abs(value) <= 1e4 for value in twist):
             return rejected('too_large' if all(map(math.isfinite, twist)) else 'not_finite',
                             f'twist {twist}')
-        if sample.stamp_ns <= self.settled_ns:
-            return rejected(*self._late(sample.stamp_ns))
-        at = len(self._waiting)
-        if at > 0 and sample.stamp_ns <= self._waiting[-1].stamp_ns:
-            at = bisect.bisect_left(self._waiting, sample.stamp_ns, key=_stamp)
-            if self._waiting[at].stamp_ns == sample.stamp_ns:
-                return rejected('duplicate_stamp',
-                                f'odometry at {1e-9 * sample.stamp_ns:.3f} s came before')
-            del self._ahead[at:]
-            self.n_sorted += 1
         variance = sample.twist_variance
-        self._waiting.insert(at, _Sample(
+        at = self._insert(_Sample(
             sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,
             None if variance is None else tuple(variance.tolist()), twist))
-        behind = self._waiting[-1].stamp_ns - sample.stamp_ns > FAR_AHEAD_NS + self._window_ns
-        self._n_behind = self._n_behind + 1 if behind else 0
-        if self._n_behind >= MANY_BEHIND:
-            self._drop_far_ahead(sample.stamp_ns)
+        if isinstance(at, Answer):
+            return at
+        del self._ahead[at:], self._ahead[len(self._waiting):]
         return ACCEPTED
 
-    def _drop_far_ahead(self, now_ns: int) -> None:
-        """Remove the samples that are far ahead of a stamp [ns]."""
-        kept = bisect.bisect_right(
-            self._waiting, now_ns + FAR_AHEAD_NS + self._window_ns, key=_stamp)
-        self.n_dropped += len(self._waiting) - kept
-        del self._waiting[kept:], self._ahead[kept:]
-        self._n_behind = 0
-
-    def _late(self, stamp_ns: int) -> tuple[str, str]:
-        """Return reason and detail of the rejection of a stamp that is not after `settled_ns`."""
+    def _was_settled(self, stamp_ns: int) -> bool:
         stamps = self.timeline.stamps_ns
         at = int(np.searchsorted(stamps, stamp_ns))
-        came = at < len(stamps) and (stamps[at] == stamp_ns or self.timeline.dense(at))
-        return ('duplicate_stamp' if came else 'out_of_order',
-                f'odometry at {1e-9 * stamp_ns:.3f} s after {1e-9 * self.settled_ns:.3f} s')
+        return at < len(stamps) and bool(stamps[at] == stamp_ns or self.timeline.dense(at))
 
     def settle(self, until_ns: int | None = None) -> Iterator[tuple[int, Pose]]:
         """
@@ -247,21 +237,14 @@ class OdometryStream:
             at = int(np.searchsorted(stamps, stamp_ns, side='right'))
             # samples at rest that the timeline left out lie in between
             return stamp_ns + 1 if self.timeline.dense(at) and at > 0 else int(stamps[at])
-        at = bisect.bisect_right(self._waiting, stamp_ns, key=_stamp)
+        at = bisect.bisect_right(self._waiting, stamp_ns, key=stamp_of)
         return self._waiting[at].stamp_ns if at < len(self._waiting) else None
 
-    def saved(self, nodes_ns: IntArray, tied: tuple[int, int]) -> SavedStream:
-        """
-        Return the state, with the samples next to the hidden nodes and the newest ones.
-
-        Parameters
-        ----------
-        nodes_ns : ndarray of int64, shape (N,), stamps of the hidden nodes [ns]; N >= 1
-        tied : tuple of int, `SecondaryEdges.progress` of this source
-
-        """
+    def saved(self, nodes_ns: StampsNs, tied: tuple[int, int]) -> SavedStream:
+        """Return the state, with the samples next to the hidden nodes and the newest ones."""
         stamps, rows, dense = self.timeline.thinned(
-            nodes_ns, min(int(nodes_ns[-1]), self.settled_ns - RECENT_NS))
+            # and those of the last minute, for measurements that come late
+            nodes_ns, min(int(nodes_ns[-1]), self.settled_ns - 60_000_000_000))
         waiting = np.array([(*sample.pose, sample.speed, *(sample.variance or NOTHING))
                             for sample in self._waiting]).reshape(-1, 7)
         waiting[~np.isfinite(waiting)] = 0.0    # stands for unknown, too
@@ -299,11 +282,6 @@ class OdometryStream:
     def covariance(self, motion: Motion, *, floor: bool = True) -> FloatArray:
         """
         Return the covariance, shape (3, 3), of a motion by this odometry in the frame at its end.
-
-        Parameters
-        ----------
-        motion, floor : as in `odometry_covariance`
-
         """
         return np.asarray(self._source.covariance_scale * odometry_covariance(
             self._noise, motion, floor=floor))
@@ -359,27 +337,22 @@ class OdometryStream:
         motion = (_integrated(before.twist, twist, elapsed) if integrates
                   else between_one(before.raw, raw))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
-        jump = (integrates and elapsed > LONGEST_TWIST) or is_jump(
+        # twists are not integrated over a longer gap [s]
+        jump = (integrates and elapsed > 1.0) or is_jump(
             before.window.speeds, step, elapsed, sample.speed, self._source.maximum_speed)
         if before.row.stamp_ns <= self.saved_ns < stamp_ns and (jump or elapsed > RESUMED_WITHIN):
-            return _after_restart(before, stamp_ns, raw)._replace(twist=twist)
+            return _elsewhere(before, sample, before.row.pose, RESTART_VARIANCE, restarted=True)
         if jump:
-            return _after_jump(before, stamp_ns, raw, elapsed)._replace(twist=twist)
+            return _after_jump(before, sample, elapsed)
         if integrates:
             pose = compose_one(before.row.pose, motion)
         else:
             pose = raw if before.offset is None else compose_one(before.offset, raw)
-        row = next_row(before.row, stamp_ns, pose, self._step_variance(sample, step, elapsed))
+        variance = (step_variance(self._source, sample.variance, step, elapsed)
+                    if self._source.noise_from is NoiseFrom.TWIST else NOTHING)
+        row = next_row(before.row, stamp_ns, pose, variance)
         return _Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
                         jumped=False, twist=twist)
-
-    def _step_variance(
-        self, sample: _Sample, step: tuple[float, float], elapsed: float,
-    ) -> Variances:
-        """Return the variance of (x, y, theta) of a step by the twist; zero with other models."""
-        if self._source.noise_from is not NoiseFrom.TWIST:
-            return NOTHING
-        return step_variance(self._source, sample.variance, step, elapsed)
 
 
 def _integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
@@ -388,7 +361,7 @@ def _integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
     return exp_one((x, y, theta))
 
 
-def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _Instant:
+def _after_jump(before: _Instant, sample: _Sample, elapsed: float) -> _Instant:
     """Return the state at a sample to which odometry has jumped."""
     time = min(elapsed, MEMORY_TIME)
     speeds = before.window.speeds
@@ -396,9 +369,18 @@ def _after_jump(before: _Instant, stamp_ns: int, raw: Pose, elapsed: float) -> _
     pose = compose_one(before.row.pose, (x * time, y * time, wrap_one(theta * time)))
     way, turn = (rate * elapsed if math.isfinite(rate) else 0.0 for rate in speeds.recent)
     position, heading = (JUMP_SIGMA[0] + way)**2, (JUMP_SIGMA[1] + turn)**2
-    row = next_row(before.row, stamp_ns, pose, loose=(position, position, heading))
-    offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
-    return _Instant(raw, row, offset, SpeedWindow(speeds, stamp_ns, pose), jumped=True)
+    return _elsewhere(before, sample, pose, (position, position, heading), speeds)
+
+
+def _elsewhere(
+    before: _Instant, sample: _Sample, pose: Pose, variance: Variances, speeds: Speeds = UNKNOWN,
+    *, restarted: bool = False,
+) -> _Instant:
+    """Return the state at a sample from which on odometry has another origin."""
+    row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
+    offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
+    return _Instant(sample.pose, row, offset, SpeedWindow(speeds, sample.stamp_ns, pose),
+                    jumped=True, restarted=restarted, twist=sample.twist)
 
 
 def _described(before: _Instant, after: _Instant) -> str:
@@ -407,15 +389,6 @@ def _described(before: _Instant, after: _Instant) -> str:
     begin_ns, end_ns = before.row.stamp_ns, after.row.stamp_ns
     return (f'by {math.hypot(x, y):.2f} m and {math.degrees(turn):.1f} degrees within '
             f'{(end_ns - begin_ns) * 1e-9:.3f} s at {end_ns * 1e-9:.3f} s')
-
-
-def _after_restart(before: _Instant, stamp_ns: int, raw: Pose) -> _Instant:
-    """Return the state at a sample at which odometry restarts after a graph was loaded."""
-    pose = before.row.pose
-    row = next_row(before.row, stamp_ns, pose, loose=RESTART_VARIANCE)
-    offset = compose_one(pose, between_one(raw, (0.0, 0.0, 0.0)))
-    return _Instant(
-        raw, row, offset, SpeedWindow(UNKNOWN, stamp_ns, pose), jumped=True, restarted=True)
 
 
 def _saved_instant(last: _Instant) -> SavedInstant:
@@ -441,7 +414,3 @@ def _restored_instant(saved: SavedStream, last: SavedInstant) -> _Instant:
 def _nothing(variance: Variances) -> Variances:
     """Return `NOTHING` itself for a variance of zero, as `next_row` compares by identity."""
     return variance if any(variance) else NOTHING
-
-
-def _stamp(sample: _Sample) -> int:
-    return sample.stamp_ns

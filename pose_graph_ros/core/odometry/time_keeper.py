@@ -19,6 +19,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
     YawRate,
 )
+from pose_graph_ros.core.quantities import StampNs
 
 # Stamps that are farther apart are not of one time [ns]. The poses of odometry are accumulated, so
 # the motion of the few messages that are refused is not lost.
@@ -27,17 +28,14 @@ APART_NS = 60_000_000_000
 LATEST_NS = 5_000_000_000
 # Number of consecutive stamps, and the time that they span [ns], that show another time.
 EVIDENCE, EVIDENCE_NS = 5, 1_000_000_000
-# For so long after the first odometry the preferred one may still say that time is another [ns].
-AT_FIRST_NS = 10_000_000_000
 
 
 class Judgement(NamedTuple):
     """What a stamp says."""
 
-    refusal: Answer | None = None
-    """Why its message is not used, unless time begins again."""
+    refusal: Answer | None = None  # why its message is not used, unless time begins again
+    # length of the jump back with which time begins again with this stamp [ns], else 0
     jump_ns: int = 0
-    """Length of the jump back with which time begins again with this stamp [ns], else 0."""
 
 
 PRESENT = Judgement()
@@ -72,17 +70,9 @@ class _Watch:
 
 
 class TimeKeeper:
-    """
-    Keeps the time of the robot.
+    """Keeps the time of the robot."""
 
-    Parameters
-    ----------
-    odometry : sequence of str, its sources, the preferred one first; other sources tell no time
-    threshold_ns : int, a stamp behind the newest one by less is late, and no jump [ns]
-
-    """
-
-    def __init__(self, odometry: Sequence[str], threshold_ns: int) -> None:
+    def __init__(self, odometry: Sequence[str], threshold_ns: StampNs) -> None:
         self.threshold_ns = threshold_ns
         self._odometry = list(odometry)
         self._watches: dict[str, _Watch] = {}
@@ -140,9 +130,9 @@ class TimeKeeper:
         """Judge a stamp of odometry that is before the earliest one of the present, or ahead."""
         others_ns = self._newest_but(source)
         watch.extend(stamp_ns, others_ns)
-        # at first, the preferred odometry need not have the time of the one that came before it
+        # for ten seconds preferred odometry need not have the time of the one that came before it
         decides = (not watch.was_present and source == self._odometry[0]
-                   and now_ns - self._since_ns < AT_FIRST_NS)
+                   and now_ns - self._since_ns < 10_000_000_000)
         if watch.is_evidence and (decides or self._moves(watch, others_ns)):
             begins_again = stamp_ns < earliest_ns
             if decides or begins_again:

@@ -9,9 +9,9 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.scalar_se2 import Pose, wrap_one
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Pose, wrap_one
 from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, Variances
+from pose_graph_ros.core.quantities import StampNs, StampsNs
 
 # Motions below both of these are not added to path length and turns: odometry jitters at rest,
 # and the sum of its jitter at 50 Hz would be a long path [m, rad].
@@ -24,11 +24,6 @@ STANDING_NS = 1_000_000_000
 # samples at rest of which some are left out [ns].
 LARGEST_GAP_NS = 1_000_000_000
 
-# Accelerations that interpolation between two samples must allow for [m/s^2, rad/s^2]: an
-# acceleration a moves the pose away from uniform motion by a t1 t2 / 2, with t1 and t2 the times
-# to the two samples.
-UNIFORM_WITHIN = (1.0, 0.5)
-
 NOTHING: Variances = (0.0, 0.0, 0.0)
 
 
@@ -36,20 +31,14 @@ class Row(NamedTuple):
     """A sample, with the sums of path length, turns and variances up to it."""
 
     stamp_ns: int
-    pose: Pose
-    """`T_odom_base` in a frame without jumps [m, m, rad]."""
-    distance: float
-    """Path length so far [m]."""
-    turn: float
-    """Sum of absolute turns so far [rad]."""
-    variance: Variances
-    """Sums of the variances of (x, y, theta) so far [m^2, m^2, rad^2]."""
-    counted: Pose
-    """Pose up to which path length and turns have been added."""
-    counted_ns: int
-    """Stamp of `counted`, or a later one up to which the robot stood still [ns]."""
+    pose: Pose  # `T_odom_base` in a frame without jumps [m, m, rad]
+    distance: float  # path length so far [m]
+    turn: float  # sum of absolute turns so far [rad]
+    variance: Variances  # sums of the variances of (x, y, theta) so far [m^2, m^2, rad^2]
+    counted: Pose  # pose up to which path length and turns have been added
+    counted_ns: int  # stamp of `counted`, or a later one up to which the robot stood still [ns]
+    # sums of the variances since then; they are added to `variance` once the robot moves
     held: Variances
-    """Sums of the variances since then; they are added to `variance` once the robot moves."""
 
 
 def next_row(
@@ -59,15 +48,8 @@ def next_row(
     """
     Return the row of the next sample.
 
-    Parameters
-    ----------
-    before : Row, optional, row of the sample before; None for the first sample
-    pose : tuple, `T_odom_base` [m, m, rad]
-    variance : tuple
-        Variance of (x, y, theta) of the motion since the sample before, in the robot's frame; it
-        is added only if the robot moves.
-    loose : tuple, variance that is added in any case
-
+    `variance` is that of the motion since the sample before, in the robot's frame, and is added
+    only if the robot moves; `loose` is added in any case.
     """
     if before is None:
         return Row(stamp_ns, pose, 0.0, 0.0, NOTHING, pose, stamp_ns, NOTHING)
@@ -98,15 +80,15 @@ class OdometryTimeline:
 
     def __init__(self) -> None:
         self._stamps = GrowingArray((), np.int64)
+        # x, y, theta, path length, sum of absolute turns
         self._samples = GrowingArray((5,), np.float64)
-        """x, y, theta, path length, sum of absolute turns."""
+        # sums of the variances of x, y, theta; empty while all are zero
         self._variances = GrowingArray((3,), np.float64)
-        """Sums of the variances of x, y, theta; empty while all are zero."""
+        # whether equal samples between the one before and this one were left out
         self._dense = GrowingArray((), np.bool_)
-        """Whether equal samples between the one before and this one were left out."""
         self._last: Row | None = None
+        # whether the newest two samples are equal: an equal one would replace the newest
         self.resting = False
-        """Whether the newest two samples are equal: an equal one would replace the newest."""
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -176,7 +158,7 @@ class OdometryTimeline:
                     column.drop_first(n_old)
 
     def thinned(
-        self, instants_ns: IntArray, since_ns: int,
+        self, instants_ns: StampsNs, since_ns: StampNs,
     ) -> tuple[IntArray, FloatArray, BoolArray]:
         """
         Return stamps, rows and `dense` of the samples for the motions between some instants.
@@ -184,12 +166,6 @@ class OdometryTimeline:
         These are the first sample, those at the instants or else on both sides of them, and all
         from a later instant on. Motions between these instants do not depend on other samples. The
         rows, shape (T, 8), are pose, path length, sum of absolute turns, and sums of variances.
-
-        Parameters
-        ----------
-        instants_ns : ndarray of int64, shape (N,), covered instants [ns]
-        since_ns : int, stamp from which all samples are returned [ns]
-
         """
         stamps = self.stamps_ns
         keep = np.zeros(len(stamps), dtype=bool)
@@ -207,16 +183,7 @@ class OdometryTimeline:
         self, stamps_ns: IntArray, rows: FloatArray, dense: BoolArray, last: Row, *,
         resting: bool,
     ) -> None:
-        """
-        Fill this empty timeline with the result of `thinned`.
-
-        Parameters
-        ----------
-        stamps_ns, rows, dense : as returned by `thinned`
-        last : Row, the newest sample
-        resting : bool, as `resting`
-
-        """
+        """Fill this empty timeline with the result of `thinned`."""
         self._stamps.append(stamps_ns)
         self._samples.append(rows[:, :5])
         if np.any(rows[:, 5:]):
@@ -236,15 +203,8 @@ class OdometryTimeline:
         rates = np.median(steps[moving, 2:] / steps[moving, 1:2], axis=0)
         return np.asarray(rates * np.sum(steps[moving, 1]) / np.sum(steps[moving, 0]))
 
-    def motion(self, start_ns: int, end_ns: int) -> Motion:
-        """
-        Return the motion between two instants; raise ValueError if one is not covered.
-
-        Parameters
-        ----------
-        start_ns, end_ns : int, stamps [ns]; ValueError if the start is after the end
-
-        """
+    def motion(self, start_ns: StampNs, end_ns: StampNs) -> Motion:
+        """Return the motion between two instants; raise ValueError if one is not covered."""
         if start_ns > end_ns:
             raise ValueError(f'expected start <= end, got {start_ns} and {end_ns}')
         start, start_variance = self._at(start_ns)
@@ -255,32 +215,19 @@ class OdometryTimeline:
                       float(end[4] - start[4]),
                       end[5:] - start[5:] + start_variance + end_variance)
 
-    def motion_to(self, start_ns: int, end: Row) -> Motion:
-        """
-        Return the motion from an instant to a row that may not be in the timeline yet.
-
-        Parameters
-        ----------
-        start_ns : int, stamp [ns]; ValueError if it is not covered
-        end : Row, the newest row of the timeline, or one made from it by `next_row`
-
-        """
+    def motion_to(self, start_ns: StampNs, end: Row) -> Motion:
+        """Return the motion from an instant to a row that may not be in the timeline yet."""
         start, start_variance = self._at(start_ns)
         return Motion(se2.between(start[:3], np.array(end.pose)), float(end.distance - start[3]),
                       float(end.turn - start[4]),
                       np.array(end.variance) - start[5:] + start_variance)
 
-    def rests(self, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+    def rests(self, start_ns: StampNs, end_ns: StampNs) -> list[tuple[int, int]]:
         """
         Return the stretches of some time during which the robot does not leave the jitter.
 
         Each begins and ends at a sample; returned are their stamps [ns]. In the first of them the
         robot may have begun to stand just then, at the last it may have begun to move.
-
-        Parameters
-        ----------
-        start_ns, end_ns : int, stamps [ns]
-
         """
         stamps = self._stamps.values
         rows = slice(int(np.searchsorted(stamps, start_ns)),
@@ -324,9 +271,10 @@ class OdometryTimeline:
         first, second = self._rows(slice(before, after + 1))
         row = first + fraction * (second - first)
         row[:3] = se2.interpolate(first[:3], second[:3], fraction)
-        # the error of interpolation is at most the path between the samples
+        # An acceleration a moves the pose away from uniform motion by a t1 t2 / 2, with t1 and t2
+        # the times to the two samples: here by 1 m/s^2 and 0.5 rad/s^2, but at most by the path.
         way, turn = second[3:5] - first[3:5]
         bend = 0.5 * fraction * (1.0 - fraction) * ((end - start) * 1e-9)**2
-        position = min(UNIFORM_WITHIN[0] * bend, float(way))
-        heading = min(UNIFORM_WITHIN[1] * bend, float(turn))
+        position = min(bend, float(way))
+        heading = min(0.5 * bend, float(turn))
         return row, np.array((position**2, position**2, heading**2))

@@ -1,51 +1,138 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations between consecutive hidden nodes by gyroscopes, and what they measure at rest."""
+"""
+Rotations between consecutive hidden nodes by gyroscopes, and what they measure at rest.
+
+How well they agree with those of odometry is told to people, and has no part in the estimate. A
+rotation by the gyroscope minus that by odometry is, over the time t between two hidden nodes,
+
+    d = b t + tau (w_1 - w_0) + k a
+
+with b the bias, tau how much its stamps are early, w the rates at both nodes, a the rotation and
+k the error of the scale. These three are fitted to the newest rotations by least squares, with the
+noise that both claim.
+"""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, YawRate
-from pose_graph_ros.core.odometry.agreement import Agreement, Difference
 from pose_graph_ros.core.odometry.gyro import GyroStream, RateIntegral, Rotation, SavedRates
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.timeline import STANDING_NS
 from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows5
 
-# Parts of a standstill by the wheels in which the robot may still, or already, turn [ns].
-STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
+# Rotations of independent sensors that differ by more contradict each other [sigma].
+CONTRADICTORY = 1.5
+LEAST = 30  # rotations for a verdict
 # A robot whose gyroscope shows more than this many sigmas of its bias at rest is turned by others.
 MOST_BIAS = 5.0
-# Nodes that are closer than this have no rotation between them: a robot was put elsewhere [ns].
-SHORTEST_NS = 1_000_000
+
+
+class Difference(NamedTuple):
+    """How much rotations differ from those of odometry."""
+
+    sigmas: float  # root mean square of what the bias does not explain, in units of its sigma
+    # what is probably wrong, as a sentence without capital and full stop; '' for nothing
+    reason: str
+
+
+class Agreement:
+    """The sums over the newest rotations of one gyroscope."""
+
+    def __init__(self) -> None:
+        self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
+        self._squares = self._n = self._turned = 0.0
+        # products of time and rotation by odometry with that rotation and the gyroscope's
+        self._shares = np.zeros((2, 2))
+
+    def add(
+        self, difference: float, seconds: float, change: float, angle: float, variance: float,
+    ) -> None:
+        """
+        Add a rotation, `angle` by the gyroscope and that less a difference by odometry.
+
+        `variance` is that of the difference, `change` how much the rate changes meanwhile [rad/s].
+        """
+        row, fade = np.array((seconds, change, angle)), 1.0 - 1.0 / 1000.0  # the fit forgets
+        left = difference
+        if self._n >= LEAST:
+            left -= float(row @ self._fit()[0])
+        # differences beyond 5 sigma do not count, as those of wheels that slip
+        weight = min(25.0 / (left * left + 1e-300), 1.0 / variance)
+        self._normal = fade * self._normal + weight * np.outer(row, row)
+        self._right = fade * self._right + weight * difference * row
+        self._squares = fade * self._squares + weight * difference * difference
+        self._n = fade * self._n + 1.0
+        by_odometry = angle - difference
+        self._shares = fade * self._shares + weight * np.outer(
+            (seconds, by_odometry), (by_odometry, angle))
+        self._turned = fade * self._turned + max(abs(angle), abs(by_odometry))
+
+    def _fit(self) -> tuple[FloatArray, FloatArray]:
+        """Return bias, time and scale, and their covariance."""
+        # weak priors: 0.1 rad/s, 10 s, 10
+        covariance = np.linalg.inv(self._normal + np.diag((1e2, 1e-2, 1e-2)))
+        return np.asarray(covariance @ self._right), np.asarray(covariance, dtype=np.float64)
+
+    def _share(self) -> float:
+        """Return how much the gyroscope turns per rotation by odometry, but for its bias."""
+        (time_by, time_angle), (by_by, by_angle) = self._shares.tolist()
+        per_time = time_by / float(self._normal[0, 0])
+        return (by_angle - per_time * time_angle) / max(by_by - per_time * time_by, 1e-300)
+
+    def difference(self) -> Difference | None:
+        """Return the difference by now; None as long as too little is known."""
+        if self._n < LEAST or self._turned < 2.0 * math.pi:
+            return None
+        explained = self._right[0]**2 / self._normal[0, 0]
+        sigmas = math.sqrt(max(self._squares - explained, 0.0) / self._n)
+        found, covariance = self._fit()
+        rest = max((self._squares - float(found @ self._right)) / self._n, 1.0)
+        shown = np.abs(found) > 5.0 * np.sqrt(rest * np.diagonal(covariance))
+        _, early, scale = found.tolist()
+        reason = ''
+        if sigmas < 0.1:
+            reason = 'odometry seems to contain it already, so that it counts twice'
+        elif sigmas < CONTRADICTORY:
+            pass
+        elif self._share() < 0.3 and not (shown[2] and scale > 1.0):
+            reason = ('it does not turn with odometry: its z axis is not up (see mounting and '
+                      '/tf_static), or it is dead')
+        elif shown[2] and scale > 1.0:
+            reason = 'it turns the other way: check its mounting'
+        elif shown[1] and abs(early) > 0.05:
+            reason = (f'its stamps seem to be {abs(early):.2f} s '
+                      f'{"early" if early > 0.0 else "late"}: see time_offset')
+        elif shown[2] and abs(scale) > 0.05 and scale < 1.0:
+            reason = f'odometry turns {1.0 - scale:.2f} times as much'
+        return Difference(sigmas, reason)
+
+
+# Parts of a standstill by the wheels in which the robot may still, or already, turn [ns].
+STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
 
 
 class Turn(NamedTuple):
     """The rotation from one hidden node to the next."""
 
     source: str
-    i: int
-    """Id of the node that it begins at."""
-    j: int
-    """Id of the node that it leads to."""
-    stamp_ns: int
-    """Middle of the time in between [ns]."""
-    angle: float
-    """Rotation, with the bias during `seconds`, not wrapped [rad]."""
-    variance: float
-    """[rad^2]"""
-    seconds: float
-    """Time for which the robot was not at rest, during which the bias acted [s]."""
-    rest_rate: float = 0.0
-    """Mean rate at rest, which is the bias [rad/s]."""
-    rest_variance: float = 0.0
-    """Of that rate [rad^2/s^2]; 0 if the robot was not at rest."""
+    i: int  # id of the node that it begins at
+    j: int  # id of the node that it leads to
+    stamp_ns: int  # middle of the time in between [ns]
+    angle: float  # rotation, with the bias during `seconds`, not wrapped [rad]
+    variance: float  # [rad^2]
+    seconds: float  # time for which the robot was not at rest, during which the bias acted [s]
+    rest_rate: float = 0.0  # mean rate at rest, which is the bias [rad/s]
+    rest_variance: float = 0.0  # of that rate [rad^2/s^2]; 0 if the robot was not at rest
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +140,11 @@ class SavedGyro:
     """Saved state of a gyroscope."""
 
     rates: SavedRates
-    next_node: int
-    """Number of the hidden node that the next rotation leads to."""
+    next_node: int  # number of the hidden node that the next rotation leads to
+    # stamps of rotations that are not in the graph yet, shape (W,); see `Turn` [ns]
     waiting_ns: Integers
-    """Stamps of rotations that are not in the graph yet, shape (W,); see `Turn` [ns]."""
-    waiting_ends: Pairs
-    """Ids of their nodes, shape (W, 2)."""
-    waiting: Rows5
-    """Angle, variance, time, and what rest tells, shape (W, 5)."""
+    waiting_ends: Pairs  # ids of their nodes, shape (W, 2)
+    waiting: Rows5  # angle, variance, time, and what rest tells, shape (W, 5)
 
 
 class Gyros:
@@ -74,19 +158,15 @@ class Gyros:
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
         self._nodes, self._config = nodes, config
-        self.streams: dict[str, GyroStream] = {}
-        """By the name of the source."""
+        self.streams: dict[str, GyroStream] = {}  # by the name of the source
+        # Number of rotations by source: 'rotations' that were made, those that a 'gap' in the
+        # rates has left out, and those 'before_window', whose nodes have left the graph. Whoever
+        # takes them clears it.
         self.counts: Counter[tuple[str, str]] = Counter()
-        """
-        Number of rotations by source: 'rotations' that were made, those that a 'gap' in the rates
-        has left out, and those 'before_window', whose nodes have left the graph. Whoever takes
-        them clears it.
-        """
         self._agreement: dict[str, Agreement] = {}
+        # number of the hidden node that the next rotation leads to, by source
         self._next: dict[str, int] = {}
-        """Number of the hidden node that the next rotation leads to, by source."""
-        self.new: list[Turn] = []
-        """Rotations not yet taken; whoever takes them clears the list."""
+        self.new: list[Turn] = []  # rotations not yet taken; whoever takes them clears the list
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for rotations that are made from now on."""
@@ -124,14 +204,15 @@ class Gyros:
         """Make the rotation to a node, given by its number."""
         nodes = self._nodes
         start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
-        if end_ns - start_ns < SHORTEST_NS or node in nodes.relocated:
+        # closer nodes have no rotation between them: a robot was put elsewhere
+        if end_ns - start_ns < 1_000_000 or node in nodes.relocated:
             return
         integral = stream.integral(start_ns, end_ns)
         if integral is None:
             if stream.first_ns <= start_ns:
                 self.counts[source, 'gap'] += 1
             return
-        if nodes.table.has_left(node - 1) or nodes.table.has_left(node):
+        if nodes.has_left(node - 1) or nodes.has_left(node):
             self.counts[source, 'before_window'] += 1
             return
         rotation = integral.between(start_ns, end_ns)
@@ -203,11 +284,7 @@ class Gyros:
         """
         Return the rotation of the robot between two recent stamps, and its variance.
 
-        Parameters
-        ----------
-        start_ns, end_ns : int, stamps [ns]
-        biases : mapping, of each source [rad/s]; the first one with a rotation is used
-
+        It is that of the first source that has one, among those with a bias [rad/s].
         """
         for source, bias in biases.items():
             stream = self.streams.get(source)

@@ -6,9 +6,15 @@ Back-substitution from the roots of the Bayes tree down, as far as values change
 A clique is visited if it was built in this iteration, or if a node of its separator has moved by
 more than the wildfire threshold (M. Kaess et al., "iSAM2", IJRR 2012) since its solution was last
 passed to the cliques below. The threshold is `alpha` times the sigma that the node's own
-constraints give it. If the separator has moved as a rigid body, all nodes below are moved with it
-(`rigid_propagation`). Nodes that have turned, and cliques whose frames have turned, are listed for
+constraints give it. Nodes that have turned, and cliques whose frames have turned, are listed for
 `relinearization`, which checks their linearization errors.
+
+The error of a constraint between two poses does not change with a common motion of both. So if the
+separator of a clique that is not anchored has moved as a rigid body, that motion is applied to the
+poses of all nodes below, and nothing is solved for. Most nodes far from a loop closure move this
+way. The deviation of the separator's motion from the rigid one, in sigmas of its nodes, is added
+to the *drift* of the clique. Above `FREE_FRACTION` of alpha the clique is solved for instead, and
+its drift is added to that of its children.
 """
 
 import math
@@ -19,17 +25,14 @@ from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import solve_rows
 from pose_graph_ros.core.graph import factors, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.pools import triangle_size
-from pose_graph_ros.core.smoother.rigid_propagation import propagate, rigid_motion
 
 # Energy of a constraint that is assumed to predict its linearization error from a turn [sigma^2].
 USUAL_ENERGY = 0.1
-# The constraints of a node that moves by more than this many times alpha are checked in any case.
-CHECK_MOVE = 100.0
 # Fraction of alpha that limits the moves of nodes and the drift of cliques where nothing below is
 # tied to the map: there the effect of a move that is not passed down does not decay.
 FREE_FRACTION = 0.35
-# Return codes of `_update_child`.
-LEFT, PROPAGATED, SOLVED = range(3)
+# How a clique is updated after its parent (`_update_child`).
+_AS_IT_IS, _PROPAGATED, _SOLVED = range(3)
 
 
 @kernel
@@ -37,7 +40,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     """
     Write the new solution of a node, and list the node if it has moved by more than alpha sigmas.
 
-    phi is the angle of its clique's frame [rad].
+    The frame of its clique has the angle phi.
     """
     node_f, node_i, scalars = tb.node_f(head), tb.node_i(head), tb.scalars(head)
     work_i, room = tb.work_i(head), head[tb.NODE_ROOM]
@@ -57,7 +60,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     # approximate squared linearization error due to the turn since the last check
     turn2 = (dth - phi - f[tb.CHECKED_TURN]) ** 2
     error2 = turn2 * (turn2 * f[tb.SCALE_R] * f[tb.SCALE_R] + USUAL_ENERGY)
-    if (error2 > scalars[tb.SETTING_SHARE] or moved > CHECK_MOVE * alpha
+    if (error2 > scalars[tb.SETTING_SHARE] or moved > 100.0 * alpha
             or head[tb.SINCE] < head[tb.ITERATION]):
         f[tb.CHECKED_TURN] = dth - phi
         work_i[room + head[tb.N_CHECKS]] = v
@@ -135,34 +138,120 @@ def _set_turn(head, c, parent_turn):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
+    """
+    Return the rigid motion that fits this iteration's moves of the nodes of a clique's separator.
+
+    First comes the largest deviation of a node from it, or any above the limit, at which the fit
+    stops [sigma]; then its angle and the mean positions before and after it: it is
+    `x -> R_turn (x - pivot) + goal`.
+    """
+    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
+    begin = clique_i[c, tb.NODES] + clique_i[c, tb.N_FRONTAL]
+    n = clique_i[c, tb.N_SEPARATOR]
+    iteration = head[tb.ITERATION]
+    turn = pivot_x = pivot_y = goal_x = goal_y = 0.0
+    for m in range(begin, begin + n):
+        v = pool_i[m]
+        f = node_f[v]
+        goal_x += f[tb.POSE]
+        goal_y += f[tb.POSE + 1]
+        if node_i[v, tb.CHANGED] == iteration:
+            turn += f[tb.DELTA + 2] - f[tb.SEEN + 2]
+            pivot_x += f[tb.SEEN] - f[tb.DELTA]
+            pivot_y += f[tb.SEEN + 1] - f[tb.DELTA + 1]
+    weight = 1.0 / n
+    turn *= weight
+    goal_x, goal_y = goal_x * weight, goal_y * weight
+    pivot_x, pivot_y = goal_x + pivot_x * weight, goal_y + pivot_y * weight
+    if n == 1:
+        return 0.0, turn, pivot_x, pivot_y, goal_x, goal_y
+    versine, sine = math.cos(turn) - 1.0, math.sin(turn)
+    deviation = 0.0
+    for m in range(begin, begin + n):
+        v = pool_i[m]
+        f = node_f[v]
+        dx = dy = dth = 0.0
+        if node_i[v, tb.CHANGED] == iteration:
+            dx, dy = f[tb.DELTA] - f[tb.SEEN], f[tb.DELTA + 1] - f[tb.SEEN + 1]
+            dth = f[tb.DELTA + 2] - f[tb.SEEN + 2]
+        x, y = f[tb.POSE] - dx - pivot_x, f[tb.POSE + 1] - dy - pivot_y
+        dx -= goal_x - pivot_x + versine * x - sine * y
+        dy -= goal_y - pivot_y + sine * x + versine * y
+        deviation = max(deviation, max(abs(dx), abs(dy)) * f[tb.SCALE_T],
+                        abs(dth - turn) * f[tb.SCALE_R])
+        if deviation > limit:
+            break
+    return deviation, turn, pivot_x, pivot_y, goal_x, goal_y
+
+
+@kernel
+def _propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
+    """Return the number of nodes at or below a clique, after moving them by a rigid motion."""
+    node_f, clique_i, pool_i = tb.node_f(head), tb.clique_i(head), tb.pool_i(head)
+    _, turn, pivot_x, pivot_y, goal_x, goal_y = motion
+    cos, sin = math.cos(turn), math.sin(turn)
+    bottom, moved = depth, 0
+    stack[depth] = c
+    depth += 1
+    while depth > bottom:
+        depth -= 1
+        row = clique_i[stack[depth]]
+        for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
+            v = pool_i[m]
+            transaction_log.log_solution(head, v)
+            f = node_f[v]
+            x, y = f[tb.POSE] - pivot_x, f[tb.POSE + 1] - pivot_y
+            x, y = cos * x - sin * y + goal_x, sin * x + cos * y + goal_y
+            dx, dy = x - f[tb.POSE], y - f[tb.POSE + 1]
+            f[tb.POSE], f[tb.POSE + 1] = x, y
+            f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2] + turn)
+            f[tb.DELTA] += dx
+            f[tb.DELTA + 1] += dy
+            f[tb.DELTA + 2] += turn
+            f[tb.SEEN] += dx
+            f[tb.SEEN + 1] += dy
+            f[tb.SEEN + 2] += turn
+        moved += row[tb.N_FRONTAL]
+        child = row[tb.CHILD]
+        while child >= 0:
+            if clique_i[child, tb.N_FRONTAL] > 0:
+                stack[depth] = child
+                depth += 1
+            child = clique_i[child, tb.SIBLING]
+    return moved
+
+
+@kernel
 def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
     """
     Update a clique after its parent was visited, as far as that takes no solve.
 
-    Return LEFT: its separator has not moved; PROPAGATED: its separator has moved as a rigid body,
-    and all nodes at and below the clique were moved with it; or SOLVED: it is to be solved for.
+    Return _AS_IT_IS: its separator has not moved; _PROPAGATED: that has moved as a rigid body, and
+    all nodes at and below the clique were moved with it; or _SOLVED: it is to be solved for.
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     clique_f = tb.clique_f(head)
     row, iteration = clique_i[c], head[tb.ITERATION]
     if row[tb.BUILT] >= head[tb.SINCE]:
-        return SOLVED
+        return _SOLVED
     limit = FREE_FRACTION * tb.scalars(head)[tb.SETTING_ALPHA]
     begin = row[tb.NODES] + row[tb.N_FRONTAL]
     for m in range(begin, begin + row[tb.N_SEPARATOR]):
         if node_i[pool_i[m], tb.CHANGED] == iteration:
             if row[tb.ANCHORED] != 0:
-                return SOLVED
+                return _SOLVED
             slack = limit - clique_f[c, tb.DRIFT]
-            motion = rigid_motion(head, c, slack)
+            motion = _rigid_motion(head, c, slack)
             if motion[0] > slack:
-                return SOLVED
+                return _SOLVED
             if motion[0] > 0.0:
                 transaction_log.log_clique(head, c)
                 clique_f[c, tb.DRIFT] += motion[0]
-            tb.scalars(head)[tb.N_MOVED] += propagate(head, c, motion, stack, depth)
-            return PROPAGATED
-    return SOLVED if clique_f[c, tb.DRIFT] > limit else LEFT
+            tb.scalars(head)[tb.N_MOVED] += _propagate(head, c, motion, stack, depth)
+            return _PROPAGATED
+    return _SOLVED if clique_f[c, tb.DRIFT] > limit else _AS_IT_IS
 
 
 @kernel
@@ -217,9 +306,9 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                     transaction_log.log_clique(head, child)
                     clique_f[child, tb.DRIFT] += drift
                 code = _update_child(head, child, stack, depth)
-                if code != LEFT or refines:
+                if code != _AS_IT_IS or refines:
                     _set_turn(head, child, turn)
-                if code == SOLVED:
+                if code == _SOLVED:
                     _fetch_rows(head, child)
                     if c >= 0:
                         stack[depth] = c

@@ -12,9 +12,9 @@ other node moves.
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, NUMBERS, ROWS
-from pose_graph_ros.core.elimination.fronts import LEAST_PIVOT
+from pose_graph_ros.core.elimination.assembly import substitute_fixed
+from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
 from pose_graph_ros.core.graph import (
-    factor_types,
     factors,
     normal_equations,
     pools,
@@ -22,7 +22,8 @@ from pose_graph_ros.core.graph import (
     tables as tb,
     transaction_log,
 )
-from pose_graph_ros.core.graph.scales import scale_by_edge
+from pose_graph_ros.core.graph.rows import scale_by
+from pose_graph_ros.core.smoother.tree_update import lacks_memory
 
 # Return codes of `extend`.
 EXTENDED, NO_ROOM, NOT_A_CHAIN = range(3)
@@ -54,7 +55,7 @@ def _root_equations(head, v, values, front, ld):  # type: ignore[no-untyped-def]
     """Write the equations of a node that is alone in a root, from its rows of R."""
     pool_f, node_i = tb.pool_f(head), tb.node_i(head)
     if node_i[v, tb.FIXED] != 0:
-        return  # `_insert_fixed` writes the rows of a fixed node
+        return  # `substitute_fixed` writes the rows of a fixed node
     r = pool_f[values:values + _ROOT]
     a, b, c, x = 1.0 / r[0], r[1], r[2], r[3]
     d, e, y = 1.0 / r[4], r[5], r[6]
@@ -75,38 +76,6 @@ def _set_least_pivots(head, v, least):  # type: ignore[no-untyped-def]
     least[2] = LEAST_PIVOT * f[tb.SCALE_R] * f[tb.SCALE_R]
 
 
-@kernel
-def _eliminate_3(front, n, least):  # type: ignore[no-untyped-def]
-    """
-    Factorise the first three of n rows of n + 1 numbers, and subtract them from the others.
-
-    Return the first row with a bad pivot, or -1.
-    """
-    ld = n + 1
-    for k in range(3):
-        pivot = front[k * ld + k]
-        if not pivot > least[k]:
-            return k
-        inverse = 1.0 / math.sqrt(pivot)
-        front[k * ld + k] = inverse
-        for c in range(k + 1, ld):
-            front[k * ld + c] *= inverse
-        for i in range(k + 1, n):
-            a = front[k * ld + i]
-            for c in range(i, ld):
-                front[i * ld + c] -= a * front[k * ld + c]
-    return -1
-
-
-@kernel
-def _copy_rows(front, ld, begin, end, at, pool_f):  # type: ignore[no-untyped-def]
-    """Copy the upper triangle of rows of a front and their right-hand sides, without gaps."""
-    for k in range(begin, end):
-        for c in range(k, ld):
-            pool_f[at] = front[k * ld + c]
-            at += 1
-
-
 @kernel(signature=(tb.HEAD, NUMBERS, ROWS, NUMBER))
 def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     """
@@ -114,20 +83,13 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
 
     NO_ROOM: a table is full. NOT_A_CHAIN: a general update is necessary. After these two the graph
     is unchanged.
-
-    Parameters
-    ----------
-    mean, information : ndarray, shapes (3,) and (3, 3), of the edge
-    weight : float, of the edge
-
     """
     clique_f, node_f, edge_f = tb.clique_f(head), tb.node_f(head), tb.edge_f(head)
     pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
     edge_i, clique_i, pool_i = tb.edge_i(head), tb.clique_i(head), tb.pool_i(head)
     v, e = head[tb.N_NODES], head[tb.N_EDGES]
-    if (v + head[tb.N_PRIORS] >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM]
-            or head[tb.POOL_F_END] + _PAIR + _ROOT > len(pool_f)
-            or head[tb.POOL_I_END] + 3 > len(pool_i) or len(work_f) < 256):
+    lacks = lacks_memory(head, head[tb.POOL_F_END] + _PAIR + _ROOT, head[tb.POOL_I_END] + 3, 256)
+    if lacks or v + head[tb.N_PRIORS] >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM]:
         return NO_ROOM
     if len(mean) != 3 or information.shape != (3, 3):
         return NOT_A_CHAIN
@@ -144,32 +106,33 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     head[tb.UPDATE] += 1    # rows are stamped, but not logged: nothing has to be rolled back
     _write_node(head, v, last, mean)
     f = edge_f[e]
-    factor_types.prepare(f, 0)
+    factors.prepare(f, 0)
     tb.edge_id(head)[e] = head[tb.NEXT_EDGE]
     edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = 0
     edge_i[e, tb.OWNER] = c
     edge_i[e, tb.EDGE_LOGGED] = head[tb.UPDATE]
-    factors.linearize_edge(head, e)
+    factors.linearize(head, e)
     f[tb.ERROR2] = f[tb.ENERGY] = 0.0
     # the front of the old root and the new node, in work space that holds the new root as well
-    front, least = work_f[:42], work_f[42:45]
+    ld, ld_root = padded(6), padded(3)
+    front, root, least = work_f[:6 * ld], work_f[6 * ld:6 * ld + 3 * ld_root], work_f[250:253]
     front[:] = 0.0
-    _root_equations(head, last, old[tb.VALUES], front, 7)
-    normal_equations.add_edge(head, e, 0, 3, -1, front, 7)
+    _root_equations(head, last, old[tb.VALUES], front, ld)
+    normal_equations.add(head, e, 0, 3, -1, front, ld)
     scale_t, scale_r = node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R]
-    scale_by_edge(head, e, weight)
+    scale_by(head, e, weight)
     _set_least_pivots(head, last, least)
     if node_i[last, tb.FIXED] != 0:
-        _insert_fixed(head, last, front)
+        substitute_fixed(head, last, 0, front, 6, ld)
         least[:] = 0.0
-    bad = _eliminate_3(front, 6, least)
-    root = work_f[45:57]
+    bad = factorize(front, 3, 6, ld, least)
     for m in range(3):
-        for n in range(4):
-            root[4 * m + n] = front[7 * (m + 3) + n + 3]
+        for n in range(3):
+            root[ld_root * m + n] = front[ld * (m + 3) + n + 3]
+        root[ld_root * (m + 1) - 1] = front[ld * (m + 4) - 1]
     _set_least_pivots(head, v, least)
     if bad < 0:
-        bad = _eliminate_3(root, 3, least)
+        bad = factorize(root, 3, 3, ld_root, least)
     if bad >= 0:
         node_f[last, tb.SCALE_T], node_f[last, tb.SCALE_R] = scale_t, scale_r
         return NOT_A_CHAIN
@@ -179,7 +142,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     pools.give_nodes(head, nodes, 1)
     r = transaction_log.take_clique(head, 1, 0)
     pool_i[clique_i[r, tb.NODES]] = v
-    _copy_rows(root, 4, 0, 3, clique_i[r, tb.VALUES], pool_f)
+    write_rows(root, 3, ld_root, pool_f, clique_i[r, tb.VALUES])
     clique_i[r, tb.CHILD] = c
     clique_i[r, tb.ANCHORED] = old[tb.ANCHORED]
     for m in range(tb.CLIQUE_F):
@@ -187,7 +150,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     old[tb.PARENT], old[tb.SIBLING], old[tb.N_SEPARATOR] = r, -1, 1
     old[tb.NODES], old[tb.VALUES] = pools.take_nodes(head, 2), pools.take_values(head, _PAIR)
     pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v
-    _copy_rows(front, 7, 0, 6, old[tb.VALUES], pool_f)
+    write_rows(front, 6, ld, pool_f, old[tb.VALUES])
     node_i[v, tb.CLIQUE] = r
     edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 4 * e
     edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 4 * e + 1
@@ -196,16 +159,3 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     head[tb.NEXT_EDGE] += 1
     head[tb.LOG_I_END] = 0
     return EXTENDED
-
-
-@kernel
-def _insert_fixed(head, v, front):  # type: ignore[no-untyped-def]
-    """Write the solution of a fixed node into a front of two nodes, of which it is the first."""
-    node_f = tb.node_f(head)
-    for m in range(3):
-        x = node_f[v, tb.DELTA + m]
-        for n in range(3, 6):
-            front[7 * n + 6] -= front[7 * m + n] * x
-        front[7 * m:7 * m + 6] = 0.0
-        front[7 * m + m] = 1.0
-        front[7 * m + 6] = x

@@ -1,182 +1,218 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Marginal covariances from the Bayes tree: of one node, of two nodes jointly, of all nodes.
+Marginal covariances from the Bayes tree: of a node, of two jointly, and of errors of edges.
 
-With `H = R^T R`, the covariance of nodes i and j is the product `Y_i^T Y_j` of the solutions of
-`R^T Y_i = E_i`, where E_i are the three columns of the identity that belong to node i. Y_i is zero
-except in the frontal rows of the cliques from that of i up to its root. The product therefore only
-involves the cliques that are on the paths of both nodes, and is zero under different roots.
+With J the Jacobian of an error and `P = H^-1` the covariance of all nodes, `H = R^T R`, that is
+`J P J^T = Y^T Y` with `R^T Y = J^T`; for the covariance of nodes, J has rows of the identity. J^T
+has nonzero rows at one or two nodes alone, so Y has them in the cliques from there to the roots.
+The right-hand sides of two nodes are added in the lowest clique that is above both; the large
+cliques near the root are solved for once, and what is common to both nodes cancels before it is
+squared: the covariance between two neighbours is exact however uncertain both are in the map.
 
-The covariances of all nodes are computed in one sweep (`sparse_inverse`).
-
-Rows of R hold the reciprocal of their diagonal. A fixed node has rows of the identity; taking 0 as
-their reciprocals gives it no uncertainty. The rows of a clique are equations in its frame
-(`clique_frames`), so right-hand sides and results are rotated by the angle of the frame. A node is
-updated by adding to its pose in map axes, so covariances are in map axes [m, m, rad].
+Rows of R hold the reciprocal of their diagonal. A fixed node has rows of the identity; it is left
+out, and so gets no uncertainty. The rows of a clique are equations in its frame (`clique_frames`),
+so right-hand sides are rotated by the angle of the frame. A node is updated by adding to its pose
+in map axes, so covariances are in map axes [m, m, rad].
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import INTEGER, kernel, ROWS
+from pose_graph_ros.core.compiled.jit import (
+    BYTES,
+    INTEGER,
+    INTEGERS,
+    kernel,
+    MATRICES,
+    ROWS,
+)
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.error_functions import write_data
 from pose_graph_ros.core.graph.pools import row_start
 
 _FAST = {'reassoc', 'contract', 'nsz'}
 
 
+class Innovations(NamedTuple):
+    """What K edges disagree with the estimate by, in the axes of their errors."""
+
+    errors: Poses   # at the present estimate
+    covariances: Covariances    # from the uncertainty of the estimate alone, J P J^T
+
+    def squared_distances(self, information: FloatArray) -> FloatArray:
+        """
+        Return `e^T (J P J^T + information^-1)^-1 e`, shape (K,), chi2 of independent constraints.
+
+        The information matrices, shape (K, 3, 3), may be singular, as those of positions are.
+        """
+        joint = np.eye(3) + self.covariances @ information
+        scaled = np.linalg.solve(joint, self.errors[:, :, None])[:, :, 0]
+        return np.einsum('mi,mij,mj->m', self.errors, information, scaled)
+
+
+def innovations(head: IntArray, edges: Edges) -> Innovations:
+    """Return by how much edges, not in the graph or with weight 0, disagree with the estimate."""
+    result = Innovations(np.empty((len(edges), 3)), np.empty((len(edges), 3, 3)))
+    columns = edges.i, edges.j, edges.mean, edges.kind, edges.bias
+    edge_innovations(head, *map(np.ascontiguousarray, columns), *result)
+    return result
+
+
 @kernel(signature=(tb.HEAD, ROWS), allocates=True)
 def newest_covariance(head, out):  # type: ignore[no-untyped-def]
-    """
-    Write the covariance of the newest pose, shape (3, 3), in constant time if alone in a root.
-
-    Return False, with nothing written, if there is no pose or edits are not solved for.
-    """
-    v = head[tb.NEWEST]
-    if v < 0 or head[tb.N_TOUCHED] > 0:
+    """Write that of the newest pose; False if there is none, or edits are not solved for."""
+    if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
         return False
-    pool_f, node_i, clique_i = tb.pool_f(head), tb.node_i(head), tb.clique_i(head)
-    row = clique_i[node_i[v, tb.CLIQUE]]
-    if row[tb.N_FRONTAL] != 1 or row[tb.N_SEPARATOR] != 0:
-        node_covariance(head, v, out)
-        return True
-    if node_i[v, tb.FIXED] != 0:
-        out[:] = 0.0
-        return True
-    # the inverse of R, row by row, and its product with its transpose
-    at = row[tb.VALUES]
-    a, d, f = pool_f[at], pool_f[at + 4], pool_f[at + 7]
-    e = -d * pool_f[at + 5] * f
-    b = -a * pool_f[at + 1] * d
-    c = -a * (pool_f[at + 1] * e + pool_f[at + 2] * f)
-    out[0, 0], out[1, 1], out[2, 2] = a * a + b * b + c * c, d * d + e * e, f * f
-    out[0, 1] = out[1, 0] = b * d + c * e
-    out[0, 2] = out[2, 0] = c * f
-    out[1, 2] = out[2, 1] = e * f
+    node_covariance(head, head[tb.NEWEST], out)
     return True
 
 
 @kernel(signature=(tb.HEAD, INTEGER, ROWS), allocates=True)
 def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
-    """
-    Write the covariance of a node.
-
-    Parameters
-    ----------
-    v : int, node
-    out : ndarray, shape (3, 3)
-
-    """
-    path, n_rows = _path_to_root(head, v)
-    y = _solution(head, v, path, n_rows)
-    _product(y, y, n_rows, out)
+    """Write the covariance of a node, shape (3, 3)."""
+    out[:] = 0.0
+    _begin(head, v, np.eye(3), -1, np.empty((3, 48)), np.empty((3, 48)), out)
+    _mirror(out)
 
 
 @kernel(signature=(tb.HEAD, INTEGER, INTEGER, ROWS), allocates=True)
 def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
-    """
-    Write the joint covariance of two nodes.
-
-    Parameters
-    ----------
-    i, j : int
-    out : ndarray, shape (6, 6), zeros
-
-    """
-    clique_i = tb.clique_i(head)
-    path_i, rows_i = _path_to_root(head, i)
-    path_j, rows_j = _path_to_root(head, j)
-    y_i, y_j = _solution(head, i, path_i, rows_i), _solution(head, j, path_j, rows_j)
-    _product(y_i, y_i, rows_i, out[:3, :3])
-    _product(y_j, y_j, rows_j, out[3:, 3:])
-    # rows of the cliques on both paths, from the root down
-    common, k = 0, 1
-    while (k <= min(len(path_i), len(path_j))
-           and path_i[len(path_i) - k] == path_j[len(path_j) - k]):
-        common += 3 * clique_i[path_i[len(path_i) - k], tb.N_FRONTAL]
-        k += 1
-    _product(y_i, y_j, common, out[:3, 3:])
+    """Write the joint covariance of two nodes, shape (6, 6)."""
+    of_i, of_j = np.zeros((6, 3)), np.zeros((6, 3))
     for m in range(3):
-        for n in range(3):
-            out[3 + n, m] = out[m, 3 + n]
+        of_i[m, m] = of_j[3 + m, m] = 1.0
+    _write_covariance(head, i, of_i, j, of_j, out)
+
+
+@kernel(signature=(tb.HEAD, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS, MATRICES), allocates=True)
+def edge_innovations(head, i, j, mean, kind, bias, error, out):  # type: ignore[no-untyped-def]
+    """Write errors, (M, 3), of edges given by columns of `Edges`, and J P J^T, (M, 3, 3)."""
+    node_f = tb.node_f(head)
+    f, start_j, end_j = np.empty(tb.EDGE_F), np.empty((3, 3)), np.empty((3, 3))
+    for k in range(len(i)):
+        write_data(f, kind[k], mean[k], bias[k])
+        _edge_jacobians(f, kind[k], node_f[i[k]], node_f[j[k]], error[k], start_j, end_j)
+        _write_covariance(head, i[k], start_j, j[k], end_j, out[k])
+
+
+@kernel
+def _edge_jacobians(f, kind, start, end, error, start_j, end_j):  # type: ignore[no-untyped-def]
+    """Write the error of an edge with row f, and its Jacobians, in map axes."""
+    error[0], error[1], error[2], c, s, ax, ay = factors.model(f, kind, start, end, 0.0)
+    ft, fth = factors.factors_of_end(f, kind)
+    start_j[:] = 0.0
+    end_j[:] = 0.0
+    start_j[0, 0], start_j[0, 1], start_j[0, 2] = -c, -s, c * ay - s * ax
+    start_j[1, 0], start_j[1, 1], start_j[1, 2] = s, -c, -s * ay - c * ax
+    start_j[2, 2] = -1.0
+    end_j[0, 0], end_j[0, 1], end_j[1, 0], end_j[1, 1] = ft * c, ft * s, -ft * s, ft * c
+    end_j[2, 2] = fth
 
 
 @kernel(allocates=True)
-def _path_to_root(head, v):  # type: ignore[no-untyped-def]
-    """Return the cliques from that of a node to its root, and the number of frontal rows."""
-    node_i, clique_i = tb.node_i(head), tb.clique_i(head)
-    n, n_rows = 0, 0
-    c = node_i[v, tb.CLIQUE]
+def _write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-def]
+    """Write J P J^T, shape (m, m), of an error with Jacobians by two nodes, shape (m, 3)."""
+    node_i, clique_i, m = tb.node_i(head), tb.clique_i(head), len(out)
+    out[:] = 0.0
+    common = _lowest_common(clique_i, node_i[i, tb.CLIQUE], node_i[j, tb.CLIQUE])
+    spare = np.empty((m, 96))
+    first, spare, at_i = _begin(head, i, of_i, common, np.empty((m, 96)), spare, out)
+    second, spare, at_j = _begin(head, j, of_j, common, np.empty((m, 96)), spare, out)
+    if common >= 0:
+        n = 3 * (clique_i[common, tb.N_FRONTAL] + clique_i[common, tb.N_SEPARATOR])
+        for r in range(m):
+            for q in range(n):
+                first[r, q] += second[r, q]
+        _climb(head, common, -1, min(at_i, at_j), first, spare, out)
+    _mirror(out)
+
+
+@kernel
+def _depth(clique_i, c):  # type: ignore[no-untyped-def]
+    depth = 0
     while c >= 0:
-        n += 1
-        n_rows += 3 * clique_i[c, tb.N_FRONTAL]
+        depth += 1
         c = clique_i[c, tb.PARENT]
-    path = np.empty(n, np.int32)
-    c = node_i[v, tb.CLIQUE]
-    for k in range(n):
-        path[k] = c
-        c = clique_i[c, tb.PARENT]
-    return path, n_rows
+    return depth
+
+
+@kernel
+def _lowest_common(clique_i, a, b):  # type: ignore[no-untyped-def]
+    """Return the lowest clique on the paths of two cliques to their roots; -1 without one."""
+    depth_a, depth_b = _depth(clique_i, a), _depth(clique_i, b)
+    while depth_a > depth_b:
+        a = clique_i[a, tb.PARENT]
+        depth_a -= 1
+    while depth_b > depth_a:
+        b = clique_i[b, tb.PARENT]
+        depth_b -= 1
+    while a != b:
+        a, b = clique_i[a, tb.PARENT], clique_i[b, tb.PARENT]
+    return a
 
 
 @kernel(allocates=True)
-def _solution(head, v, path, n_rows):  # type: ignore[no-untyped-def]
-    """Return Y^T of `R^T Y = E` for a node, in the frontal rows of the cliques of `path`."""
-    pool_f, node_i, clique_i = tb.pool_f(head), tb.node_i(head), tb.clique_i(head)
-    pool_i = tb.pool_i(head)
-    y = np.empty((3, n_rows))
-    # right-hand sides of the present clique and of its parent
-    here, above = np.empty((3, 48)), np.empty((3, 48))
-    end = 0
-    for k in range(len(path)):
-        row = clique_i[path[k]]
+def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped-def]
+    """
+    Climb from a node to a clique, which is not solved for; -1 to climb beyond the root.
+
+    Add Y^T Y to the upper triangle of `out`. Return the right-hand sides of the clique, work
+    space, and the number of its frontal nodes before the first with a nonzero right-hand side.
+    """
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    c = node_i[v, tb.CLIQUE]
+    row = clique_i[c]
+    here = _cleared(here, 3 * (row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]))
+    first = 0
+    while pool_i[row[tb.NODES] + first] != v:
+        first += 1
+    turn = clique_frames.present_turn(head, c)
+    cos, sin = math.cos(turn), math.sin(turn)
+    for r in range(len(jacobian)):
+        x, y = jacobian[r, 0], jacobian[r, 1]
+        here[r, 3 * first], here[r, 3 * first + 1] = cos * x + sin * y, cos * y - sin * x
+        here[r, 3 * first + 2] = jacobian[r, 2]
+    if c == top:
+        return here, spare, first
+    here, spare = _climb(head, c, top, first, here, spare, out)
+    return here, spare, 0
+
+
+@kernel(allocates=True)
+def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-def]
+    """Solve for the cliques from c up to, and without, one above; return its right-hand sides."""
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    pool_f = tb.pool_f(head)
+    while c != top:
+        row = clique_i[c]
         n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
-        rows, n = 3 * n_frontal, 3 * (n_frontal + n_separator)
         nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_frontal + n_separator]
-        first = 0
-        if k == 0:
-            here = cleared(here, n)
-            while nodes[first] != v:
-                first += 1
-            turn = clique_frames.present_turn(head, path[k])
-            cos, sin = math.cos(turn), math.sin(turn)
-            here[0, 3 * first], here[0, 3 * first + 1] = cos, -sin
-            here[1, 3 * first], here[1, 3 * first + 1] = sin, cos
-            here[2, 3 * first + 2] = 1.0
-            y[:, :3 * first] = 0.0
         values = pool_f[row[tb.VALUES]:]
         for f in range(first, n_frontal):
-            if node_i[nodes[f], tb.FIXED] != 0:
-                y[:, end + 3 * f:end + 3 * f + 3] = 0.0
-            else:
-                _solve_block(values, 3 * f, n, here, y[:, end:])
-        end += rows
-        if n_separator > 0:
-            above = pass_up(head, path[k], here, above)
-            here, above = above, here
-    return y
+            if node_i[nodes[f], tb.FIXED] == 0:
+                _solve_block(values, 3 * f, 3 * (n_frontal + n_separator), here, out)
+        first, below, c = 0, c, row[tb.PARENT]
+        if c < 0:
+            break
+        spare = _passed_up(head, below, here, spare)
+        here, spare = spare, here
+    return here, spare
 
 
 @kernel(allocates=True)
-def pass_up(head, c, here, above):  # type: ignore[no-untyped-def]
-    """
-    Return the right-hand sides of a clique's separator as those of its parent, in its frame.
-
-    Parameters
-    ----------
-    c : int, clique with a parent
-    here : ndarray, three right-hand sides of the clique
-    above : ndarray, three vectors to be overwritten, if they are long enough
-
-    """
+def _passed_up(head, c, here, above):  # type: ignore[no-untyped-def]
+    """Return the right-hand sides of a clique's separator as those of its parent, in its frame."""
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     row = clique_i[c]
     parent = clique_i[row[tb.PARENT]]
     n_above = parent[tb.N_FRONTAL] + parent[tb.N_SEPARATOR]
-    above = cleared(above, 3 * n_above)
+    above = _cleared(above, 3 * n_above)
     for m in range(n_above):
         node_i[pool_i[parent[tb.NODES] + m], tb.INDEX] = 3 * m
     turn = (clique_frames.present_turn(head, c)
@@ -184,51 +220,43 @@ def pass_up(head, c, here, above):  # type: ignore[no-untyped-def]
     cos, sin = math.cos(turn), math.sin(turn)
     for s in range(row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]):
         at = node_i[pool_i[row[tb.NODES] + s], tb.INDEX]
-        for m in range(3):
-            p, q = here[m, 3 * s], here[m, 3 * s + 1]
-            above[m, at], above[m, at + 1] = cos * p - sin * q, sin * p + cos * q
-            above[m, at + 2] = here[m, 3 * s + 2]
+        for r in range(len(here)):
+            p, q = here[r, 3 * s], here[r, 3 * s + 1]
+            above[r, at], above[r, at + 1] = cos * p - sin * q, sin * p + cos * q
+            above[r, at + 2] = here[r, 3 * s + 2]
     return above
 
 
 @kernel(allocates=True)
-def cleared(vectors, n):  # type: ignore[no-untyped-def]
-    """
-    Return three vectors whose first n entries are zero; `vectors` themselves if long enough.
-
-    Parameters
-    ----------
-    vectors : ndarray, shape (3, M)
-    n : int
-
-    """
+def _cleared(vectors, n):  # type: ignore[no-untyped-def]
+    """Return vectors whose first n entries are zero; `vectors` themselves if long enough."""
     if vectors.shape[1] < n:
-        return np.zeros((3, 2 * n))
+        return np.zeros((len(vectors), 2 * n))
     vectors[:, :n] = 0.0
     return vectors
 
 
 @kernel(allocates=True, fastmath=_FAST)
-def _solve_block(values, k, n, rhs, y):  # type: ignore[no-untyped-def]
-    """Solve for the three rows of R from row k on; subtract them from the right-hand sides."""
-    for m in range(3):
-        r, row = k + m, values[row_start(k + m, n):]
-        a, b, c = rhs[0, r] * row[r], rhs[1, r] * row[r], rhs[2, r] * row[r]
-        y[0, r], y[1, r], y[2, r] = a, b, c
-        first, second, third = rhs[0, :n], rhs[1, :n], rhs[2, :n]
-        for q in range(r + 1, n):
-            first[q] -= a * row[q]
-            second[q] -= b * row[q]
-            third[q] -= c * row[q]
+def _solve_block(values, k, n, rhs, out):  # type: ignore[no-untyped-def]
+    """Solve for the three rows of R from row k on; add Y^T Y to the upper triangle of `out`."""
+    r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
+                  values[row_start(k + 2, n):])
+    for r in range(len(rhs)):
+        x = rhs[r, :n]
+        a = x[k] * r0[k]
+        b = (x[k + 1] - a * r0[k + 1]) * r1[k + 1]
+        c = (x[k + 2] - a * r0[k + 2] - b * r1[k + 2]) * r2[k + 2]
+        x[k], x[k + 1], x[k + 2] = a, b, c
+        for q in range(k + 3, n):
+            x[q] -= a * r0[q] + b * r1[q] + c * r2[q]
+        for s in range(r + 1):
+            y = rhs[s]
+            out[s, r] += y[k] * a + y[k + 1] * b + y[k + 2] * c
 
 
-@kernel(allocates=True, fastmath=_FAST)
-def _product(a, b, n, out):  # type: ignore[no-untyped-def]
-    """Write the 3x3 inner products of the rows of a and of b, over their last n entries."""
-    for i in range(3):
-        for j in range(3):
-            x, y = a[i, a.shape[1] - n:], b[j, b.shape[1] - n:]
-            total = 0.0
-            for k in range(n):
-                total += x[k] * y[k]
-            out[i, j] = total
+@kernel
+def _mirror(out):  # type: ignore[no-untyped-def]
+    """Copy the upper triangle of a matrix to the lower one."""
+    for r in range(len(out)):
+        for s in range(r):
+            out[r, s] = out[s, r]

@@ -16,15 +16,16 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import touch, unlink_edge
+from pose_graph_ros.core.graph.editing import unlink_edge
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
-from pose_graph_ros.core.graph.scales import add_to_scale, scale_by_edge
-from pose_graph_ros.core.smoother.tree_update import LEAVES
+from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
+from pose_graph_ros.core.smoother.tree_update import (
+    DONE,
+    lacks_memory,
+    MORE_MEMORY,
+    ORDERED_FIRST,
+)
 
-# Return codes of `drop`.
-DROPPED, MORE_MEMORY = range(2)
-# Fraction of the squared scale of a node below which its information is rounding.
-ROUNDING = 1e-14
 # States of cliques: whether all nodes at and below them leave.
 _UNKNOWN, _WHOLE, _MIXED = range(3)
 
@@ -71,11 +72,6 @@ def far_from_linear(head, nodes):  # type: ignore[no-untyped-def]
     Tell whether the linearization errors of the constraints of leaving nodes are above a budget.
 
     It is that of a step that moves as many nodes. An edge between two of them counts twice.
-
-    Parameters
-    ----------
-    nodes : ndarray of int, rows of the leaving nodes
-
     """
     node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
     edge_f, observed_f, scalars = tb.edge_f(head), tb.observed_f(head), tb.scalars(head)
@@ -110,11 +106,6 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
 
     These are the cliques with a leaving node that hold, or are above, one that remains. Their
     leaving nodes are ordered before all others. The caller has begun an update.
-
-    Parameters
-    ----------
-    nodes : ndarray of int, rows of the leaving nodes
-
     """
     node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     touched, stack = tb.touched(head), tb.work_i(head)
@@ -128,7 +119,7 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
         if node_i[v, tb.TOUCHED] == 0:
             touched[head[tb.N_TOUCHED]] = v
             head[tb.N_TOUCHED] += 1
-        node_i[v, tb.TOUCHED] = LEAVES
+        node_i[v, tb.TOUCHED] = ORDERED_FIRST
         stack[0] = node_i[v, tb.CLIQUE]
         depth = 1
         while depth > 0:
@@ -150,15 +141,7 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
 
 @kernel
 def _drop_constraints(head, v, leaves):  # type: ignore[no-untyped-def]
-    """
-    Take the constraints of a leaving node out of all lists and sums; return their energy.
-
-    Parameters
-    ----------
-    v : int
-    leaves : ndarray of bool, which nodes leave
-
-    """
+    """Take the constraints of a leaving node out of all lists and sums; return their energy."""
     edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
     edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
     energy = 0.0
@@ -169,7 +152,7 @@ def _drop_constraints(head, v, leaves):  # type: ignore[no-untyped-def]
         f = edge_f[e]
         if f[tb.WEIGHT] == 0.0:
             continue    # another of its ends has left just before
-        scale_by_edge(head, e, -f[tb.WEIGHT])
+        scale_by(head, e, -f[tb.WEIGHT])
         for m in range(3):
             if edge_i[e, m] >= 0 and not leaves[edge_i[e, m]]:
                 unlink_edge(head, e, m)
@@ -197,15 +180,7 @@ def _scale_by_prior(head, c, sign):  # type: ignore[no-untyped-def]
 
 @kernel
 def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
-    """
-    Drop all cliques below a clique, and all constraints in them and in it; return their energy.
-
-    Parameters
-    ----------
-    top : int, clique
-    leaves : ndarray of bool, which nodes leave
-
-    """
+    """Drop all cliques below one, and all constraints in them and in it; return their energy."""
     clique_i, clique_f, pool_i = tb.clique_i(head), tb.clique_f(head), tb.pool_i(head)
     stack = tb.work_i(head)
     stack[0] = top
@@ -240,7 +215,7 @@ def _clear_rounding(head, c):  # type: ignore[no-untyped-def]
     for i in range(size):
         f = node_f[pool_i[row[tb.NODES] + (rows + i) // 3]]
         scale = f[tb.SCALE_T] if i % 3 < 2 else f[tb.SCALE_R]
-        if update[row_start(i, size) + i] <= ROUNDING * scale * scale:
+        if update[row_start(i, size) + i] <= 1e-14 * scale * scale:
             for k in range(i):
                 update[row_start(k, size) + i] = 0.0
             for k in range(i, size + 1):
@@ -252,11 +227,7 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
     """
     Turn a clique into a prior on its separator, which remains where it is in the tree.
 
-    Parameters
-    ----------
-    c : int
-    energy : float, of the prior at the present poses [sigma^2]
-
+    Its energy at the present poses is given [sigma^2].
     """
     node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
     clique_i, clique_f, pool_i = tb.clique_i(head), tb.clique_f(head), tb.pool_i(head)
@@ -267,23 +238,24 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
     phi, seen = clique_frames.present_turn(head, c), clique_f[c, tb.TURN_SEEN]
     # the update matrix in map axes, with the right-hand side at the present poses
     at = old_values + triangle_size(3 * n_frontal, 3 * n_frontal + size)
-    to = work_f[:triangle_size(size, size)]
-    clique_frames.turned_update(pool_f[at:], n, nodes, node_f, phi, to)
+    n_numbers = triangle_size(size, size)
+    clique_frames.turned_update(pool_f[at:], n, nodes, node_f, phi, work_f)
+    work = work_f[n_numbers:]
+    minus_x, right = work[:size], work[size:2 * size]
     for i in range(size):
-        r = to[row_start(i, size):]
-        x = node_f[nodes[i // 3], tb.DELTA + i % 3]
-        r[size] -= r[i] * x
-        for k in range(i + 1, size):
-            r[size] -= r[k] * node_f[nodes[k // 3], tb.DELTA + k % 3]
-            to[row_start(k, size) + size] -= r[k] * x
+        minus_x[i] = -node_f[nodes[i // 3], tb.DELTA + i % 3]
+        right[i] = work_f[row_start(i, size) + size]
+    clique_frames.add_product(work_f, size, minus_x, right)
+    for i in range(size):
+        work_f[row_start(i, size) + size] = right[i]
     row[tb.NODES] = pools.take_nodes(head, n)
     row[tb.VALUES] = pools.take_values(head, pools.n_values(0, n))
     for k in range(n):
         pool_i[row[tb.NODES] + k] = nodes[k]
     at = row[tb.VALUES]
-    for k in range(len(to)):
-        pool_f[at + k] = to[k]
-    at += len(to)
+    for k in range(n_numbers):
+        pool_f[at + k] = work_f[k]
+    at += n_numbers
     for k in range(n):
         for m in range(3):
             pool_f[at + 3 * k + m] = node_f[nodes[k], tb.POSE + m]
@@ -315,17 +287,12 @@ def _keep_waiting(head):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD, INTEGERS), allocates=True)
 def drop(head, nodes):  # type: ignore[no-untyped-def]
     """
-    Return DROPPED after taking nodes that are whole subtrees out of the tree.
+    Return DONE after taking nodes that are whole subtrees out of the tree.
 
     Their rows leave with the next `Graph.commit`. MORE_MEMORY: nothing has changed, and the pools
     must grow to `NEED_F` and `NEED_I` of the head. No node may be touched.
-
-    Parameters
-    ----------
-    nodes : ndarray of int, rows of the leaving nodes
-
     """
-    pool_f, node_i, clique_i = tb.pool_f(head), tb.node_i(head), tb.clique_i(head)
+    node_i, clique_i = tb.node_i(head), tb.clique_i(head)
     pool_i, scalars = tb.pool_i(head), tb.scalars(head)
     state, leaves = _states(head, nodes)
     tops = np.empty(len(nodes), np.int32)
@@ -339,8 +306,7 @@ def drop(head, nodes):  # type: ignore[no-untyped-def]
             n_tops += 1
             need_f += pools.rounded(pools.n_values(0, row[tb.N_SEPARATOR]))
             need_i += pools.rounded(row[tb.N_SEPARATOR])
-    if need_f > len(pool_f) or need_i > len(pool_i):
-        head[tb.NEED_F], head[tb.NEED_I], head[tb.NEED_WORK] = need_f, need_i, 0
+    if lacks_memory(head, need_f, need_i, 0):
         return MORE_MEMORY
     for k in range(n_tops):
         _clear_rounding(head, tops[k])
@@ -353,5 +319,5 @@ def drop(head, nodes):  # type: ignore[no-untyped-def]
     _keep_waiting(head)
     head[tb.N_TURNED] = 0
     head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
-    return DROPPED
+    return DONE
 

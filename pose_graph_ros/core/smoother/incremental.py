@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The incremental smoother; `docs/solver.md` describes the method."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,28 +12,63 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import (
+    Covariance,
+    Covariances,
+    FloatArray,
+    IntArray,
+    Poses,
+    PoseVector,
+)
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother import (
-    batch_fallback,
     chain,
     covariances,
     forgetting,
-    innovations,
-    refinement,
     step,
+    tree_update,
+    trial,
 )
-from pose_graph_ros.core.smoother.innovations import Innovations
-from pose_graph_ros.core.smoother.results import DIVERGED, Forgotten, Refinement, UpdateResult
+from pose_graph_ros.core.smoother.covariances import Innovations, innovations
 from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 from pose_graph_ros.core.smoother.trial import Trial
 
-# Attempts to order leaving nodes first: a step may touch further ones that wait to be linearized.
-_ATTEMPTS = 4
-_NOT_REFINED = Refinement(finished=True, moved=0.0)
-_EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', 0, 1, 1, 1)
+# Reason of an update that has failed because it must not fall back to the batch optimiser.
+DIVERGED = 'the iterations diverge'
+
+
+class UpdateResult(NamedTuple):
+    """Status and statistics of an update."""
+
+    # CONVERGED; MAX_ITERATIONS if linearization errors above the budget remain for the next
+    # update; FAILED if the update was rolled back
+    status: Status
+    reason: str     # of a failure, else empty
+    relinearized: int = 0   # constraints and turned clique frames that were linearized again
+    eliminated: int = 0     # nodes whose cliques were, summed over the iterations
+    visited: int = 0    # cliques that were solved for, summed over the iterations
+    iterations: int = 0     # back-substitutions
+
+
+class Refinement(NamedTuple):
+    """What a call of `IncrementalSmoother.refine` has done."""
+
+    finished: bool  # nothing more can be done before the next update
+    moved: float    # largest change of a coordinate of a position [m]
+
+
+class Forgotten(NamedTuple):
+    """What `IncrementalSmoother.forget` has taken out of the graph."""
+
+    nodes: IntArray     # ids, ascending
+    poses: Poses    # their last estimates
+    edges: IntArray     # ids of all edges that ended at them
+    observed: IntArray  # ids of all observed nodes on them
+
+
+_EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', eliminated=1, visited=1, iterations=1)
 
 
 class IncrementalSmoother:
@@ -40,13 +77,7 @@ class IncrementalSmoother:
 
     The cost of an update is proportional to what it changes. Every connected part of the graph
     needs a fixed or an observed node. An update that leaves a node undetermined is rolled back,
-    bit for bit.
-
-    Parameters
-    ----------
-    config : SmootherConfig, optional
-    graph : Graph, optional, that the batch optimiser has solved, or an empty one
-
+    bit for bit. It begins with a graph that the batch optimiser has solved, or an empty one.
     """
 
     def __init__(self, config: SmootherConfig | None = None, graph: Graph | None = None) -> None:
@@ -60,34 +91,32 @@ class IncrementalSmoother:
         scalars[tb.SETTING_SHARE] = self._config.budget_share
 
     @property
-    def poses(self) -> FloatArray:
-        """Estimates of all hidden nodes in the map, shape (N, 3), as a view that stays current."""
+    def poses(self) -> Poses:
+        """Estimates of all hidden nodes in the map, as a view that stays current."""
         return self.graph.poses
 
     def update(self, update: GraphUpdate, *, fall_back: bool = True) -> UpdateResult:
         """
         Return the result of editing the graph and bringing the estimate up to date.
 
-        A GraphUpdateError, for a part that does not fit the graph, leaves the graph unchanged, as
-        any other exception does.
-
-        Parameters
-        ----------
-        update : GraphUpdate
-        fall_back : bool
-            Whether the whole graph is optimised at once if the iterations diverge, which takes ten
-            times as long as them; otherwise the result is FAILED with the reason `DIVERGED`, and a
-            `trial` can find the optimum part by part.
-
+        If the iterations diverge, the whole graph is optimised at once, which takes ten times as
+        long as them; without the fallback the result is FAILED with the reason `DIVERGED`, and a
+        `trial` can find the optimum part by part. A GraphUpdateError, for a part that does not fit
+        the graph, leaves the graph unchanged, as any other exception does.
         """
+        with self._editing():
+            self.graph.apply(update)
+            return self._step(step.FIRST, fall_back=fall_back)
+
+    @contextmanager
+    def _editing(self) -> Iterator[None]:
+        """Begin an update, and roll it back if an exception ends it."""
         self.graph.begin()
         try:
-            self.graph.apply(update)
-            result = self._step(step.FIRST, fall_back=fall_back)
+            yield
         except BaseException:
             self.graph.rollback()
             raise
-        return result
 
     def append(self, update: GraphUpdate) -> bool:
         """
@@ -96,12 +125,8 @@ class IncrementalSmoother:
         It is not, and nothing has changed, if the update asks for anything to be eliminated.
         Raises GraphUpdateError as `update` does.
         """
-        self.graph.begin()
-        try:
+        with self._editing():
             self.graph.apply(update)
-        except BaseException:
-            self.graph.rollback()
-            raise
         if self.graph.has_touched:
             self.graph.rollback()
             return False
@@ -112,48 +137,35 @@ class IncrementalSmoother:
         """
         Do one iteration from the estimate, which is within a budget of it, to the minimum of chi2.
 
-        The first call after an update solves for all that updates have changed; see `refinement`.
+        The first call after an update solves for all that updates have changed; see `step`.
         After a failure or an interruption the graph is as before, bit for bit. Raises ValueError
         if edits of the graph wait for an update.
         """
         self._require_solved()
         if self.graph.newest_pose < 0:
-            return _NOT_REFINED
+            return Refinement(finished=True, moved=0.0)
         code = self._refinement_step()
-        if code in (refinement.REFINED, refinement.UNFINISHED):
+        if code in (tree_update.DONE, tree_update.UNFINISHED):
             moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
-            return Refinement(finished=code == refinement.REFINED, moved=moved)
+            return Refinement(finished=code == tree_update.DONE, moved=moved)
         self._memory.head[tb.INTERRUPT] = 0
-        return _NOT_REFINED._replace(finished=code == refinement.FAILED)
+        return Refinement(finished=code != tree_update.INTERRUPTED, moved=0.0)
 
     def _refinement_step(self) -> int:
-        """Do an iteration in a transaction; return the code of `refinement.refine`."""
-        head, code = self._memory.head, refinement.MORE_MEMORY
-        while code == refinement.MORE_MEMORY:
-            self.graph.begin()
-            try:
-                code = refinement.refine(head)
-            except BaseException:
-                self.graph.rollback()
-                raise
-            if code in (refinement.REFINED, refinement.UNFINISHED):
+        """Do an iteration in a transaction; return the code of `step.refine`."""
+        while True:
+            with self._editing():
+                code: int = step.refine(self._memory.head)
+            if code in (tree_update.DONE, tree_update.UNFINISHED):
                 self.graph.commit()
-                break
+                return code
             self.graph.rollback()
-            if code == refinement.MORE_MEMORY:
-                self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
-        return code
+            if code != tree_update.MORE_MEMORY:
+                return code
+            self._make_room()
 
-    def trial(self, update: GraphUpdate, poses: FloatArray | None = None) -> Trial:
-        """
-        Return a trial of new weights, on a copy.
-
-        Parameters
-        ----------
-        update : GraphUpdate, new weights; raises ValueError as `refine` does
-        poses : ndarray, shape (N, 3), optional, where it starts
-
-        """
+    def trial(self, update: GraphUpdate, poses: Poses | None = None) -> Trial:
+        """Return a trial of new weights, on a copy; raises ValueError as `refine` does."""
         self._require_solved()
         other = IncrementalSmoother(self._config)
         return Trial(self.graph, other.graph, update, other._eliminate, poses)
@@ -165,7 +177,7 @@ class IncrementalSmoother:
         FAILED, and nothing has changed, if the trial has failed or is outdated, or if what was
         added cannot be solved for. The trial must have come to its end, and cannot be used again.
         """
-        failed = UpdateResult(Status.FAILED, 'the trial has failed', 0, 0, 0, 0)
+        failed = UpdateResult(Status.FAILED, 'the trial has failed')
         if trial.result is None or trial.result.status is Status.FAILED or trial.is_outdated:
             return failed
         other = IncrementalSmoother(self._config, trial.graph)
@@ -181,21 +193,14 @@ class IncrementalSmoother:
         self._memory.head[tb.INTERRUPT] = 1
 
     def extend(
-        self, mean: FloatArray, information: FloatArray, weight: float = 1.0,
+        self, mean: PoseVector, information: FloatArray, weight: float = 1.0,
     ) -> UpdateResult:
         """
         Return the result of appending a hidden node to the newest pose by an odometry edge.
 
         Equal to an update with one hidden node at the pose that odometry predicts and one edge, at
-        a fraction of the cost. Raises GraphUpdateError as `update` does, and if the graph has no
-        hidden node.
-
-        Parameters
-        ----------
-        mean : ndarray, shape (3,), pose of the new node in the newest one [m, m, rad]
-        information : ndarray, shape (3, 3), in the frame of the new node
-        weight : float, of the edge
-
+        a fraction of the cost. The information is in the frame of the new node. Raises
+        GraphUpdateError as `update` does, and if the graph has no hidden node.
         """
         head = self._memory.head
         try:
@@ -213,7 +218,7 @@ class IncrementalSmoother:
                 f'extend: expected arrays of shapes (3,) and (3, 3), got {shapes}')
         if code == chain.NO_ROOM:
             self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
-            self._make_room(int(head[tb.POOL_F_END]) + 256, int(head[tb.POOL_I_END]) + 8, 256)
+            self._make_room()
             return self.extend(mean, information, weight)
         node, last = self.graph.next_ids.node, self.graph.newest_pose
         if last < 0:
@@ -233,21 +238,13 @@ class IncrementalSmoother:
         and neither the estimate nor any covariance changes; else they are ordered first, in a step
         like that of an update. Raises GraphUpdateError for a node that is not in the graph, for
         the newest pose, and if that step fails; ValueError as `refine` does.
-
-        Parameters
-        ----------
-        nodes : collection of int, ids of hidden nodes
-
         """
         rows = self._may_leave(nodes)
         self._linearize(rows)
         self._order_first(rows)
         poses = self.graph.poses[rows]
-        code = forgetting.MORE_MEMORY
-        while code == forgetting.MORE_MEMORY:
-            code = forgetting.drop(self._memory.head, rows)
-            if code == forgetting.MORE_MEMORY:
-                self._make_room(*self._memory.head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+        while forgetting.drop(self._memory.head, rows) == tree_update.MORE_MEMORY:
+            self._make_room()
         left = self.graph.commit()
         return Forgotten(left.nodes, poses, left.edges, left.observed)
 
@@ -258,11 +255,6 @@ class IncrementalSmoother:
         What `forget` makes of them keeps its linearization. Nothing happens if the linearization
         errors of the constraints of the nodes are within the budget of an update that moves them.
         Whoever wants their last estimate asks for it between the two. Raises as `forget` does.
-
-        Parameters
-        ----------
-        nodes : collection of int, ids of hidden nodes
-
         """
         self._linearize(self._may_leave(nodes))
 
@@ -282,36 +274,32 @@ class IncrementalSmoother:
     def _linearize(self, rows: IntArray) -> None:
         head = self._memory.head
         if forgetting.far_from_linear(head, rows):
-            while self._refinement_step() == refinement.INTERRUPTED:
+            while self._refinement_step() == tree_update.INTERRUPTED:
                 head[tb.INTERRUPT] = 0
 
     def _order_first(self, rows: IntArray) -> None:
         """Make whole subtrees of nodes, by row, or raise GraphUpdateError."""
-        for _ in range(_ATTEMPTS):
-            self.graph.begin()
-            try:
+        for _ in range(4):  # a step may touch further nodes that wait to be linearized
+            with self._editing():
                 if not forgetting.touch_mixed(self._memory.head, rows):
                     self.graph.rollback()
                     return
                 result = self._step(step.FIRST)
-            except BaseException:
-                self.graph.rollback()
-                raise
             if result.status is Status.FAILED:
                 raise GraphUpdateError(f'forget: {result.reason}')
         raise GraphUpdateError('forget: the nodes cannot be ordered first')
 
-    def newest_covariance(self) -> FloatArray:
-        """Return the covariance of the newest pose in map axes, shape (3, 3)."""
+    def newest_covariance(self) -> Covariance:
+        """Return the covariance of the newest pose in map axes."""
         covariance = np.empty((3, 3))
         if not covariances.newest_covariance(self._memory.head, covariance):
             # raises an error with the cause
             return self.covariance(self.graph.newest_pose)
         return covariance
 
-    def covariance(self, node: int) -> FloatArray:
+    def covariance(self, node: int) -> Covariance:
         """
-        Return the covariance of a hidden node in map axes, shape (3, 3).
+        Return the covariance of a hidden node in map axes.
 
         Raises ValueError if there is no such node, or edits of the graph are not solved for.
         """
@@ -321,21 +309,14 @@ class IncrementalSmoother:
         return out
 
     def joint_covariance(self, i: int, j: int) -> FloatArray:
-        """
-        Return the joint covariance of two hidden nodes in map axes, i's coordinates first, (6, 6).
-
-        Parameters
-        ----------
-        i, j : int, the nodes; raises as `covariance`
-
-        """
+        """Return the joint covariance, (6, 6), of two hidden nodes; raises as `covariance`."""
         rows = self._eliminated([i, j])
         out = np.zeros((6, 6))
         covariances.pair_covariance(self._memory.head, *rows, out)
         return out
 
-    def covariances(self) -> FloatArray:
-        """Return those of all hidden nodes, shape (N, 3, 3); raises as `covariance`."""
+    def covariances(self) -> Covariances:
+        """Return those of all hidden nodes; raises as `covariance`."""
         self._require_solved()
         out = np.zeros((self.graph.n_nodes, 3, 3))
         all_covariances(self._memory.head, out)
@@ -347,9 +328,7 @@ class IncrementalSmoother:
 
         Raises as `covariance` does.
         """
-        return innovations.at_estimate(
-            self._memory.head, edges.renumbered(
-                lambda nodes: np.asarray(self._eliminated(nodes), dtype=np.int64)))
+        return innovations(self._memory.head, edges.renumbered(self._eliminated))
 
     def _require_solved(self) -> None:
         waiting = int(self._memory.head[tb.N_TOUCHED])
@@ -358,25 +337,17 @@ class IncrementalSmoother:
                 f'covariances: expected a graph whose edits have all been solved for, got one '
                 f'with {waiting} hidden nodes that wait for the solver')
 
-    def _eliminated(self, nodes: Sequence[int] | IntArray) -> Sequence[int] | IntArray:
+    def _eliminated(self, nodes: Sequence[int] | IntArray) -> IntArray:
         """Return the rows of hidden nodes in a graph whose edits have all been solved for."""
         self._require_solved()
-        end = int(self._memory.head[tb.NEXT_NODE])
-        wrong = [node for node in nodes
-                 if not (isinstance(node, int | np.integer) and 0 <= node < end)]
-        if len(wrong) > 0:
-            expected = f'a hidden node in 0..{end - 1}' if end > 0 else 'a graph with nodes'
-            raise ValueError(f'covariances: expected {expected}, got {wrong[0]}')
-        if end == self._memory.head[tb.N_NODES]:
-            return nodes    # no node has left, so ids are rows; a sixth of the time
         rows = self.graph.node_rows(nodes)
-        if np.any(rows < 0):
+        if (rows < 0).any():
             raise ValueError(
-                f'covariances: hidden node {nodes[int(np.argmin(rows))]} has left the graph')
+                f'covariances: hidden node {nodes[int(np.argmin(rows))]} is not in the graph')
         return rows
 
     def chi2(self) -> float:
-        """Return the energy of all constraints; see `chi2_of`."""
+        """Return the energy of all constraints."""
         return chi2_of(self.graph)
 
     def _eliminate(self) -> bool:
@@ -387,29 +358,28 @@ class IncrementalSmoother:
     def _step(self, entered: int, *, fall_back: bool = True) -> UpdateResult:
         """Bring the estimate up to date, growing the memory as needed, or roll the update back."""
         head = self._memory.head
-        code = step.run(head, self._config.max_iterations, entered)
-        while code == step.MORE_MEMORY:
-            self._make_room(*head[tb.NEED_F:tb.NEED_WORK + 1].tolist())
+        iterations = self._config.max_iterations
+        while (code := step.run(head, iterations, entered)) == tree_update.MORE_MEMORY:
+            self._make_room()
             entered = step.AFTER_BATCH if entered == step.AFTER_BATCH else step.RESUMED
-            code = step.run(head, self._config.max_iterations, entered)
-        if code == step.DIVERGED and not fall_back:
+        if code == tree_update.DIVERGED and not fall_back:
             self.graph.rollback()
-            return UpdateResult(Status.FAILED, DIVERGED, 0, 0, 0, 0)
-        if code == step.DIVERGED:
+            return UpdateResult(Status.FAILED, DIVERGED)
+        if code == tree_update.DIVERGED:
             return self._fall_back_to_batch()
-        if code == step.BAD_PIVOT:
+        if code == tree_update.BAD_PIVOT:
             node = self.graph.node_ids[head[tb.BAD_NODE]]
             reason = f'hidden node {node} is not determined'
             self.graph.rollback()
-            return UpdateResult(Status.FAILED, reason, 0, 0, 0, 0)
+            return UpdateResult(Status.FAILED, reason)
         self.graph.commit()
-        status = Status.CONVERGED if code == step.SETTLED else Status.MAX_ITERATIONS
-        relinearized, eliminated, visited, iterations = (
-            head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
-        return UpdateResult(status, '', relinearized, eliminated, visited, iterations)
+        status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
+        return UpdateResult(status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
 
-    def _make_room(self, floats: int, integers: int, work: int) -> None:
+    def _make_room(self) -> None:
+        """Let the pools and the work space grow to what a kernel needs."""
         memory, head = self._memory, self._memory.head
+        floats, integers, work = head[tb.NEED_F:tb.NEED_WORK + 1].tolist()
         memory.ensure('pool_f', floats, keep=int(head[tb.POOL_F_END]))
         memory.ensure('pool_i', integers, keep=int(head[tb.POOL_I_END]))
         memory.ensure('work_f', work)
@@ -421,7 +391,7 @@ class IncrementalSmoother:
         This is done on a copy, which replaces the graph on success.
         """
         other = IncrementalSmoother(self._config)
-        if batch_fallback.optimize_copy(self.graph, other.graph):
+        if trial.optimize_copy(self.graph, other.graph):
             other.graph.begin()
             result = other._step(step.AFTER_BATCH)
             if result.status is not Status.FAILED:
@@ -430,5 +400,4 @@ class IncrementalSmoother:
                 return result
         self.graph.rollback()
         return UpdateResult(
-            Status.FAILED, 'the iterations do not converge, and there is no batch solution',
-            0, 0, 0, 0)
+            Status.FAILED, 'the iterations do not converge, and there is no batch solution')

@@ -12,13 +12,10 @@ next iteration (M. Kaess et al., "iSAM2", IJRR 2012, here with whitened errors).
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.elimination import clique_frames, prior_model
+from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import touch
+from pose_graph_ros.core.graph.rows import touch
 from pose_graph_ros.core.smoother.back_substitution import back_substitute
-
-# Fraction of the budget that may remain when the worst constraints are linearized again.
-LEFT_OVER = 0.4
 
 
 @kernel
@@ -30,21 +27,26 @@ def _append_waiting(head, entry):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _adds_much(scalars, energy, error2):  # type: ignore[no-untyped-def]
+    """Add a constraint to the sums; tell whether its linearization error is large."""
+    scalars[tb.CHI2] += energy
+    scalars[tb.ERROR2_SUM] += error2
+    return error2 > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+
+
+@kernel
 def _check_edge(head, e, frame):  # type: ignore[no-untyped-def]
     """
     Evaluate an edge at the present estimate; it waits if its linearization error is large.
 
-    Frame is the turn of its clique, as for `factors.check_edge`.
+    Frame is the turn of its clique, as for `factors.check`.
     """
     edge_f, scalars, edge_i = tb.edge_f(head), tb.scalars(head), tb.edge_i(head)
     transaction_log.log_energy(head, e)
     f = edge_f[e]
     scalars[tb.CHI2] -= f[tb.ENERGY]
-    factors.check_edge(head, e, frame)
-    scalars[tb.CHI2] += f[tb.ENERGY]
-    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
-    if (f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
-            and edge_i[e, tb.EDGE_WAITS] == 0):
+    factors.check(head, e, frame)
+    if _adds_much(scalars, f[tb.ENERGY], f[tb.ERROR2]) and edge_i[e, tb.EDGE_WAITS] == 0:
         edge_i[e, tb.EDGE_WAITS] = 1
         _append_waiting(head, e)
 
@@ -53,14 +55,11 @@ def _check_edge(head, e, frame):  # type: ignore[no-untyped-def]
 def _check_observed(head, k):  # type: ignore[no-untyped-def]
     """Evaluate an observed node at the present estimate, as `_check_edge` does an edge."""
     observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
-    transaction_log.log_observed(head, k)
+    transaction_log.log_constraint(head, -1 - k)
     f = observed_f[k]
     scalars[tb.CHI2] -= f[tb.ENERGY]
-    factors.check_observed(head, k)
-    scalars[tb.CHI2] += f[tb.ENERGY]
-    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
-    if (f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
-            and observed_i[k, tb.OBS_WAITS] == 0):
+    factors.check(head, -1 - k, factors.NO_TURN)
+    if _adds_much(scalars, f[tb.ENERGY], f[tb.ERROR2]) and observed_i[k, tb.OBS_WAITS] == 0:
         observed_i[k, tb.OBS_WAITS] = 1
         _append_waiting(head, -1 - k)
 
@@ -104,7 +103,7 @@ def _check_turned(head):  # type: ignore[no-untyped-def]
     for k in range(head[tb.N_TURNED]):
         c = turned[k]
         if clique_i[c, tb.N_FRONTAL] == 0:
-            error2 = prior_model.linearization_error2(head, c, tb.work_f(head))
+            error2 = clique_frames.prior_error2(head, c, tb.work_f(head))
         else:
             slip = clique_frames.frame_slip(head, c)
             error2 = clique_frames.interface_error2(head, c, slip, tb.work_f(head))
@@ -168,21 +167,21 @@ def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
         entry = waiting[n]
         worst = _bin(_error2(head, entry) / allowed) < cut
         if entry >= 0:
-            transaction_log.log_edge(head, entry)
+            transaction_log.log_constraint(head, entry)
             edge_i[entry, tb.EDGE_WAITS] = 0
             if worst:
                 head[tb.N_RELINEARIZED] += 1
-                factors.linearize_edge(head, entry)
+                factors.linearize(head, entry)
                 for side in range(3):
                     if edge_i[entry, side] >= 0:
                         _touch(head, edge_i[entry, side])
         else:
             k = -1 - entry
-            transaction_log.log_observed(head, k)
+            transaction_log.log_constraint(head, -1 - k)
             observed_i[k, tb.OBS_WAITS] = 0
             if worst:
                 head[tb.N_RELINEARIZED] += 1
-                factors.linearize_observed(head, k)
+                factors.linearize(head, -1 - k)
                 _touch(head, observed_i[k, tb.OBS_NODE])
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
@@ -243,5 +242,5 @@ def solve(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def relinearize(head):  # type: ignore[no-untyped-def]
-    """Linearize the worst waiting constraints again, and touch their nodes."""
-    _relinearize_worst(head, LEFT_OVER * _budget(head))
+    """Linearize the worst waiting constraints again, until 0.4 of the budget remains."""
+    _relinearize_worst(head, 0.4 * _budget(head))

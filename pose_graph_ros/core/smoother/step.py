@@ -5,23 +5,35 @@ The loop of a step: eliminate, solve and relinearize until the linearization err
 
 The loop is one kernel, since in most steps its parts take less time than the Python between them
 would. It returns to Python for more memory and for the batch fallback, and can be re-entered.
+
+A step leaves linearization errors, and moves of less than `alpha` sigmas, where they hardly change
+chi2. Along soft modes they can still add up to metres. A *refinement* solves for all cliques that
+steps have solved for since the last one, checks all constraints there, linearizes those with an
+error again, and repeats this until the errors are below `ENOUGH`. By Cauchy-Schwarz no coordinate
+of any node is then further from the minimum than the root of that, in its posterior sigmas. Each
+call of `refine` does one iteration, and the graph is valid after each.
 """
 
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
 from pose_graph_ros.core.graph import tables as tb, transaction_log
+from pose_graph_ros.core.graph.rows import touch
 from pose_graph_ros.core.smoother import relinearization, tree_update
+from pose_graph_ros.core.smoother.tree_update import (
+    DIVERGED,
+    DONE,
+    INTERRUPTED,
+    MORE_MEMORY,
+    UNFINISHED,
+)
 
 # How `run` is entered: after an edit; again, with the memory that it has asked for; after the
 # batch fallback, when there is no further fallback.
 FIRST, RESUMED, AFTER_BATCH = range(3)
-# Return codes of `run`.
-SETTLED, LEFT_OVER, MORE_MEMORY, BAD_PIVOT, DIVERGED = range(5)
-# A step has only diverged if its squared linearization error is above this [sigma^2] and above
-# this fraction of chi2. A false constraint raises chi2 and all linearization errors with it.
-DOUBT = 1.0
-DOUBT_RATIO = 1e-3
-# Squared linearization error above which another iteration can only increase it [sigma^2].
-HOPELESS = 1e6
+# Sum of the squared linearization errors at the end of a refinement [sigma^2].
+ENOUGH = 1e-10
+# `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
+ALPHA = 1e-6
+SHARE = 1e-13
 
 
 @kernel
@@ -29,15 +41,16 @@ def _has_diverged(head, out_of_iterations):  # type: ignore[no-untyped-def]
     """
     Tell whether the iterations have diverged.
 
-    That is so if the squared linearization error is large (DOUBT, DOUBT_RATIO) and either no
-    iteration is left, the last one has not halved the error, or the error is above HOPELESS.
+    That is so if the squared linearization error is large, in sigma^2 and against chi2 (a false
+    constraint raises chi2 and all linearization errors with it), and either no iteration remains,
+    the last one has not halved the error, or it is so large that another can only increase it.
     """
     scalars = tb.scalars(head)
     error2, before = scalars[tb.ERROR2_SUM], scalars[tb.ERROR2_BEFORE]
     scalars[tb.ERROR2_BEFORE] = error2
-    if error2 <= DOUBT or error2 <= DOUBT_RATIO * scalars[tb.CHI2]:
+    if error2 <= 1.0 or error2 <= 1e-3 * scalars[tb.CHI2]:
         return False
-    return out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < HOPELESS
+    return out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6
 
 
 @kernel
@@ -50,19 +63,10 @@ def _reset_counters(head):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD, INTEGER, INTEGER), allocates=True)    # the elimination does
 def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
-    Return SETTLED once the estimate is up to date with all touched nodes and waiting constraints.
+    Return DONE once the estimate is up to date with all touched nodes and waiting constraints.
 
-    LEFT_OVER: linearization errors above the budget wait for the next update. MORE_MEMORY: the
-    pools and the work space must grow to `NEED_F`, `NEED_I` and `NEED_WORK` of the head, and the
-    step be entered again as RESUMED (AFTER_BATCH if it was that before). BAD_PIVOT: node
-    `BAD_NODE` of the head is not determined. DIVERGED. After the last two the caller has to roll
-    the update back.
-
-    Parameters
-    ----------
-    max_iterations : int
-    entered : int, FIRST, RESUMED or AFTER_BATCH
-
+    UNFINISHED: linearization errors above the budget wait for the next update. After MORE_MEMORY
+    the step is entered again as RESUMED (AFTER_BATCH if it was that before).
     """
     if entered == FIRST:
         _reset_counters(head)
@@ -74,8 +78,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         if head[tb.N_TOUCHED] == 0:
             break
         code = tree_update.eliminate(head)
-        if code != tree_update.DONE:
-            return MORE_MEMORY if code == tree_update.MORE_MEMORY else BAD_PIVOT
+        if code != DONE:
+            return code
         settled = relinearization.solve(head)
         if settled:
             break
@@ -85,4 +89,121 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         if out_of_iterations:
             break
     transaction_log.commit(head)
-    return SETTLED if settled else LEFT_OVER
+    return DONE if settled else UNFINISHED
+
+
+@kernel
+def _touch_clique(head, c):  # type: ignore[no-untyped-def]
+    pool_i, clique_i = tb.pool_i(head), tb.clique_i(head)
+    v = pool_i[clique_i[c, tb.NODES]]
+    transaction_log.log_node(head, v)
+    touch(head, v)
+    head[tb.N_RELINEARIZED] += 1
+
+
+@kernel
+def _touch_waiting(head):  # type: ignore[no-untyped-def]
+    """Touch the cliques of waiting constraints and turned frames; eliminating linearizes them."""
+    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
+    waiting, clique_i, work_i = tb.waiting(head), tb.clique_i(head), tb.work_i(head)
+    turned = work_i[2 * head[tb.NODE_ROOM]:]
+    for n in range(head[tb.N_TURNED]):
+        _touch_clique(head, clique_i[turned[n], tb.PARENT])
+    for n in range(head[tb.N_WAITING]):
+        entry = waiting[n]
+        if entry >= 0:
+            transaction_log.log_constraint(head, entry)
+            edge_i[entry, tb.EDGE_WAITS] = 0
+            _touch_clique(head, edge_i[entry, tb.OWNER])
+        else:
+            k = -1 - entry
+            transaction_log.log_constraint(head, entry)
+            observed_i[k, tb.OBS_WAITS] = 0
+            _touch_clique(head, node_i[observed_i[k, tb.OBS_NODE], tb.CLIQUE])
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _solve(head):  # type: ignore[no-untyped-def]
+    """Solve for the cliques that have changed since the last refinement, and check them."""
+    head[tb.SINCE] = head[tb.REFINED]
+    relinearization.solve_and_check(head)
+
+
+@kernel
+def _solve_from_the_root(head):  # type: ignore[no-untyped-def]
+    node_i, clique_i, work_i = tb.node_i(head), tb.clique_i(head), tb.work_i(head)
+    c = node_i[head[tb.NEWEST], tb.CLIQUE]
+    while clique_i[c, tb.PARENT] >= 0:
+        c = clique_i[c, tb.PARENT]
+    work_i[0] = c
+    head[tb.N_ROOTS] = 1
+    head[tb.ITERATION] += 1
+    _solve(head)
+
+
+@kernel(allocates=True)
+def _iterate(head):  # type: ignore[no-untyped-def]
+    """Linearize what waits again, eliminate it and what is above it, and solve."""
+    scalars = tb.scalars(head)
+    chi2, error2 = scalars[tb.CHI2], scalars[tb.ERROR2_SUM]
+    _touch_waiting(head)
+    if head[tb.N_TOUCHED] == 0:
+        return DONE      # many errors, each of them negligible
+    marked, affected = tree_update.mark(head)
+    head[tb.ITERATION] += 1
+    code = tree_update.refresh(head, marked, True)
+    if code != DONE:
+        return code
+    tree_update.forget_touched(head)
+    head[tb.N_ELIMINATED] = len(affected)
+    _solve(head)
+    # Gauss-Newton goes uphill, by at most 0.1 sigma^2, where it swings a soft mode
+    if not scalars[tb.CHI2] <= scalars[tb.LOWEST] + 0.1 or head[tb.ROUND] >= 20:
+        return DIVERGED
+    head[tb.ROUND] += 1
+    scalars[tb.LOWEST] = min(scalars[tb.LOWEST], scalars[tb.CHI2])
+    least = 1e-11 * max(chi2, 1.0)  # rounding errors, which cannot be reduced any further
+    stalls = abs(scalars[tb.CHI2] - chi2) <= least and scalars[tb.ERROR2_SUM] > 0.5 * error2
+    return DONE if stalls or scalars[tb.ERROR2_SUM] <= ENOUGH else UNFINISHED
+
+
+@kernel(allocates=True)
+def _refine(head):  # type: ignore[no-untyped-def]
+    scalars = tb.scalars(head)
+    if head[tb.LISTED] != head[tb.UPDATE] - 1:
+        head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
+        _solve_from_the_root(head)
+        head[tb.ROUND], scalars[tb.LOWEST] = 0, scalars[tb.CHI2]
+    if head[tb.INTERRUPT] != 0:
+        return INTERRUPTED
+    code = _iterate(head) if scalars[tb.ERROR2_SUM] > ENOUGH else DONE
+    if head[tb.INTERRUPT] != 0 and code != MORE_MEMORY:
+        return INTERRUPTED
+    if code == DONE:
+        relinearization.forget_waiting(head)
+        head[tb.REFINED] = head[tb.ITERATION] + 1
+    elif code == UNFINISHED:
+        head[tb.LISTED] = head[tb.UPDATE]
+    return code
+
+
+@kernel(signature=(tb.HEAD,), allocates=True)
+def refine(head):  # type: ignore[no-untyped-def]
+    """
+    Return DONE if the estimate is at the minimum, or UNFINISHED after an iteration towards it.
+
+    INTERRUPTED: `INTERRUPT` of the head was set. DIVERGED: the iteration leads away from the
+    minimum. After all but the first two the caller has to roll back what `transaction_log.begin`
+    has begun. The graph must have no touched nodes.
+    """
+    scalars = tb.scalars(head)
+    alpha, share = scalars[tb.SETTING_ALPHA], scalars[tb.SETTING_SHARE]
+    scalars[tb.SETTING_ALPHA], scalars[tb.SETTING_SHARE] = ALPHA, SHARE
+    _reset_counters(head)
+    code = _refine(head)
+    scalars[tb.SETTING_ALPHA], scalars[tb.SETTING_SHARE] = alpha, share
+    if code in (DONE, UNFINISHED):
+        scalars[tb.LARGEST_MOVE] = transaction_log.largest_move(head)
+        transaction_log.commit(head)
+    return code

@@ -13,17 +13,28 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination.assembly import eliminate_clique, work_size
-from pose_graph_ros.core.elimination.ordering import minimum_degree
-from pose_graph_ros.core.elimination.quotient_graph import amalgamate, newest_last, structure
+from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
+from pose_graph_ros.core.elimination.symbolic import amalgamate, attach, newest_last, structure
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 
-# Return codes of the kernels.
-DONE, MORE_MEMORY, BAD_PIVOT, INTERRUPTED = range(4)
+# Return codes of the kernels of all modules here. UNFINISHED: what remains can wait for another
+# step. MORE_MEMORY: the pools and the work space must grow to `NEED_F`, `NEED_I` and `NEED_WORK`
+# of the head, then the kernel be called again. BAD_PIVOT: node `BAD_NODE` of the head is not
+# determined. After the last three the caller has to roll back.
+DONE, UNFINISHED, MORE_MEMORY, BAD_PIVOT, DIVERGED, INTERRUPTED = range(6)
 # Limits of amalgamated cliques: stored zero blocks (3x3) and frontal nodes.
 RELAXED_ZEROS = 16
 RELAXED_FRONTAL = 16
 # Value of TOUCHED for nodes that are ordered before all others, since they are about to leave.
-LEAVES = 2
+ORDERED_FIRST = 2
+
+
+@kernel
+def lacks_memory(head, need_f, need_i, need_work):  # type: ignore[no-untyped-def]
+    """Tell whether the pools or the work space have to grow before a kernel can go on."""
+    head[tb.NEED_F], head[tb.NEED_I], head[tb.NEED_WORK] = need_f, need_i, need_work
+    return (need_f > len(tb.pool_f(head)) or need_i > len(tb.pool_i(head))
+            or need_work > len(tb.work_f(head)))
 
 
 @kernel(allocates=True)
@@ -48,10 +59,7 @@ def mark(head):  # type: ignore[no-untyped-def]
         while c >= 0 and clique_i[c, tb.MARKED] != stamp:
             clique_i[c, tb.MARKED] = stamp
             if n_marked == len(marked):
-                longer = np.empty(2 * n_marked, np.int32)
-                for k in range(n_marked):
-                    longer[k] = marked[k]
-                marked = longer
+                marked = grown(marked, 0)
             marked[n_marked] = c
             n_marked += 1
             n_affected += clique_i[c, tb.N_FRONTAL]
@@ -73,19 +81,8 @@ def mark(head):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True, inline='always')    # callees compile once
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
-    """
-    Return DONE after replacing the marked cliques: their nodes are ordered and eliminated anew.
-
-    MORE_MEMORY: no clique was changed, the pools and the work space must grow to `NEED_F`,
-    `NEED_I` and `NEED_WORK` of the head. BAD_PIVOT: node `BAD_NODE` of the head is not determined.
-
-    Parameters
-    ----------
-    marked, affected : ndarray of int32, from `mark`; `affected` is reordered
-
-    """
-    pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
-    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
+    """Replace the marked cliques: their nodes are ordered and eliminated anew."""
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     n_leaving = _leaving_first(head, affected)
     n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
@@ -103,11 +100,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             need_f += pools.rounded(pools.n_values(frontal[k], n_separator))
             need_i += pools.rounded(frontal[k] + n_separator)
             largest = max(largest, work_size(frontal[k] + n_separator))
-    head[tb.NEED_F] = head[tb.POOL_F_END] + need_f
-    head[tb.NEED_I] = head[tb.POOL_I_END] + need_i
-    head[tb.NEED_WORK] = largest
-    if (head[tb.NEED_F] > len(pool_f) or head[tb.NEED_I] > len(pool_i)
-            or largest > len(work_f)):
+    if lacks_memory(head, head[tb.POOL_F_END] + need_f, head[tb.POOL_I_END] + need_i, largest):
         return MORE_MEMORY
     _push_drift_down(head, marked, orphans)
     head[tb.LOOSE] = -1
@@ -134,10 +127,10 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
                 pool_i[at + m] = affected[nodes[offset[k] + n_frontal[k] + m]]
     for k in range(n_cliques):
         if into[k] == k and parent[k] >= 0:
-            _attach_child(head, clique[into[parent[k]]], clique[k])
+            attach(head, clique[into[parent[k]]], clique[k])
     for k in range(len(orphans)):
         transaction_log.log_clique(head, orphans[k])
-        _attach_child(head, clique[into[parent[n_cliques + k]]], orphans[k])
+        attach(head, clique[into[parent[n_cliques + k]]], orphans[k])
     for k in range(n_cliques):
         if into[k] == k:
             bad = eliminate_clique(head, clique[k], True)
@@ -154,7 +147,7 @@ def _leaving_first(head, affected):  # type: ignore[no-untyped-def]
     node_i = tb.node_i(head)
     n = 0
     for k in range(len(affected)):
-        if node_i[affected[k], tb.TOUCHED] == LEAVES:
+        if node_i[affected[k], tb.TOUCHED] == ORDERED_FIRST:
             affected[n], affected[k] = affected[k], affected[n]
             n += 1
     return n
@@ -193,27 +186,10 @@ def _push_drift_down(head, marked, orphans):  # type: ignore[no-untyped-def]
             clique_f[orphans[k], tb.DRIFT] += drift
 
 
-@kernel
-def _attach_child(head, parent, child):  # type: ignore[no-untyped-def]
-    clique_i = tb.clique_i(head)
-    clique_i[child, tb.PARENT] = parent
-    clique_i[child, tb.SIBLING] = clique_i[parent, tb.CHILD]
-    clique_i[parent, tb.CHILD] = child
-
-
 @kernel(inline='always')
 def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
-    """
-    Return codes as `rebuild` after eliminating the marked cliques with the same structure.
-
-    Parameters
-    ----------
-    marked : ndarray of int32, from `mark`
-    interruptible : bool, whether to end with INTERRUPTED once `INTERRUPT` of the head is set
-
-    """
-    pool_f, work_f, clique_i = tb.pool_f(head), tb.work_f(head), tb.clique_i(head)
-    work_i = tb.work_i(head)
+    """Eliminate the marked cliques again with the same structure."""
+    clique_i, ready = tb.clique_i(head), tb.work_i(head)
     need, largest = np.int64(0), np.int64(0)
     for k in range(len(marked)):
         row = clique_i[marked[k]]
@@ -221,9 +197,7 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
         largest = max(largest, work_size(row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]))
         if row[tb.VALUES_BORN] != head[tb.UPDATE]:
             need += pools.rounded(pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
-    head[tb.NEED_F], head[tb.NEED_I] = head[tb.POOL_F_END] + need, 0
-    head[tb.NEED_WORK] = largest
-    if head[tb.NEED_F] > len(pool_f) or largest > len(work_f):
+    if lacks_memory(head, head[tb.POOL_F_END] + need, 0, largest):
         return MORE_MEMORY
     for k in range(len(marked)):
         parent = clique_i[marked[k], tb.PARENT]
@@ -231,7 +205,6 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
             clique_i[parent, tb.MARKED] += 1
     # children first; MARKED counts the marked children that are still to be eliminated
     n_ready = 0
-    ready = work_i
     for k in range(len(marked)):
         if clique_i[marked[k], tb.MARKED] == 0:
             ready[n_ready] = marked[k]
@@ -275,8 +248,7 @@ def eliminate(head):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques from the touched nodes up to the roots again.
 
-    Return DONE: no node is touched any more, and the roots are on the stack for the
-    back-substitution; or MORE_MEMORY or BAD_PIVOT as `rebuild` does.
+    DONE: no node is touched any more, and the roots are on the stack for the back-substitution.
     """
     marked, affected = mark(head)
     head[tb.ITERATION] += 1

@@ -1,7 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A trial: the graph with other weights, optimised as a copy while the graph itself goes on.
+The batch optimiser on copies of the graph: for a step that diverges, and for trials.
+
+Gauss-Newton converges from a good estimate. A loop closure that contradicts the estimate by
+radians, over a part of the graph with little information, can make it diverge. That is rare and
+detected at once, so steps are not damped. `optimize_copy` begins at a linear start, and begins
+again at the poses before the step if the result has a higher chi2 than these. The minimum that it
+finds is better than the result of a damped step, at the cost of a few steps.
+
+A trial is the graph with other weights, optimised as a copy while the graph itself goes on.
 
 The batch optimisation of a large graph takes much longer than an update may, so a trial is worked
 on in parts of at most an iteration; the last one eliminates the copy. It fails where it takes many
@@ -16,38 +24,49 @@ from dataclasses import replace
 import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import BatchResult, Parts, Start, Status
+from pose_graph_ros.core.batch.optimizer import BatchResult, Optimization, Start, Status
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph import transaction_log
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed, Prior
-from pose_graph_ros.core.solver_config import SolverConfig
 
-# With more iterations it would converge where an update does not: at a minimum with errors so
+_OF_STEP = SolverConfig(max_iterations=50, step_tolerance=1e-6)
+# Unit headings take longer than an update may.
+_STARTS_OF_STEP = (Start.CHORDAL, Start.JOINT, Start.PRESENT)
+# With more iterations a trial would converge where an update does not: at a minimum with errors so
 # large that Gauss-Newton leads away from it.
 _CONFIG = SolverConfig(max_iterations=optimizer.TRUSTED_ITERATIONS, step_tolerance=1e-6)
 # The others take longer than a part may.
 _STARTS = (Start.CHORDAL, Start.PRESENT)
 
 
+def optimize_copy(graph: Graph, copy: Graph) -> bool:
+    """Return whether the batch optimiser finds a solution for a copy of the graph."""
+    poses = np.empty((graph.n_nodes, 3))
+    # the start if the linear start leads to a higher chi2
+    transaction_log.poses_before(graph.memory.head, poses)
+    copy.fill(graph.rows()._replace(poses=poses))
+    copy.apply(graph.leaving())
+    result = optimizer.optimize_from_linear_start(copy, _OF_STEP, _STARTS_OF_STEP)
+    if result.status is Status.FAILED:
+        return False
+    copy.set_poses(copy.poses)
+    return True
+
+
 class Trial:
     """
-    A copy of a graph with other weights, which is optimised in parts.
+    A copy, empty at first, of a solved graph with other weights, which is optimised in parts.
 
-    Parameters
-    ----------
-    graph : Graph, of which the smoother has solved for all edits
-    copy : Graph, empty
-    update : GraphUpdate, new weights
-    eliminate : callable, eliminates the copy as a whole; tells whether that was possible
-    poses : ndarray, shape (N, 3), optional
-        Where to start; by default the better of a linear start and the present poses.
-
+    `eliminate` eliminates the copy as a whole and tells whether that was possible. By default it
+    starts at the better of a linear start and the present poses.
     """
 
     def __init__(
         self, graph: Graph, copy: Graph, update: GraphUpdate, eliminate: Callable[[], bool],
-        poses: FloatArray | None = None,
+        poses: Poses | None = None,
     ) -> None:
         self._graph, self._update, self._eliminate = graph, update, eliminate
         self._start = poses
@@ -68,7 +87,7 @@ class Trial:
                 self.result = end.value
         return self.result is None
 
-    def _optimization(self, copy: Graph) -> Parts:
+    def _optimization(self, copy: Graph) -> Optimization:
         rows, start = self._before, self._start
         copy.fill(rows if start is None else rows._replace(poses=start))
         copy.apply(self._update)
@@ -145,17 +164,11 @@ def _changed(
             if weight != before and number not in chosen}
 
 
-def continued(graph: Graph, poses: FloatArray, ids: IntArray | None = None) -> FloatArray:
+def continued(graph: Graph, poses: Poses, ids: IntArray | None = None) -> Poses:
     """
     Return poses of all nodes: newer ones than those given move with the last of these.
 
-    Parameters
-    ----------
-    graph : Graph, of N nodes
-    poses : ndarray, shape (K, 3), other poses of nodes
-    ids : ndarray of int, shape (K,), optional
-        Ids of these nodes, some of which may have left the graph; by default its first K nodes.
-
+    Those given have ids, some of which may have left the graph, or are its first nodes.
     """
     rows = np.arange(len(poses)) if ids is None else graph.node_rows(ids)
     moved, is_pose = graph.poses.copy(), graph.is_pose

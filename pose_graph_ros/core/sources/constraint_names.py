@@ -2,58 +2,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the constraints with the largest energies: source, stamp and hidden nodes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import constraint_tables, ConstraintTable, DIAGONAL
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.sources.constraint_queue import ConstraintOrigin, Queue
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.source_constraints import Queue
 
 
 @dataclass(frozen=True, slots=True)
 class ConstraintEnergy:
-    """One constraint and its energy."""
-
-    energy: float
-    """Weighted energy, its part of chi2."""
-    unweighted: float
-    """Energy without the weight, by the covariance alone."""
-    freedom: int
-    """Degrees of freedom, which is the expected value of the unweighted energy."""
-    source: str
-    """Source of the measurement; empty if unknown."""
-    kind: str
-    """`odometry`, `loop_closure`, `global_pose`, `position`, `heading`, or `bias`."""
-    name: str
-    """Readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`."""
-    edge: bool = True
-    """Whether `number` is that of an edge; else of an observed node."""
-    number: int = -1
-    """Its id in the graph."""
+    energy: float  # weighted energy, its part of chi2
+    unweighted: float  # energy without the weight, by the covariance alone
+    freedom: int  # degrees of freedom, which is the expected value of the unweighted energy
+    source: str  # source of the measurement; empty if unknown
+    kind: str  # `odometry`, `loop_closure`, `global_pose`, `position`, `heading`, or `bias`
+    name: str  # readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`
+    edge: bool = True  # whether `number` is that of an edge; else of an observed node
+    number: int = -1  # its id in the graph
+    # numbers of the hidden nodes of the path that it has, in the order of the name
     nodes: tuple[int, ...] = ()
-    """Numbers of the hidden nodes of the path that it has, in the order of the name."""
+    # of the measurement, or when the bin of a bias begins [ns]; -1 for edges between poses
     stamp_ns: int = -1
-    """Of the measurement, or when the bin of a bias begins [ns]; -1 for edges between poses."""
 
 
 def largest(
     graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, n: int,
 ) -> list[ConstraintEnergy]:
-    """
-    Return the constraints with the largest weighted energies, in descending order.
-
-    Parameters
-    ----------
-    factors : FactorBuilder, knows the sources of the constraints
-    n : int, number of constraints at most; those without energy are left out
-
-    """
+    """Return the constraints with the largest weighted energies, in descending order."""
     tables = constraint_tables(graph)
     energies = np.concatenate([table.weights * table.energies for table in tables])
     n = min(n, int(np.count_nonzero(energies > 0.0)))
@@ -61,36 +43,48 @@ def largest(
         return []
     rows = np.flatnonzero(energies >= np.partition(energies, len(energies) - n)[-n])
     rows = rows[np.argsort(-energies[rows], kind='stable')][:n]
-    named = []
-    for row in rows.tolist():
-        edge = row < graph.n_edges
-        number, table = (row, tables[0]) if edge else (row - graph.n_edges, tables[1])
-        names = _names(number, table, graph, nodes, factors, edge=edge)
-        ids = graph.edge_ids if edge else graph.observed_ids
-        named.append(ConstraintEnergy(
-            float(energies[row]), float(table.energies[number]), int(table.freedom[number]),
-            *names, edge, int(ids[number]),
-            _numbers(graph, nodes, table.integers[number], edge=edge),
-            _stamp_ns(graph, factors, table.integers[number], int(ids[number]), edge=edge)))
-    return named
+    return [_named(row, float(energies[row]), tables, graph, (nodes, factors))
+            for row in rows.tolist()]
 
 
-def _numbers(
-    graph: Graph, nodes: HiddenNodes, integers: IntArray, *, edge: bool,
-) -> tuple[int, ...]:
-    """Return the numbers of the hidden nodes in a row of a table, without biases."""
-    rows = integers[[tb.END_I, tb.END_J] if edge else [tb.OBS_NODE]]
-    ids = graph.node_ids[rows[graph.is_pose[rows]]]
-    return tuple(np.searchsorted(nodes.ids, ids).tolist())
-
-
-def _stamp_ns(
-    graph: Graph, factors: FactorBuilder, integers: IntArray, number: int, *, edge: bool,
-) -> int:
-    """Return the stamp of a measurement or of a bias, given its row and id; -1 for others."""
-    node = int(graph.node_ids[integers[tb.END_I if edge else tb.OBS_NODE]])
-    origin = factors.origin(number, edge=edge) or factors.bias_origin(node)
-    return -1 if origin is None else origin.stamp_ns
+def _named(
+    row: int, energy: float, tables: Sequence[ConstraintTable], graph: Graph,
+    origins: tuple[HiddenNodes, FactorBuilder],
+) -> ConstraintEnergy:
+    """Return a constraint by its row: edges come first, then observed nodes."""
+    nodes, factors = origins
+    edge = row < graph.n_edges
+    table, at = (tables[0], row) if edge else (tables[1], row - graph.n_edges)
+    number = int((graph.edge_ids if edge else graph.observed_ids)[at])
+    integers = table.integers[at]
+    ends = integers[[tb.END_I, tb.END_J] if edge else [tb.OBS_NODE]]
+    ids = graph.node_ids[ends]
+    places = np.searchsorted(nodes.ids, ids[graph.is_pose[ends]]).tolist()
+    origin, of_bias = factors.origin(number, edge=edge), factors.bias_origin(int(ids[0]))
+    known = origin or of_bias
+    if edge and integers[tb.EDGE_KIND] != EdgeKind.BIAS:
+        kind = EdgeKind(int(integers[tb.EDGE_KIND])).name.lower()
+        i, j = np.searchsorted(nodes.ids, ids).tolist()
+        source = '' if origin is None else origin.source
+        if origin is None and integers[tb.EDGE_KIND] == EdgeKind.ODOMETRY:
+            source = nodes.primary_at(int(nodes.stamps_ns[j]))
+        name = f'{source or kind} x{i} - x{j}'
+    else:
+        if len(places) > 0:
+            position, _, heading = table.numbers[at][DIAGONAL] > 0.0
+            kind = 'heading' if not position else 'global_pose' if heading else 'position'
+            where = f' near x{places[0]}'
+        else:
+            # one on a bias alone comes from no measurement and is named after the bias
+            origin, kind, where = of_bias, 'bias', ''
+        source, name = '', f'{kind}{where}'
+        if origin is not None:
+            source = origin.source
+            what = f'error of {source}' if kind == 'bias' else source
+            name = f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'
+    return ConstraintEnergy(
+        energy, float(table.energies[at]), int(table.freedom[at]), source, kind, name, edge,
+        number, tuple(places), -1 if known is None else known.stamp_ns)
 
 
 def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
@@ -102,46 +96,3 @@ def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
     return [f'{source} x{i} - x{j}' for source, (i, j) in ends] + [
         f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
         f'x{int(np.searchsorted(nodes.ids, each.attachment.node))}' for each in queue.observed]
-
-
-def _names(
-    row: int, table: ConstraintTable, graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, *,
-    edge: bool,
-) -> tuple[str, str, str]:
-    """Return source, kind and name of a constraint, given its row in the graph."""
-    number = int((graph.edge_ids if edge else graph.observed_ids)[row])
-    integers, origin = table.integers[row], factors.origin(number, edge=edge)
-    if not edge or integers[tb.EDGE_KIND] == EdgeKind.BIAS:
-        node = int(graph.node_ids[integers[tb.END_I if edge else tb.OBS_NODE]])
-        return _measurement_name(origin, node, table.numbers[row], nodes, factors)
-    kind = EdgeKind(int(integers[tb.EDGE_KIND]))
-    ends = graph.node_ids[integers[[tb.END_I, tb.END_J]]]
-    i, j = np.searchsorted(nodes.ids, ends).tolist()
-    source = '' if origin is None else origin.source
-    if origin is None and kind == EdgeKind.ODOMETRY:
-        source = nodes.primary_at(int(nodes.stamps_ns[j]))
-    name = kind.name.lower()
-    return source, name, f'{source or name} x{i} - x{j}'
-
-
-def _measurement_name(
-    origin: ConstraintOrigin | None, node: int, numbers: FloatArray, nodes: HiddenNodes,
-    factors: FactorBuilder,
-) -> tuple[str, str, str]:
-    """
-    Return source, kind and name of a constraint that was made from a measurement in the map.
-
-    `node` is the id of its hidden node, `numbers` its row of the constraint table. A
-    constraint on a bias alone comes from no measurement and is named after the bias.
-    """
-    number = int(np.searchsorted(nodes.ids, node))
-    if number == len(nodes) or nodes.ids[number] != node:
-        origin, kind, where = factors.bias_origin(node), 'bias', ''
-    else:
-        position, _, heading = numbers[DIAGONAL] > 0.0
-        kind = 'heading' if not position else 'global_pose' if heading else 'position'
-        where = f' near x{number}'
-    if origin is None:
-        return '', kind, f'{kind}{where}'
-    what = f'error of {origin.source}' if kind == 'bias' else origin.source
-    return origin.source, kind, f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'

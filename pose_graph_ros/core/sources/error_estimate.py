@@ -31,57 +31,19 @@ from pose_graph_ros.core.graph.constraints import (
     upper,
 )
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
     MeasuredPath,
+    no_past,
+    PastPath,
 )
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
-from pose_graph_ros.core.sources.past_path import no_past, PastPath
+from pose_graph_ros.core.sources.settings import SOURCES
 
-# Number of measurements that are used: the newest ones, and as many of all older ones.
-NEWEST = OLDER = 2000
-# Minimum number of measurements for an estimate.
-LEAST_POSITIONS = 10
-# Number of filtered measurements in one step of a search, of 0.3 us each.
-PER_STEP = 5000
-# Number of nodes that are joined in one step, of 0.1 us each.
-NODES_PER_STEP = 10_000
-# How much more likely correlated errors must be, in twice the difference of the logarithms; once
-# they are believed, they must only be more likely, so that it does not flip to and fro.
-SIGNIFICANT = 20.0
-# The same for each time that the filter was lost: then odometry was wrong, or many positions.
-PER_LOST = 100.0
-# The same of the errors of odometry. The constant ones are states with a prior, which by itself
-# keeps them from being believed where little shows them. Beside correlated errors, which may be
-# taken for those of odometry, it is `SIGNIFICANT`.
-SIGNIFICANT_ODOMETRY = 6.0
-# The same of one factor on the noise of odometry; and how much less likely larger ones may be.
-SIGNIFICANT_SCALE = 4.0
-# Longest time constant, in units of the time from the first measurement to the last. Shorter ones
-# would make the variance of an error that hardly changes in this time too small.
-LONGEST = 16.0
-# Smallest correlation of consecutive measurements that matters.
-LEAST_CORRELATION = 0.2
-# Sigma of the logarithm of the total variance in units of the claimed one, before it is seen.
-SPREAD = 0.7
-# The same of white errors that are smaller: where positions scatter much less than is claimed, the
-# rest of the claim is mostly an error that changes slowly.
-SMALLER_SPREAD = 0.5
-# The same of the noise of way and turn by odometry: settings of turns are hardly ever known.
-WAY_SPREAD, TURN_SPREAD = 2.0, 3.0
-# Exponents of 2 on the lattice: smallest step, and bounds of the variances.
-FINEST, LEAST, MOST = 0.25, -10.0, 8.0
-# Exponents with which the searches begin: correlated and white part; way and turn, also less than
-# white errors need; way, turn and white part.
-BEGINNINGS = ((0.0, -5.0), (0.0, -3.0), (-0.5, -2.0), (-1.0, -1.0))
-ODOMETRY_BEGINNINGS = (0.0, 0.0), (-4.0, -4.0)
-WHITE_BEGINNINGS = tuple((at, at, 0.0) for at in (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0))
 # Place of the noise of odometry in a point, from the end; that of turns, if way has its own.
 ODOMETRY = -2
-# Headings at which the filter starts, of which the best one is used.
-HEADINGS = 16
 LOG_2 = math.log(2.0)
 
 Point = tuple[float, ...]
@@ -90,33 +52,26 @@ Point = tuple[float, ...]
 class Estimate(NamedTuple):
     """What the positions of a source and odometry show together."""
 
+    # statistics of the errors of the source; None for white errors
     errors: CorrelatedErrors | None
-    """Statistics of the errors of the source; None for white errors."""
     odometry: OdometryErrors
-    rate_sigma: float = math.inf
-    """Sigma of the constant error of the yaw rate [rad/s]."""
-    scale_sigma: float = math.inf
-    """Sigma of that of the scale."""
+    rate_sigma: float = math.inf  # sigma of the constant error of the yaw rate [rad/s]
+    scale_sigma: float = math.inf  # sigma of that of the scale
 
 
 NOTHING = Estimate(None, AS_CLAIMED)
-Search = Generator[None, None, Estimate]
-"""Yields after each step."""
-PathSteps = Generator[None, None, MeasuredPath]
-"""The same of a path."""
+Search = Generator[None, None, Estimate]  # yields after each step
+PathSteps = Generator[None, None, MeasuredPath]  # the same of a path
 
 
 class PathOdometry(NamedTuple):
     """What is known of the odometry between the hidden nodes."""
 
-    ids: IntArray
-    """Ids of the nodes, ascending, shape (N,)."""
-    stamps_ns: IntArray
-    """Shape (N,) [ns]."""
-    errors: OdometryErrors
-    """Those that the edges in the graph know of."""
+    ids: IntArray  # ids of the nodes, ascending, shape (N,)
+    stamps_ns: IntArray  # shape (N,) [ns]
+    errors: OdometryErrors  # those that the edges in the graph know of
+    # constant errors that the motions of a path are to be without, near the true ones
     reference: OdometryErrors
-    """Constant errors that the motions of a path are to be without, near the true ones."""
 
 
 class _Edges(NamedTuple):
@@ -128,8 +83,6 @@ class _Edges(NamedTuple):
 
 
 class _Minimum(NamedTuple):
-    """The best point of the lattice so far."""
-
     value: float
     point: Point
 
@@ -140,15 +93,6 @@ def measured_path(
 ) -> PathSteps:
     """
     Return the positions of a source along the path by odometry, sorted by stamp, after some steps.
-
-    Parameters
-    ----------
-    graph : Graph, whose nodes may leave between two steps
-    odometry : PathOdometry
-    stamps_ns : ndarray of int64, shape (K,)
-    ids : ndarray of int64, shape (K,), of the observed nodes; headings among them are left out
-    past : PastPath, optional, positions that have left the graph
-
     """
     stamps_ns, observed = _sorted(graph, stamps_ns, ids)
     chosen = _chosen(len(observed))
@@ -159,7 +103,7 @@ def measured_path(
     n, begin = len(until), 0
     motions = _no_motions(n)
     while begin < n:
-        most = until[max(begin - 1, 0)] + NODES_PER_STEP
+        most = until[max(begin - 1, 0)] + SOURCES.nodes_per_step
         end = max(int(np.searchsorted(until, most)), begin + 1)
         chain_motions(*edges, until, begin, end, *motions)
         begin = end
@@ -175,19 +119,7 @@ def left_behind(
     graph: Graph, odometry: PathOdometry, stamps_ns: IntArray, ids: IntArray, *,
     past: PastPath | None, node: int,
 ) -> PastPath:
-    """
-    Return the positions of a source before a node, when those before it leave the graph.
-
-    Parameters
-    ----------
-    graph : Graph, with the nodes that leave
-    odometry : PathOdometry, with a reference without constant errors
-    stamps_ns : ndarray of int64, shape (K,)
-    ids : ndarray of int64, shape (K,), of the observed nodes that leave
-    past : PastPath, optional, those that have left before
-    node : int, id of the first node that stays
-
-    """
+    """Return the positions of a source before a node, when those before it leave the graph."""
     stamps_ns, observed = _sorted(graph, stamps_ns, ids)
     before = np.flatnonzero(observed.node < node)
     stamps_ns, observed = stamps_ns[before], observed.rows(before)
@@ -202,7 +134,6 @@ def left_behind(
 
 
 def _no_motions(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return room for motions, their noises, those of the way, and levers."""
     return np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3))
 
 
@@ -231,21 +162,17 @@ def _path(
 
 
 def _chosen(n: int) -> IntArray | slice:
-    """Return which of n measurements, by stamp, are used."""
-    if n <= NEWEST + OLDER:
+    newest, n_older = SOURCES.newest_positions, SOURCES.older_positions
+    if n <= newest + n_older:
         return slice(n)
-    older = np.linspace(0, n - NEWEST, OLDER, endpoint=False).astype(np.int64)
-    return np.concatenate((older, np.arange(n - NEWEST, n)))
+    older = np.linspace(0, n - newest, n_older, endpoint=False).astype(np.int64)
+    return np.concatenate((older, np.arange(n - newest, n)))
 
 
 def _odometry(
     graph: Graph, odometry: PathOdometry, nodes: IntArray, begin: int | None = None,
 ) -> tuple[IntArray, _Edges]:
-    """
-    Return where nodes are among the poses of a path, and the odometry after each pose.
-
-    With `begin`, the id of a node that is still there, that is the first of them.
-    """
+    """Return where nodes are among the poses of a path, and the odometry after each pose."""
     at, rows = np.cumsum(graph.is_pose) - 1, graph.node_rows(nodes)
     if begin is not None:
         rows = np.append(graph.node_rows(begin), rows)
@@ -278,35 +205,29 @@ def _odometry(
 def search(positions: MeasuredPath, *, correlated: bool = False) -> Search:
     """
     Return what the positions on a path show of their errors and of odometry, after some steps.
-
-    Parameters
-    ----------
-    positions : MeasuredPath
-    correlated : bool, whether the errors are taken for correlated ones until now
-
     """
-    if len(positions.seconds) < LEAST_POSITIONS:
+    if len(positions.seconds) < SOURCES.least_positions:
         return NOTHING
     evaluate = _Evaluation(positions)
     yield from evaluate.find_heading()
-    white = yield from _descend(evaluate, list(WHITE_BEGINNINGS))
+    white = yield from _descend(evaluate, [(at, at, 0.0) for at in SOURCES.white_beginnings])
     period = float(np.median(np.diff(positions.seconds)))
     shortest, longest = (
-        math.ceil(math.log2(max(time, 1e-3)) / FINEST) * FINEST
-        for time in (period, LONGEST * float(positions.seconds[-1])))
+        math.ceil(math.log2(max(time, 1e-3)) / SOURCES.finest) * SOURCES.finest
+        for time in (period, SOURCES.longest_time * float(positions.seconds[-1])))
     evaluate.bounds = shortest, longest
     found = _Minimum(math.inf, white.point)
-    for odometry in {*ODOMETRY_BEGINNINGS, white.point[:2]}:
+    for odometry in {*SOURCES.odometry_beginnings, white.point[:2]}:
         found = min(found, (yield from _descend(evaluate, [
             (time, part, *odometry, white_part)
             for time in np.arange(shortest, longest + 0.1, 1.0).tolist()
-            for part, white_part in BEGINNINGS])))
+            for part, white_part in SOURCES.beginnings])))
     tau, part, *_, white_part = (2.0 ** exponent for exponent in found.point)
     errors = CorrelatedErrors(tau, part, white_part)
     correlation = part * math.exp(-period / tau) / (part + white_part)
-    needed = (0.0 if correlated else SIGNIFICANT) + PER_LOST * max(
+    needed = (0.0 if correlated else SOURCES.significant) + SOURCES.per_lost * max(
         evaluate.lost[white.point], evaluate.lost[found.point])
-    significant = white.value - found.value > needed and correlation > LEAST_CORRELATION
+    significant = white.value - found.value > needed and correlation > SOURCES.least_shared
     odometry, *sigmas = yield from _odometry_errors(
         evaluate, (found if significant else white).point)
     return Estimate(errors if significant else None, odometry, *sigmas)
@@ -324,12 +245,13 @@ def _odometry_errors(
     *errors, way, turn, white = best
     claimed = yield from _descend(evaluate, [(*errors, 0.0, white)], fixed=ODOMETRY)
     least = yield from evaluate.value(best)
-    if claimed.value - least > (SIGNIFICANT if len(errors) > 0 else SIGNIFICANT_ODOMETRY):
+    needed = SOURCES.significant if len(errors) > 0 else SOURCES.significant_odometry
+    if claimed.value - least > needed:
         for axis in (-3, ODOMETRY):
             while best[axis] < 0.0:
-                more = (*best[:axis], best[axis] + FINEST, *best[axis + 1:])
+                more = (*best[:axis], best[axis] + SOURCES.finest, *best[axis + 1:])
                 if len(errors) == 0 and (
-                        yield from evaluate.value(more)) - least > SIGNIFICANT_SCALE:
+                        yield from evaluate.value(more)) - least > SOURCES.significant_scale:
                     break
                 best = more
         yield from evaluate.value(best)
@@ -338,7 +260,7 @@ def _odometry_errors(
                 math.sqrt(rate_variance), math.sqrt(scale_variance))
     found = yield from _descend(evaluate, [(*errors, at, white) for at in (way, turn, 0.0)])
     exponent = found.point[ODOMETRY]
-    if claimed.value - found.value <= SIGNIFICANT_SCALE or exponent < 0.0:
+    if claimed.value - found.value <= SOURCES.significant_scale or exponent < 0.0:
         return AS_CLAIMED, math.inf, math.inf
     return OdometryErrors.scaled(2.0 ** (0.5 * exponent)), math.inf, math.inf
 
@@ -351,18 +273,17 @@ class _Evaluation:
         self._path = MeasuredPath(*map(np.ascontiguousarray, positions))
         self._heading = 0.0
         self._values: dict[Point, float] = {}
-        self.lost: dict[Point, int] = {}
-        """How often the filter was lost."""
+        self.lost: dict[Point, int] = {}  # how often the filter was lost
+        # constant errors of odometry, of yaw rate and scale, and their variances
         self.constants: dict[Point, list[float]] = {}
-        """Constant errors of odometry, of yaw rate and scale, and their variances."""
-        self._left = PER_STEP
-        self.bounds = LEAST, MOST
-        """Of the exponent of the time constant."""
+        self._left = SOURCES.per_step
+        # of the exponent of the time constant
+        self.bounds = SOURCES.least_exponent, SOURCES.most_exponent
 
     def find_heading(self) -> Generator[None, None, None]:
         """Find the heading at the first position that makes white errors the most likely."""
         best = math.inf
-        for angle in (2.0 * math.pi / HEADINGS * np.arange(HEADINGS)).tolist():
+        for angle in (2.0 * math.pi / SOURCES.headings * np.arange(SOURCES.headings)).tolist():
             value, *_ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, 1.0, angle, True)
             if value < best:
                 best, self._heading = value, angle
@@ -386,44 +307,35 @@ class _Evaluation:
                 *self._path, tau, correlated, 2.0 ** way, 2.0 ** turn, white, self._heading,
                 constant)
             total = math.log2(correlated + white)
-            spread = SPREAD if len(point) > 3 or total > 0.0 else SMALLER_SPREAD
+            spread = SOURCES.spread if len(point) > 3 or total > 0.0 else SOURCES.smaller_spread
             self._values[point] = value + LOG_2**2 * (
-                (total / spread) ** 2 + (way / WAY_SPREAD) ** 2 + (turn / TURN_SPREAD) ** 2)
+                (total / spread) ** 2 + (way / SOURCES.way_spread) ** 2
+                + (turn / SOURCES.turn_spread) ** 2)
             yield from self._pause()
         return self._values[point]
 
     def _pause(self) -> Generator[None, None, None]:
         self._left -= len(self._path.seconds)
         if self._left < 0:
-            self._left = PER_STEP
+            self._left = SOURCES.per_step
             yield
 
     def clipped(self, point: Point) -> Point:
-        """Return a point inside the bounds."""
         times = 1 if len(point) > 3 else 0
-        low, high = self.bounds
-        return (*(min(max(exponent, low), high) for exponent in point[:times]),
-                *(min(max(exponent, LEAST), MOST) for exponent in point[times:]))
+        bounds = self.bounds, (SOURCES.least_exponent, SOURCES.most_exponent)
+        return tuple(min(max(exponent, low), high) for axis, exponent in enumerate(point)
+                     for low, high in [bounds[axis >= times]])
 
 
 def _descend(
     evaluate: _Evaluation, beginnings: list[Point], fixed: int = 0,
 ) -> Generator[None, None, _Minimum]:
-    """
-    Return the best point near the best beginning, by steps that are halved.
-
-    Parameters
-    ----------
-    evaluate : _Evaluation
-    beginnings : list of points
-    fixed : int, index from the end of a number that stays as it is, if it is negative
-
-    """
+    """Return the best point near the best beginning, by steps that are halved."""
     values: list[_Minimum] = []
     for point in beginnings:
         values.append(_Minimum((yield from evaluate.value(point)), point))
     best, step = min(values), 1.0
-    while step >= FINEST:
+    while step >= SOURCES.finest:
         before = best
         for axis in range(-len(best.point), 0):
             if axis == fixed:

@@ -19,6 +19,7 @@ shows. See e.g. Y. Bar-Shalom et al., "Estimation with applications to tracking 
 sections 8.2 and 11.4.
 """
 
+from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
 
@@ -34,7 +35,11 @@ from pose_graph_ros.core.compiled.jit import (
     NUMBERS,
     ROWS,
 )
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import full, upper
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows2, Rows3, Rows6
+from pose_graph_ros.core.sources.settings import SOURCES
 
 # Squared Mahalanobis distance beyond which a position is taken for wrong, and left out.
 GATE = 16.0
@@ -57,24 +62,17 @@ RATE_VARIANCE, SCALE_VARIANCE = 0.005**2, 0.01**2
 class MeasuredPath(NamedTuple):
     """K measured positions in the order of their stamps, and the motion by odometry between."""
 
-    seconds: FloatArray
-    """Stamps since the first one, shape (K,) [s]."""
-    position: FloatArray
-    """Measured positions in the map, shape (K, 2) [m]."""
-    variance: FloatArray
-    """Claimed variance of a coordinate, shape (K,) [m^2]."""
-    offset: FloatArray
-    """Positions in their hidden nodes, shape (K, 2) [m]."""
+    seconds: FloatArray  # stamps since the first one, shape (K,) [s]
+    position: FloatArray  # measured positions in the map, shape (K, 2) [m]
+    variance: FloatArray  # claimed variance of a coordinate, shape (K,) [m^2]
+    offset: FloatArray  # positions in their hidden nodes, shape (K, 2) [m]
+    # pose of each one's hidden node in that of the one before, shape (K, 3); 0 for the first
     motion: FloatArray
-    """Pose of each one's hidden node in that of the one before, shape (K, 3); 0 for the first."""
-    noise: FloatArray
-    """Covariance of that motion in the frame at its end, shape (K, 3, 3)."""
-    way: FloatArray
-    """Part of it that no error of a heading makes: of xx, xy and yy, shape (K, 3)."""
-    lever: FloatArray
-    """How a higher yaw rate changes the motion, shape (K, 3) [m s, m s, s]."""
+    noise: FloatArray  # covariance of that motion in the frame at its end, shape (K, 3, 3)
+    way: FloatArray  # part of it that no error of a heading makes: of xx, xy and yy, shape (K, 3)
+    lever: FloatArray  # how a higher yaw rate changes the motion, shape (K, 3) [m s, m s, s]
+    # yaw rate and scale that are no longer in the motion, shape (K, 2) [rad/s, 1]
     taken_out: FloatArray
-    """Yaw rate and scale that are no longer in the motion, shape (K, 2) [rad/s, 1]."""
 
 
 @kernel(signature=(ROWS, ROWS, NUMBERS, INTEGERS, INTEGER, INTEGER, ROWS, MATRICES, ROWS, ROWS))
@@ -84,15 +82,9 @@ def chain_motions(  # type: ignore[no-untyped-def]
     """
     Join the motions of a path: row k of the result is that from pose until[k - 1] to until[k].
 
-    Parameters
-    ----------
-    means, informations : ndarray, shapes (N - 1, 3) and (N - 1, 6), of the edge after each pose;
-        an information of 0 stands for none
-    seconds : ndarray, shape (N - 1,), from each pose to the next one [s]
-    until : ndarray of int, shape (K,), not decreasing, less than N
-    begin, end : int, of the rows of the result that are written
-    out_motion, out_noise, out_way, out_lever : ndarray, columns of a `MeasuredPath`
-
+    Means and informations (upper triangles, 0 for none) are those of the edge after each pose,
+    with the seconds to the next one. Rows from `begin` to `end` are written, as columns of a
+    `MeasuredPath`.
     """
     for k in range(begin, end):
         x = y = theta = 0.0
@@ -225,11 +217,7 @@ def _fade(pose, p, phi):  # type: ignore[no-untyped-def]
 
 @kernel
 def _measure(pose, p, gain, z, offset, factor, white):  # type: ignore[no-untyped-def]
-    """
-    Return twice the negative logarithm of the likelihood of a position, after correcting by it.
-
-    The second result is whether it was left out as wrong, for which the likelihood has a bound.
-    """
+    """Correct by a position; return its -2 log likelihood, and whether it was left out."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ox, oy = c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]
     ex = z[0] - pose[0] - ox - factor * pose[MX]
@@ -265,18 +253,10 @@ def filtered(  # type: ignore[no-untyped-def]
     """
     Return twice the negative logarithm of the likelihood of positions, and how often it was lost.
 
-    Then come the constant errors of odometry and their variances: of the yaw rate, of the scale.
-
-    Parameters
-    ----------
-    seconds, position, variance, offset, motion, noise, way, lever, taken_out : ndarray
-        Columns of a `MeasuredPath`.
-    tau : float, time constant of the correlated error [s]
-    correlated, white : float, variances of the two parts, in units of the claimed variance
-    by_way, by_turn : float, factors on the two parts of the noise of the motions
-    heading : float, of the robot at the first position [rad]
-    constant : bool, whether odometry may have constant errors
-
+    Then come the constant errors of odometry and their variances: of the yaw rate, of the scale;
+    they stay 0 unless `constant`. Correlated and white part are in units of the claimed variance,
+    the noise by way and by turn in units of that of the motions; the heading is that at the first
+    position.
     """
     pose, p = np.zeros(N_STATES), np.zeros((N_STATES, N_STATES))
     gain = np.zeros((N_STATES, 2))
@@ -299,3 +279,102 @@ def filtered(  # type: ignore[no-untyped-def]
         total += cost
         left_out = left_out + 1 if wrong else 0
     return total, n_lost, pose[RATE], pose[SCALE], p[RATE, RATE], p[SCALE, SCALE]
+
+
+_Motions = tuple[FloatArray, ...]   # with `noise`, `way` and `lever`
+
+
+@dataclass(frozen=True, slots=True)
+class PastPath:
+    """
+    Positions that have left the graph, with the motions between them; see `MeasuredPath`.
+
+    The statistics of errors are estimated from these as well, as a window may be shorter than the
+    time in which errors change. Every second one is dropped when there are too many, and the
+    motions on both sides of it are joined.
+    """
+
+    stamps_ns: Integers
+    position: Rows2
+    variance: Numbers
+    offset: Rows2
+    motion: Rows3  # shape (K + 1, 3); the last one leads to `node`
+    noise: Rows6  # upper triangles of the covariances of the motions, shape (K + 1, 6)
+    node: int  # id of the first node that is left in the graph
+    # their parts by the way, shape (K + 1, 3); empty in files of older versions
+    way: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    # how a higher yaw rate changes them, shape (K + 1, 3); empty in files of older versions
+    lever: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+
+    def continued(self, stamps_ns: IntArray, path: MeasuredPath) -> MeasuredPath:
+        """Return the path with these positions before those that are in the graph."""
+        motion, noise, way, lever = _with_next(self, path)
+        stamps_ns = np.maximum.accumulate(np.concatenate((self.stamps_ns, stamps_ns)))
+        seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
+        return MeasuredPath(
+            seconds, np.concatenate((self.position, path.position)),
+            np.concatenate((self.variance, path.variance)),
+            np.concatenate((self.offset, path.offset)), motion, np.ascontiguousarray(noise), way,
+            lever, np.concatenate((
+                np.zeros((len(motion) - len(path.taken_out), 2)), path.taken_out)))
+
+    def extended(
+        self, stamps_ns: IntArray, path: MeasuredPath, node: int,
+    ) -> 'PastPath':
+        motion, noise, way, lever = _with_next(self, path)
+        grown = PastPath(
+            np.concatenate((self.stamps_ns, stamps_ns)),
+            np.concatenate((self.position, path.position)),
+            np.concatenate((self.variance, path.variance)),
+            np.concatenate((self.offset, path.offset)), motion, upper(noise), node, way, lever)
+        return grown.thinned() if len(grown.stamps_ns) > 2 * SOURCES.kept_positions else grown
+
+    def thinned(self) -> 'PastPath':
+        """Return every second position."""
+        n = len(self.stamps_ns) // 2 * 2
+        first, second = self.motion[:n:2], self.motion[1:n:2]
+        noises = full(self.noise)
+        joined, noise, way, lever = _joined(
+            (first, noises[:n:2], self.way[:n:2], self.lever[:n:2]),
+            (second, noises[1:n:2], self.way[1:n:2], self.lever[1:n:2]))
+        rest, kept = slice(n, None), slice(1, n, 2)
+        every = np.arange(len(self.stamps_ns))
+        which = np.append(every[kept], every[rest])
+        return PastPath(
+            self.stamps_ns[which], self.position[which], self.variance[which],
+            self.offset[which], np.concatenate((joined, self.motion[rest])),
+            upper(np.concatenate((noise, noises[rest]))), self.node,
+            np.concatenate((way, self.way[rest])), np.concatenate((lever, self.lever[rest])))
+
+
+def no_past(node: int) -> PastPath:
+    """Return a path without positions before a node, given by its id."""
+    return PastPath(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty((0, 2)),
+                    np.zeros((1, 3)), np.zeros((1, 6)), node, np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+def _with_next(past: PastPath, path: MeasuredPath) -> _Motions:
+    """Return the motions of a path, the last of which is joined with the first of others."""
+    last = past.motion, full(past.noise), past.way, past.lever
+    if len(path.motion) == 0:
+        return tuple(column[:-1] for column in last)
+    new = path.motion, path.noise, path.way, path.lever
+    joined = _joined(tuple(column[-1:] for column in last), tuple(column[:1] for column in new))
+    return tuple(np.concatenate((one[:-1], both, other[1:]))
+                 for one, both, other in zip(last, joined, new, strict=True))
+
+
+def _joined(first: _Motions, second: _Motions) -> _Motions:
+    """Return motions one after the other, and their covariances in the frames at their ends."""
+    adjoint = se2.adjoint(se2.inverse(second[0]))
+    turned = np.swapaxes(adjoint, 1, 2)
+    way = adjoint[:, :2, :2] @ first[2][:, [[0, 1], [1, 2]]] @ turned[:, :2, :2]
+    c, s = np.cos(first[0][:, 2]), np.sin(first[0][:, 2])
+    # the second motion and its lever in the frame that the first one begins in
+    x, y = (c * second[0][:, 0] - s * second[0][:, 1], s * second[0][:, 0] + c * second[0][:, 1])
+    by_x, by_y, time = second[3].T
+    lever = first[3] + np.column_stack((
+        c * by_x - s * by_y - y * first[3][:, 2], s * by_x + c * by_y + x * first[3][:, 2], time))
+    return (np.asarray(se2.compose(first[0], second[0])),
+            adjoint @ first[1] @ turned + second[1],
+            way[:, [0, 0, 1], [0, 1, 1]] + second[2], lever)

@@ -14,27 +14,21 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.sources import source_report
-from pose_graph_ros.core.sources.constraint_queue import (
+from pose_graph_ros.core.sources.gauss_markov import Additions, CorrelatedErrors, GaussMarkovBias
+from pose_graph_ros.core.sources.gyro_bias import GyroBiases
+from pose_graph_ros.core.sources.measurement_constraints import motion_noise
+from pose_graph_ros.core.sources.settings import SOURCES
+from pose_graph_ros.core.sources.source_constraints import (
     AttachedMeasurement,
     ConstraintOrigin,
+    Held,
     NewConstraint,
     NO_NOISE,
     Queue,
+    SavedSource,
+    SourceConstraints,
 )
-from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
-from pose_graph_ros.core.sources.gauss_markov import (
-    Additions,
-    CorrelatedErrors,
-    GaussMarkovBias,
-    WHITE_SHARE,
-)
-from pose_graph_ros.core.sources.gyro_bias import GyroBiases
-from pose_graph_ros.core.sources.measurement_constraints import motion_noise
-from pose_graph_ros.core.sources.source_constraints import Held, SavedSource, SourceConstraints
 from pose_graph_ros.core.sources.source_report import SourceReport
-
-# A report is renewed after so many more measurements, as a share of those in the graph.
-MORE_RESIDUALS = 0.05
 
 
 class FactorBuilder:
@@ -50,20 +44,15 @@ class FactorBuilder:
     def __init__(self, config: BackendConfig, reweighting: Reweighting) -> None:
         self.config = config    # for later updates; error models keep their own settings
         self._reweighting = reweighting
+        # of the sources whose errors are correlated in time
         self._error_models: dict[str, GaussMarkovBias] = {}
-        """Of the sources whose errors are correlated in time."""
         self._constraints: dict[str, SourceConstraints] = {}
-        self._pose_edges: dict[str, GrowingArray] = {}
-        """Ids of the edges between poses, by source."""
-        self.new: list[NewConstraint] = []
-        """Constraints of the update that was built last."""
+        self._pose_edges: dict[str, GrowingArray] = {}  # ids of the edges between poses, by source
+        self.new: list[NewConstraint] = []  # constraints of the update that was built last
         self._n_new_bias_edges = 0
-        self.gyros = GyroBiases(config)
-        """Biases of gyroscopes, and the edges of their rotations."""
-        self._abandoned: list[int] = []
-        """Ids of biases that hold no measurement any more."""
-        self.n_bias_edges = 0
-        """Number of edges of the graph that end at a bias."""
+        self.gyros = GyroBiases(config)  # biases of gyroscopes, and the edges of their rotations
+        self._abandoned: list[int] = []  # ids of biases that hold no measurement any more
+        self.n_bias_edges = 0  # number of edges of the graph that end at a bias
 
     @property
     def _models(self) -> list[GaussMarkovBias | GyroBiases]:
@@ -76,14 +65,7 @@ class FactorBuilder:
 
     def build(self, queue: Queue, graph: Graph) -> GraphUpdate:
         """
-        Return the update that adds the constraints of a queue to the graph.
-
-        Call `commit` when the update has been applied, `rollback` when it has failed.
-
-        Parameters
-        ----------
-        graph : Graph, it is not changed
-
+        Return the update that adds a queue to the graph, to be followed by `commit` or `rollback`.
         """
         additions = Additions(graph.next_ids)
         for model in self._models:
@@ -126,13 +108,13 @@ class FactorBuilder:
             return None
         if source not in self._error_models and not settings.finds_correlation:
             self._error_models[source] = GaussMarkovBias(
-                CorrelatedErrors(settings.correlation_time, 1.0, WHITE_SHARE))
+                CorrelatedErrors(settings.correlation_time, 1.0, SOURCES.white_share))
         return self._error_models.get(source)
 
     def finding(self) -> list[str]:
         """Return the sources whose errors are estimated and that have measurements."""
         return [source for source, constraints in self._constraints.items()
-                if constraints.n_ever >= LEAST_POSITIONS
+                if constraints.n_ever >= SOURCES.least_positions
                 and self._settings(source).finds_correlation]
 
     def due_for_estimate(self) -> list[str]:
@@ -141,11 +123,9 @@ class FactorBuilder:
                 >= self._constraints[source].next_estimate]
 
     def has(self, source: str) -> bool:
-        """Tell whether a source has constraints in the map."""
         return source in self._constraints
 
     def constraints(self, source: str) -> SourceConstraints:
-        """Return the constraints of a source that has some."""
         return self._constraints[source]
 
     def pose_edges(self) -> dict[str, IntArray]:
@@ -166,14 +146,6 @@ class FactorBuilder:
         return None if model is None or model.errors.tau == 0.0 else model.errors
 
     def set_error_model(self, source: str, model: GaussMarkovBias | None) -> None:
-        """
-        Set the model of the errors of a source from now on.
-
-        Parameters
-        ----------
-        model : GaussMarkovBias, optional, with all measurements of the source
-
-        """
         old = self._error_models.pop(source, None)
         if isinstance(old, GaussMarkovBias):
             self.abandon(old)
@@ -188,15 +160,7 @@ class FactorBuilder:
     def leaving_biases(
         self, edges: IntArray, observed: IntArray, others: Mapping[str, GaussMarkovBias],
     ) -> list[int]:
-        """
-        Return the ids of the biases that nothing needs once constraints have left the graph.
-
-        Parameters
-        ----------
-        edges, observed : ndarray of int, ids of the constraints
-        others : mapping, further models of sources, which are not in use yet
-
-        """
+        """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned, *self.gyros.leaving(edges)]
         for source, constraints in self._constraints.items():
             models = [each[source] for each in (self._error_models, others) if source in each]
@@ -208,29 +172,13 @@ class FactorBuilder:
         return biases
 
     def leaving(self, source: str, edges: IntArray, observed: IntArray) -> BoolArray:
-        """
-        Return which measurements of a source leave with constraints, shape (K,).
-
-        Parameters
-        ----------
-        source : str, that has some
-        edges, observed : ndarray of int, ids of the constraints
-
-        """
         return self._constraints[source].leaving(
             edges, observed, added_as_edges=self._has_given_bias(source))
 
     def forget(
         self, nodes: IntArray, edges: IntArray, observed: IntArray,
     ) -> dict[str, IntArray]:
-        """
-        Return the numbers of the measurements that are left, after forgetting the others.
-
-        Parameters
-        ----------
-        nodes, edges, observed : ndarray of int, ids
-
-        """
+        """Return the numbers of the measurements that are left, after forgetting the others."""
         gone, kept = {*nodes.tolist()}, {}
         self.gyros.forget(gone, edges)
         self._abandoned = [node for node in self._abandoned if node not in gone]
@@ -244,12 +192,10 @@ class FactorBuilder:
         return kept
 
     def rollback(self) -> None:
-        """Discard the update that was built last."""
         for model in self._models:
             model.rollback()
 
     def commit(self) -> None:
-        """Record the constraints of the update that was built last."""
         self.n_bias_edges += self._n_new_bias_edges
         for is_edge, number, source, stamp_ns, kind, _, noise, held_by in self.new:
             odometry = self.config.odometry.get(source) if stamp_ns < 0 else None
@@ -273,15 +219,7 @@ class FactorBuilder:
             model.begin()
 
     def origin(self, number: int, *, edge: bool) -> ConstraintOrigin | None:
-        """
-        Return where a constraint comes from; None if this builder has not added it.
-
-        Parameters
-        ----------
-        number : int, id of an edge or of an observed node
-        edge : bool, whether it is an edge
-
-        """
+        """Return where a constraint comes from; None if this builder has not added it."""
         for source, constraints in self._constraints.items():
             stamp_ns = constraints.stamp_ns(
                 number, edge=edge, added_as_edges=self._has_given_bias(source))
@@ -353,7 +291,6 @@ class FactorBuilder:
         constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints)
 
     def _settings(self, source: str) -> MeasurementSource:
-        """Return the settings of a source; without any, headings are white."""
         return self.config.measurement_source(source, GlobalPose)
 
     def _has_given_bias(self, source: str) -> bool:
@@ -365,14 +302,13 @@ class FactorBuilder:
         """Return how well the newest measurements of each source fit the estimate."""
         for source, constraints in self._constraints.items():
             n, before = constraints.n_ever, constraints.n_reported
-            if n - before > MORE_RESIDUALS * min(len(constraints), before):
+            if n - before > SOURCES.more_residuals * min(len(constraints), before):
                 constraints.report = self.report(source, graph)
                 constraints.n_reported = n if constraints.report.n > 0 else 0
         return {source: each.report for source, each in self._constraints.items()
                 if each.report is not None and each.report.energy > 0.0}
 
     def report(self, source: str, graph: Graph) -> SourceReport:
-        """Return how well the newest measurements of a source fit a graph that has them."""
         constraints, biased = self._constraints[source], self._has_given_bias(source)
         used = constraints.used(graph, added_as_edges=biased)
         return source_report.report(

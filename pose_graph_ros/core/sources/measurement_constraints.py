@@ -26,15 +26,7 @@ from pose_graph_ros.core.odometry.motion import Attachment
 
 
 def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
-    """
-    Return the motion from the last hidden node before a stamp, or why there is none.
-
-    Parameters
-    ----------
-    nodes : HiddenNodes, with at least one node
-    stamp_ns : int, not later than what odometry covers
-
-    """
+    """Return the motion from the last hidden node before a stamp, or why there is none."""
     first_ns = int(nodes.stamps_ns[0])
     if stamp_ns < first_ns:
         return rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
@@ -54,14 +46,7 @@ def _before_window(stamp_ns: int, nodes: HiddenNodes) -> Answer:
 
 
 def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | Answer:
-    """
-    Return the attachment of the reference pose of a loop closure, or why it has none.
-
-    Parameters
-    ----------
-    closure : LoopClosure, names its reference by stamp or by number of the hidden node
-
-    """
+    """Return the attachment of the reference pose of a loop closure, or why it has none."""
     if closure.reference_ns is not None:
         return attach(nodes, closure.reference_ns)
     node = closure.reference_node
@@ -69,7 +54,7 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
         return rejected('unknown_node', f'there is no hidden node {node}')
     if node < nodes.n_frozen:
         return _before_window(int(nodes.stamps_ns[node]), nodes)
-    return nodes.table.attachment(node, np.zeros(3), np.zeros((3, 3)))
+    return nodes.attachment(node, np.zeros(3), np.zeros((3, 3)))
 
 
 def absolute_constraint(measurement: Absolute, attachment: Attachment) -> ObservedNodes:
@@ -78,11 +63,6 @@ def absolute_constraint(measurement: Absolute, attachment: Attachment) -> Observ
 
     That of a position has no information on the heading and lies in map axes; that of a heading
     has none on the position; that of a global pose is (3.51)-(3.53).
-
-    Parameters
-    ----------
-    attachment : Attachment, its motion is the offset of the observed node
-
     """
     offset, noise, information = attachment.motion, attachment.noise, np.zeros((3, 3))
     if isinstance(measurement, Position):
@@ -114,11 +94,7 @@ def swept_variance(measurement: Position, attachment: Attachment) -> float:
 
 
 def motion_noise(measurement: Absolute, attachment: Attachment) -> FloatArray:
-    """
-    Return what the motion since the node adds to the variances of a measurement, shape (2,).
-
-    These are the variances of a coordinate of the position and of the heading [m^2, rad^2].
-    """
+    """Return the variances of position and heading that the motion since the node adds."""
     noise = attachment.noise
     if isinstance(measurement, Position):
         return np.array((swept_variance(measurement, attachment), 0.0))
@@ -137,11 +113,6 @@ def loop_closure_constraint(
     `z' = T_i z T_j^-1`. A small error at the end of z is mapped to the end of z' by the adjoint of
     T_j, an error at its start by that of T_j z^-1. If the variances of x and y are infinite, the
     edge constrains the headings alone.
-
-    Parameters
-    ----------
-    reference, attachment : Attachment, of the reference pose and of the later pose
-
     """
     z = measurement.pose
     mean = se2.compose(se2.compose(reference.motion, z), se2.inverse(attachment.motion))
@@ -159,16 +130,7 @@ def loop_closure_constraint(
 def closure_covariance(
     own: FloatArray, pose: FloatArray, reference: Attachment, attachment: Attachment,
 ) -> FloatArray:
-    """
-    Return the covariance of a loop closure with what the motions since the nodes add, (3, 3).
-
-    Parameters
-    ----------
-    own : ndarray, shape (3, 3), of the closure, in the frame of the measured pose
-    pose : ndarray, shape (3,), as measured
-    reference, attachment : Attachment, as for `loop_closure_constraint`
-
-    """
+    """Return the covariance of a closure with that of the motions since its nodes."""
     back, out = se2.adjoint(se2.inverse(pose)), se2.adjoint(attachment.motion)
     return np.asarray(
         out @ (own + attachment.noise + back @ reference.noise @ back.T) @ out.T)

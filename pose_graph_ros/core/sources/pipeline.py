@@ -2,12 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a received measurement to a constraint in the queue, in any order of stamps."""
 
+from array import array
+import bisect
 from collections import Counter, deque
 from collections.abc import Iterator
+import itertools
+from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.measurements import (
     Absolute,
     ACCEPTED,
@@ -25,65 +30,173 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.odometry.turns import Gyros
-from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.measurement_constraints import (
     absolute_constraint,
     attach,
     attach_reference,
     loop_closure_constraint,
 )
+from pose_graph_ros.core.sources.settings import SOURCES
+from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.validation import validate
-from pose_graph_ros.core.sources.waiting import (
-    due_ns,
-    MAX_WAITING,
-    SeenStamps,
-    WaitingMeasurements,
-)
 
-# Maximum number of measurements that wait for the alignment; the oldest are dropped.
-MOST_UNALIGNED = 5000
-# Number of refused loop closures that are remembered.
-MOST_REFUSED = 1000
+
+class WaitingMeasurement(NamedTuple):
+    due_ns: int  # stamp that odometry must reach [ns]
+    arrival: int  # number of measurements that arrived before it
+    source: str
+    measurement: PoseMeasurement
+
+
+class WaitingMeasurements:
+    """Waiting measurements, ordered by the stamp at which they are due."""
+
+    def __init__(self) -> None:
+        # in descending order of `due_ns`, then of `arrival`
+        self._waiting: list[WaitingMeasurement] = []
+        self._arrival = itertools.count()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def push(self, source: str, measurement: PoseMeasurement) -> WaitingMeasurement | None:
+        """Add a measurement; of too many the one due last is dropped, and returned."""
+        waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
+        bisect.insort(self._waiting, waiting, key=_last_first)
+        return self._waiting.pop(0) if len(self) > SOURCES.most_waiting else None
+
+    @property
+    def measurements(self) -> list[tuple[str, PoseMeasurement]]:
+        return [(waiting.source, waiting.measurement) for waiting in self._waiting]
+
+    def until(self, stamp_ns: int) -> list[tuple[str, PoseMeasurement]]:
+        """Return the measurements due up to a stamp [ns], with their sources, earliest first."""
+        return [(waiting.source, waiting.measurement) for waiting in itertools.takewhile(
+            lambda waiting: waiting.due_ns <= stamp_ns, reversed(self._waiting))]
+
+    def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
+        """Remove and return the measurements due up to a stamp [ns], the earliest first."""
+        at = bisect.bisect_left(self._waiting, (-covered_ns, -next(self._arrival)),
+                                key=_last_first)
+        due = self._waiting[at:]
+        del self._waiting[at:]
+        return due[::-1]
+
+
+def _last_first(waiting: WaitingMeasurement) -> tuple[int, int]:
+    return -waiting.due_ns, -waiting.arrival
+
+
+_NO_STAMPS: 'array[int]' = array('q')
+
+
+class SeenStamps:
+    """Stamps and references of the measurements seen so far, by source; 16 bytes each."""
+
+    def __init__(self) -> None:
+        self._stamps: dict[str, array[int]] = {}
+        self._references: dict[str, array[int]] = {}
+
+    def has(self, source: str, measurement: PoseMeasurement) -> bool:
+        """Tell whether a measurement with the same stamp and reference was added."""
+        return self._find(source, measurement) >= 0
+
+    def near(self, source: str, stamp_ns: int, period_ns: int) -> bool:
+        """Tell whether the source has a stamp closer than a period to a given one."""
+        stamps = self._stamps.get(source, _NO_STAMPS)
+        at = bisect.bisect_left(stamps, stamp_ns)
+        return ((at > 0 and stamp_ns - stamps[at - 1] < period_ns)
+                or (at < len(stamps) and stamps[at] - stamp_ns < period_ns))
+
+    def add(self, source: str, measurement: PoseMeasurement) -> None:
+        stamps = self._stamps.setdefault(source, array('q'))
+        at = bisect.bisect_right(stamps, measurement.stamp_ns)
+        stamps.insert(at, measurement.stamp_ns)
+        self._references.setdefault(source, array('q')).insert(at, _reference(measurement))
+
+    def remove(self, source: str, measurement: PoseMeasurement) -> None:
+        at = self._find(source, measurement)
+        if at >= 0:
+            del self._stamps[source][at], self._references[source][at]
+
+    def forget(self, before_ns: int) -> None:
+        """Forget all stamps before one [ns]: such measurements are refused for another reason."""
+        for source, stamps in self._stamps.items():
+            n = bisect.bisect_left(stamps, before_ns)
+            del stamps[:n], self._references[source][:n]
+
+    def saved(
+        self, without: list[tuple[str, PoseMeasurement]],
+    ) -> dict[str, tuple[IntArray, IntArray]]:
+        """Return stamps and references, shape (M,) each, by source, without some measurements."""
+        left_out: dict[str, list[int]] = {}
+        for source, measurement in without:
+            left_out.setdefault(source, []).append(self._find(source, measurement))
+        result = {}
+        for source, stamps in self._stamps.items():
+            rows = [at for at in left_out.get(source, ()) if at >= 0]
+            result[source] = (np.delete(np.array(stamps), rows),
+                              np.delete(np.array(self._references[source]), rows))
+        return result
+
+    def restore(self, source: str, stamps_ns: IntArray, references: IntArray) -> None:
+        self._stamps[source] = array('q', stamps_ns.tolist())
+        self._references[source] = array('q', references.tolist())
+
+    def _find(self, source: str, measurement: PoseMeasurement) -> int:
+        stamps = self._stamps.get(source)
+        if stamps is None:
+            return -1
+        begin = bisect.bisect_left(stamps, measurement.stamp_ns)
+        end = bisect.bisect_right(stamps, measurement.stamp_ns)
+        reference, references = _reference(measurement), self._references[source]
+        return next((at for at in range(begin, end) if references[at] == reference), -1)
+
+
+def due_ns(measurement: PoseMeasurement) -> int:
+    """Return the stamp that odometry must have reached to attach a measurement [ns]."""
+    if isinstance(measurement, LoopClosure) and measurement.reference_ns is not None:
+        return max(measurement.stamp_ns, measurement.reference_ns)
+    return measurement.stamp_ns
+
+
+def _reference(measurement: PoseMeasurement) -> int:
+    """
+    Return the stamp of a reference, -2 - k for node k, or 0: it tells those of one stamp apart.
+    """
+    if not isinstance(measurement, LoopClosure):
+        return 0
+    if measurement.reference_ns is not None:
+        return measurement.reference_ns
+    return -1 if measurement.reference_node is None else -2 - measurement.reference_node
+
+
 
 
 class MeasurementPipeline:
-    """
-    Measurements between their arrival and the update that adds them to the graph.
-
-    A measurement is validated by the policy of its source, waits until odometry has reached its
-    stamp, and is attached to the hidden node before that stamp. Its outcome is counted.
-
-    Parameters
-    ----------
-    nodes : HiddenNodes, what measurements are attached to
-
-    """
+    """Measurements between their arrival and the update that adds them to the graph."""
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
         self._nodes, self._config = nodes, config
+        # yaw rates, from which rotations between the hidden nodes are made
         self.gyros = Gyros(nodes, config)
-        """Yaw rates, from which rotations between the hidden nodes are made."""
+        # measurements that wait for odometry to reach their stamps
         self.waiting = WaitingMeasurements()
-        """Measurements that wait for odometry to reach their stamps."""
-        self.seen = SeenStamps()
-        """Stamps of the measurements that were accepted or wait."""
-        self.queue = Queue()
-        """Constraints for the next update."""
+        self.seen = SeenStamps()  # stamps of the measurements that were accepted or wait
+        self.queue = Queue()  # constraints for the next update
+        # how often each source got each answer: (source, 'accepted' or the reason)
         self.counts: Counter[tuple[str, str]] = Counter()
-        """How often each source got each answer: (source, 'accepted' or the reason)."""
+        # detail of the newest refusal by source and reason
         self.refusals: dict[tuple[str, str], str] = {}
-        """Detail of the newest refusal by source and reason."""
+        # source and stamps [ns] of the newest loop closures that could not be attached
         self.refused_closures = deque[tuple[str, int, int | None]](
-            maxlen=MOST_REFUSED)
-        """Source and stamps [ns] of the newest loop closures that could not be attached."""
+            maxlen=SOURCES.most_refused)
 
     def configure(self, config: BackendConfig) -> None:
-        """Set the settings for later measurements."""
         self._config = config
         self.gyros.configure(config)
 
     def add(self, measurement: Measurement, source: str) -> Answer:
-        """Return the answer to a measurement that is added, after counting it."""
         if isinstance(measurement, YawRate):
             answer = self.count(source, self.gyros.add(measurement, source))
             self._take_turns()
@@ -133,7 +246,8 @@ class MeasurementPipeline:
         """Let a measurement wait for odometry; if too many wait, drop the one due last."""
         excess = self.waiting.push(source, measurement)
         if excess is not None:
-            answer = rejected('too_many_pending', f'{MAX_WAITING} measurements wait for odometry')
+            answer = rejected('too_many_pending',
+                              f'{SOURCES.most_waiting} measurements wait for odometry')
             if excess.measurement is measurement:
                 return answer
             self.count(excess.source, answer)
@@ -149,7 +263,6 @@ class MeasurementPipeline:
                 self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
 
     def _attach(self, measurement: PoseMeasurement, source: str) -> Answer:
-        """Queue the constraint of a measurement whose stamp odometry has reached."""
         answer = self._try_to_attach(measurement, source)
         if answer.status is AnswerStatus.REJECTED and isinstance(measurement, LoopClosure):
             self.refused_closures.append((source, measurement.stamp_ns, measurement.reference_ns))
@@ -182,14 +295,7 @@ class MeasurementPipeline:
         return ACCEPTED
 
     def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
-        """
-        Attach a measurement to a hidden node, with no motion in between.
-
-        Parameters
-        ----------
-        node : int, id of the node in the graph
-
-        """
+        """Attach a measurement to a hidden node, with no motion in between."""
         self._enqueue(measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))))
 
     def _enqueue(self, measurement: Absolute, source: str, attachment: Attachment) -> None:
@@ -201,7 +307,7 @@ class MeasurementPipeline:
         Take the constraints out of the queue that can be added to the graph.
 
         If the graph is not aligned with the map, observed nodes stay in the queue; the oldest ones
-        beyond `MOST_UNALIGNED` are dropped and counted.
+        beyond `most_unaligned` are dropped and counted.
         """
         ready = Queue(edges=self.queue.edges, turns=self.queue.turns)
         self.queue.edges, self.queue.turns = [], []
@@ -209,17 +315,13 @@ class MeasurementPipeline:
             ready.observed, self.queue.observed = self.queue.observed, []
         else:
             # bounds the memory of a robot that is not aligned for days
-            excess = self.queue.observed[:-MOST_UNALIGNED]
+            excess = self.queue.observed[:-SOURCES.most_unaligned]
             del self.queue.observed[:len(excess)]
             self.counts.update((dropped.source, 'dropped_unaligned') for dropped in excess)
         return ready
 
     def needed_ns(self, *, aligned: bool) -> int | None:
-        """
-        Return the earliest stamp at which something is to be attached to the graph [ns], or None.
-
-        Before the graph is aligned with the map, that includes positions that may align it.
-        """
+        """Return the earliest stamp that something is attached at, or may align [ns]."""
         needed = [stamp_ns for _, measurement in self.waiting.measurements
                   for stamp_ns in self._stamps_of(measurement)]
         for edge in self.queue.edges:
@@ -241,14 +343,6 @@ class MeasurementPipeline:
                 yield int(self._nodes.stamps_ns[node])
 
     def count(self, source: str, answer: Answer) -> Answer:
-        """
-        Return an answer after counting it.
-
-        Parameters
-        ----------
-        answer : Answer, one that is pending is not counted
-
-        """
         if answer.status is AnswerStatus.ACCEPTED:
             self.counts[source, 'accepted'] += 1
         elif answer.status is AnswerStatus.REJECTED:

@@ -1,58 +1,150 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The measurements of one source in the graph, and what holds each of them."""
+"""Constraints that are attached to hidden nodes: on their way into the graph, and in it."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
-from pose_graph_ros.core.saved_columns import Integers, Numbers, Pairs, Rows2
-from pose_graph_ros.core.sources.error_estimate import LEAST_POSITIONS
+from pose_graph_ros.core.measurements import Absolute, Measurement
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, OdometryErrors
+from pose_graph_ros.core.odometry.turns import Turn
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Pairs, Rows2, Rows3, Rows6
+from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
-from pose_graph_ros.core.sources.past_path import PastPath
+from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_report import SourceReport
+
+NO_NOISE: Final[FloatArray] = np.zeros(2)
+
+
+@dataclass(frozen=True, slots=True)
+class SavedEdges:
+    sources: tuple[str, ...]
+    i: Integers
+    j: Integers
+    mean: Rows3
+    information: Rows6
+    kind: EdgeKinds
+    stamps_ns: Pairs  # of a loop closure and of its other end [ns]; -1 for odometry
+
+
+class QueuedEdge(NamedTuple):
+    source: str
+    edge: Edges
+    stamp_ns: int = -1  # of the loop closure [ns]; -1 for an edge of odometry
+    reference_ns: int = -1  # stamp of its other end [ns]
+
+    def is_on(self, nodes: Collection[int]) -> bool:
+        return int(self.edge.i[0]) in nodes or int(self.edge.j[0]) in nodes
+
+
+class AttachedMeasurement(NamedTuple):
+    source: str
+    observed: ObservedNodes  # its constraint if its error is treated as white
+    measurement: Absolute
+    attachment: Attachment
+
+
+@dataclass(slots=True)
+class Queue:
+    """Constraints for the next update, with their sources."""
+
+    edges: list[QueuedEdge] = field(default_factory=list)
+    observed: list[AttachedMeasurement] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.edges) + len(self.observed) + len(self.turns)
+
+    def extend(self, other: 'Queue') -> None:
+        self.edges += other.edges
+        self.observed += other.observed
+        self.turns += other.turns
+
+    def joined(self, other: 'Queue') -> 'Queue':
+        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed],
+                     [*self.turns, *other.turns])
+
+    def newest(self, n: int) -> 'Queue':
+        return Queue(self.edges[-n:], self.observed[-n:], self.turns[-n:])
+
+    def replace_by(self, other: 'Queue') -> None:
+        self.edges, self.observed, self.turns = other.edges, other.observed, other.turns
+
+    def drop(self, nodes: Collection[int]) -> list[str]:
+        """Return the sources of the constraints on nodes that have left, after removing them."""
+        gone = [each.source for each in self.edges if each.is_on(nodes)]
+        gone += [each.source for each in self.observed if each.attachment.node in nodes]
+        gone += [turn.source for turn in self.turns if turn.i in nodes or turn.j in nodes]
+        if len(gone) > 0:
+            self.turns = [
+                turn for turn in self.turns if turn.i not in nodes and turn.j not in nodes]
+            self.edges = [each for each in self.edges if not each.is_on(nodes)]
+            self.observed = [
+                each for each in self.observed if each.attachment.node not in nodes]
+        return gone
+
+    def halves(self) -> 'tuple[Queue, Queue]':
+        half = len(self) // 2
+        n_edges = min(half, len(self.edges))
+        n_observed = min(half - n_edges, len(self.observed))
+        n_turns = half - n_edges - n_observed
+        return (Queue(self.edges[:n_edges], self.observed[:n_observed], self.turns[:n_turns]),
+                Queue(self.edges[n_edges:], self.observed[n_observed:], self.turns[n_turns:]))
+
+
+class ConstraintOrigin(NamedTuple):
+    """The measurement that a constraint was made from."""
+
+    source: str
+    stamp_ns: int  # [ns]; -1 for an edge between poses
+
+
+class NewConstraint(NamedTuple):
+    """A constraint in the update that was built last."""
+
+    is_edge: bool
+    number: int  # its id
+    source: str
+    stamp_ns: int  # of the measurement [ns]; -1 for an edge of odometry
+    kind: type[Measurement]  # `LoopClosure` for all edges between poses
+    reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
+    # what the motion since the node adds to its variances; see `motion_noise`
+    noise: FloatArray = NO_NOISE
+    held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
 
 
 @dataclass(frozen=True, slots=True)
 class SavedSource:
-    """The measurements and constraints of one source."""
-
-    seen_ns: Integers
-    """Stamps of all measurements that were received [ns], sorted."""
+    seen_ns: Integers  # stamps of all measurements that were received [ns], sorted
+    # for each stamp the reference of the loop closure, 0 for others; see `waiting`
     seen_references: Integers
-    """For each stamp the reference of the loop closure, 0 for others; see `waiting`."""
+    # Stamp [ns] and id of each constraint, shape (K, 2). The ids are those of edges if a bias with
+    # a given correlation time was estimated, else those of observed nodes.
     rows: Pairs
-    """
-    Stamp [ns] and id of each constraint, shape (K, 2). The ids are those of edges if a bias with
-    a given correlation time was estimated, else those of observed nodes.
-    """
-    n_otherwise: int
-    """Number of constraints that were added under other settings."""
-    ties: Integers
-    """Ids of its edges between hidden nodes, except those of the primary odometry."""
-    bins: SavedBins | None
-    """States of its bias, if it has one."""
+    n_otherwise: int  # number of constraints that were added under other settings
+    ties: Integers  # ids of its edges between hidden nodes, except those of the primary odometry
+    bins: SavedBins | None  # states of its bias, if it has one
+    # estimated statistics of its errors that are in use; None for white or given ones
     errors: CorrelatedErrors | None = None
-    """Estimated statistics of its errors that are in use; None for white or given ones."""
+    # what the motion since the node adds to the variances, or empty; see `motion_noise`
     noise: Rows2 = field(default_factory=lambda: np.empty((0, 2)))
-    """What the motion since the node adds to the variances, or empty; see `motion_noise`."""
+    # with estimated statistics, ids of the edges that hold the measurements, or empty
     edges: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """With estimated statistics, ids of the edges that hold the measurements, or empty."""
-    next_estimate: int = LEAST_POSITIONS
-    """Number of measurements at which its errors are estimated next."""
-    odometry_scale: float = 1.0
-    """In files of older versions, factor on the sigmas of odometry."""
-    n_gone: int = 0
-    """Number of its measurements that have left the graph."""
-    past: PastPath | None = None
-    """Their positions, where its errors are estimated."""
+    # number of measurements at which its errors are estimated next
+    next_estimate: int = SOURCES.least_positions
+    odometry_scale: float = 1.0  # in files of older versions, factor on the sigmas of odometry
+    n_gone: int = 0  # number of its measurements that have left the graph
+    past: PastPath | None = None  # their positions, where its errors are estimated
+    # `OdometryErrors` that its measurements show; empty in files of older versions
     odometry: Numbers = field(default_factory=lambda: np.empty(0))
-    """`OdometryErrors` that its measurements show; empty in files of older versions."""
 
 
 class Held(NamedTuple):
@@ -71,26 +163,19 @@ class SourceConstraints:
     """
 
     def __init__(self) -> None:
+        # stamp [ns] of each measurement, and the id of what it was first added as
         self.rows = GrowingArray((2,), np.int64)
-        """Stamp [ns] of each measurement, and the id of what it was first added as."""
+        # what the motion since the node adds to its variances; see `motion_noise`
         self.noise = GrowingArray((2,), np.float64)
-        """What the motion since the node adds to its variances; see `motion_noise`."""
-        self.edges = GrowingArray((), np.int64)
-        """Id of the edge that holds it instead, or -1."""
-        self.report: SourceReport | None = None
-        """The newest report."""
-        self.n_reported = 0
-        """Number of measurements when it was made; 0 if none of them was used."""
-        self.n_gone = 0
-        """Number of measurements that have left the graph."""
-        self.past: PastPath | None = None
-        """Their positions, where the errors are estimated."""
-        self.n_otherwise = 0
-        """Constraints of a loaded graph that were added under other settings."""
-        self.next_estimate = LEAST_POSITIONS
-        """Number of measurements at which the errors are estimated next."""
-        self.odometry = AS_CLAIMED
-        """Errors of odometry that the measurements show."""
+        self.edges = GrowingArray((), np.int64)  # id of the edge that holds it instead, or -1
+        self.report: SourceReport | None = None  # the newest report
+        self.n_reported = 0  # number of measurements when it was made; 0 if none of them was used
+        self.n_gone = 0  # number of measurements that have left the graph
+        self.past: PastPath | None = None  # their positions, where the errors are estimated
+        self.n_otherwise = 0  # constraints of a loaded graph that were added under other settings
+        # number of measurements at which the errors are estimated next
+        self.next_estimate = SOURCES.least_positions
+        self.odometry = AS_CLAIMED  # errors of odometry that the measurements show
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -101,15 +186,6 @@ class SourceConstraints:
         return len(self) + self.n_gone
 
     def leaving(self, edges: IntArray, observed: IntArray, *, added_as_edges: bool) -> BoolArray:
-        """
-        Return which measurements leave with constraints, shape (K,).
-
-        Parameters
-        ----------
-        edges, observed : ndarray of int, ids
-        added_as_edges : bool, whether the measurements were first added as edges
-
-        """
         return np.asarray(np.isin(self.rows.values[:, 1], edges if added_as_edges else observed))
 
     def forget(self, gone: BoolArray) -> IntArray:
@@ -123,33 +199,18 @@ class SourceConstraints:
 
     def append(self, stamp_ns: int, number: int, noise: FloatArray, edge: int) -> None:
         """
-        Append a measurement.
-
-        Parameters
-        ----------
-        number : int, id of what it was added as
-        noise : ndarray, shape (2,), see `motion_noise`
-        edge : int, id of the edge that holds it instead, or -1
-
+        Append a measurement: the id of what it was added as, and of the edge that holds it, or -1.
         """
         self.rows.append_one((stamp_ns, number))
         self.noise.append_one(noise)
         self.edges.append_one(edge)
 
     def held(self, which: IntArray) -> Held:
-        """Return what holds some measurements, given by their numbers."""
         edges = self.edges.values[which]
         return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]), edges >= 0)
 
     def used(self, graph: Graph, *, added_as_edges: bool) -> BoolArray:
-        """
-        Return which measurements have a weight above 0, shape (K,).
-
-        Parameters
-        ----------
-        added_as_edges : bool, whether the measurements were first added as edges
-
-        """
+        """Return which measurements have a weight above 0, shape (K,)."""
         held = self.held(np.arange(len(self)))
         is_edge = held.is_edge | added_as_edges
         used = np.empty(len(self), dtype=bool)
@@ -158,16 +219,7 @@ class SourceConstraints:
         return used
 
     def stamp_ns(self, number: int, *, edge: bool, added_as_edges: bool) -> int | None:
-        """
-        Return the stamp of the measurement that a constraint holds [ns], or None.
-
-        Parameters
-        ----------
-        number : int, id
-        edge : bool, whether it is that of an edge
-        added_as_edges : bool, whether the measurements were first added as edges
-
-        """
+        """Return the stamp of the measurement that a constraint holds [ns], or None."""
         if edge is added_as_edges:
             # ids are appended in increasing order
             at = int(np.searchsorted(self.rows.values[:, 1], number))
@@ -179,7 +231,6 @@ class SourceConstraints:
         return int(self.rows.values[found_at[0], 0]) if len(found_at) > 0 else None
 
     def restore(self, saved: SavedSource) -> None:
-        """Restore saved measurements."""
         n = len(saved.rows)
         self.rows.append(saved.rows)
         self.noise.append(saved.noise if len(saved.noise) == n else np.zeros((n, 2)))

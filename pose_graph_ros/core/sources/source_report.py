@@ -10,30 +10,87 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.sources import autocorrelation
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+from pose_graph_ros.core.sources.settings import SOURCES
 
-# Number of the newest residuals of a source that are evaluated.
-MOST_RESIDUALS = 5000
-# The whiteness test is skipped below this mean squared residual [sigma^2].
-LEAST_ENERGY = 0.1
-# Measurements fit badly from this mean squared residual on [sigma^2], if they are so many.
-FAR, MANY = 9.0, 30
+
+class Autocorrelation(NamedTuple):
+    tau: float  # time constant of the correlated part [s]; 0 if nothing is significant
+    # standard deviation of the correlated part of a coordinate, in the unit of the residuals
+    sigma_correlated: float
+
+    @property
+    def significant(self) -> bool:
+        return self.tau > 0.0
+
+
+def estimate(stamps_ns: IntArray, residuals: FloatArray) -> Autocorrelation:
+    """
+    Return the time constant of errors, and the sigma of their correlated part.
+
+    The sum of a first-order Gauss-Markov process and white noise has the autocovariance `c(h) =
+    s_c^2 exp(-h / tau)` for h > 0 and `c(0) = s_c^2 + s_w^2`, which is fitted to that of the
+    residuals at lags of whole periods. These are smaller than the errors, because the estimate
+    follows the measurements: s_c comes out a little too small, and so does tau.
+
+    Residuals have the shape (N, d), with independent coordinates of the same statistics, and
+    increasing stamps.
+    """
+    n = len(stamps_ns)
+    variance = float(np.mean(residuals**2)) if n > 0 else 0.0
+    white = Autocorrelation(0.0, 0.0)
+    if n < SOURCES.least_residuals or variance <= 0.0:
+        return white
+    period = float(np.median(np.diff(stamps_ns))) * 1e-9
+    if period <= 0.0:
+        return white
+    lags, covariance = autocovariances(stamps_ns, residuals)
+    if len(lags) == 0 or lags[0] > 1:
+        return white
+    first = float(covariance[0]) / variance
+    deviation = 1.0 / np.sqrt(n * residuals.shape[1])
+    if first < max(SOURCES.least_correlation, SOURCES.significant_lag * deviation):
+        return white
+    faded = np.flatnonzero(covariance < SOURCES.faded * covariance[0])
+    end = int(faded[0]) if len(faded) > 0 else len(lags)
+    if end < 2:
+        # a single lag is left, which cannot separate the two parts
+        tau, correlated = -period / np.log(min(first, 0.99)), variance
+    else:
+        # line through the logarithms; larger covariances are more certain and weigh more
+        slope, level = np.polyfit(
+            lags[:end] * period, np.log(covariance[:end]), 1, w=covariance[:end])
+        tau = -1.0 / slope if slope < 0.0 else float(lags[end - 1] * period)
+        correlated = min(float(np.exp(level)), variance)
+    return Autocorrelation(float(tau), float(np.sqrt(correlated)))
+
+
+def autocovariances(stamps_ns: IntArray, residuals: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return lags, in median periods, and the autocovariance at each."""
+    times = (stamps_ns - stamps_ns[0]) * 1e-9
+    ticks = np.round(times / float(np.median(np.diff(times)))).astype(np.int64)
+    lags, values, lag = [], [], 1
+    while lag <= SOURCES.longest_lag * len(ticks):
+        partner = np.searchsorted(ticks, ticks + lag)
+        paired = partner < len(ticks)
+        paired[paired] = ticks[partner[paired]] == ticks[paired] + lag
+        if np.sum(paired) >= SOURCES.least_residuals // 2:
+            lags.append(lag)
+            values.append(float(np.mean(residuals[paired] * residuals[partner[paired]])))
+        lag = max(lag + 1, int(SOURCES.next_lag * lag))
+    return np.array(lags, dtype=np.int64), np.array(values)
+
+
 
 
 class SourceReport(NamedTuple):
-    """How well the measurements of a source fit."""
-
-    n: int
-    """Number of its measurements that are used."""
+    n: int  # number of its measurements that are used
+    # mean squared residual of a coordinate, in units of its sigma; 0 if there is none
     energy: float
-    """Mean squared residual of a coordinate, in units of its sigma; 0 if there is none."""
-    errors: autocorrelation.Autocorrelation
-    """Autocorrelation of the newest residuals [m]."""
+    errors: Autocorrelation  # autocorrelation of the newest residuals [m]
+    # statistics of its errors that the graph is built with; None for white errors
     in_use: CorrelatedErrors | None
-    """Statistics of its errors that the graph is built with; None for white errors."""
-    found: bool
-    """Whether these are estimated from the errors (`correlation_time` of -1)."""
+    found: bool  # whether these are estimated from the errors (`correlation_time` of -1)
 
     @property
     def strain(self) -> float:
@@ -44,17 +101,13 @@ class SourceReport(NamedTuple):
     @property
     def fits_badly(self) -> bool:
         """Whether many measurements contradict the estimate, whoever is to blame."""
-        return self.n >= MANY and self.strain > FAR
+        return self.n >= SOURCES.many and self.strain > SOURCES.far
 
     @property
     def wrongly_white(self) -> bool:
-        """
-        Whether its errors are treated as white but look correlated: its sigmas are too low.
-
-        Where the statistics of the errors are estimated, that estimate is the better judge.
-        """
+        """Whether errors that are treated as white, as they were told to be, look correlated."""
         return (self.in_use is None and not self.found and self.errors.significant
-                and self.energy > LEAST_ENERGY)
+                and self.energy > SOURCES.least_energy)
 
 
 def report(
@@ -64,16 +117,11 @@ def report(
     """
     Return how well the newest measurements of a source fit the estimate.
 
-    Parameters
-    ----------
-    rows : ndarray of int64, shape (K, 2)
-        Stamp [ns] and id of each measurement that is used, in the order of their addition.
-    biased : bool, whether the constraints are edges to a bias; else they are observed nodes
-    in_use : CorrelatedErrors, optional, statistics in use; None for white errors
-    found : bool, whether these are estimated from the errors
-
+    Rows are stamp [ns] and id of each measurement that is used, in the order of their addition: of
+    an edge to a bias, or of an observed node. `found` says that statistics are estimated from the
+    errors.
     """
-    newest = rows[-MOST_RESIDUALS:]
+    newest = rows[-SOURCES.most_residuals:]
     newest = newest[np.argsort(newest[:, 0], kind='stable')]
     newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
     stamps, numbers = newest[:, 0], newest[:, 1]
@@ -90,16 +138,11 @@ def report(
     energy = float(np.einsum('ki,kij,kj->', errors, information, errors))
     n_measured = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0))
     return SourceReport(len(rows), energy / max(n_measured, 1),
-                        autocorrelation.estimate(stamps, residuals), in_use, found)
+                        estimate(stamps, residuals), in_use, found)
 
 
 def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArray]:
-    """
-    Return residuals of positions in map axes, and their information, for edges to a bias.
-
-    The residual is the whole error of the measurement: the part that the bias explains and the
-    white rest.
-    """
+    """Return whole errors of positions in map axes, of edges to a bias, and their information."""
     errors = graph.edge_errors(edges)[:, :2]
     factor = edges.bias[:, 2]
     total = errors - factor[:, None] * graph.poses_of(edges.j)[:, :2]

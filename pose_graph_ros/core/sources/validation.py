@@ -34,20 +34,12 @@ LEAST_EIGENVALUE = 1e-6
 
 
 class Validated(NamedTuple):
-    """A measurement that can be used, and what was repaired in it."""
-
     measurement: PoseMeasurement
-    repairs: tuple[str, ...]
-    """Keys for counting, such as `default_covariance`."""
+    repairs: tuple[str, ...]  # keys for counting, such as `default_covariance`
 
 
 def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validated | Answer:
-    """
-    Return a measurement in usable form, or why it is rejected.
-
-    A pose without information on the heading becomes a position; one without information on the
-    position becomes a heading.
-    """
+    """Return a measurement without what it has no information on, or why it is rejected."""
     kind = type(measurement).__name__
     numbers = _numbers(measurement)
     defect = value_defect(numbers)
@@ -86,15 +78,10 @@ def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validate
 
 def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     """
-    Return a usable covariance, shape (d, d), close to a broken one.
+    Return a usable covariance of x, y and perhaps yaw, close to a broken one.
 
     Unknown variances are replaced by the default, uninformative ones by the ceiling, both without
     correlations. The rest is made symmetric and, by its eigenvalues, positive definite.
-
-    Parameters
-    ----------
-    cov : ndarray, shape (d, d), of x, y and, for d = 3, yaw
-
     """
     diagonal, uninformative = np.diagonal(cov).copy(), _is_uninformative(cov)
     unknown = ~uninformative & ~(diagonal > 0.0)
@@ -128,7 +115,6 @@ def _numbers(measurement: PoseMeasurement) -> FloatArray:
 
 
 def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
-    """Return the covariance, shape (d, d), with the variances that the policy overrides."""
     variances = np.diagonal(cov).copy()
     variances[:2] = policy.override[0]**2
     if len(policy.override) == 2:
@@ -214,6 +200,5 @@ def _ceilings(policy: CovariancePolicy) -> FloatArray:
 
 
 def _capped(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
-    """Return the covariance with variances limited to the ceiling, and its correlations."""
     factor = np.minimum(1.0, np.sqrt(_ceilings(policy)[:len(cov)] / np.diagonal(cov)))
     return np.asarray(cov * factor * factor[:, None])

@@ -8,11 +8,11 @@ So those that stay are apart from each other, and their number grows with the ar
 the time; how a place is divided does not matter, as it would with the cells of a grid, whose
 borders the errors of each pass cross anew. A node that leaves has a kept one beside it, its
 *anchor*: the node keeps its pose relative to the anchor, and what concerns the node later is
-attached to the anchor.
+attached to the anchor. Nodes leave in groups of connected ones (`sparse_removal`).
 
-Nodes leave in groups of connected ones. The prior of a group becomes a tree of edges at once
-(`marginalization.sparsification`), with the edges that earlier groups have left between the same
-nodes taken into it, so that the number of edges stays in proportion to the number of nodes.
+Fixes, poses and rotations tell of a node once and for all, and their biases connect it with those
+before and after it. So the measurements leave stretch by stretch, in the order of time, with the
+biases that only they need, whether their nodes leave or stay.
 """
 
 from collections.abc import Collection, Iterator
@@ -25,52 +25,120 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.window.segments import carriers, first_of
-from pose_graph_ros.core.window.sparse_removal import leaving, with_fewer_edges
+from pose_graph_ros.core.window.sparse_removal import leaving, LIMITS, with_fewer_edges
 
-# Nodes leave whenever so many new ones have been made; so many are looked at each time.
-EVERY, MOST_AT_ONCE = 10, 40
-# Edges of the kind PRIOR for each pose, above which some of them are replaced by fewer ones, and
-# how often in one step.
-MOST_EDGES, MOST_REPLACED = 2.5, 3
-# Fixes, poses and rotations for each pose that stays, up to which they stay as well, with their
-# nodes: what they tell of the errors they have in common is exact only as long as they are in the
-# graph. A small area counts as so many times the newest nodes.
-MOST_MEASUREMENTS, LEAST = 2.0, 4
-# A group has at most this many nodes, and about this many neighbours in all.
-MOST_IN_GROUP, MOST_NEIGHBOURS = 10, 12
-# So many poses are compared at once, or as many as stay: the pairs of all would need too much
-# memory where a place has been driven often before it is thinned.
-PART = 256
+
+class Segment(NamedTuple):
+    """Consecutive poses, and the measurements of them."""
+
+    poses: IntArray  # ids, ascending
+    edges: IntArray  # ids of the measurements that are edges
+    observed: IntArray  # ids of the others
+    after: int  # id of the next pose
+
+
+def carriers(graph: Graph) -> tuple[IntArray, IntArray]:
+    """
+    Return the poses that hold the measurements of a graph, by ids.
+
+    Shapes are (M,) for edges, with -1 where an edge is no measurement in the map, and (K,) for
+    observed nodes, likewise.
+    """
+    edges, observed = graph.edges, graph.observed
+    is_pose = graph.is_pose
+    of_pose = is_pose[graph.node_rows(edges.i)]
+    on_bias = (edges.kind == EdgeKind.BIAS) & of_pose
+    # a rotation is held by the later one of its poses
+    holder = np.where(on_bias, edges.i, np.where(
+        edges.kind == EdgeKind.TURN, np.maximum(edges.i, edges.j), -1))
+    measured = is_pose[graph.node_rows(observed.node)] & (observed.kind != ObservedKind.PRIOR)
+    return holder, np.where(measured, observed.node, -1)
+
+
+def first_of(holder: IntArray, seen: IntArray) -> int:
+    """
+    Return the first pose that holds measurements, by its id; one after all poses if none does.
+    """
+    every = np.concatenate((holder, seen))
+    return int(np.min(every[every >= 0], initial=np.iinfo(np.int64).max))
+
+
+def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | None:
+    """
+    Return the next stretch of which the measurements leave; None if it is not complete yet.
+
+    No bias has measurements in it and after it.
+    """
+    holder, seen = carriers(graph)
+    ahead = older[np.searchsorted(older, first_of(holder, seen)):]
+    size = _size(graph, ahead[:LIMITS.stretch], np.isin(ahead, leaving))
+    # where no bias is needed on both sides
+    ends = _ends(graph, ahead[:LIMITS.longest_stretch + 1], holder)
+    ends = ends[ends < len(ahead)]
+    if size == 0 or len(ends) == 0 or len(ahead) <= size:
+        return None
+    fitting = int(np.searchsorted(ends, size, side='right'))
+    end = int(ends[max(fitting - 1, 0)])
+    poses = ahead[:end]
+    return Segment(poses, graph.edge_ids[np.isin(holder, poses)],
+                   graph.observed_ids[np.isin(seen, poses)], int(ahead[end]))
+
+
+def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
+    """Return after how many of some poses no bias has measurements on both sides, at least one."""
+    edges = graph.edges
+    measured = np.flatnonzero(holder >= 0)
+    if len(measured) == 0:
+        return np.arange(1, len(poses) + 1)
+    bias = np.where(edges.kind == EdgeKind.TURN, edges.k, edges.j)[measured]
+    order = np.lexsort((holder[measured], bias))
+    bias, holder = bias[order], holder[measured][order]
+    begins = np.flatnonzero(np.diff(bias, prepend=-2))
+    ends = np.append(begins[1:], len(bias)) - 1
+    # a bias is in use between its first and its last pose
+    opened = np.searchsorted(poses, holder[begins]), np.searchsorted(poses, holder[ends])
+    blocked = np.zeros(len(poses) + 2, dtype=np.int64)
+    np.add.at(blocked, opened[0] + 1, 1)
+    np.add.at(blocked, opened[1] + 1, -1)
+    free = np.cumsum(blocked)[:len(poses) + 1] == 0
+    return np.flatnonzero(free)[1:]
+
+
+def _size(graph: Graph, poses: IntArray, leaves: BoolArray) -> int:
+    """Return how many of some poses make a stretch, as far as not too many others are around."""
+    edges = graph.edges
+    is_pose = graph.is_pose
+    used = (edges.weight > 0.0) & is_pose[graph.node_rows(edges.i)] & is_pose[
+        graph.node_rows(edges.j)]
+    ends = np.column_stack((edges.i[used], edges.j[used]))
+    around, inside = set[int](), set[int]()
+    for size, (pose, leave) in enumerate(zip(poses.tolist(), leaves.tolist(), strict=False)):
+        if leave:
+            inside.add(pose)
+            around.update(ends[np.any(ends == pose, axis=1)].ravel().tolist())
+        else:
+            around.add(pose)
+        if size > 0 and len(around - inside) > LIMITS.stretch_around:
+            return size
+    return len(poses)
 
 
 class Crowd(NamedTuple):
     """Nodes that leave, in ascending order, and the kept nodes that stand for them."""
 
-    leaving: IntArray
-    """Shape (L,)."""
-    anchors: IntArray
-    """Shape (L,)."""
+    leaving: IntArray  # shape (L,)
+    anchors: IntArray  # shape (L,)
 
 
 def crowded(
-    poses: FloatArray, preferred: BoolArray, config: ThinningConfig, part: int = PART,
+    poses: Poses, preferred: BoolArray, config: ThinningConfig, part: int = LIMITS.compared,
 ) -> Crowd:
-    """
-    Return rows of poses that leave.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (N, 3), in the order of time, without the newest ones [m, m, rad]
-    preferred : ndarray of bool, shape (N,), those that stay before others
-    config : ThinningConfig
-    part : int, see `PART`
-
-    """
+    """Return rows of poses that leave."""
     order = np.argsort(~preferred, kind='stable')
     place, heading = poses[order, :2], poses[order, 2]
     anchor = np.full(len(poses), -1, dtype=np.int64)
@@ -103,13 +171,6 @@ def crowd(graph: Graph, config: ThinningConfig, first: int = 0) -> Crowd:
     Return ids of the hidden nodes of a graph that leave it, and of their anchors.
 
     Fixed nodes and the newest ones never leave.
-
-    Parameters
-    ----------
-    graph : Graph
-    config : ThinningConfig
-    first : int, id of the first node that is not frozen
-
     """
     rows = np.flatnonzero(graph.is_pose & (graph.node_ids >= first))[:-config.newest]
     fixed = graph.fixed
@@ -123,14 +184,10 @@ def crowd(graph: Graph, config: ThinningConfig, first: int = 0) -> Crowd:
 class Places(NamedTuple):
     """Nodes that leave, ascending, with their places relative to nodes that stay."""
 
-    nodes: IntArray
-    """Ids, shape (L,)."""
-    anchors: IntArray
-    """Ids, shape (L,)."""
-    relative: FloatArray
-    """Poses in the anchors, shape (L, 3) [m, m, rad]."""
-    noise: FloatArray
-    """Covariances of these, in the frames of the nodes, shape (L, 3, 3)."""
+    nodes: IntArray  # ids, shape (L,)
+    anchors: IntArray  # ids, shape (L,)
+    relative: FloatArray  # poses in the anchors, shape (L, 3) [m, m, rad]
+    noise: FloatArray  # covariances of these, in the frames of the nodes, shape (L, 3, 3)
 
     def rows(self, index: BoolArray) -> Self:
         """Return the places of some of the nodes."""
@@ -142,45 +199,34 @@ class Thinning:
     """Decides now and then which nodes leave; see the module."""
 
     def __init__(self) -> None:
-        self._n_made, self._next = -EVERY, 0
+        self._n_made, self._next = -LIMITS.every, 0
+        # number of poses that stay, when it was last looked, or what stands for it
         self._n_stay = 0
-        """Number of poses that stay, when it was last looked, or what stands for it."""
 
     def measurements_are_due(self, graph: Graph) -> bool:
         """Return whether there are so many measurements in the map that the oldest are to go."""
         n_measured = sum(int(np.count_nonzero(held >= 0)) for held in carriers(graph))
         # with about one for each node that comes before the next look
-        return n_measured + EVERY > MOST_MEASUREMENTS * self._n_stay
+        return n_measured + LIMITS.every > LIMITS.measurements * self._n_stay
 
     def places(
         self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int,
         keep: Collection[int] = (), first: int = 0,
     ) -> Places | None:
-        """
-        Return the nodes that leave now, maybe none; None most times.
-
-        Parameters
-        ----------
-        smoother : IncrementalSmoother, without edits that wait
-        config : ThinningConfig
-        n_made : int, how many hidden nodes were made, with those that have left
-        keep : collection of int, ids of nodes that do not leave
-        first : int, id of the first node that is not frozen
-
-        """
-        if config.cell == 0.0 or n_made < self._n_made + EVERY:
+        """Return the nodes that leave now, maybe none; None most times."""
+        if config.cell == 0.0 or n_made < self._n_made + LIMITS.every:
             return None
         self._n_made = n_made
         graph = smoother.graph
         found = crowd(graph, config, first)
         n_stay = int(np.count_nonzero(graph.is_pose)) - len(found.leaving)
-        self._n_stay = max(n_stay, LEAST * config.newest)
+        self._n_stay = max(n_stay, LIMITS.least_area * config.newest)
         if not self.measurements_are_due(graph):
             before = found.leaving < first_of(*carriers(graph))
             found = Crowd(*(ids[before] for ids in found))
         found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
         # those that are not sure enough to leave must not keep others from being looked at
-        order = np.argsort(found.leaving < self._next, kind='stable')[:MOST_AT_ONCE]
+        order = np.argsort(found.leaving < self._next, kind='stable')[:LIMITS.looked_at]
         if len(order) > 0:
             self._next = int(found.leaving[order[-1]]) + 1
         chosen = Crowd(*(ids[np.sort(order)] for ids in found))
@@ -188,15 +234,7 @@ class Thinning:
 
 
 def groups(graph: Graph, places: Places) -> Iterator[Places]:
-    """
-    Yield connected groups of nodes; each must leave the graph before the next is asked for.
-
-    Parameters
-    ----------
-    graph : Graph
-    places : Places, all nodes that leave
-
-    """
+    """Yield connected groups of nodes; each must leave the graph before the next is asked for."""
     while len(places.nodes) > 0:
         edges = graph.edges
         used = edges.weight > 0.0
@@ -209,12 +247,6 @@ def groups(graph: Graph, places: Places) -> Iterator[Places]:
 def removed(smoother: IncrementalSmoother, update: GraphUpdate | None) -> Left | None:
     """
     Return what has left the graph with an update, or None if there is none or the solver fails.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother
-    update : GraphUpdate, optional
-
     """
     if update is None:
         return None
@@ -228,8 +260,8 @@ def removed(smoother: IncrementalSmoother, update: GraphUpdate | None) -> Left |
 
 def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
     """Replace some edges between poses by fewer ones where there are many; yield what leaves."""
-    for _ in range(MOST_REPLACED):
-        update = with_fewer_edges(smoother.graph, MOST_EDGES)
+    for _ in range(LIMITS.replaced):
+        update = with_fewer_edges(smoother.graph, LIMITS.prior_edges)
         if update is None:
             return
         gone = removed(smoother, update)
@@ -244,13 +276,6 @@ def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig)
 
     The standard deviation of the position relative to the anchor is at most half of `cell`, that
     of the heading half of `angle`. So what odometry alone brings together is not thinned.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother, without edits that wait
-    found : Crowd, with ids
-    config : ThinningConfig
-
     """
     graph = smoother.graph
     start, end = graph.poses_of(found.anchors), graph.poses_of(found.leaving)
@@ -268,12 +293,6 @@ def relative_noise(
     Return the covariances of the poses of nodes in others, shape (L, 3, 3).
 
     They are in the frames of the nodes.
-
-    Parameters
-    ----------
-    smoother : IncrementalSmoother, without edits that wait
-    anchors, nodes : ndarray of int, shape (L,), ids
-
     """
     start, end = smoother.graph.poses_of(anchors), smoother.graph.poses_of(nodes)
     noise = np.empty((len(start), 3, 3))
@@ -290,13 +309,7 @@ def relative_noise(
 
 def group(leaving: IntArray, ends: IntArray) -> IntArray:
     """
-    Return the first group of connected nodes among those that leave, ascending.
-
-    Parameters
-    ----------
-    leaving : ndarray of int, shape (L,), ids in ascending order
-    ends : ndarray of int, shape (M, 2), ids of the ends of all edges
-
+    Return the first group of connected nodes among those that leave, given the ends of edges.
     """
     neighbours: dict[int, set[int]] = {node: set() for node in leaving.tolist()}
     concerned = ends[np.isin(ends, leaving).any(axis=1)]
@@ -306,12 +319,12 @@ def group(leaving: IntArray, ends: IntArray) -> IntArray:
                 neighbours[one].add(other)
     first = int(leaving[0])
     members, around = {first}, set(neighbours[first])
-    while len(members) < MOST_IN_GROUP:
+    while len(members) < LIMITS.group_nodes:
         node = min(around & neighbours.keys(), default=None)
         if node is None:
             break
         grown = (around | neighbours[node]) - members - {node}
-        if len(grown) > MOST_NEIGHBOURS:
+        if len(grown) > LIMITS.group_neighbours:
             break
         members.add(node)
         around = grown

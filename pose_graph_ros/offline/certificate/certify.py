@@ -4,14 +4,23 @@
 Whether a minimum is the global one, and if not, a lower one.
 
 1. The headings of the given poses are moved to the near minimum of the objective of
-   `formulation`, positions eliminated.
-2. The certificate matrix of this minimum proves a lower bound (`spectrum`). If it is f, but for
+   `objective`, positions eliminated.
+2. The certificate matrix of this minimum proves a lower bound (`examined`). If it is f, but for
    the gap that rounding needs, the minimum is global.
 3. Else headings become rows of one number more (the Riemannian staircase: N. Boumal,
    V. Voroninski, A. Bandeira, "The non-convex Burer-Monteiro approach works on smooth
    semidefinite programs", 2016; SE-Sync, section 4). The eigenvector of the negative eigenvalue
    leads downhill from there. The minimum over rows is a lower bound as soon as its own matrix is
    positive; rounded to one number for each heading, it is a start for step 1.
+
+The proof: S = Q - L is the certificate matrix of headings. For any headings y of length 1,
+`f(y) = y^H S y + trace(L)`. So if S + diag(s) is positive definite, f is nowhere below
+trace(L) - sum(s). Definiteness is that of the sparse matrix M - diag(0, L - s), of which
+S + diag(s) is the Schur complement, and is read from its LU factors without pivoting: to rounding,
+a proof. At a stationary point trace(L) is f, and if S has no negative eigenvalue the point is the
+global minimum, also of the relaxation to rows of r numbers (L. Carlone, G. Calafiore,
+C. Tommolillo, F. Dellaert, "Planar pose graph optimization: duality, optimal solutions, and
+verification", T-RO 2016; N. Boumal, V. Voroninski, A. Bandeira, 2016).
 
 What is proved holds for this objective, and for chi2 with the error (3.48) as far as the objective
 is nowhere above chi2: `Formulation.below_chi2`, docs/solver.md.
@@ -24,18 +33,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray
-from pose_graph_ros.offline.certificate.formulation import Formulation
-from pose_graph_ros.offline.certificate.quadratic_form import QuadraticForm
-from pose_graph_ros.offline.certificate.riemannian import Inverse, minimized, unit_rows
-from pose_graph_ros.offline.certificate.spectrum import examined, LEAST_COST, Spectrum
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.sparse import BlockFactors
+from pose_graph_ros.offline.certificate.objective import Formulation, QuadraticForm
+from pose_graph_ros.offline.certificate.riemannian import (
+    Inverse,
+    minimized,
+    multipliers,
+    unit_rows,
+)
 
-MAX_RANK = 6
-# Gap up to which a minimum is called global, as a fraction of its cost (at least LEAST_COST).
-GAP = 1e-5
-# Relative decrease of f by which another minimum counts as lower.
-LOWER = 1e-9
-HALVINGS = 30
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """Numbers of the certificate; fractions of f are those of at least 1."""
+
+    max_rank: int = 6  # numbers for each heading at most
+    gap: float = 1e-5  # fraction of f up to which a minimum is called global
+    lower: float = 1e-9  # fraction of f by which another minimum counts as lower
+    shift: float = 5e-7  # fraction of f that the shifts s of all headings lower the bound by
+    accuracy: float = 1e-4  # relative, of eigenvalues
+
+
+TUNING = Tuning()
 
 
 class Verdict(Enum):
@@ -50,24 +71,15 @@ class Verdict(Enum):
 class Certificate:
     """What was found of the minimum near given poses, and of the best one."""
 
-    verdict: Verdict
-    """Of the best minimum that was found."""
-    chi2: float
-    """Objective of `formulation` at the best minimum."""
-    near: float
-    """The same at the minimum near the given poses."""
-    gap: float
-    """How far below `chi2` the global minimum may be at most."""
+    verdict: Verdict  # of the best minimum that was found
+    chi2: float  # f at the best minimum
+    near: float  # f at the minimum near the given poses
+    gap: float  # how far below `chi2` the global minimum may be at most
+    # smallest eigenvalue of the certificate matrix of the best minimum, but for the zero; None if
+    # it is not known, or not needed as f is 0
     smallest: float | None
-    """
-    Smallest eigenvalue of the certificate matrix of the best minimum, but for the zero.
-
-    None if it is not known, or not needed as the objective is 0.
-    """
-    rank: int
-    """Numbers for each heading with which the bound was found; 1 without the staircase."""
-    poses: FloatArray
-    """Of all hidden nodes at the best minimum, shape (N, 3) [m, m, rad]."""
+    rank: int  # numbers for each heading with which the bound was found; 1 without the staircase
+    poses: Poses  # of all hidden nodes at the best minimum
 
     @property
     def bound(self) -> float:
@@ -77,25 +89,32 @@ class Certificate:
     @property
     def relative_gap(self) -> float:
         """The gap as a fraction of chi2, at least of 1."""
-        return self.gap / max(self.chi2, LEAST_COST)
+        return self.gap / max(self.chi2, 1.0)
 
     @property
     def is_lower(self) -> bool:
         """Whether another minimum is lower than that near the given poses."""
-        return self.chi2 < self.near - LOWER * max(self.near, LEAST_COST)
+        return self.chi2 < self.near - TUNING.lower * max(self.near, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """What is known of the certificate matrix of some headings."""
+
+    positive: bool  # whether S plus the shift was shown to be positive definite
+    bound: float  # lower bound of f for all headings; holds to rounding
+    # smallest eigenvalue, but for those of the columns of Y, which are zero at a stationary point;
+    # None if it was not asked for, or the iteration for it did not converge
+    smallest: float | None
+    direction: ComplexArray | None  # its eigenvector, shape (n,)
 
 
 class NearHessian(NamedTuple):
     """What an optimiser that has moved the poses to a minimum of chi2 knows of it."""
 
-    places: IntArray
-    """Place of each hidden node that is not fixed in its order of elimination, shape (F,)."""
+    places: IntArray  # of the F hidden nodes that are not fixed, in its order of elimination
+    # from derivatives of chi2 by the headings of these, (F,), to their part of a Gauss-Newton step
     solve: Callable[[FloatArray], FloatArray]
-    """
-    From derivatives of chi2 by the headings of these, shape (F,), to a step of Gauss-Newton.
-
-    The steps for them are those with which the positions change as well.
-    """
 
     def order(self, formulation: Formulation) -> IntArray:
         """Return the place of each unknown of the objective, the map last."""
@@ -113,21 +132,13 @@ class NearHessian(NamedTuple):
 
 
 def certify(
-    formulation: Formulation, poses: FloatArray, *, eigenvalue: bool = True,
+    formulation: Formulation, poses: Poses, *, eigenvalue: bool = True,
     hessian: NearHessian | None = None,
 ) -> Certificate:
     """
     Return a certificate for the minimum of the objective near some poses, or for a lower one.
 
     Raises LinearSolveError if the objective does not determine the positions or headings.
-
-    Parameters
-    ----------
-    formulation : Formulation
-    poses : ndarray, shape (N, 3), of all hidden nodes [m, m, rad]
-    eigenvalue : bool, whether to compute `smallest` if there is a proof without it
-    hessian : NearHessian, optional, spares work
-
     """
     form = QuadraticForm(formulation, None if hessian is None else hessian.order(formulation))
     if form.n == 1:
@@ -136,7 +147,7 @@ def certify(
     z = minimized(form, formulation.headings(poses)[:, None],
                   None if hessian is None else hessian.inverse(formulation))
     cost = near = form.cost(z)
-    if cost <= GAP * LEAST_COST:
+    if cost <= TUNING.gap * 1.0:
         # a sum of squares is nowhere below 0, whatever rounding leaves of the matrix
         return Certificate(Verdict.CERTIFIED, cost, near, cost, None, 1,
                            formulation.poses(form.positions(z)[:, 0], z[:, 0]))
@@ -146,12 +157,12 @@ def certify(
         y, rank, above = _staircase(form, z, spectrum)
         other = minimized(form, rounded(y))
         bound = max(bound, above)
-        if form.cost(other) < near - LOWER * max(near, LEAST_COST):
+        if form.cost(other) < near - TUNING.lower * max(near, 1.0):
             z, cost = other, form.cost(other)
             spectrum = examined(form, z, eigenvalue=eigenvalue)
             bound = max(bound, spectrum.bound)
     gap = max(cost - bound, 0.0)
-    certified = gap <= GAP * max(cost, LEAST_COST)
+    certified = gap <= TUNING.gap * max(cost, 1.0)
     return Certificate(
         Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED, cost, near, gap,
         spectrum.smallest, rank,
@@ -163,7 +174,8 @@ def _staircase(
 ) -> tuple[ComplexArray, int, float]:
     """Return rows at a minimum over rows of more numbers, how many, and the best bound."""
     bound = spectrum.bound
-    while not spectrum.positive and y.shape[1] < MAX_RANK and spectrum.direction is not None:
+    while (not spectrum.positive and y.shape[1] < TUNING.max_rank
+           and spectrum.direction is not None):
         y = minimized(form, _escaped(form, y, spectrum.direction))
         spectrum = examined(form, y)
         bound = max(bound, spectrum.bound)
@@ -174,7 +186,7 @@ def _escaped(form: QuadraticForm, y: ComplexArray, direction: ComplexArray) -> C
     """Return rows of one number more, at a lower cost along a direction of negative curvature."""
     cost = form.cost(y)
     direction = direction / np.max(np.abs(direction))
-    for k in range(HALVINGS):
+    for k in range(30):
         longer = unit_rows(np.column_stack((y, 0.5**k * direction)))
         if form.cost(longer) < cost:
             return longer
@@ -185,3 +197,81 @@ def rounded(y: ComplexArray) -> ComplexArray:
     """Return the headings, shape (n, 1), nearest to rows, shape (n, r), in one direction."""
     _, _, adjoint = np.linalg.svd(y, full_matrices=False)
     return unit_rows(y @ adjoint[:1].conj().T)
+
+
+def examined(form: QuadraticForm, y: ComplexArray, *, eigenvalue: bool = True) -> Spectrum:
+    """
+    Return what the certificate matrix of rows of length 1 at a stationary point of f says.
+
+    `eigenvalue` asks for the smallest one also if there is a proof without it. Raises
+    LinearSolveError if rounding leaves no matrix positive definite that has to be.
+    """
+    diagonal = multipliers(y, form.product(y))
+    total = float(np.sum(diagonal))
+    # the first against rounding in the factors
+    shift = 1e-15 * form.diagonal + TUNING.shift * (abs(total) + 1.0) / form.n
+    factors = _definite(form, shift - diagonal)
+    if factors is not None:
+        smallest, vector = (_smallest(form, factors, -float(np.mean(shift)), y) if eigenvalue
+                            else (None, None))
+        return Spectrum(True, total - float(np.sum(shift)), smallest, vector)
+    # a shift at which it is definite lies below the smallest eigenvalue
+    sigma = float(np.max(shift))
+    # Q has no negative eigenvalue, so above the largest entry of L rounding is to blame
+    most = 100.0 * (sigma + float(np.max(np.abs(diagonal))))
+    while factors is None:
+        sigma *= 10.0
+        if not sigma <= most:
+            raise LinearSolveError('certificate: the numbers are too different in size')
+        factors = _definite(form, sigma - diagonal)
+    smallest, vector = _smallest(form, factors, -sigma, None)
+    proved = total - form.n * sigma
+    if smallest is not None:
+        # the eigenvalue is an estimate from above; what is a little lower is proved
+        sigma = -smallest * (1.0 + 100.0 * TUNING.accuracy)
+        if _definite(form, sigma - diagonal) is not None:
+            proved = max(proved, total - form.n * sigma)
+    return Spectrum(False, proved, smallest, vector)
+
+
+def _definite(form: QuadraticForm, shift: FloatArray) -> BlockFactors | None:
+    """Return the factors of M with a shift of the headings if it is definite, else None."""
+    try:
+        factors = form.factors(shift)
+    except LinearSolveError:
+        return None
+    return factors if factors.is_positive else None
+
+
+def _smallest(
+    form: QuadraticForm, factors: BlockFactors, sigma: float, known: ComplexArray | None,
+) -> tuple[float | None, ComplexArray | None]:
+    """Return the smallest eigenvalue of S, orthogonal to the known vectors, and its vector."""
+    n = form.n
+    if n < 3 + (0 if known is None else known.shape[1]):
+        return None, None
+    basis = np.zeros((n, 0), dtype=np.complex128) if known is None else np.linalg.qr(known)[0]
+
+    def inverse(v: ComplexArray) -> ComplexArray:
+        right = _without(basis, v.ravel())[:, None]
+        return _without(basis, form.inverse(factors, right)[:, 0])
+
+    # takes 0.1 s to load
+    import scipy.sparse.linalg  # noqa: PLC0415
+
+    operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=inverse, dtype=np.complex128)
+    rng = np.random.default_rng(0)
+    try:
+        values, vectors = scipy.sparse.linalg.eigsh(
+            operator, k=1, which='LM', tol=TUNING.accuracy,
+            v0=_without(basis, rng.normal(size=n) + 1j * rng.normal(size=n)))
+    except scipy.sparse.linalg.ArpackError:
+        return None, None
+    if not abs(values[0]) > 0.0:
+        return None, None
+    return float(1.0 / values[0] + sigma), np.asarray(vectors[:, 0])
+
+
+def _without(basis: ComplexArray, v: ComplexArray) -> ComplexArray:
+    """Return a vector without its components along orthonormal columns."""
+    return np.asarray(v - basis @ (basis.conj().T @ v))

@@ -17,31 +17,14 @@ from collections.abc import Callable
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
-from pose_graph_ros.offline.certificate.quadratic_form import QuadraticForm
+from pose_graph_ros.offline.certificate.objective import QuadraticForm
 
 Operator = Callable[[ComplexArray], ComplexArray]
 Inverse = Callable[[FloatArray], FloatArray]
-MAX_STEPS = 300
-MAX_INNER = 300
-# The iteration ends at a predicted decrease of f of this fraction.
-TOLERANCE = 1e-11
-# Decrease of the squared preconditioned residual at which a step is good enough.
-INNER = 1e-6
-# Fraction of the diagonal that makes the preconditioner definite.
-DAMPING = 1e-12
-# Fraction of f by which it may rise through rounding.
-ROUNDING = 1e-14
 
 
 def inner(a: ComplexArray, b: ComplexArray) -> float:
-    """
-    Return the real inner product of two arrays.
-
-    Parameters
-    ----------
-    a, b : ndarray of complex, the same shape
-
-    """
+    """Return the real inner product of two arrays."""
     return float(np.vdot(a, b).real)
 
 
@@ -54,14 +37,7 @@ def unit_rows(y: ComplexArray) -> ComplexArray:
 
 
 def multipliers(y: ComplexArray, product: ComplexArray) -> FloatArray:
-    """
-    Return the diagonal L, shape (n,).
-
-    Parameters
-    ----------
-    y, product : ndarray, shape (n, r), Y and Q Y
-
-    """
+    """Return the diagonal L, shape (n,), given Y and Q Y, shape (n, r)."""
     return np.asarray(np.sum(y.real * product.real + y.imag * product.imag, axis=1))
 
 
@@ -71,19 +47,13 @@ def minimized(
     """
     Return headings at a minimum of f near the given ones, or where steps no longer lower it.
 
-    Parameters
-    ----------
-    form : QuadraticForm
-    y : ndarray, shape (n, r), rows of length 1
-    inverse : callable, optional
-        From derivatives by the headings, shape (n,), to changes of them, near the minimum: of
-        headings that are angles, r = 1.
-
+    `inverse` goes from derivatives by headings that are angles, (n,), to changes of them near the
+    minimum.
     """
     cost, radius = form.cost(y), np.inf
     product = form.product(y)
     solve = None if inverse is not None else _preconditioner(form, multipliers(y, product))
-    for _ in range(MAX_STEPS):
+    for _ in range(300):
         diagonal = multipliers(y, product)[:, None]
         tangent = _projection(y)
         gradient = tangent(product - diagonal * y)
@@ -102,13 +72,13 @@ def minimized(
             return tangent(1j * y * inverse((y.conj() * v).imag[:, 0])[:, None])
 
         decrease = inner(gradient, precondition(gradient))
-        if not decrease > TOLERANCE * cost:
+        if not decrease > 1e-11 * cost:
             break
         radius = min(radius, 100.0 * np.sqrt(decrease))
         step, predicted, at_limit = _step(hessian, precondition, gradient, radius)
         candidate = unit_rows(y + step)
         after = form.cost(candidate)
-        slack = ROUNDING * cost
+        slack = 1e-14 * cost   # may be rounding
         ratio = (cost - after + slack) / (predicted + slack)
         if ratio < 0.25:
             radius = min(radius, np.sqrt(decrease)) * 0.25
@@ -133,7 +103,7 @@ def _projection(y: ComplexArray) -> Operator:
 
 def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Operator:
     """Return v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite."""
-    damping = DAMPING * form.diagonal
+    damping = 1e-12 * form.diagonal   # makes it definite
     factors = form.factors(damping - diagonal, turned=False)
     if not factors.is_positive:
         factors = form.factors(damping, turned=False)
@@ -160,7 +130,7 @@ def _step(
     direction = -scaled
     length, cross, own = 0.0, 0.0, square
     at_limit = False
-    for _ in range(MAX_INNER):
+    for _ in range(300):
         image = hessian(direction)
         curvature = inner(direction, image)
         alpha = square / curvature if curvature > 0.0 else np.inf
@@ -175,7 +145,7 @@ def _step(
         length += 2.0 * alpha * cross + alpha**2 * own
         scaled = precondition(residual)
         before, square = square, inner(residual, scaled)
-        if square <= INNER * first:
+        if square <= 1e-6 * first:
             break
         beta = square / before
         cross = beta * (cross + alpha * own)

@@ -95,15 +95,7 @@ class BinnedPattern(NamedTuple):
 
 
 def hessian(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
-    """
-    Return the pattern of H, poses in the order of time and then biases.
-
-    Parameters
-    ----------
-    graph : Graph
-    most_bins : int
-
-    """
+    """Return the pattern of H, poses in the order of time and then biases."""
     free = np.flatnonzero(~graph.fixed)
     order = np.concatenate((free[graph.is_pose[free]], free[~graph.is_pose[free]]))
     place = np.full(graph.n_nodes, -1)
@@ -125,15 +117,7 @@ def hessian(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
 
 
 def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
-    """
-    Return the pattern of the factor R that the smoother has of a graph.
-
-    Parameters
-    ----------
-    graph : Graph, all of whose edits have been solved for
-    most_bins : int
-
-    """
+    """Return the pattern of the factor R that the smoother has of a graph."""
     memory, fixed = graph.memory, graph.fixed
     cliques = memory['clique_i'][:memory.head[tb.N_CLIQUES]]
     frontal, separator, first = (

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
 from pose_graph_ros.offline.simulation.settings import Closures
 
 TRIES, TRIED = 10_000, 8
@@ -38,14 +38,6 @@ def revisits(
 ) -> tuple[IntArray, IntArray]:
     """
     Return the earlier and the later pose of true closures, shape (L,) each, as numbers of places.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    path : Path
-    places : ndarray, shape (K,), poses of the path that are compared, in order
-    closures : Closures; their rate is left to `found`
-
     """
     poses, stamps = path.poses[places], path.stamps_ns[places]
     pairs = KDTree(poses[:, :2]).query_pairs(closures.radius, output_type='ndarray')
@@ -63,18 +55,9 @@ def revisits(
 
 
 def measured(
-    generator: np.random.Generator, old: FloatArray, new: FloatArray, closures: Closures,
+    generator: np.random.Generator, old: Poses, new: Poses, closures: Closures,
 ) -> FloatArray:
-    """
-    Return what true closures measure: the later pose in the earlier one, with noise.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    old, new : ndarray, shape (L, 3), true poses
-    closures : Closures
-
-    """
+    """Return what true closures measure: the later pose in the earlier one, with noise."""
     noise = generator.normal(0.0, closures.sigmas, (len(new), 3))
     return se2.compose(se2.between(old, new), noise)
 
@@ -87,14 +70,6 @@ def false_pairs(
 
     There are fewer groups than asked where the path has too few places that are apart and driven
     in the same direction.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    path : Path
-    sizes : list of int, of the groups
-    closures : Closures
-
     """
     false = closures.false
     begin = max(1, int(np.searchsorted(

@@ -15,16 +15,7 @@ AGAIN_S = 1.0  # within which a message that comes twice comes again
 
 
 def jumped(odometry: Trajectory, jumps: Iterable[Jump], start_ns: int) -> Trajectory:
-    """
-    Return odometry with jumps, in the order of their times.
-
-    Parameters
-    ----------
-    odometry : Trajectory
-    jumps : iterable of Jump, of odometry
-    start_ns : int
-
-    """
+    """Return odometry with jumps, in the order of their times."""
     poses = odometry.poses.copy()
     for jump in sorted(jumps, key=lambda each: each.at_s):
         k = int(np.searchsorted(odometry.stamps_ns, start_ns + round(jump.at_s * 1e9)))
@@ -64,16 +55,7 @@ def moved(
 
 
 def heard(stamps_ns: IntArray, outages: Iterable[Outage], start_ns: int) -> BoolArray:
-    """
-    Return which measurements are in no outage, shape (M,).
-
-    Parameters
-    ----------
-    stamps_ns : ndarray, shape (M,)
-    outages : iterable of Outage, of their topic
-    start_ns : int
-
-    """
+    """Return which measurements are in no outage, shape (M,)."""
     time = (stamps_ns - start_ns) * 1e-9
     kept = np.ones(len(stamps_ns), dtype=bool)
     for outage in outages:
@@ -86,14 +68,6 @@ def arrivals(
 ) -> tuple[IntArray, IntArray]:
     """
     Return which messages of a topic are recorded, and when [ns], shape (K,) each, by that time.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    topic : str
-    stamps_ns : ndarray, shape (M,), when they were measured
-    setup : Setup
-
     """
     n = len(stamps_ns)
     late, again = generator.random(n), generator.random((2, n))

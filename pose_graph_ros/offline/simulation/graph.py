@@ -18,6 +18,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation import disturbances, sensors
 from pose_graph_ros.offline.simulation.closures import (
     false_pairs,
@@ -61,17 +62,11 @@ class SimulatedGraph:
         return graph
 
 
-def graph_of(way: Course, node_distance: float) -> SimulatedGraph:
+def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     """
     Return a graph along a course, in the frame in which it begins, or in that of the world.
 
     The latter if there are fixes or global poses.
-
-    Parameters
-    ----------
-    way : Course
-    node_distance : float, of neighbouring nodes along the path [m]
-
     """
     setup, streams = way.setup, way.streams
     at = np.unique(np.searchsorted(

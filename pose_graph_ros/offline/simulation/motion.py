@@ -13,7 +13,8 @@ from itertools import accumulate
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
+from pose_graph_ros.core.quantities import Metres
 
 PERIOD_S = 0.01  # sample period of the motion [s]
 MARGIN_S = 5.0  # by which paths last longer than the motion, whose end is smoothed [s]
@@ -85,19 +86,9 @@ def path_length(path: FloatArray) -> FloatArray:
 
 
 def wandering(
-    generator: np.random.Generator, points: FloatArray, step: float, sigma: float,
+    generator: np.random.Generator, points: Points, step: Metres, sigma: Metres,
 ) -> FloatArray:
-    """
-    Return poses along a line, which wander slowly to its sides, shape (P, 3), not wrapped.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    points : ndarray, shape (P, 2), points of the line [m]
-    step : float, distance between them [m]
-    sigma : float, standard deviation of the distance from the line [m]
-
-    """
+    """Return poses along a line, which wander slowly to its sides, shape (P, 3), not wrapped."""
     direction = np.gradient(points, axis=0) / step
     normal = np.column_stack((-direction[:, 1], direction[:, 0]))
     aside = gaussian_filter1d(gauss_markov(generator, len(points), sigma, step / 60.0), 8.0 / step)

@@ -18,6 +18,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.quantities import Seconds
 from pose_graph_ros.offline.simulation import disturbances, sensors
 from pose_graph_ros.offline.simulation.closures import (
     false_pairs,
@@ -94,20 +95,10 @@ class Course:
 
 
 def course(
-    world: World, seed: int, duration_s: float,
+    world: World, seed: int, duration_s: Seconds,
     change: Callable[[Setup], Setup] = lambda usual: usual,
 ) -> Course:
-    """
-    Return a motion through a world; equal arguments give equal ones.
-
-    Parameters
-    ----------
-    world : World
-    seed : int, not negative
-    duration_s : float, length, 10 s or more [s]
-    change : callable, returns what is simulated from what usually is
-
-    """
+    """Return a motion through a world; equal arguments give equal ones."""
     streams = {name: np.random.default_rng((seed, k)) for k, name in enumerate(STREAMS)}
     generator = np.random.default_rng(seed) if world.one_stream else streams['world']
     motion = world.drive(generator, duration_s)

@@ -33,13 +33,6 @@ def jittered_stamps(
 ) -> IntArray:
     """
     Return stamps of a sensor during the truth, with random phase and jitter, shape (M,) [ns].
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    truth : Trajectory
-    period_s : float
-
     """
     span = truth.stamps_ns[-1] - truth.stamps_ns[0]
     ticks = np.arange(generator.uniform(0.2, 0.8), span * 1e-9 / period_s - 0.2)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 import math
 
+from pose_graph_ros.core.config import require, require_member
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.setting_checks import require, require_member
 
 ODOMETRY, GYRO, FIXES, POSES, CLOSURES = (
     '/odom', '/imu/data', '/gps/fix', '/global_pose', '/loop_closure')

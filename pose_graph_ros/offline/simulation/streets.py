@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation.motion import ramp
 
 # Four directions of a crossing's streets, counter-clockwise.
@@ -92,21 +93,13 @@ def street_path(
 
 
 def aisle_corners(
-    rng: np.random.Generator, length: float, aisles: int, spacing: float, depth: float,
+    rng: np.random.Generator, length: Metres, aisles: int, spacing: Metres, depth: Metres,
 ) -> FloatArray:
     """
     Return the corners of a way through the aisles of a hall in random order, shape (K, 2) [m].
 
     Aisle k leads from (k spacing, 0) to (k spacing, depth). At both ends a lane joins all aisles.
     The robot drives each aisle from end to end and then changes to any other.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    length : float, of the way at least [m]
-    aisles : int, number of aisles, at least 2
-    spacing, depth : float, distance of the aisles, and their length [m]
-
     """
     aisle, y, driven = int(rng.integers(aisles)), 0.0, 0.0
     corners = [(aisle * spacing, y)]

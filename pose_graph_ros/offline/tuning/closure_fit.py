@@ -23,10 +23,9 @@ from scipy.sparse.linalg import splu
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.kinds import EdgeKind
 from pose_graph_ros.offline.tuning.fit import decided, Fit, Minimum, minimum
 from pose_graph_ros.offline.tuning.likelihood import Parameter, PRIOR_SPREAD, Role
 
@@ -37,15 +36,7 @@ CLOSURE_SPREAD = 1.5
 
 
 class ClosureProblem:
-    """
-    Costs of a graph of odometry and closures as a function of two factors on sigmas.
-
-    Parameters
-    ----------
-    graph : Graph, at the optimum
-    tick : callable, called at each evaluation
-
-    """
+    """Costs of a graph of odometry and closures as a function of two factors on sigmas."""
 
     def __init__(self, graph: Graph, tick: Callable[[], None] = lambda: None) -> None:
         edges, poses = graph.edges_by_row, graph.poses

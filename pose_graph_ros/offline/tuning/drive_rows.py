@@ -34,14 +34,7 @@ class Measured(NamedTuple):
     """Columns X to HEADING_VAR of the rows of `likelihood`, shape (M, 9)."""
 
     def rows(self, which: BoolArray) -> 'Measured':
-        """
-        Return some of them.
-
-        Parameters
-        ----------
-        which : ndarray of bool, shape (M,)
-
-        """
+        """Return some of them."""
         return Measured(self.stamps_ns[which], self.values[which])
 
     @property
@@ -71,14 +64,7 @@ class DriveRows(NamedTuple):
         return np.asarray((self.stamps_ns - self.stamps_ns[:1]) * 1e-9, dtype=np.float64)
 
     def without(self, held_out: BoolArray) -> 'DriveRows':
-        """
-        Return the rows with some measurements left out, but not their motions.
-
-        Parameters
-        ----------
-        held_out : ndarray of bool, shape (N,)
-
-        """
+        """Return the rows with some measurements left out, but not their motions."""
         return self._replace(source=np.where(held_out, -1, self.source))
 
 

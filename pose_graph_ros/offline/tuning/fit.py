@@ -95,16 +95,7 @@ class Fit(NamedTuple):
     """Ratio by which stretches contradict each other more than the model says, at least 1."""
 
     def value(self, role: Role, index: int, default: float) -> float:
-        """
-        Return the value of a parameter.
-
-        Parameters
-        ----------
-        role : Role
-        index : int, as in `Parameter`
-        default : float, if there is no such parameter
-
-        """
+        """Return the value of a parameter."""
         return next((each.value for each in self.found if each.parameter.role is role
                      and each.parameter.index == index), default)
 
@@ -116,15 +107,7 @@ class AnyProblem(Protocol):
     n_beyond: int
 
     def value(self, parameters: Sequence[Parameter], x: FloatArray) -> float:
-        """
-        Return the cost.
-
-        Parameters
-        ----------
-        parameters : sequence of Parameter, P of them
-        x : ndarray, shape (P,), their logarithms
-
-        """
+        """Return the cost."""
 
 
 class Minimum(NamedTuple):
@@ -136,16 +119,7 @@ class Minimum(NamedTuple):
 
 
 def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 0.05) -> Fit:
-    """
-    Return the most likely parameters, with their intervals.
-
-    Parameters
-    ----------
-    problem : Problem, with white errors
-    parameters : sequence of Parameter, with white errors of all sources
-    white_share : float, setting of the white part of correlated errors
-
-    """
+    """Return the most likely parameters, with their intervals."""
     problem.find_heading()
     best = _unrestricted(problem, parameters, white_share)
     ratio = _contradiction(problem, *best[:2])
@@ -157,17 +131,7 @@ def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 
 
 
 def decided(problem: AnyProblem, best: Minimum, ratio: float, n_measurements: int) -> Fit:
-    """
-    Return the fit after settings that are likely enough are kept.
-
-    Parameters
-    ----------
-    problem : Problem
-    best : Minimum, over all parameters
-    ratio : float, by which thresholds are raised
-    n_measurements : int, for the result
-
-    """
+    """Return the fit after settings that are likely enough are kept."""
     parameters, x, cost = best
     kept: list[Parameter] = []
     while True:
@@ -234,17 +198,7 @@ def minimum(
     problem: AnyProblem, parameters: Sequence[Parameter], x: FloatArray, *,
     hold: Sequence[Parameter] = (),
 ) -> tuple[FloatArray, float]:
-    """
-    Return where the cost is least, from near there with some settings held, and the cost.
-
-    Parameters
-    ----------
-    problem : Problem
-    parameters : sequence of Parameter, P of them
-    x : ndarray, shape (P,), logarithms to begin with
-    hold : sequence of Parameter, whose settings stay
-
-    """
+    """Return where the cost is least, from near there with some settings held, and the cost."""
     def value(free: FloatArray) -> float:
         return problem.value([*parameters, *hold], _with_settings(free, hold))
     if len(parameters) == 0:
@@ -373,14 +327,6 @@ def estimate(
 ) -> dict[str, Fit]:
     """
     Return a fit for each source of odometry; only the first one has those of the other sources.
-
-    Parameters
-    ----------
-    odometry : mapping, the primary one first
-    sources : mapping, what was measured in the map; the indices of the fits are by this order
-    config : BackendConfig, the settings
-    tick : callable, called at each evaluation
-
     """
     thinned = {name: _thinned(of) for name, of in sources.items()}
     fits: dict[str, Fit] = {}

@@ -27,7 +27,8 @@ from scipy.special import gammaincinv
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.sources.autocorrelation import estimate
+from pose_graph_ros.core.quantities import Seconds
+from pose_graph_ros.core.sources.source_report import estimate
 from pose_graph_ros.offline.tuning import likelihood as lk
 from pose_graph_ros.offline.tuning.drive_rows import DriveRows, Measured
 from pose_graph_ros.offline.tuning.fit import Fit, Found, WIDE
@@ -65,14 +66,7 @@ class Errors(NamedTuple):
         return np.asarray(np.hypot(self.errors[:, 0], self.errors[:, 1]))
 
     def rows(self, which: BoolArray) -> 'Errors':
-        """
-        Return some of them.
-
-        Parameters
-        ----------
-        which : ndarray of bool, shape (K,)
-
-        """
+        """Return some of them."""
         return Errors(self.stamps_ns[which], self.errors[which], self.covariances[which])
 
 
@@ -230,15 +224,7 @@ def _surprises(of: Errors) -> FloatArray:
 
 
 def largest_ratio(squares: float, degrees: float) -> float:
-    """
-    Return the upper end of the interval of a variance from a mean of squared errors.
-
-    Parameters
-    ----------
-    squares : float, mean squared error
-    degrees : float, number of independent errors; infinite is returned without any
-
-    """
+    """Return the upper end of the interval of a variance from a mean of squared errors."""
     if degrees <= 0.0:
         return math.inf
     quantile = 2.0 * float(gammaincinv(0.5 * degrees, TAIL))
@@ -246,15 +232,7 @@ def largest_ratio(squares: float, degrees: float) -> float:
 
 
 def shown_variances(rows: DriveRows, count: int) -> list[float]:
-    """
-    Return how large the variances of sources can be at most, in units of those they claim.
-
-    Parameters
-    ----------
-    rows : DriveRows
-    count : int, number of sources
-
-    """
+    """Return how large the variances of sources can be at most, in units of those they claim."""
     steps = rows.rows[:, :3]
     headings = np.cumsum(steps[:, 2])
     before = np.concatenate(([0.0], headings[:-1]))
@@ -277,17 +255,8 @@ def shown_variances(rows: DriveRows, count: int) -> list[float]:
     return shown
 
 
-def proven(fits: Mapping[str, Fit], shown: Sequence[float], duration: float) -> dict[str, Fit]:
-    """
-    Return fits, that with the sources first, with the values that the data prove.
-
-    Parameters
-    ----------
-    fits : mapping
-    shown : sequence of float, for each source, as by `shown_variances`
-    duration : float, of the drive [s]
-
-    """
+def proven(fits: Mapping[str, Fit], shown: Sequence[float], duration: Seconds) -> dict[str, Fit]:
+    """Return fits, that with the sources first, with the values that the data prove."""
     every = [each for fit in fits.values() for each in fit.found]
     known = {each.parameter.index for each in every if each.parameter.role is Role.TAU
              and not each.is_wide and _is_known(duration / each.value)}

@@ -311,11 +311,6 @@ class Problem:
     def thin(self, strides: Sequence[int]) -> None:
         """
         Count all measurements, and only every so manieth of them, with the same weight together.
-
-        Parameters
-        ----------
-        strides : sequence of int, 1 for all
-
         """
         at = np.flatnonzero(self.rows.source >= 0)
         useful = [stride for stride in strides if stride == 1 or len(at) >= LEAST * stride]
@@ -326,15 +321,7 @@ class Problem:
             self._levels.append((source, len(at) / max(len(at[::stride]), 1) / len(useful)))
 
     def costs(self, parameters: Sequence[Parameter], x: FloatArray) -> FloatArray:
-        """
-        Return the cost of each row, shape (N,).
-
-        Parameters
-        ----------
-        parameters : sequence of Parameter, P of them
-        x : ndarray, shape (P,), their logarithms
-
-        """
+        """Return the cost of each row, shape (N,)."""
         noise, errors = self.noise.copy(), self.errors.copy()
         for parameter, value in zip(parameters, np.exp(x).tolist(), strict=True):
             if parameter.role is Role.ODOMETRY:
@@ -356,15 +343,7 @@ class Problem:
         return total
 
     def value(self, parameters: Sequence[Parameter], x: FloatArray) -> float:
-        """
-        Return the cost of all rows with the prior.
-
-        Parameters
-        ----------
-        parameters : sequence of Parameter, P of them
-        x : ndarray, shape (P,), their logarithms
-
-        """
+        """Return the cost of all rows with the prior."""
         prior, claims = 0.0, dict[int, float]()
         for each, value in zip(parameters, x.tolist(), strict=True):
             if each.role is Role.ODOMETRY:

@@ -107,8 +107,28 @@ def integrated(heading: FloatArray, step: np.ndarray) -> FloatArray:
     return np.column_stack((path.real, path.imag, heading))
 
 
-def found(drive: Drive, **arguments: object) -> GraphAlignment:
-    return find_alignment(drive.odometry, drive.observed, POLICY, NOISE, **arguments)
+def lasting(stamps: FloatArray, times: float | FloatArray) -> TimeCorrelation:
+    return TimeCorrelation(stamps, np.broadcast_to(times, stamps.shape))
+
+
+def by(odometry: FloatArray, table: ObservedNodes) -> GraphAlignment:
+    """Return what observed nodes with white noise say."""
+    return find_alignment(odometry, table, POLICY, NOISE, lasting(np.zeros(len(table)), 0.0))
+
+
+def found(drive: Drive, times: float | FloatArray | None = None) -> GraphAlignment:
+    """Return what all positions of a drive say, whose errors last for some time."""
+    if times is None:
+        return by(drive.odometry, drive.observed)
+    return find_alignment(
+        drive.odometry, drive.observed, POLICY, NOISE, lasting(drive.stamp, times))
+
+
+def checked(
+    solved: FloatArray, odometry: FloatArray, table: ObservedNodes, sigma: float = 0.0,
+) -> GraphAlignment | None:
+    return recheck(solved, odometry, table, POLICY, NOISE,
+                   correlation=lasting(np.zeros(len(table)), 0.0), sigma=sigma)
 
 
 @given(seeds, st.integers(2, 40), st.floats(0.5, 30.0))
@@ -132,10 +152,9 @@ def test_the_order_of_the_rows_changes_nothing(seed: int, n: int, fraction: floa
     bad = rng.permutation(n)[:int(fraction * n)]
     some = some.moved(bad, 40.0 * rng.standard_normal((len(bad), 2)))
     order = rng.permutation(n)
-    times = TimeCorrelation(some.stamp, 30.0)
-    turn = found(some, correlation=times)
+    turn = found(some, 30.0)
     other = find_alignment(some.odometry, some.observed.rows(order), POLICY, NOISE,
-                      TimeCorrelation(times.stamps[order], 30.0))
+                           lasting(some.stamp[order], 30.0))
     assert (turn.sigma, turn.node) == (other.sigma, other.node)
     np.testing.assert_array_equal(turn.T_map_graph, other.T_map_graph)
 
@@ -166,8 +185,7 @@ def normalised_errors(
     squares = []
     for seed in range(150):
         some = drive(seed, n, gap, **arguments)
-        times = TimeCorrelation(some.stamp, arguments['time']) if correlated else None
-        turn = found(some, correlation=times)
+        turn = found(some, arguments['time'] if correlated else 0.0)
         if turn.T_map_graph is not None:
             squares.append((some.error(turn) / turn.sigma)**2)
     assert len(squares) > 140
@@ -196,12 +214,12 @@ def test_the_sigma_is_no_smaller_than_errors_with_a_correlation_time_of_a_minute
 def test_correlated_errors_have_a_larger_sigma() -> None:
     some = drive(0, 300, 1.0)
     white = found(some).sigma
-    assert found(some, correlation=TimeCorrelation(some.stamp, 0.0)).sigma == white
-    assert found(some, correlation=TimeCorrelation(some.stamp, 30.0)).sigma > white
+    assert found(some, 0.0).sigma == white
+    assert found(some, 30.0).sigma > white
     # errors of different receivers are independent
     times = np.where(np.arange(300) % 2 == 0, 30.0, 30.1)
-    both = found(some, correlation=TimeCorrelation(some.stamp, times)).sigma
-    assert white < both < found(some, correlation=TimeCorrelation(some.stamp, 30.0)).sigma
+    both = found(some, times).sigma
+    assert white < both < found(some, 30.0).sigma
 
 
 def test_covariances_that_are_too_small_are_seen_from_the_residuals() -> None:
@@ -219,7 +237,7 @@ def test_the_covariance_of_a_position_is_that_in_the_map() -> None:
     # of a global pose it stands in the axes of that pose, here turned by 90 degrees
     table.kind[1], table.mean[1, 2] = ObservedKind.GLOBAL_POSE, np.pi / 2.0
     table.information[1] = np.diag([1.0, 0.25, 1.0])
-    root = positions_along(np.zeros((1, 3)), table, NOISE, None).root
+    root = positions_along(np.zeros((1, 3)), table, NOISE, lasting(np.zeros(2), 0.0)).root
     covariances = sorted((root @ np.swapaxes(root, 1, 2)).round(9).tolist())
     assert covariances == [[[4.0, 0.0], [0.0, 1.0]], [[4.0, 1.0], [1.0, 2.0]]]
 
@@ -340,46 +358,23 @@ def test_one_global_pose_gives_the_angle() -> None:
     table.kind[4] = ObservedKind.GLOBAL_POSE
     table.mean[4] = some.truth[some.node[4]]
     table.information[4] = np.diag([1.0, 1.0, 100.0])
-    turn = find_alignment(some.odometry, table, POLICY, NOISE)
+    turn = by(some.odometry, table)
     assert turn.node == some.node[4]
     assert turn.sigma == pytest.approx(0.1)
     np.testing.assert_allclose(
         se2.compose(turn.T_map_graph, some.odometry[turn.node]), table.mean[4], atol=EXACT)
     # unless its heading is poor
     table.information[4] = np.diag([1.0, 1.0, 1.0])
-    assert find_alignment(some.odometry, table, POLICY, NOISE).T_map_graph is None
-
-
-@pytest.mark.parametrize('seed', range(10))
-def test_a_wrong_first_angle_is_seen_once_there_are_more_positions(seed: int) -> None:
-    some = drive(seed, 35, 3.0, sigma=0.5)
-    wrongly = some.xy.copy()
-    wrongly[:5] = se2.transform(np.array([12.0, -7.0, 1.5]), wrongly[:5] - wrongly[0]) + wrongly[0]
-    some = replace(some, xy=wrongly)
-
-    def first(k: int) -> Drive:
-        return replace(some, node=some.node[:k], xy=some.xy[:k])
-
-    early = found(first(5))
-    assert some.error(early) > 1.0
-    solved = se2.compose(early.T_map_graph, some.odometry)
-    for k in (5, 8):    # too few right positions yet
-        assert recheck(solved, some.odometry, first(k).observed, POLICY, NOISE) is None
-    again = recheck(
-        solved, some.odometry, some.observed, POLICY, NOISE, sigma=early.sigma)
-    assert again is not None
-    assert some.error(again) < max(0.2, 5.0 * again.sigma)
-    solved = se2.compose(again.T_map_graph, some.odometry)
-    assert recheck(solved, some.odometry, some.observed, POLICY, NOISE) is None
+    assert by(some.odometry, table).T_map_graph is None
 
 
 def test_an_angle_that_is_right_stays() -> None:
     for seed in range(50):
         some = drive(seed, 60, 2.0)
-        turn = find_alignment(some.odometry, some.observed.rows(slice(0, 12)), POLICY, NOISE)
+        turn = by(some.odometry, some.observed.rows(slice(0, 12)))
         solved = se2.compose(turn.T_map_graph, some.odometry)
         for k in (24, 48, 60):
-            assert recheck(solved, some.odometry, some.observed.rows(slice(0, k)), POLICY,
-                               NOISE, sigma=turn.sigma) is None
+            assert checked(
+                solved, some.odometry, some.observed.rows(slice(0, k)), turn.sigma) is None
         # drift that the graph has corrected is no reason either
-        assert recheck(some.truth, some.odometry, some.observed, POLICY, NOISE) is None
+        assert checked(some.truth, some.odometry, some.observed) is None

@@ -15,15 +15,14 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.measurements import (
     Absolute,
-    GlobalPose,
     HeadingOnly,
     OdometrySample,
     Position,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
+from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement
 
 SECOND = 1_000_000_000
 CONFIG, SOURCE = BackendConfig(), OdometrySource()
@@ -149,14 +148,6 @@ def test_a_certain_heading_and_one_position_are_enough(node: int) -> None:
     assert T_map_graph is not None
     np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
     assert some.sigma == pytest.approx(0.01)    # of the better one
-
-
-def test_a_global_pose_aligns_alone() -> None:
-    some = AlignmentMonitor(CONFIG)
-    pose = GlobalPose(SECOND, T_MAP_ODOM, np.diag([0.01, 0.01, 1e-4]))
-    T_map_graph = some.find(GRAPH, [attached(pose, 0)], NODES)
-    assert T_map_graph is not None
-    np.testing.assert_allclose(T_map_graph, T_MAP_ODOM, atol=1e-9)
 
 
 def test_a_wrong_first_angle_is_corrected_and_its_sigma_too() -> None:

@@ -13,12 +13,18 @@ from scipy.optimize import minimize
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    Loss,
+    MeasurementSource,
+    OdometrySource,
+    SolverConfig,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.losses import costs_and_weights
+from pose_graph_ros.core.graph.reweighting import costs_and_weights
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     LoopClosure,
@@ -26,7 +32,6 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 1_000_000_000
 ENDING = (Loss.TUKEY, Loss.TRUNCATED)
@@ -291,24 +296,3 @@ def test_perpendicular_walls_turn_headings_as_weighted_least_squares_says() -> N
         se2.rotation(poses[1][2]) @ (gain[:2] * innovation), [gain[2] * innovation]))
     np.testing.assert_allclose(backend.graph.poses[1], expected, atol=1e-9)
     np.testing.assert_array_equal(backend.graph.poses[0], 0.0)
-
-
-def test_a_structure_prior_leaves_positions_that_are_known_alone() -> None:
-    odometry, measurements, truth = drive(10, n=40)
-    plain = fed(PoseGraphBackend(config(Loss.NONE)), odometry, measurements)
-    plain.optimize()
-    turn = float(truth[30, 2] - truth[10, 2]) + 0.05
-    prior = LoopClosure(31 * SECOND, np.array([0.0, 0.0, turn]),
-                        np.diag([np.inf, np.inf, 1e-4]), reference_ns=11 * SECOND)
-    backend = fed(PoseGraphBackend(config(Loss.NONE)), odometry, [*measurements, prior])
-    backend.optimize()
-    turned = se2.wrap(np.diff(backend.graph.poses[[10, 30], 2])[0])
-    before = se2.wrap(np.diff(plain.graph.poses[[10, 30], 2])[0])
-    # the turn changes by the gain of a scalar Kalman update
-    joint = plain._smoother.joint_covariance(10, 30)
-    variance = joint[2, 2] + joint[5, 5] - 2.0 * joint[2, 5]
-    expected = se2.wrap(turn - before) * variance / (variance + 1e-4)
-    assert se2.wrap(turned - before) == pytest.approx(float(expected), rel=0.02)
-    # the positions move as far as the fixes let them
-    off = backend.graph.poses[:, :2] - plain.graph.poses[:, :2]
-    assert np.max(np.hypot(*off.T)) < 0.3

@@ -87,6 +87,7 @@ def test_cliques_are_what_elimination_node_by_node_gives(
     result = ordered(n, edges, elements, n_last, n_before)
     assert sorted(result.order) == list(range(n))
     assert set(result.order[:n_before]) == set(range(n_before))
+    assert result.order[n - n_last:] == list(range(n - n_last, n))
     assert all((frontal[0] < n_before) == (frontal[-1] < n_before) for frontal in result.frontal)
     near = iter(fill(n, edges, elements, result.order))
     for frontal, separator in zip(result.frontal, result.separator, strict=True):
@@ -115,16 +116,6 @@ def test_the_separator_of_a_clique_is_a_part_of_its_parent(
         assert set(element) <= nodes[parent]
         # what is below the nodes before all others has one of them
         assert min(element) < n_before or result.frontal[parent][0] >= n_before
-
-
-@given(graphs())
-@settings(max_examples=100)
-def test_the_last_nodes_are_eliminated_last_and_in_order(
-    graph: tuple[int, Pairs, list[list[int]], int],
-) -> None:
-    n, edges, elements, n_last = graph
-    order = ordered(n, edges, elements, n_last).order
-    assert order[n - n_last:] == list(range(n - n_last, n))
 
 
 def test_a_tree_gets_no_fill() -> None:

@@ -164,43 +164,6 @@ def test_the_parts_of_a_turn_in_place_compose_to_the_whole(first: float, second:
         composed(*parts, np.array([0.0, 0.0, second])), whole, atol=ROUNDING)
 
 
-def sampled_random_walk(distance: float) -> FloatArray:
-    """Drive straight ahead (or back, if negative) with a heading that walks; in the end frame."""
-    rng = np.random.default_rng(4)
-    n_drives, n_steps = 20_000, 100
-    sigma = NOISE.sigma_heading_distance * np.sqrt(abs(distance) / n_steps)
-    pose = np.zeros((n_drives, 3))
-    for _ in range(n_steps):
-        pose[:, 2] += 0.5 * sigma * rng.standard_normal(n_drives)
-        pose = se2.compose(pose, np.array([distance / n_steps, 0.0, 0.0]))
-        pose[:, 2] += np.sqrt(0.75) * sigma * rng.standard_normal(n_drives)
-    # the end as it was, seen from where it was thought to be: error in the frame at the end
-    return np.cov(se2.between(np.array([distance, 0.0, 0.0]), pose).T)
-
-
-def heading_part(distance: float) -> FloatArray:
-    noise = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_turn=0.0,
-                          sigma_heading_distance=NOISE.sigma_heading_distance)
-    return odometry(
-        np.array([distance, 0.0, 0.0]), abs(distance), 0.0, noise, floor=False)
-
-
-def test_a_walking_heading_shows_across_the_path_as_it_does_in_samples() -> None:
-    # 2e4 drives: 0.7 % one sigma, and 100 steps instead of a walk: 1 %
-    np.testing.assert_allclose(
-        sampled_random_walk(10.0)[1:, 1:], heading_part(10.0)[1:, 1:], rtol=0.05)
-
-
-@given(st.floats(0.0, 100.0), st.floats(0.0, 10.0))
-def test_odometry_that_has_a_floor_is_always_a_covariance(distance: float, turn: float) -> None:
-    increment = np.array([0.6 * distance, -0.8 * distance, turn])
-    cov = odometry(increment, distance, turn)
-    assert covariance.defect(cov) is None
-    bare = odometry(increment, distance, turn, floor=False)
-    np.testing.assert_allclose(cov - bare, np.diag([1e-4, 1e-4, 1e-6]), atol=1e-9)
-    assert np.min(np.linalg.eigvalsh(bare)) > -ROUNDING
-
-
 VARIANCE = np.array([0.04, 0.01, 0.0025])
 
 

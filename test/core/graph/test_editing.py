@@ -1,14 +1,17 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Edits keep chi2 and the lists of constraints as they follow from the rows, and can be undone."""
+"""Edits keep chi2 and lists as they follow from the rows; what leaves leaves no trace."""
+
+from collections.abc import Callable
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from random_graphs import random_edges, random_graph, random_observed, random_poses, snapshot
+from slow_smoother import differences, state
 
-from pose_graph_ros.core.graph import editing, error_functions, tables as tb
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 seeds = st.integers(0, 2**32 - 1)
@@ -29,66 +32,44 @@ def edited(graph: Graph, steps: list[tuple[str, int, float]], rng: np.random.Gen
                 observed=random_observed(rng, [graph.n_nodes]))}[what])
 
 
-def chi2(graph: Graph) -> float:
-    """Return the sum of all weighted energies, from copies of the rows."""
-    edges, observed = graph.edges, graph.observed
-    return float(np.sum(error_functions.energies(
-        error_functions.edge_errors(graph.poses, edges), edges.weighted_information))
-        + np.sum(error_functions.energies(error_functions.observed_errors(
-            graph.poses, observed), observed.weighted_information)))
-
-
-def edges_of(graph: Graph, node: int) -> list[int]:
-    """Return the edges in the list of a node; the two low bits are the end of the edge."""
-    edge_i, found = graph.memory['edge_i'], []
-    entry = int(graph.memory['node_i'][node, tb.EDGE_LIST])
-    while entry >= 0:
-        edge, side = entry >> 2, entry & 3
-        assert edge_i[edge, side] == node
-        found.append(edge)
-        entry = int(edge_i[edge, tb.NEXT_I + side])
-    return found
-
-
-def observed_of(graph: Graph, node: int) -> list[int]:
-    row, found = int(graph.memory['node_i'][node, tb.OBSERVED_LIST]), []
-    while row >= 0:
-        found.append(row)
-        row = int(graph.memory['observed_i'][row, tb.OBS_NEXT])
+def listed(graph: Graph) -> list[tuple[list[int], list[int]]]:
+    """Return the ids of the edges and the observed nodes in the lists of each node, sorted."""
+    memory, found = graph.memory, []
+    for row in memory['node_i'][:graph.n_nodes]:
+        edges, observed = [], []
+        entry, k = int(row[tb.EDGE_LIST]), int(row[tb.OBSERVED_LIST])
+        while entry >= 0:
+            edges.append(int(graph.edge_ids[entry >> 2]))
+            entry = int(memory['edge_i'][entry >> 2, tb.NEXT_I + (entry & 3)])
+        while k >= 0:
+            observed.append(int(graph.observed_ids[k]))
+            k = int(memory['observed_i'][k, tb.OBS_NEXT])
+        found.append((sorted(edges), sorted(observed)))
     return found
 
 
 @given(seeds, edits)
 @settings(max_examples=60)
-def test_after_any_edits_chi2_is_that_of_the_rows(
-    seed: int, steps: list[tuple[str, int, float]],
-) -> None:
-    graph = random_graph(seed)
-    edited(graph, steps, np.random.default_rng(seed))
-    assert graph.memory['scalars'][tb.CHI2] == pytest.approx(chi2(graph), rel=1e-9, abs=1e-6)
-
-
-@given(seeds, edits)
-@settings(max_examples=60)
-def test_each_constraint_with_a_weight_is_once_in_the_lists_of_its_nodes(
+def test_after_any_edits_chi2_and_lists_are_those_of_the_rows(
     seed: int, steps: list[tuple[str, int, float]],
 ) -> None:
     graph = random_graph(seed)
     edited(graph, steps, np.random.default_rng(seed))
     edges, observed = graph.edges, graph.observed
-    for node in range(graph.n_nodes):
-        assert sorted(edges_of(graph, node)) == np.flatnonzero(
-            ((edges.i == node) | (edges.j == node)) & (edges.weight > 0.0)).tolist()
-        assert sorted(observed_of(graph, node)) == np.flatnonzero(
-            (observed.node == node) & (observed.weight > 0.0)).tolist()
+    assert graph.memory['scalars'][tb.CHI2] == pytest.approx(
+        graph.energies().chi2, rel=1e-9, abs=1e-6)
+    assert listed(graph) == [
+        (np.flatnonzero(((edges.i == node) | (edges.j == node)) & (edges.weight > 0.0)).tolist(),
+         np.flatnonzero((observed.node == node) & (observed.weight > 0.0)).tolist())
+        for node in range(graph.n_nodes)]
 
 
 def test_a_weight_of_zero_removes_a_constraint_and_another_brings_it_back() -> None:
     graph = random_graph(8)
-    before, whole = snapshot(graph), chi2(graph)
+    before, whole = snapshot(graph), graph.energies().chi2
     graph.apply(GraphUpdate(remove_edges=range(graph.n_edges),
                             remove_observed=range(graph.n_observed)))
-    assert chi2(graph) == 0.0
+    assert graph.energies().chi2 == 0.0
     scales = graph.memory['node_f'][:graph.n_nodes, [tb.SCALE_T, tb.SCALE_R]]
     np.testing.assert_allclose(scales, 0.0, atol=1e-5)
     graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(range(graph.n_edges), 1.0),
@@ -97,27 +78,171 @@ def test_a_weight_of_zero_removes_a_constraint_and_another_brings_it_back() -> N
     assert graph.memory['scalars'][tb.CHI2] == pytest.approx(whole)
 
 
-def columns(edges: Edges) -> tuple[np.ndarray, ...]:
-    none = Graph().observed
-    return (np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.uint8), *edges.columns,
-            *(np.ascontiguousarray(column) for column in (
-                none.node.astype(np.int64), none.offset, none.mean, none.information,
-                none.kind.astype(np.uint8), none.weight)))
+# --- what leaves leaves no trace in the tables, and its id never comes back ---------------------
+
+def graph_of(seed: int) -> Graph:
+    """Return a graph with biases, some constraints of which have the weight 0."""
+    graph, rng = random_graph(seed, n_nodes=9, n_biases=3), np.random.default_rng(seed)
+    graph.apply(GraphUpdate(
+        remove_edges=rng.choice(graph.n_edges, 4, replace=False).tolist(),
+        remove_observed=rng.choice(graph.n_observed, 2, replace=False).tolist(), fix=(2,)))
+    return graph
 
 
-def test_rows_are_added_all_or_none_and_the_answer_says_why() -> None:
-    graph, rng = random_graph(4), np.random.default_rng(4)
-    graph.ensure(50, 50, 50)
-    head, before = graph.memory.head, snapshot(graph)
-    good = random_edges(rng, [0, 1], [2, 3])
-    bad = Edges(good.i, good.j, good.mean, good.information * np.array([1.0, -1.0])[:, None, None],
-                good.kind)
-    for checked, edges, expected in (
-            (False, bad, editing.UNSOUND),
-            (False, random_edges(rng, [0], [graph.n_nodes]), editing.UNSOUND),
-            (False, random_edges(rng, [0] * 10**3, [1] * 10**3), editing.NO_ROOM),
-            (True, random_edges(rng, [0] * 10**3, [1] * 10**3), editing.NO_ROOM)):
-        assert editing.add_rows(head, *columns(edges), checked) == expected
-        assert snapshot(graph) == before
-    assert editing.add_rows(head, *columns(good), False) == editing.ADDED
-    assert graph.n_edges == len(graph.edges) == random_graph(4).n_edges + 2
+def leaving(graph: Graph, rng: np.random.Generator) -> GraphUpdate:
+    nodes, edges, observed = (
+        rng.choice(ids, min(len(ids), int(rng.integers(0, 4))), replace=False).tolist()
+        for ids in (graph.node_ids, graph.edge_ids, graph.observed_ids))
+    return GraphUpdate(remove_nodes=nodes, drop_edges=edges, drop_observed=observed)
+
+
+@given(seeds)
+@settings(max_examples=60)
+def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
+    graph, rng = graph_of(seed), np.random.default_rng(seed)
+    for _ in range(3):
+        before, update = graph.rows(), leaving(graph, rng)
+        graph.apply(update)
+        stays = ~np.isin(before.node_ids, update.remove_nodes)
+        nodes = before.node_ids[stays]
+        edges = (np.isin(before.edges.i, nodes) & np.isin(before.edges.j, nodes)
+                 & ~np.isin(before.edge_ids, update.drop_edges))
+        observed = (np.isin(before.observed.node, nodes)
+                    & ~np.isin(before.observed_ids, update.drop_observed))
+        assert graph.node_ids.tolist() == nodes.tolist()
+        assert graph.edge_ids.tolist() == before.edge_ids[edges].tolist()
+        assert graph.observed_ids.tolist() == before.observed_ids[observed].tolist()
+        assert graph.next_ids == before.next_ids
+        for table, rows in ((graph.edges, before.edges.rows(edges)),
+                            (graph.observed, before.observed.rows(observed))):
+            for column, expected in zip(table.columns, rows.columns, strict=True):
+                np.testing.assert_array_equal(column, expected)
+        anew = Graph()
+        anew.fill(before._replace(
+            poses=before.poses[stays], node_kind=before.node_kind[stays],
+            dimension=before.dimension[stays], fixed=before.fixed[stays],
+            edges=before.edges.rows(edges), observed=before.observed.rows(observed),
+            node_ids=nodes, edge_ids=before.edge_ids[edges],
+            observed_ids=before.observed_ids[observed]))
+        assert snapshot(graph) == snapshot(anew)
+        assert listed(graph) == listed(anew)
+        assert graph.newest_pose == anew.newest_pose
+        assert sorted(graph.node_ids[graph.memory['touched'][:graph.memory.head[
+            tb.N_TOUCHED]]].tolist()) == nodes.tolist()
+        if len(nodes) > 0:
+            scale = [g.memory['node_f'][:g.n_nodes, tb.SCALE_T:tb.SCALE_R + 1]
+                     for g in (graph, anew)]
+            np.testing.assert_allclose(*scale, rtol=1e-6, atol=1e-5)
+        assert graph.energies().chi2 == pytest.approx(anew.energies().chi2, rel=1e-12)
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_new_rows_go_on_with_the_ids_and_find_the_nodes(seed: int) -> None:
+    graph, rng = graph_of(seed), np.random.default_rng(seed)
+    graph.apply(leaving(graph, rng)._replace(remove_nodes=[1, 11], drop_edges=[0]))
+    left, first = graph.node_ids[~graph.is_bias].tolist(), graph.next_ids
+    i, j = rng.choice(left, 2, replace=False).tolist()
+    edges = random_edges(rng, [i, first.node], [first.node + 1, j])
+    observed = random_observed(rng, [first.node, i])
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=edges, observed=observed))
+    assert graph.node_ids[-2:].tolist() == [12, 13] == [first.node, first.node + 1]
+    assert graph.next_ids == (first.node + 2, first.edge + 2, first.observed + 2)
+    found = graph.edges_at([first.edge, first.edge + 1])
+    assert (found.i.tolist(), found.j.tolist()) == (edges.i.tolist(), edges.j.tolist())
+    assert graph.observed_at([first.observed, first.observed + 1]).node.tolist() == [12, i]
+    poses = dict(zip(graph.node_ids.tolist(), graph.poses, strict=True))
+    np.testing.assert_array_equal(graph.poses_of([j, 12]), [poses[j], poses[12]])
+    assert graph.node_rows([1, 11, 99, -1]).tolist() == [-1] * 4
+    assert graph.edge_rows(0) == -1
+
+
+GONE: dict[str, tuple[Callable[[], GraphUpdate], str]] = {
+    'fix': (lambda: GraphUpdate(fix=[3]), 'fix: hidden node 3 has left the graph'),
+    'free': (lambda: GraphUpdate(free=[2, 3]), 'free: hidden node 3 has left the graph'),
+    'remove': (lambda: GraphUpdate(remove_nodes=[3]), 'remove_nodes: hidden node 3 has left'),
+    'edge': (lambda: GraphUpdate(weigh_edges={0: 1.0}), 'weigh_edges: edge 0 has left the graph'),
+    'drop': (lambda: GraphUpdate(drop_edges=[0]), 'drop_edges: edge 0 has left the graph'),
+    'observed': (lambda: GraphUpdate(remove_observed=[1]),
+                 'remove_observed: observed node 1 has left the graph'),
+    'end': (lambda: GraphUpdate(edges=random_edges(np.random.default_rng(0), [2, 4], [4, 3])),
+            'Edges: hidden node 3 has left the graph; row 1'),
+    'observation': (lambda: GraphUpdate(observed=random_observed(np.random.default_rng(0), [3])),
+                    'ObservedNodes: hidden node 3 has left the graph; row 0'),
+}
+
+
+@pytest.mark.parametrize('name', GONE)
+def test_an_id_that_has_left_is_refused_by_name(name: str) -> None:
+    make, message = GONE[name]
+    graph = random_graph(4, n_nodes=7)
+    graph.apply(GraphUpdate(remove_nodes=[3], drop_edges=[0], drop_observed=[1]))
+    before = state(graph)
+    with pytest.raises(GraphUpdateError, match=message):
+        graph.apply(make())
+    assert differences(before, state(graph)) == []
+
+
+@pytest.mark.parametrize('end', ['commit', 'rollback'])
+def test_after_an_update_what_leaves_is_taken_out_at_once_again(end: str) -> None:
+    graph = graph_of(5)
+    graph.begin()
+    graph.apply(GraphUpdate(remove_nodes=[4]))
+    getattr(graph, end)()
+    for node in (3, 6):
+        graph.apply(GraphUpdate(remove_nodes=[node]))
+        assert graph.node_rows(node) == -1
+
+
+def test_within_an_update_rows_stay_and_a_rollback_brings_all_back() -> None:
+    graph = graph_of(5)
+    before = state(graph)
+    graph.begin()
+    graph.apply(GraphUpdate(remove_nodes=[0, 8, 10], drop_edges=[3], drop_observed=[0]))
+    assert graph.n_nodes == 12
+    assert graph.newest_pose == 7
+    assert graph.leaving() == GraphUpdate(
+        remove_nodes=[0, 8, 10], drop_edges=[3], drop_observed=[0])
+    graph.rollback()
+    assert differences(before, state(graph)) == []
+    assert graph.leaving() == GraphUpdate(remove_nodes=[], drop_edges=[], drop_observed=[])
+    graph.begin()
+    edges = graph.edges
+    graph.apply(GraphUpdate(remove_nodes=[0, 8]))
+    left = graph.commit()
+    assert left.nodes.tolist() == [0, 8]
+    assert left.edges.tolist() == np.flatnonzero(
+        np.isin(edges.i, [0, 8]) | np.isin(edges.j, [0, 8])).tolist()
+
+
+def test_a_graph_can_be_emptied_and_goes_on() -> None:
+    graph = random_graph(6, n_biases=2)
+    graph.apply(GraphUpdate(remove_nodes=range(9)))
+    assert (graph.n_nodes, graph.n_edges, graph.n_observed, graph.newest_pose) == (0, 0, 0, -1)
+    assert graph.node_rows([0, 8]).tolist() == [-1, -1]
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3))))
+    assert (graph.node_ids.tolist(), graph.newest_pose) == ([9], 9)
+
+
+def test_rows_are_filled_with_their_ids_which_must_ascend() -> None:
+    graph = graph_of(7)
+    first = graph.rows()
+    graph.apply(GraphUpdate(remove_nodes=[1, 11], drop_edges=[4]))
+    copy = Graph()
+    copy.fill(graph.rows())
+    assert (snapshot(copy), copy.next_ids) == (snapshot(graph), graph.next_ids)
+    assert copy.node_ids.tolist() == graph.node_ids.tolist()
+    graph.apply(GraphUpdate(hidden=np.ones((2, 3)), fix=[13]))
+    copy.fill(graph.rows().since(first.next_ids))
+    assert snapshot(copy) == snapshot(graph)
+    with pytest.raises(GraphUpdateError, match='node: expected ascending ids from 14 on'):
+        copy.fill(graph.rows())
+
+
+def test_ids_that_somebody_holds_stay_what_they_are() -> None:
+    graph = random_graph(seed=2)
+    held = graph.node_ids, graph.edge_ids, graph.observed_ids
+    copies = [ids.copy() for ids in held]
+    graph.apply(GraphUpdate(remove_nodes=[1, 3]))
+    for ids, copy in zip(held, copies, strict=True):
+        np.testing.assert_array_equal(ids, copy)

@@ -13,14 +13,19 @@ from random_graphs import matrix, random_information, slow_edge, slow_observed, 
 from slow_smoother import EXACT
 
 from pose_graph_ros.core.batch import gauss_newton, optimizer
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    Edges,
+    FACTORS,
+    ObservedKind,
+    ObservedNodes,
+)
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.kinds import FACTORS
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.solver_config import SolverConfig
 
 N_POSES = 8
 POINTS = np.array([[3.0, 2.0], [-2.0, 4.0], [5.0, -3.0]])

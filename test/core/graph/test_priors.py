@@ -14,13 +14,13 @@ from slow_smoother import differences, EXACT, SlowGraph, state, world
 
 from pose_graph_ros.core.batch import gauss_newton, optimizer
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, packed
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.solver_config import SolverConfig
 
 seeds, flags = st.integers(0, 2**32 - 1), st.booleans()
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reweighting by robust losses, in time independent of the graph."""
 
+from dataclasses import replace
+
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -11,8 +13,7 @@ from saved_graphs import assert_same_value
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.graph import error_functions, reweighting
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.losses import costs_and_weights
-from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.graph.reweighting import costs_and_weights, Reweighting
 
 seeds = st.integers(0, 2**32 - 1)
 some_losses = st.lists(
@@ -89,7 +90,7 @@ def robust_edges(graph: Graph) -> Reweighting:
 def test_the_newest_are_reweighted_at_every_update_and_all_others_in_turn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(reweighting, 'WINDOW', 4)
+    monkeypatch.setattr(reweighting, 'TUNING', replace(reweighting.TUNING, window=4))
     graph = random_graph(2, n_edges=20)     # with three duplicates
     some, seen = robust_edges(graph), []
     for _ in range(5):
@@ -104,7 +105,7 @@ def test_the_newest_are_reweighted_at_every_update_and_all_others_in_turn(
 def test_a_saved_state_goes_on_with_the_constraint_that_is_next(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(reweighting, 'WINDOW', 4)
+    monkeypatch.setattr(reweighting, 'TUNING', replace(reweighting.TUNING, window=4))
     graph = random_graph(2, n_edges=20)
     one, other = robust_edges(graph), Reweighting()
     one.add(3, Loss.HUBER, 2.0, edge=False)

@@ -7,7 +7,8 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import rows, tables as tb
-from pose_graph_ros.core.graph.constraints import check, Edges, full
+from pose_graph_ros.core.graph.checks import check
+from pose_graph_ros.core.graph.constraints import Edges, full
 
 numbers = st.sampled_from([0.0, 1e-12, 1e-3, 0.5, 1.0, -1.0, 30.0, 1e150, 1e300, np.inf, np.nan])
 skews = st.sampled_from([0.0, 1e-9, 1e-4, -0.5])
@@ -25,7 +26,7 @@ def is_valid(matrix: np.ndarray) -> bool:
 
 def packed(matrix: np.ndarray) -> tuple[bool, np.ndarray]:
     row = np.zeros(tb.EDGE_F)
-    valid = rows._pack_information(row, matrix)
+    valid = rows.write_measurement(row, np.zeros(3), matrix)
     return valid, full(row[None, tb.INFO:tb.INFO + 6])[0]
 
 

@@ -21,7 +21,6 @@ from saved_graphs import (
 )
 from test_delay_invariance import DRIVES, Event, PLAIN, ROBUST, SAME_PATH
 
-from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
@@ -40,9 +39,8 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     Measurement,
     OdometrySample,
-    Position,
 )
-from pose_graph_ros.core.sources.waiting import WaitingMeasurements
+from pose_graph_ros.core.sources.pipeline import WaitingMeasurements
 
 CONFIGS = {'plain': PLAIN, 'robust': ROBUST, 'correlated': CORRELATED}
 
@@ -187,16 +185,6 @@ def test_edges_that_wait_and_those_set_aside_are_saved() -> None:
             [queued.source for queued in restored._quarantine.edges]) == (['waits'], ['failed'])
     assert_same_estimate(closed(restored), closed(backend), SAME_PATH)
     assert restored.graph.n_edges == backend.graph.n_edges == len(backend.node_stamps_ns) - 1 + 2
-
-
-def test_positions_that_wait_for_the_alignment_are_left_out_and_counted() -> None:
-    backend = straight_line()
-    backend.add_measurement(Position(
-        3 * SECOND, np.array([100.0, 0.0]), np.eye(2), np.zeros(2)), 'fix')
-    backend.update()
-    assert backend.estimate().alignment is AlignmentState.UNALIGNED
-    saved = through_files(backend.saved())
-    assert (saved.n_left_out, len(saved.sources['fix'].seen_ns)) == (1, 0)
 
 
 # --- other settings than before ------------------------------------------------------------------

@@ -14,9 +14,10 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement import closure_judge, closure_states
 from pose_graph_ros.core.judgement.closures import GATE
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Change, Decision, State
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
-from pose_graph_ros.core.sources.constraint_queue import NewConstraint
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 SECOND = 10**9
 LAP = 60  # duration of a round [s]
@@ -196,8 +197,8 @@ def test_a_source_that_is_no_longer_judged_keeps_the_verdicts_so_far(robust: Rob
 def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(closure_states, 'MOST_WAITING', 6)
-    monkeypatch.setattr(closure_states, 'LEFT', 4)
+    monkeypatch.setattr(
+        closure_states, 'BELIEF', replace(BELIEF, most_waiting=6, left_waiting=4))
     # each is so far off that none agrees with another one
     backend = driven(*(12.0 * (-1.0) ** k * (k + 2) for k in range(9)), 0.0, 0.0, 0.0, 0.0)
     total = backend.verdict_totals()['loop']
@@ -208,11 +209,9 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     # the first one is the nearest to the gate: not hopeless
     assert math.sqrt(10.0 * GATE) > backend.verdicts()[0].distance > math.sqrt(GATE)
     assert np.flatnonzero(judge.states.forgotten).tolist() == list(range(1, 7))
-    # nothing is kept of them that could be computed again, and they support no other
+    # they support no other
     kept = [number for cell in judge._table._cells.values() for number in cell]
     assert sorted(kept) == [0, *range(7, 13)]
-    assert {len(column) for column in judge._table._columns} == {7}
-    assert judge._table.crowd(1) == 0
     assert not np.any(backend.graph.edges.weight[judge.states.edge[:9]])
     # whom a person decides on is judged again when that is taken back
     for decision in (Decision.OUT, Decision.AUTO):
@@ -227,7 +226,7 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
 def test_of_many_new_closures_an_update_tests_some_and_the_work_the_others(
     monkeypatch: pytest.MonkeyPatch, *, large: bool,
 ) -> None:
-    monkeypatch.setattr(closure_judge, 'LARGE', 0 if large else 500)
+    monkeypatch.setattr(closure_judge, 'BELIEF', replace(BELIEF, large=0 if large else 500))
     backend = driven()
     n = 60
     for k in range(n):
@@ -238,7 +237,7 @@ def test_of_many_new_closures_an_update_tests_some_and_the_work_the_others(
             'loop')
     backend.update()
     tested = ~np.isnan(backend._judge._closures.states.distance)
-    in_update = closure_judge.MOST_NEW + closure_judge.IN_UPDATE
+    in_update = BELIEF.tests_of_new + BELIEF.tests_in_update
     assert np.count_nonzero(tested) == (0 if large else in_update)
     settle(backend)
     assert states(backend) == n * [True]

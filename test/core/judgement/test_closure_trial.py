@@ -2,27 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """What an update leaves to the work after it: closures it diverges with, tests of large graphs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise, OdometrySource
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    NodePolicy,
+    OdometryNoise,
+    OdometrySource,
+    SolverConfig,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import closure_judge
-from pose_graph_ros.core.judgement.closure_judge import IN_PART, LARGE
-from pose_graph_ros.core.judgement.residual_scale import MOST
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.innovations import Innovations
-from pose_graph_ros.core.smoother.results import DIVERGED, UpdateResult
+from pose_graph_ros.core.smoother.covariances import Innovations
+from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.smoother.trial import Trial
-from pose_graph_ros.core.solver_config import SolverConfig
 
 SECOND = 10**9
 COVARIANCE = np.square(np.diag([0.1, 0.1, 0.03]))
@@ -150,7 +155,8 @@ DIVERGING = np.array([20.0, 60.0, 2.0])
 def test_closures_that_an_update_diverges_with_are_believed_after_it(
     monkeypatch: pytest.MonkeyPatch, *, in_update: bool,
 ) -> None:
-    monkeypatch.setattr(closure_judge, 'LARGE', 600 if in_update else 500)
+    monkeypatch.setattr(
+        closure_judge, 'BELIEF', replace(BELIEF, large=600 if in_update else 500))
     backend, smoother, poses = driven(600)
     add_group(backend, poses, DIVERGING, 6)
     odometry = backend.graph.poses[-1].copy()
@@ -276,7 +282,7 @@ def test_a_person_who_decides_meanwhile_wins(parts: int) -> None:
 
 
 def test_an_update_of_a_large_graph_tests_nothing_and_its_work_a_bounded_number() -> None:
-    backend, smoother, poses = driven(LARGE + 200)
+    backend, smoother, poses = driven(BELIEF.large + 200)
     place = se2.between(poses[10], poses[-200]) + np.array([0.5, 0.3, 0.01])
     add_group(backend, poses, place, 100)
     backend.update()
@@ -289,5 +295,5 @@ def test_an_update_of_a_large_graph_tests_nothing_and_its_work_a_bounded_number(
         most = max(most, smoother.gates)
         assert smoother.solves <= 1
     # a scale is learnt from more of them
-    assert 0 < most <= max(IN_PART, MOST)
+    assert 0 < most <= max(BELIEF.tests_in_part, BELIEF.most_looked_at)
     assert states(backend) == {State.BELIEVED}

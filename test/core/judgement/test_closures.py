@@ -10,17 +10,22 @@ import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    CLOSURE_FLOORS,
+    MeasurementSource,
+    NodePolicy,
+    Robust,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.judgement import relative
-from pose_graph_ros.core.judgement.closures import claims, GATE
-from pose_graph_ros.core.judgement.floors import forward
-from pose_graph_ros.core.judgement.scale_learner import ScaleLearner
-from pose_graph_ros.core.judgement.swaps import SetSearch
+from pose_graph_ros.core.judgement import closures as cl
+from pose_graph_ros.core.judgement.closure_trial import SetSearch
+from pose_graph_ros.core.judgement.closures import claims, forward, GATE
+from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
@@ -28,7 +33,6 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     OdometrySample,
 )
-from pose_graph_ros.core.solver_config import CLOSURE_FLOORS
 
 SECOND = 10**9
 LAP, LAPS = 80, 3
@@ -205,8 +209,9 @@ def test_a_closure_that_fits_outside_of_the_graph_only_does_not_keep_the_judge_b
     backend = run(true_ones(rng), last=200)
     judge = backend._judge._closures
     monkeypatch.setattr(
-        relative, 'are_above', lambda graph, edges, limit: edges == judge.states.edge[7])
-    monkeypatch.setattr(relative, 'residuals', lambda _, some: np.full(len(some.i), 2.0 * GATE))
+        cl, 'are_above', lambda graph, edges, limit: edges == judge.states.edge[7])
+    monkeypatch.setattr(
+        cl, 'residuals', lambda _, some: np.full(len(some.i), 2.0 * GATE))
     rounds = 0
     while judge.work():
         rounds += 1

@@ -9,7 +9,7 @@ import pytest
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.judgement.consistency import Closures, squared_distances
+from pose_graph_ros.core.judgement.closures import Closures, squared_distances
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.marginalization.marginalize import marginalize
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother

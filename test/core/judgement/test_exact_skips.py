@@ -7,7 +7,7 @@ import pytest
 from test_closure_reports import driven
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.judgement import relative
+from pose_graph_ros.core.judgement import closures as cl
 from pose_graph_ros.core.judgement.closures import GATE
 
 
@@ -23,7 +23,7 @@ def test_every_residual_above_the_gate_is_looked_at(seed: int) -> None:
         poses = backend.graph.poses + scale * rng.normal(size=backend.graph.poses.shape) * (
             1.0, 1.0, 0.1)
         backend.graph.set_poses(se2.wrapped(poses))
-        bad = relative.residuals(backend.graph, judge._table.rows(inside)) > GATE
-        assert np.all(relative.are_above(
+        bad = cl.residuals(backend.graph, judge._table.rows(inside)) > GATE
+        assert np.all(cl.are_above(
             backend.graph, judge._states.edge[inside], 0.5 * GATE)[bad])
     assert np.any(bad)

@@ -3,6 +3,7 @@
 """The decision at the end of a stream: the same set and the same path for any order of arrival."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -20,6 +21,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement import final
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Decision
 from pose_graph_ros.core.measurements import LoopClosure, Measurement, OdometrySample, Position
 
@@ -194,7 +196,7 @@ def test_a_graph_without_a_solution_keeps_what_is_believed(
 
 def test_in_a_very_large_graph_the_set_is_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = DRIVES[1, False]
-    monkeypatch.setattr(final, 'MOST', 100)
+    monkeypatch.setattr(final, 'BELIEF', replace(BELIEF, most_at_end=100))
     backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
     scans = {one.stamp_ns for one in drive.measurements}
     found = believed(backend)

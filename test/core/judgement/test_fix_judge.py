@@ -15,8 +15,7 @@ from pose_graph_ros.core.judgement import run_set
 from pose_graph_ros.core.judgement.run_set import best_runs
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import GlobalPose, Measurement, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import UpdateResult
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 SECOND = 1_000_000_000
 

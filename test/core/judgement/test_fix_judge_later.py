@@ -12,15 +12,13 @@ from random_graphs import snapshot
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import BackendConfig, POSITIONS
+from pose_graph_ros.core.config import BackendConfig, POSITIONS, SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.smoother.results import UpdateResult
-from pose_graph_ros.core.solver_config import SolverConfig
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 SECOND = 1_000_000_000
 Event = OdometrySample | Measurement
@@ -242,9 +240,9 @@ def test_a_final_optimisation_that_fails_undoes_what_was_decided_for_it() -> Non
     # the judge decides otherwise at the end
     believed = next(each.id for each in backend.verdicts() if each.state.in_graph)
     record = backend._judge._fixes.states.records[int(believed.split('/')[1])]
-    record[6] = 0
-    backend._smoother.update(GraphUpdate(weigh_observed={int(record[0]): 0.0}))
-    backend._reweighting.set_base_weight(int(record[0]), 0.0)
+    record['believed'] = False
+    backend._smoother.update(GraphUpdate(weigh_observed={int(record['held']): 0.0}))
+    backend._reweighting.set_base_weight(int(record['held']), 0.0)
     backend.verdict_changes()
     backend.finish()
     for _ in range(20):

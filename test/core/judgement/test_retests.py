@@ -5,7 +5,8 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 
-from pose_graph_ros.core.judgement.belief_rule import MOST_TURNS, Retests
+from pose_graph_ros.core.judgement.beliefs import Retests
+from pose_graph_ros.core.judgement.settings import BELIEF
 
 EACH = np.arange(3)
 
@@ -41,7 +42,7 @@ def test_it_is_tested_once_for_what_is_believed_or_when_it_is_asked_for() -> Non
 
 def test_those_that_take_turns_wait_for_another_closure() -> None:
     them = retests()
-    for _ in range(MOST_TURNS):
+    for _ in range(BELIEF.most_turns):
         np.testing.assert_array_equal(them.due(0, 100), [True] * 3)
         them.thrown_out(EACH[1:])
     np.testing.assert_array_equal(them.due(0, 100), [True, False, False])

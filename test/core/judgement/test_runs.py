@@ -8,7 +8,8 @@ import pytest
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.runs import EVENT, LEAST_MEMBERS, Run, Transition
+from pose_graph_ros.core.judgement.runs import Run, Transition
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import Track
 
 SECOND = 1_000_000_000
@@ -25,7 +26,7 @@ def price(way: float, moved: float) -> float:
     cov = np.diag((0.2, 0.2, 0.01))
     before = Run(1, 0, Track(0, np.zeros(3), cov), believed=True)
     after = Run(2, SECOND, Track(1, np.array((moved, 0.0, 0.0)), cov), believed=False)
-    after.n = LEAST_MEMBERS
+    after.n = BELIEF.least_members
     return after.ways_after(before, chain)[0].price
 
 
@@ -37,7 +38,7 @@ def test_odometry_that_agrees_costs_no_event() -> None:
 def test_a_jump_is_cheaper_where_the_positions_go_on(jump: float) -> None:
     # odometry goes too far, or the positions do
     slip, leap = price(1.0 + jump, 1.0), price(1.0, 1.0 + jump)
-    assert EVENT <= slip < leap
+    assert BELIEF.event <= slip < leap
 
 
 def test_a_jump_costs_more_the_farther_it_is_and_less_the_longer_the_way() -> None:

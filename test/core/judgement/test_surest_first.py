@@ -11,14 +11,15 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement import selection, surest_first
-from pose_graph_ros.core.judgement.floors import floored, FLOORS, forward
+from pose_graph_ros.core.judgement import final
+from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 
 def believed(drive: Drive) -> list[bool]:
     problem = TruncatedProblem(drive.graph, drive.closures)
-    return list(surest_first.select(problem))
+    return list(final.select(problem))
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -29,7 +30,7 @@ def test_the_right_closures_are_found(seed: int, n_wrong: int, groups: tuple[int
     assert not np.any(found & ~drive.right)
     assert np.sum(found) >= 0.9 * np.sum(drive.right)
     problem = TruncatedProblem(drive.graph, drive.closures)
-    choice = selection.best(problem)
+    choice = final.best(problem)
     assert not np.any(choice.believed & ~drive.right)
     assert drive.error(choice.poses) < 1.0
 
@@ -42,7 +43,7 @@ def test_the_order_of_the_rows_does_not_matter(seed: int) -> None:
     shuffled.fill(rows._replace(edges=rows.edges.rows(order)))
     place = np.argsort(order)
     problem = TruncatedProblem(shuffled, place[drive.closures])
-    assert list(surest_first.select(problem)) == believed(drive)
+    assert list(final.select(problem)) == believed(drive)
 
 
 def test_a_gate_is_that_of_the_smoother() -> None:
@@ -50,7 +51,7 @@ def test_a_gate_is_that_of_the_smoother() -> None:
     problem = TruncatedProblem(drive.graph, drive.closures)
     none = np.zeros(len(problem))
     problem.solve(none)
-    gates = surest_first._Gates(problem)
+    gates = final._Gates(problem)
     everything = np.arange(len(problem))
     gates.passing(everything, 1e9, np.inf)
     smoother = IncrementalSmoother()
@@ -66,7 +67,7 @@ def test_a_gate_is_that_of_the_smoother() -> None:
             error @ np.linalg.solve(S, error), rel=1e-5)
         # apart from the factor for those without neighbours
         ratio = gates.volume[k] / np.sqrt(np.linalg.det(S))
-        assert min(abs(ratio / factor - 1.0) for factor in surest_first.ALONE) < 1e-5
+        assert min(abs(ratio / factor - 1.0) for factor in BELIEF.lonely_factors) < 1e-5
 
 
 @pytest.mark.parametrize('weight', [1.0, 0.3])
@@ -77,7 +78,7 @@ def test_gates_begin_with_those_of_odometry_alone(weight: float) -> None:
         int(odometry[20]): 0.1 * weight}))
     problem = TruncatedProblem(drive.graph, drive.closures)
     problem.solve(np.zeros(len(problem)))
-    gates = surest_first._Gates(problem)
+    gates = final._Gates(problem)
     volume, covariances = gates.volume.copy(), gates._covariances.copy()
     gates.passing(np.arange(len(problem)), 1e9, np.inf)
     np.testing.assert_allclose(volume, gates.volume, rtol=1e-5)
@@ -106,7 +107,7 @@ def test_limits_fall_where_covariances_are_far_too_large() -> None:
     for graph, low, high in ((drive.graph, 0.5, 1.0), (loose, 0.01, 0.1)):
         problem = TruncatedProblem(graph, drive.closures)
         before = problem.limits.copy()
-        assert np.mean(surest_first.select(problem)) > 0.95
+        assert np.mean(final.select(problem)) > 0.95
         assert low <= np.max(problem.limits / before) <= high
 
 

@@ -11,12 +11,12 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import (
     biased_observations,
     LEAST_SIGMA,
     Observation,
     observations,
-    STATED,
     Track,
 )
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
@@ -109,7 +109,7 @@ def test_observations_have_their_covariances_in_map_axes_with_floors(seed: int) 
     least = np.square((LEAST_SIGMA[0], LEAST_SIGMA[0], LEAST_SIGMA[1]))
     for k, seen in enumerate(observations(table)):
         size = 2 if kinds[k] == ObservedKind.POSITION else 3
-        expected = STATED * covariance.turned(covs[k, :size, :size], -means[k, 2])
+        expected = BELIEF.stated * covariance.turned(covs[k, :size, :size], -means[k, 2])
         expected = covariance.floored(expected, least[:size])
         assert (seen.node, seen.size) == (k, size)
         assert_allclose(seen.noise, expected, rtol=1e-7, atol=1e-9)

@@ -8,10 +8,11 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
+from pose_graph_ros.core.config import GyroSource, RateNoise
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.gyro_config import GyroSource, RateNoise
 from pose_graph_ros.core.measurements import AnswerStatus, YawRate
-from pose_graph_ros.core.odometry.gyro import GyroStream, MANY_BEHIND, UNIFORM_WITHIN
+from pose_graph_ros.core.odometry.gyro import GyroStream, UNIFORM_WITHIN
+from pose_graph_ros.core.odometry.reorder_buffer import MANY_BEHIND
 
 SECOND = 1_000_000_000
 EPOCH = 1_767_225_600_000_000_001

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Position
+from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 
 SECOND = 1_000_000_000
@@ -334,105 +333,7 @@ def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
                 np.testing.assert_array_equal(one.noise, other.noise)
 
 
-@settings(max_examples=12)
-@given(SILENCES, st.integers(0, 10**6))
-def test_the_attachment_of_a_stamp_does_not_depend_on_later_samples(
-    silences: list[tuple[str, float, float]], seed: int,
-) -> None:
-    times = {'wheel': np.arange(0.0, 30.0, 0.1), 'visual': np.arange(0.03, 30.0, 0.13),
-             'lidar': np.arange(1.31, 30.0, 0.2)}
-    for name, begin, long in silences:
-        times[name] = without(times[name], begin, begin + long)
-    nodes = HiddenNodes(CONFIG, Made())
-    asked = np.sort(np.random.default_rng(seed).integers(0, 30 * SECOND, 200)) + EPOCH
-    at_once, waiting = {}, asked.tolist()
-    for source, sample in by_stamp(times):
-        nodes.add_sample(sample, source)
-        while waiting and nodes.covered_ns >= waiting[0]:
-            stamp = waiting.pop(0)
-            if stamp >= nodes.stamps_ns[0]:
-                at_once[stamp] = nodes.attach(stamp)
-    nodes.finish()
-    for stamp, attachment in at_once.items():
-        later = nodes.attach(stamp)
-        assert (attachment is None) == (later is None)
-        if attachment is not None:
-            assert attachment.node == later.node
-            np.testing.assert_array_equal(attachment.motion, later.motion)
-            np.testing.assert_array_equal(attachment.noise, later.noise)
-
-
 # --- In the graph ----------------------------------------------------------------------------
-
-def test_the_information_of_two_sources_sums() -> None:
-    two = PoseGraphBackend(CONFIG)
-    for name, sample in by_stamp({'wheel': WHEEL[:100], 'visual': WHEEL[:100]}):
-        two.add_odometry(sample, name)
-    two.optimize()
-    n = two.graph.n_nodes
-    assert two.graph.n_edges == 2 * (n - 1)
-    edges = two.graph.edges
-    assert sorted(zip(edges.i.tolist(), edges.j.tolist(), strict=True)) == sorted(
-        2 * [(k, k + 1) for k in range(n - 1)])
-    singles = []
-    for name in ('wheel', 'visual'):
-        one = PoseGraphBackend(CONFIG)
-        for sample in samples(WHEEL[:100], FRAMES[name]):
-            one.add_odometry(sample, name)
-        one.optimize()
-        assert one.graph.n_edges == n - 1
-        singles.append(one.graph.edges.information)
-    for k in range(n - 1):
-        both = edges.information[(edges.i == k)].sum(axis=0)
-        np.testing.assert_allclose(both, singles[0][k] + singles[1][k], rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize('spread', [0.0, 0.2])
-def test_the_path_stays_good_when_sources_come_and_go(spread: float) -> None:
-    rng = np.random.default_rng(2)
-    backend = PoseGraphBackend(CONFIG)
-    times = {'wheel': without(WHEEL, 10.0, 18.0), 'visual': without(VISUAL, 20.0, 40.0)}
-    events = [(one.stamp_ns + rng.uniform(0.0, spread) * 1e9, name, one)
-              for name, one in by_stamp(times)]
-    events += [(stamp_of(t) + 1e9, 'fix', Position(
-        stamp_of(t), truth(t)[:2] + rng.normal(0.0, 0.3, 2), 0.09 * np.eye(2), np.zeros(2)))
-        for t in np.arange(0.45, 29.0, 1.0)]
-    for _, name, event in sorted(events, key=lambda item: item[0]):
-        if name == 'fix':
-            backend.add_measurement(event, name)
-        else:
-            backend.add_odometry(event, name)
-        assert backend.update().status is not Status.FAILED
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend.n_waiting == 0
-    assert backend.counts['fix', 'accepted'] == 29
-    path = backend.estimate().path
-    expected = np.array([truth((t - EPOCH) * 1e-9) for t in path.stamps_ns])
-    assert path.stamps_ns[-1] > stamp_of(29.8)
-    assert np.max(np.hypot(*(path.poses - expected)[:, :2].T)) < 0.5
-
-
-@pytest.mark.parametrize('rate', [5, 50])
-def test_the_path_error_stays_bounded_across_resets(rate: int) -> None:
-    rng = np.random.default_rng(3)
-    backend = PoseGraphBackend(CONFIG)
-    times = np.arange(0.0, 60.0, 1.0 / rate)
-    resets, frame = [15.0, 20.0, 40.0], FRAMES['wheel']
-    for t in times.tolist():
-        if len(resets) > 0 and t >= resets[0]:
-            frame = truth(t)
-            resets.pop(0)
-        backend.add_odometry(samples([t], frame)[0], 'wheel')
-        if t % 1.0 < 0.5 / rate:
-            backend.add_measurement(GlobalPose(
-                stamp_of(t), truth(t) + rng.normal(0.0, [0.2, 0.2, 0.05]),
-                np.diag([0.04, 0.04, 0.0025])), 'pose')
-        backend.update()
-    backend.optimize()
-    assert backend.counts['wheel', 'jump'] == 3
-    path = backend.estimate().path
-    expected = np.array([truth((t - EPOCH) * 1e-9) for t in path.stamps_ns])
-    assert np.max(np.hypot(*(path.poses - expected)[:, :2].T)) < 0.6
 
 
 def test_a_jump_makes_the_estimate_stale_at_once() -> None:
@@ -456,7 +357,7 @@ def test_without_the_samples_behind_thinned_nodes_motions_are_interpolated_betwe
     before = [nodes.attach(stamp_ns) for stamp_ns in instants]
     nodes.drop_samples(5)   # nothing was thinned out
     assert len(nodes.streams['wheel'].timeline) > 1000
-    nodes.table.thin(nodes.ids[[4]], nodes.ids[[3]], np.array([[2.0, 0.0, 0.0]]),
+    nodes.thin(nodes.ids[[4]], nodes.ids[[3]], np.array([[2.0, 0.0, 0.0]]),
                      0.01 * np.eye(3)[None])
     nodes.drop_samples(5)
     timeline = nodes.streams['wheel'].timeline

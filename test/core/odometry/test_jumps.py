@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Jumps of odometry: what is one, and the speeds from which that follows."""
+"""Jumps of odometry: what is one, the speeds from which that follows, and what fills gaps."""
 
 import math
 
@@ -8,16 +8,21 @@ from hypothesis import assume, given, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.geometry.scalar_se2 import compose_one, wrap_one
+from pose_graph_ros.core.geometry.se2 import compose_one, wrap_one
 from pose_graph_ros.core.odometry.jumps import (
+    gap_motion,
     is_jump,
+    JUMP_SIGMA,
     LEAST_TIME,
     MEMORY_TIME,
+    RESTART_VARIANCE,
+    RESUMED_WITHIN,
     SLACK,
     Speeds,
     SpeedWindow,
     UNKNOWN,
 )
+from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 
 SECOND = 1_000_000_000
 LIMIT = 60.0
@@ -85,14 +90,6 @@ def test_no_stated_speed_permits_more_than_the_limit(
     assert not is_jump(UNKNOWN, (0.999 * longest, 0.0), elapsed, stated, limit)
 
 
-@pytest.mark.parametrize('stated', [math.nan, math.inf, -math.inf])
-def test_a_stated_speed_that_is_not_finite_is_ignored(stated: float) -> None:
-    before = Speeds((1.0, 0.0, 0.0), (1.0, 0.0), (1.0, 0.0))
-    for length in np.linspace(0.0, 3.0, 61):
-        assert (is_jump(before, (length, 0.0), 0.1, stated, LIMIT)
-                == is_jump(before, (length, 0.0), 0.1, 0.0, LIMIT))
-
-
 # --- Speeds ----------------------------------------------------------------------------------
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -123,3 +120,55 @@ def test_the_velocity_does_not_depend_on_the_frame(
     window = SpeedWindow(UNKNOWN, 0, start).moved(SECOND * 2, compose_one(start, between), step)
     assert window.speeds.velocity == pytest.approx(tuple(b / 2.0 for b in between), abs=1e-12)
     assert window.speeds.recent == pytest.approx((step[0] / 2.0, step[1] / 2.0))
+
+
+END = 5 * SECOND
+# Standard deviations of x, y and yaw across a jump of a robot at rest.
+SIGMA = (JUMP_SIGMA[0], JUMP_SIGMA[0], JUMP_SIGMA[1])
+
+
+def timeline(speed: float, turn_rate: float = 0.0) -> OdometryTimeline:
+    """Return samples of 5 s at 10 Hz; the robot stands for the first 4 s."""
+    one = OdometryTimeline()
+    for k in range(51):
+        time = max(0.1 * k - 4.0, 0.0)
+        one.append(next_row(
+            one._last, k * SECOND // 10, (speed * time, 0.0, turn_rate * time)))
+    return one
+
+
+@pytest.mark.parametrize('gap', [0.5, 1.5, 2.0])
+def test_the_robot_keeps_the_speed_that_it_had_before_a_gap(gap: float) -> None:
+    mean, noise = gap_motion(timeline(3.0), END, END + round(gap * 1e9), -1)
+    np.testing.assert_allclose(mean, [3.0 * gap, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(noise)), np.add([3.0 * gap, 3.0 * gap, 0.0], SIGMA))
+    assert np.count_nonzero(noise - np.diag(np.diag(noise))) == 0
+
+
+def test_in_a_long_gap_the_mean_ends_and_the_covariance_grows() -> None:
+    mean, noise = gap_motion(timeline(3.0, 0.2), END, END + 60 * SECOND, -1)
+    np.testing.assert_allclose(mean[2], 0.2 * MEMORY_TIME)
+    np.testing.assert_allclose(np.sqrt(noise[0, 0]), JUMP_SIGMA[0] + 3.0 * 60.0, rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(noise[2, 2]), JUMP_SIGMA[1] + 0.2 * 60.0, rtol=1e-6)
+
+
+def test_a_single_sample_gives_no_speed() -> None:
+    one = OdometryTimeline()
+    one.append(next_row(None, END, (1.0, 2.0, 0.3)))
+    mean, noise = gap_motion(one, END, END + SECOND, -1)
+    np.testing.assert_array_equal(mean, 0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(noise)), SIGMA)
+
+
+@pytest.mark.parametrize('saved_ns', [END, END + SECOND])
+def test_a_long_gap_at_the_end_of_a_loaded_graph_is_a_restart(saved_ns: int) -> None:
+    limit_ns = END + round(RESUMED_WITHIN * 1e9)
+    mean, noise = gap_motion(timeline(3.0), END, limit_ns + 1, saved_ns)
+    np.testing.assert_array_equal(mean, 0.0)
+    np.testing.assert_array_equal(noise, np.diag(RESTART_VARIANCE))
+    np.testing.assert_allclose(np.sqrt(RESTART_VARIANCE), [1.0, 1.0, 0.3])
+    # neither a short one nor one of samples that came since
+    for until_ns, saved in ((limit_ns, saved_ns), (limit_ns + 1, END - 1)):
+        mean, _ = gap_motion(timeline(3.0), END, until_ns, saved)
+        np.testing.assert_allclose(mean, [3.0 * MEMORY_TIME, 0.0, 0.0], atol=1e-9)

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The covariance of a motion by odometry: that of samples, additive along the path, bounded."""
+"""Motions by odometry: their covariance is that of samples; errors go in and out of both."""
 
 from dataclasses import replace
 
@@ -10,10 +10,18 @@ import numpy as np
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph_update import Measured
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.odometry.motion import (
+    AS_CLAIMED,
+    changed,
     Motion,
     odometry_covariance,
+    OdometryErrors,
 )
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 NOISE = OdometryNoise()
 NO_FLOORS = replace(NOISE, sigma_floor_position=1e-9, sigma_floor_heading=1e-9)
@@ -66,3 +74,125 @@ def test_turning_the_motion_leaves_the_covariance_in_the_frame_at_its_end() -> N
         turned = np.array([*(se2.rotation(theta) @ chord), theta])
         np.testing.assert_allclose(
             odometry_covariance(NOISE, Motion(turned, 4.0, 2.0)), expected, atol=1e-12)
+
+
+SECOND = 1_000_000_000
+some_errors = st.builds(
+    OdometryErrors, st.floats(0.01, 50.0), st.floats(0.01, 50.0), st.floats(-0.02, 0.02),
+    st.floats(-0.05, 0.05))
+
+
+def edges(seed: int, n: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return motions, covariances and durations."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0.0, 0.01, (n, 3, 3)) + 0.02 * np.eye(3)
+    return rng.normal(0.0, 1.0, (n, 3)), root @ np.swapaxes(root, 1, 2), rng.uniform(0.1, 3.0, n)
+
+
+@given(st.integers(0, 1000), some_errors, some_errors)
+def test_other_errors_can_be_put_in_and_taken_out(
+    seed: int, one: OdometryErrors, other: OdometryErrors,
+) -> None:
+    means, noise, seconds = edges(seed)
+    first = changed(means, np.linalg.inv(noise), seconds, AS_CLAIMED, one)
+    np.testing.assert_allclose(np.linalg.inv(first[1]), one.covariances(noise), rtol=1e-7)
+    directly = changed(means, np.linalg.inv(noise), seconds, AS_CLAIMED, other)
+    for found, expected in zip(
+            changed(*first, seconds, one, other), directly, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
+
+
+@given(some_errors)
+def test_the_parts_of_the_noise_are_those_of_the_way_and_of_the_heading(
+    errors: OdometryErrors,
+) -> None:
+    """A motion with an error of the heading at its begin, and one of its own."""
+    _, noise, _ = edges(3)
+    spread = errors.covariances(noise)
+    np.testing.assert_allclose(spread[:, 2, 2], errors.turn * noise[:, 2, 2])
+    for of, factor in ((noise, 1.0), (spread, errors.way)):
+        known = of[:, :2, :2] - of[:, :2, 2:] @ of[:, 2:, :2] / of[:, 2:, 2:]
+        by_way = noise[:, :2, :2] - noise[:, :2, 2:] @ noise[:, 2:, :2] / noise[:, 2:, 2:]
+        np.testing.assert_allclose(known, factor * by_way, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(OdometryErrors(2.0, 3.0).covariances(np.zeros((1, 3, 3))), 0.0)
+
+
+def test_a_constant_rate_on_an_arc_is_taken_out() -> None:
+    errors, speed, seconds = OdometryErrors(rate=0.02, scale=0.01), 2.0, np.array((1.0,))
+
+    def arc(rate: float, speed: float) -> np.ndarray:
+        angle = rate * seconds[0]
+        return np.array([(speed / rate * np.sin(angle), speed / rate * (1.0 - np.cos(angle)),
+                          angle)])
+
+    found = errors.motions(arc(0.1, speed), seconds)
+    np.testing.assert_allclose(found, arc(0.12, 1.01 * speed), rtol=1e-3)
+    np.testing.assert_allclose(errors.as_odometry_says(found, seconds), arc(0.1, speed))
+
+
+def chain_graph(means: np.ndarray, informations: np.ndarray) -> IncrementalSmoother:
+    smoother, n = IncrementalSmoother(), len(means)
+    poses = [np.zeros(3)]
+    for mean in means:
+        poses.append(se2.compose(poses[-1], mean))
+    ends = np.arange(n)
+    smoother.update(GraphUpdate(
+        hidden=np.array(poses), fix=(0,), edges=Edges(
+            np.append(ends, 0), np.append(ends + 1, n), np.vstack((means, poses[n] + 0.1)),
+            np.concatenate((informations, 10.0 * np.eye(3)[None])),
+            [EdgeKind.ODOMETRY] * n + [EdgeKind.LOOP_CLOSURE])))
+    return smoother
+
+
+@given(st.integers(0, 1000), some_errors)
+def test_a_graph_with_other_edges_is_the_one_made_with_them(
+    seed: int, errors: OdometryErrors,
+) -> None:
+    means, noise, seconds = edges(seed)
+    informations = np.linalg.inv(noise)
+    smoother, n = chain_graph(means, informations), len(means)
+    known = changed(means, informations, seconds, AS_CLAIMED, errors)
+    new = chain_graph(*known)
+    measured = Measured(np.arange(n), *known)
+    before = smoother.graph.poses.copy()
+    smoother.graph.begin()
+    smoother.graph.apply(GraphUpdate(measure_edges=[measured]))
+    smoother.graph.rollback()
+    np.testing.assert_array_equal(smoother.graph.edges.mean[:n], means)
+    np.testing.assert_array_equal(smoother.graph.poses, before)
+    smoother.update(GraphUpdate(measure_edges=[measured]))
+    np.testing.assert_allclose(smoother.graph.edges.mean[:n], known[0])
+    np.testing.assert_allclose(smoother.graph.edges.information, new.graph.edges.information,
+                               rtol=1e-12)
+    closed = smoother.graph.edges.mean[n]
+    new.graph.apply(GraphUpdate(measure_edges=[Measured(
+        np.array((n,)), closed[None], smoother.graph.edges.information[n:])]))
+    for each in (smoother, new):
+        for _ in range(30):
+            each.update(GraphUpdate())
+            each.refine()
+    np.testing.assert_allclose(smoother.chi2(), new.chi2(), rtol=1e-5, atol=1e-6)
+    scales = (each.graph.memory['node_f'][:n + 1, 3:] for each in (smoother, new))
+    assert all(np.all(np.isfinite(one)) for one in scales)
+
+
+@given(st.integers(0, 1000), some_errors, some_errors)
+def test_a_chain_follows_the_edges(
+    seed: int, before: OdometryErrors, after: OdometryErrors,
+) -> None:
+    means, noise, seconds = edges(seed)
+    stamps_ns = np.round(np.append(0.0, np.cumsum(seconds)) * SECOND).astype(np.int64)
+    seconds = np.diff(stamps_ns) / SECOND
+    chains = []
+    for errors in (before, after):
+        graph, ends = Graph(), np.arange(len(means))
+        known = changed(means, np.linalg.inv(noise), seconds, AS_CLAIMED, errors)
+        graph.apply(GraphUpdate(hidden=np.zeros((len(means) + 1, 3)), fix=(0,), edges=Edges(
+            ends, ends + 1, *known, [EdgeKind.ODOMETRY] * len(means))))
+        chains.append(OdometryChain())
+        chains[-1].extend(graph)
+    chains[0].correct(before, after, stamps_ns, np.ones(len(means), dtype=bool))
+    np.testing.assert_allclose(chains[0].poses, chains[1].poses, atol=1e-9)
+    np.testing.assert_allclose(chains[0].sums, chains[1].sums, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(chains[0].travel(chains[0].nodes), chains[1].travel(
+        chains[1].nodes), atol=1e-9)

@@ -5,12 +5,16 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
+from random_graphs import random_information, random_poses
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometrySource
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.covariance import propagated
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, LoopClosure, OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.node_table import ThinnedNodes
 from pose_graph_ros.core.sources.measurement_constraints import attach, attach_reference
 
 SECOND = 1_000_000_000
@@ -78,9 +82,9 @@ def test_nodes_edges_and_attachments_are_those_of_nodes_that_never_left(
     np.testing.assert_array_equal(part.stamps_ns, whole.stamps_ns)
     np.testing.assert_array_equal(part.ids, whole.ids)
     np.testing.assert_array_equal(part.odometry, whole.odometry[part.n_frozen:])
-    np.testing.assert_array_equal(part.table.frozen, whole.odometry[:part.n_frozen] + 100.0)
+    np.testing.assert_array_equal(part.frozen, whole.odometry[:part.n_frozen] + 100.0)
     np.testing.assert_array_equal(
-        part.table.travelled, whole.table.travelled[part.n_frozen:])
+        part.travelled, whole.travelled[part.n_frozen:])
     # no edge begins at a node that has left, as one after a long silence would
     wanted = {(int(edge.i[0]), int(edge.j[0])): edge for _, edge in edges}
     found = {(int(edge.i[0]), int(edge.j[0])): edge for _, edge in edges_too}
@@ -160,3 +164,51 @@ def test_saved_and_restored_nodes_continue_as_they_would_have(
         assert_same_value(*edges)
     assert made_too == made
     assert other.n_frozen == one.n_frozen
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_places_are_passed_on_from_anchor_to_anchor(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 30
+    kept, nodes = set(range(n)), ThinnedNodes()
+    steps: dict[int, tuple[int, FloatArray, FloatArray]] = {}
+    for _ in range(4):
+        leaving = rng.choice(sorted(kept - {0}), 6, replace=False)
+        kept -= set(leaving.tolist())
+        anchors = rng.choice(sorted(kept), 6)
+        relative, noise = random_poses(rng, 6), random_information(rng, 6)
+        nodes.add(leaving, anchors, relative, noise)
+        steps |= {int(node): (int(anchor), mean, C) for node, anchor, mean, C in zip(
+            leaving, anchors, relative, noise, strict=True)}
+    assert len(nodes) == len(steps)
+    if seed % 2 == 0:   # else each place is passed on for itself
+        assert nodes.places().numbers.tolist() == sorted(steps)
+    for number in range(n):
+        place = nodes.place(number)
+        if number in kept:
+            assert place is None
+            continue
+        assert place is not None
+        chain = [steps[number]]
+        while chain[-1][0] not in kept:
+            chain.append(steps[chain[-1][0]])
+        mean, C = np.zeros(3), np.zeros((3, 3))
+        for _, step, noise_ in reversed(chain):
+            mean, C = se2.compose(mean, step), at_the_end(mean, C, step, noise_)
+        assert place.anchor == chain[-1][0]
+        np.testing.assert_allclose(
+            se2.between(place.mean, mean), 0.0, atol=1e-5)   # single precision
+        np.testing.assert_allclose(place.noise, C, rtol=1e-5, atol=1e-4 * np.max(np.abs(C)))
+
+
+def at_the_end(
+    mean: FloatArray, C: FloatArray, step: FloatArray, noise: FloatArray,
+) -> FloatArray:
+    """Return the covariance of two steps one after the other, in the frame at the end."""
+    axes = np.eye(3)
+    axes[:2, :2] = se2.rotation(mean[2])
+    end = np.eye(3)
+    end[:2, :2] = se2.rotation(se2.compose(mean, step)[2])
+    in_anchor = propagated(mean, axes @ C @ axes.T, step, noise)
+    return end.T @ in_anchor @ end

@@ -9,13 +9,13 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.gyro_config import Integrate
 from pose_graph_ros.core.measurements import AnswerStatus, OdometrySample
-from pose_graph_ros.core.odometry.gaps import JUMP_SIGMA
-from pose_graph_ros.core.odometry.stream import MANY_BEHIND, OdometryStream
+from pose_graph_ros.core.odometry.jumps import JUMP_SIGMA
+from pose_graph_ros.core.odometry.reorder_buffer import MANY_BEHIND
+from pose_graph_ros.core.odometry.stream import OdometryStream
 
 SECOND = 1_000_000_000
 # The Unix time of 2026 in nanoseconds: a double does not hold it.

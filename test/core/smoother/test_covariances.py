@@ -1,14 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances from the Bayes tree are blocks of the dense inverse of H."""
+"""Covariances from the Bayes tree are blocks of the dense inverse P of H, and J P J^T."""
 
 from hypothesis import given, settings, strategies as st
+import jacobians
 import numpy as np
 import pytest
-from slow_smoother import EXACT, SlowGraph, world
+from slow_smoother import driven, EXACT, SlowGraph, world
 
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother import covariances
@@ -20,16 +21,9 @@ RELATIVE = 1e-9
 seeds = st.integers(0, 2**32 - 1)
 
 
-def driven(seed: int, steps: int) -> IncrementalSmoother:
+def linearized(seed: int, steps: int) -> IncrementalSmoother:
     """Return a smoother after random edits, everything linearized at the estimate."""
-    smoother, slow, here = IncrementalSmoother(EXACT), SlowGraph(), world(seed)
-    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
-    slow = slow.edited(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
-    for _ in range(steps):
-        update = here.mixture(slow)
-        if smoother.update(update).status is not Status.FAILED:
-            slow = slow.edited(update)
-        del here.truth[len(slow.poses):]
+    smoother, *_ = driven(seed, steps)
     smoother.graph.set_poses(smoother.poses.copy())
     smoother.update(GraphUpdate())
     return smoother
@@ -52,27 +46,17 @@ def rows(*nodes: int) -> list[int]:
 
 @given(seeds, st.integers(0, 25))
 @settings(max_examples=30)
-def test_all_covariances_are_the_blocks_of_the_inverse(seed: int, steps: int) -> None:
-    smoother = driven(seed, steps)
+def test_covariances_are_the_blocks_of_the_inverse(seed: int, steps: int) -> None:
+    smoother = linearized(seed, steps)
     expected, actual = dense(smoother), smoother.covariances()
     assert actual.shape == (smoother.graph.n_nodes, 3, 3)
     for node, block in enumerate(actual):
         at = rows(node)
         assert off(block, expected[np.ix_(at, at)]) < RELATIVE
-        np.testing.assert_array_equal(block, block.T)
-
-
-@given(seeds, st.integers(0, 25))
-@settings(max_examples=20)
-def test_each_covariance_alone_is_that_block_too(seed: int, steps: int) -> None:
-    smoother = driven(seed, steps)
-    expected = dense(smoother)
-    for node in range(smoother.graph.n_nodes):
-        at = rows(node)
         assert off(smoother.covariance(node), expected[np.ix_(at, at)]) < RELATIVE
-    np.testing.assert_allclose(
-        smoother.newest_covariance(), smoother.covariance(smoother.graph.newest_pose),
-        rtol=1e-12, atol=1e-18)
+        np.testing.assert_array_equal(block, block.T)
+    np.testing.assert_array_equal(
+        smoother.newest_covariance(), smoother.covariance(smoother.graph.newest_pose))
 
 
 @given(seeds, st.integers(0, 25), st.data())
@@ -80,14 +64,13 @@ def test_each_covariance_alone_is_that_block_too(seed: int, steps: int) -> None:
 def test_joint_covariances_have_the_blocks_of_both(
     seed: int, steps: int, data: st.DataObject,
 ) -> None:
-    smoother = driven(seed, steps)
+    smoother = linearized(seed, steps)
     expected, node = dense(smoother), st.integers(0, smoother.graph.n_nodes - 1)
     for _ in range(5):
         i, j = data.draw(node), data.draw(node)
         joint, at = smoother.joint_covariance(i, j), rows(i, j)
         assert off(joint, expected[np.ix_(at, at)]) < RELATIVE
         np.testing.assert_array_equal(joint, joint.T)
-        np.testing.assert_array_equal(joint[:3, :3], smoother.covariance(i))
 
 
 def pose_information(scale: float = 1.0) -> np.ndarray:
@@ -104,24 +87,6 @@ def chain(n: int, *, bend: float = 0.1) -> GraphUpdate:
         hidden=np.array(poses), fix=[0],
         edges=Edges(range(n - 1), range(1, n), mean, [pose_information()] * (n - 1),
                     [EdgeKind.ODOMETRY] * (n - 1)))
-
-
-def test_a_fixed_node_has_no_uncertainty_and_no_correlation() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(chain(6))
-    smoother.update(GraphUpdate(fix=[3]))
-    np.testing.assert_array_equal(smoother.covariance(3), np.zeros((3, 3)))
-    np.testing.assert_array_equal(smoother.covariances()[[0, 3]], np.zeros((2, 3, 3)))
-    np.testing.assert_array_equal(smoother.joint_covariance(3, 5)[:3], np.zeros((3, 6)))
-    assert np.all(np.diag(smoother.joint_covariance(3, 5))[3:] > 0.0)
-    # it separates uncorrelated parts; the covariances behind it are those of a chain from there
-    np.testing.assert_allclose(smoother.joint_covariance(1, 5)[:3, 3:], 0.0, atol=1e-18)
-    alone = IncrementalSmoother(EXACT)
-    alone.update(chain(3))
-    turn = np.eye(3)
-    turn[:2, :2] = se2.rotation(smoother.poses[3, 2])
-    np.testing.assert_allclose(
-        smoother.covariance(5), turn @ alone.covariance(2) @ turn.T, rtol=1e-9, atol=1e-15)
 
 
 def test_nodes_in_different_parts_are_not_correlated() -> None:
@@ -150,3 +115,78 @@ def test_covariances_require_that_edits_are_solved_for() -> None:
         smoother.newest_covariance()
     smoother.update(GraphUpdate())
     assert smoother.covariances().shape == (4, 3, 3)
+
+
+def candidates(smoother: IncrementalSmoother, rng: np.random.Generator, n: int) -> Edges:
+    """Return random edges, also to biases, of any consistency."""
+    graph, sigma = smoother.graph, (2.0, 2.0, 1.0)
+    poses, biases = np.flatnonzero(~graph.is_bias), np.flatnonzero(graph.is_bias)
+    pairs = [rng.choice(poses, 2, replace=False) for _ in range(n if len(poses) > 1 else 0)]
+    kinds = [EdgeKind.LOOP_CLOSURE] * len(pairs)
+    if len(biases) > 0:
+        pairs += [(rng.choice(poses), rng.choice(biases)) for _ in range(n)]
+        kinds += [EdgeKind.BIAS] * n
+    i, j = np.reshape(pairs, (-1, 2)).T.astype(np.int64)
+    root = rng.normal(size=(len(i), 3, 3))
+    return Edges(i, j, rng.normal(size=(len(i), 3)) * sigma, root @ np.swapaxes(root, 1, 2), kinds,
+                 bias=rng.normal(size=(len(i), 4)))
+
+
+@given(seeds, st.integers(0, 25))
+@settings(max_examples=30)
+def test_innovations_are_those_of_the_dense_inverse(seed: int, steps: int) -> None:
+    smoother = linearized(seed, steps)
+    poses, P = smoother.poses, dense(smoother).reshape(len(smoother.poses), 3, -1, 3)
+    edges = candidates(smoother, np.random.default_rng(seed), 5)
+    linear = jacobians.linearize_edges(poses, edges)
+    errors, actual = smoother.edge_innovations(edges)
+    np.testing.assert_allclose(errors, error_functions.edge_errors(poses, edges), atol=1e-12)
+    for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
+        J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
+        joint = np.block([[P[i, :, i], P[i, :, j]], [P[j, :, i], P[j, :, j]]])
+        assert off(actual[k], J @ joint @ J.T) < RELATIVE
+        np.testing.assert_array_equal(actual[k], actual[k].T)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_innovations_are_those_of_joint_covariances_wherever_linearized(seed: int) -> None:
+    smoother, here = IncrementalSmoother(), world(seed, noise=(0.2, 0.2, 0.1))
+    smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
+    for _ in range(30):
+        smoother.update(here.new_nodes(2))
+    smoother.update(GraphUpdate(edges=here.edges(here.pairs(3))))
+    edges = candidates(smoother, here.rng, 5)
+    linear = jacobians.linearize_edges(smoother.poses, edges)
+    for k, actual in enumerate(smoother.edge_innovations(edges).covariances):
+        J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
+        joint = smoother.joint_covariance(edges.i[k], edges.j[k])
+        assert off(actual, J @ joint @ J.T) < 1e-8
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_distances_are_those_by_the_inverse_also_without_information_on_the_heading(
+    seed: int,
+) -> None:
+    smoother = linearized(seed, 10)
+    edges = candidates(smoother, np.random.default_rng(seed), 5)
+    found = smoother.edge_innovations(edges)
+    total = found.covariances + np.linalg.inv(edges.information)
+    np.testing.assert_allclose(
+        found.squared_distances(edges.information),
+        np.einsum('mi,mij,mj->m', found.errors, np.linalg.inv(total), found.errors), rtol=1e-7)
+    edges.information[:, 2, :] = edges.information[:, :, 2] = 0.0
+    position = np.linalg.inv(
+        found.covariances[:, :2, :2] + np.linalg.inv(edges.information[:, :2, :2]))
+    np.testing.assert_allclose(
+        found.squared_distances(edges.information),
+        np.einsum('mi,mij,mj->m', found.errors[:, :2], position, found.errors[:, :2]), rtol=1e-7)
+
+
+def test_neighbours_far_from_what_fixes_them_have_an_exact_relative_covariance() -> None:
+    smoother = IncrementalSmoother(EXACT)
+    smoother.update(chain(2000, bend=1e-3))
+    edges = smoother.graph.edges_at(np.array([1990]))
+    covariance = smoother.edge_innovations(edges).covariances[0]
+    np.testing.assert_allclose(covariance, np.linalg.inv(edges.information[0]), rtol=1e-12)

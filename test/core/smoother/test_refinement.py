@@ -8,12 +8,12 @@ from slow_smoother import state
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.solver_config import SolverConfig
 
 SIGMA = np.array([0.05, 0.05, 0.02])
 INFORMATION = np.diag(SIGMA**-2.0)
@@ -75,7 +75,8 @@ def test_a_refinement_ends_at_the_batch_optimum(seed: int, observed: bool) -> No
     before = off(smoother)
     refined(smoother)
     excess, worst = off(smoother)
-    assert before[0] > 1e-5    # otherwise this tests nothing
+    # an update may leave 0.02 in what it moves; elsewhere earlier ones have left some
+    assert 1e-5 < before[0] < 0.05
     assert abs(excess) < 1e-6
     assert worst < 1e-3
     assert worst < 0.1 * before[1]

@@ -9,10 +9,8 @@ from slow_smoother import EXACT
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.smoother.back_substitution import FREE_FRACTION
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 STEP = np.array([1.0, 0.0, 0.1])
@@ -54,8 +52,7 @@ def test_a_tail_moves_rigidly_when_the_ring_is_closed() -> None:
     result = smoother.update(update)
     assert np.min(np.hypot(*(smoother.poses - before)[TAIL_NODES, :2].T)) > 0.01
     assert result.visited < 2 * RING
-    off = smoother.poses - exact.poses
-    off[:, 2] = se2.wrap(off[:, 2])
+    off = se2.wrapped(smoother.poses - exact.poses)
     assert np.max(np.abs(off[RING_NODES] / SIGMA)) < 5.0 * LINEAR.alpha
     tail = smoother.poses[TAIL_NODES]
     inner = se2.between(tail[:-1], tail[1:])
@@ -63,22 +60,17 @@ def test_a_tail_moves_rigidly_when_the_ring_is_closed() -> None:
 
 
 @pytest.mark.parametrize('config', [LINEAR, EXACT], ids=['default', 'exact'])
-def test_drift_stays_below_its_limit_and_small_moves_do_not_get_lost(
+def test_small_moves_do_not_get_lost(
     config: SmootherConfig,
 ) -> None:
     """A closure that gets stronger in many small steps bends the ring a little in each."""
     smoother, exact = ring_with_a_tail(config), ring_with_a_tail(EXACT)
     for engine in (smoother, exact):
         engine.update(GraphUpdate(edges=closure(np.array([0.05, -0.1, 0.02]))))
-    number, drifts = smoother.graph.n_edges - 1, []
+    number = smoother.graph.n_edges - 1
     for weight in np.geomspace(1.0, 0.01, 150):
         smoother.update(GraphUpdate(weigh_edges={number: weight}))
-        n = smoother.graph.memory.head[tb.N_CLIQUES]
-        drifts.append(np.max(smoother.graph.memory['clique_f'][:n, tb.DRIFT]))
     exact.update(GraphUpdate(weigh_edges={number: weight}))
-    assert max(drifts) <= FREE_FRACTION * config.alpha
-    assert (max(drifts) > 0.0) == (config.alpha > 0.0)
-    off = smoother.poses - exact.poses
-    off[:, 2] = se2.wrap(off[:, 2])
+    off = se2.wrapped(smoother.poses - exact.poses)
     # along the tail an error of the heading grows with the distance from the ring
     assert np.max(np.abs(off[RING_NODES] / SIGMA)) < max(5.0 * config.alpha, 1e-6)

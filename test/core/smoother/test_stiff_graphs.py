@@ -9,10 +9,10 @@ from stiff_graphs import stiff_graph, StiffGraph
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.solver_config import SolverConfig
 
 # Decades of the information in the stiff direction above the others.
 DECADES = (0.0, 6.0, 10.0, 11.5)

@@ -6,7 +6,8 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.sources.autocorrelation import estimate, LEAST_RESIDUALS
+from pose_graph_ros.core.sources.settings import SOURCES
+from pose_graph_ros.core.sources.source_report import estimate
 
 SECOND = 1_000_000_000
 
@@ -46,7 +47,8 @@ def test_white_errors_are_not_called_correlated(seed: int, n: int, period: float
 
 
 @pytest.mark.parametrize('residuals', [
-    np.zeros((100, 2)), np.ones((100, 2)), np.ones((LEAST_RESIDUALS - 1, 2)), np.zeros((0, 2))])
+    np.zeros((100, 2)), np.ones((100, 2)), np.ones((SOURCES.least_residuals - 1, 2)),
+    np.zeros((0, 2))])
 def test_degenerate_residuals_give_finite_numbers(residuals: np.ndarray) -> None:
     found = estimate(stamps(len(residuals), 1.0), residuals)
     assert np.all(np.isfinite(found))

@@ -9,7 +9,6 @@ import jacobians
 import numpy as np
 import pytest
 from random_graphs import (
-    chordal,
     consistent_graph,
     random_edges_to_biases,
     random_graph,
@@ -20,9 +19,9 @@ from scipy.optimize import least_squares
 from slow_smoother import cliques, differences, EXACT, state, world
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.joint_start import joint
+from pose_graph_ros.core.batch.linear_starts import chordal, joint
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SmootherConfig
+from pose_graph_ros.core.config import SmootherConfig, SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -31,9 +30,8 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind,
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.smoother import batch_fallback
+from pose_graph_ros.core.smoother import trial as trials
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.solver_config import SolverConfig
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -89,7 +87,7 @@ def test_energy_linearization_error_and_scale_are_those_of_the_formulas(seed: in
     rows[:, tb.DELTA:tb.DELTA + 3] = moves
     rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(before + moves)
     for e in range(12):
-        factors.check_edge(graph.memory.head, e, factors.NO_TURN)
+        factors.check(graph.memory.head, e, factors.NO_TURN)
     error = error_functions.edge_errors(graph.poses, edges)
     linear = (first.error + np.einsum('mij,mj->mi', first.jacobian_i, moves[i])
               + np.einsum('mij,mj->mi', first.jacobian_j, moves[j]))
@@ -344,13 +342,13 @@ def test_a_closure_that_contradicts_all_is_solved_for_on_a_copy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     smoother, copied = with_biases(SmootherConfig()), []
-    optimize_copy = batch_fallback.optimize_copy
+    optimize_copy = trials.optimize_copy
 
     def watched(graph: Graph, copy: Graph) -> bool:
         copied.append(copy)
         return optimize_copy(graph, copy)
 
-    monkeypatch.setattr(batch_fallback, 'optimize_copy', watched)
+    monkeypatch.setattr(trials, 'optimize_copy', watched)
     smoother.update(GraphUpdate(edges=Edges(
         [2], [10], [[0.0, 0.0, 3.0]], ODOMETRY[None], [EdgeKind.LOOP_CLOSURE])))
     assert len(copied) == 1

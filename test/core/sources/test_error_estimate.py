@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The statistics of errors: the likelihood by an oracle, what is found, and what is not."""
 
+from dataclasses import replace
 import itertools
 
 import numpy as np
@@ -17,7 +18,7 @@ from pose_graph_ros.core.graph.constraints import (
     upper,
 )
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.error_estimate import measured_path, PathOdometry, search
 from pose_graph_ros.core.sources.error_likelihood import (
@@ -28,6 +29,7 @@ from pose_graph_ros.core.sources.error_likelihood import (
     RATE_VARIANCE,
     SCALE_VARIANCE,
 )
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
 
@@ -300,7 +302,7 @@ def test_a_path_without_known_errors_is_as_likely_with_them_as_states() -> None:
 def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)
     at_once = to_the_end(measured_path(*arguments))
-    monkeypatch.setattr(error_estimate, 'NODES_PER_STEP', 7)
+    monkeypatch.setattr(error_estimate, 'SOURCES', replace(SOURCES, nodes_per_step=7))
     assert len(list(measured_path(*arguments))) >= 40 // 7
     for one, other in zip(to_the_end(measured_path(*arguments)), at_once, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -309,8 +311,8 @@ def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None
 def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(error_estimate, 'NEWEST', 10)
-    monkeypatch.setattr(error_estimate, 'OLDER', 5)
+    monkeypatch.setattr(error_estimate, 'SOURCES', replace(
+        SOURCES, newest_positions=10, older_positions=5))
     found = to_the_end(measured_path(
         line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)))
     assert len(found.seconds) == 15

@@ -11,9 +11,9 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import Position
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources.constraint_queue import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
+from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
 
 SECOND = 1_000_000_000
 N = 40

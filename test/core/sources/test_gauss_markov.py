@@ -28,17 +28,12 @@ from pose_graph_ros.core.measurements import (
     Position,
 )
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources.gauss_markov import (
-    Additions,
-    BINS,
-    CorrelatedErrors,
-    GaussMarkovBias,
-    WHITE_SHARE,
-)
+from pose_graph_ros.core.sources.gauss_markov import Additions, CorrelatedErrors, GaussMarkovBias
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
-TAU = float(BINS)
+TAU = float(SOURCES.bins)
 """Time constant for which a bin is one second [s]."""
 NOWHERE = Attachment(0, np.zeros(3), np.zeros((3, 3)))
 NO_NOISE = np.zeros(2)
@@ -151,7 +146,7 @@ def generalised_least_squares(
 
 def test_poses_and_sigma_are_those_of_the_full_covariance() -> None:
     rng = np.random.default_rng(2)
-    sigma, share = 2.0, WHITE_SHARE
+    sigma, share = 2.0, SOURCES.white_share
     fixes = [position(second, second - 1.0 + rng.normal(0.0, sigma), 0.0, sigma)
              for second in range(1, 41)]
     source = MeasurementSource(correlation_time=TAU)

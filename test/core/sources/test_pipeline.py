@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What happens to measurements before they are in the graph: thinned, dropped, placed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, CovariancePolicy, MeasurementSource
 from pose_graph_ros.core.measurements import Fix, HeadingOnly, OdometrySample, Position
 from pose_graph_ros.core.sources import pipeline
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
 
@@ -34,7 +37,7 @@ def test_a_source_can_be_thinned_by_stamps() -> None:
 
 
 def test_while_unaligned_the_oldest_positions_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, 'MOST_UNALIGNED', 50)
+    monkeypatch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_unaligned=50))
     backend, rng = PoseGraphBackend(), np.random.default_rng(0)
 
     def drive(seconds: range, speed: float, x: float) -> float:

@@ -11,11 +11,12 @@ from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.odometry.odometry_errors import AS_CLAIMED
-from pose_graph_ros.core.sources import past_path
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
+from pose_graph_ros.core.sources.error_likelihood import no_past
 from pose_graph_ros.core.sources.gauss_markov import Additions, GaussMarkovBias
-from pose_graph_ros.core.sources.waiting import SeenStamps
+from pose_graph_ros.core.sources.pipeline import SeenStamps
+from pose_graph_ros.core.sources.settings import SOURCES
 
 
 class Chain:
@@ -150,7 +151,7 @@ def test_the_measured_path_goes_on_before_the_window(seed: int) -> None:
 
 
 def test_the_past_is_bounded() -> None:
-    path = past_path.no_past(0)
+    path = no_past(0)
     graph, stamps_ns, ids = drive(1, 12)
     part = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids))
     grown = part._replace(motion=np.zeros((len(ids) + 1, 3)),
@@ -159,7 +160,7 @@ def test_the_past_is_bounded() -> None:
                           lever=np.zeros((len(ids) + 1, 3)))
     for k in range(600):
         path = path.extended(stamps_ns + k * 100 * SECOND, grown, 0)
-        assert len(path.stamps_ns) <= 2 * past_path.KEPT
+        assert len(path.stamps_ns) <= 2 * SOURCES.kept_positions
     assert np.all(np.diff(path.stamps_ns) > 0)
     assert path.stamps_ns[-1] == stamps_ns[-1] + 599 * 100 * SECOND
 

@@ -3,6 +3,8 @@
 """Waiting measurements and stamps seen so far, compared with plain lists and sets."""
 
 
+from dataclasses import replace
+
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
@@ -15,7 +17,9 @@ from pose_graph_ros.core.measurements import (
     Measurement,
     OdometrySample,
 )
-from pose_graph_ros.core.sources.waiting import SeenStamps, WaitingMeasurements
+from pose_graph_ros.core.sources import pipeline
+from pose_graph_ros.core.sources.pipeline import SeenStamps, WaitingMeasurements
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
 
@@ -46,7 +50,7 @@ def test_what_is_due_comes_out_by_stamp_then_by_arrival(steps: list[tuple[bool, 
 @given(st.lists(st.integers(0, 30), max_size=40), st.integers(1, 9))
 def test_where_there_are_too_many_the_latest_goes(stamps: list[int], most: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr('pose_graph_ros.core.sources.waiting.MAX_WAITING', most)
+        patch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_waiting=most))
         pending, plain = WaitingMeasurements(), []
         for k, stamp in enumerate(stamps):
             gone = pending.push(f'{k}', heading(stamp))
@@ -78,7 +82,7 @@ def test_what_has_come_before_is_known(
 
 
 def test_a_dropped_measurement_may_be_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('pose_graph_ros.core.sources.waiting.MAX_WAITING', 2)
+    monkeypatch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_waiting=2))
     backend = PoseGraphBackend()
     ahead = heading(100 * SECOND)
     for one in (ahead, heading(2 * SECOND), heading(SECOND)):

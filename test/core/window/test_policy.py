@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.config import WindowConfig
+from pose_graph_ros.core.forgetting import LIMITS, n_leaving
 from pose_graph_ros.core.odometry.node_table import NodeTable
-from pose_graph_ros.core.window.policy import GROUP, LEAST_NODES, LONGEST_HOLD, n_leaving
 
 SECOND = 1_000_000_000
 
@@ -28,12 +28,12 @@ def slow(config: WindowConfig, n: int) -> int:
     most = 0
     for limit, spacing in ((config.nodes, 1.0), (config.seconds, 2.0), (config.metres, 3.0)):
         if limit > 0:
-            group = max(GROUP * limit, 1.0) if spacing == 1.0 else GROUP * limit
+            group = max(LIMITS.group * limit, 1.0) if spacing == 1.0 else LIMITS.group * limit
             group = math.floor(group) if spacing == 1.0 else group
             newest = n if spacing == 1.0 else (n - 1) * spacing
             begin = math.floor((newest - limit) / group) * group
             most = max(most, sum(k * spacing < begin for k in range(n)))
-    return max(min(most, n - LEAST_NODES), 0)
+    return max(min(most, n - LIMITS.newest), 0)
 
 
 @pytest.mark.parametrize('config', [
@@ -65,7 +65,7 @@ def test_what_is_needed_stays_but_not_for_ever() -> None:
         table = table_of(n)
         leaving.append(n_leaving(config, table, needed_ns=int(table.stamps_ns[3]) + SECOND))
     # node 3 goes with all that are more than twice the window old
-    assert leaving == [3, 3, 3, 90 - LONGEST_HOLD * 40]
+    assert leaving == [3, 3, 3, 90 - LIMITS.longest_hold * 40]
     # what lies in the part that stays holds nothing up
     table = table_of(60)
     assert n_leaving(config, table, needed_ns=int(table.stamps_ns[50])) == n_leaving(config, table)

@@ -6,20 +6,25 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from random_graphs import consistent_graph
 
-from pose_graph_ros.core.config import SmootherConfig, ThinningConfig
+from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.marginalization.marginalize import marginalize
-from pose_graph_ros.core.odometry.thinned_nodes import ThinnedNodes
+from pose_graph_ros.core.marginalization.marginalize import equations, marginalize
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.sources.gauss_markov import (
+    Additions,
+    CorrelatedErrors,
+    GaussMarkovBias,
+)
 from pose_graph_ros.core.window.sparse_removal import (
+    cut_chains,
     sparse_marginalization,
     sparse_removal,
     with_fewer_edges,
 )
-from pose_graph_ros.core.window.thinning import groups, removed, simplify, Thinning
+from pose_graph_ros.core.window.thinning import next_segment
 
 EXACT = SmootherConfig(alpha=0.0, budget=1e-20, max_iterations=20)
 
@@ -127,42 +132,77 @@ def test_fewer_edges_take_the_place_of_many() -> None:
     assert np.min(np.linalg.eigvalsh(covariances(graph) - before)) > -1e-9
 
 
-def test_the_graph_of_a_place_that_is_driven_often_does_not_grow() -> None:
-    rng = np.random.default_rng(2)
-    per_lap, laps, sigma = 40, 12, np.array((0.02, 0.02, 0.005))
-    angle = 2.0 * np.pi / per_lap * np.arange(per_lap * laps)
-    truth = se2.wrapped(np.column_stack((6.0 * np.cos(angle), 6.0 * np.sin(angle), angle)))
-    smoother, thinning, thinned = IncrementalSmoother(), Thinning(), ThinnedNodes()
-    smoother.update(GraphUpdate(hidden=truth[:1], fix=[0]))
-    config, sizes = ThinningConfig(cell=2.0, newest=15), []
-    for k in range(1, len(truth)):
-        mean = se2.compose(se2.between(truth[k - 1], truth[k]), sigma * rng.standard_normal(3))
-        smoother.extend(mean, np.diag(sigma**-2))
-        if k > per_lap and k % 5 == 0:
-            other = k - per_lap * int(rng.integers(1, k // per_lap + 1))
-            mean = se2.compose(
-                se2.between(truth[other], truth[k]), 2.0 * sigma * rng.standard_normal(3))
-            noise, place = np.diag(4.0 * sigma**2), thinned.place(other)
-            if place is not None:
-                adjoint = se2.adjoint(se2.inverse(mean))
-                noise = noise + adjoint @ place.noise @ adjoint.T
-                other, mean = place.anchor, se2.compose(place.mean, mean)
-            smoother.update(GraphUpdate(edges=Edges(
-                [other], [k], [mean], [np.linalg.inv(noise)], [EdgeKind.LOOP_CLOSURE])))
-        places = thinning.places(smoother, config, k + 1)
-        if places is not None:
-            for group in groups(smoother.graph, places):
-                assert removed(
-                    smoother, sparse_removal(smoother.graph, group.nodes)) is not None
-                thinned.add(*group)
-            for _ in simplify(smoother):
-                pass
-        if k % per_lap == per_lap - 1:
-            sizes.append((smoother.graph.n_nodes, smoother.graph.n_edges))
-    nodes, edges = np.array(sizes).T
-    assert np.max(nodes[4:]) < 2 * per_lap
-    assert np.max(edges[4:]) < 4 * np.max(nodes[4:])
-    assert len(thinned) == len(truth) - smoother.graph.n_nodes
-    off = smoother.graph.poses_of(len(truth) - 1) - truth[-1]
-    off[2] = se2.wrap(off[2])
-    assert off @ np.linalg.solve(smoother.newest_covariance(), off) < 16.0
+N = 18
+
+
+def drive(seed: int, tau: float, *, headings: bool) -> tuple[Graph, GaussMarkovBias]:
+    """
+    Return a graph in which all constraints agree, with a fix each second, and its biases.
+
+    All errors are 0, so no Jacobian changes when nodes leave.
+    """
+    rng = np.random.default_rng(seed)
+    steps = np.column_stack((
+        rng.uniform(0.5, 2.0, N - 1), rng.normal(0.0, 0.2, N - 1), rng.normal(0.0, 0.3, N - 1)))
+    poses = np.zeros((N, 3))
+    for k, step in enumerate(steps):
+        poses[k + 1] = se2.compose(poses[k], step)
+    i = np.arange(N - 1)
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=poses, edges=Edges.joined([
+        Edges(i, i + 1, steps, np.tile(np.diag((400.0, 900.0, 1e4)), (N - 1, 1, 1)), 0 * i),
+        Edges([1], [N - 3], se2.between(poses[[1]], poses[[N - 3]]), np.diag((50.0, 20.0, 100.0))[
+            None], [EdgeKind.LOOP_CLOSURE])])))
+    model, additions = GaussMarkovBias(CorrelatedErrors(tau, 1.0, 0.1)), Additions(graph.next_ids)
+    for k in range(N):
+        kind = ObservedKind.GLOBAL_POSE if headings else ObservedKind.POSITION
+        mean = poses[[k]] if headings else np.append(poses[k, :2], 0.0)[None]
+        model.add(k * 1_000_000_000, ObservedNodes(
+            [k], mean=mean, information=[np.diag((1.0, 1.0, 25.0 * headings))], kind=[kind]),
+            np.array((0.01, 0.001)), additions)
+    graph.apply(additions.update())
+    return graph, model
+
+
+def joint_covariance(graph: Graph, nodes: list[int]) -> FloatArray:
+    """Return the covariance of all coordinates of nodes, by a dense inverse."""
+    columns = 3 * graph.node_rows(np.array(nodes))[:, None] + np.arange(3)
+    H, _ = equations(graph)
+    return np.asarray(np.linalg.inv(H)[np.ix_(columns.ravel(), columns.ravel())])
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from((2.0, 20.0, 300.0)), st.booleans())
+@settings(max_examples=15)
+def test_where_a_chain_is_cut_no_covariance_becomes_smaller(
+    seed: int, tau: float, headings: bool,
+) -> None:
+    graph, model = drive(seed, tau, headings=headings)
+    before_poses, rng = graph.poses.copy(), np.random.default_rng(seed)
+    first = graph.node_ids.copy()
+    before = joint_covariance(graph, first.tolist())
+    smoother = IncrementalSmoother(EXACT, graph)
+    for _ in range(2):  # the second one takes in what the first has left
+        older = graph.node_ids[graph.is_pose][:-3]
+        leaving = older[rng.random(len(older)) < 0.5]
+        segment = next_segment(graph, older, leaving)
+        if segment is None:
+            break
+        biases = np.array(model.leaving(segment.after * 1_000_000_000))
+        cuts = cut_chains(graph, biases)
+        assert cuts is not None
+        assert len(cuts.cuts) == 1
+        leaving = leaving[np.isin(leaving, segment.poses)]
+        update = sparse_removal(graph, np.sort(np.append(leaving, biases)), segment.edges,
+                                segment.observed, cuts)
+        assert update is not None
+        smoother.update(update)
+        model.forget(set(biases.tolist()))
+        kept = graph.node_ids.tolist()
+        columns = (3 * np.searchsorted(first, kept)[:, None] + np.arange(3)).ravel()
+        after = joint_covariance(graph, kept)
+        scale = 1.0 / np.sqrt(np.diagonal(before)[columns])
+        more = (after - before[np.ix_(columns, columns)]) * scale[:, None] * scale
+        assert np.min(np.linalg.eigvalsh(more)) > -1e-5
+        np.testing.assert_allclose(
+            graph.poses, before_poses[np.searchsorted(first, kept)], atol=1e-6)
+    assert graph.n_nodes < len(first) - 3

@@ -80,7 +80,7 @@ def test_the_newest_nodes_and_the_fixed_one_stay_and_then_the_oldest() -> None:
 def test_a_group_is_connected_and_has_few_neighbours() -> None:
     chain = np.column_stack((np.arange(29), np.arange(1, 30)))
     assert thinning.group(np.array([3, 4, 5, 9]), chain).tolist() == [3, 4, 5]
-    assert len(thinning.group(np.arange(1, 29), chain)) == thinning.MOST_IN_GROUP
+    assert len(thinning.group(np.arange(1, 29), chain)) == thinning.LIMITS.group_nodes
     # a hub with many neighbours leaves alone
     star = np.column_stack((np.zeros(20, dtype=int), np.arange(1, 21)))
     assert thinning.group(np.array([0, 1, 2]), star).tolist() == [0]

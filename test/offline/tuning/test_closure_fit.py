@@ -7,9 +7,8 @@ import pytest
 
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.kinds import EdgeKind
 from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
 from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures
 from pose_graph_ros.offline.tuning.fit import Found

@@ -1,0 +1,360 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A drive: what was measured, the corrected path, how far they are apart, and the files of these.
+
+Paths are interpolated at the stamps of the truth or of the fixes; stamps outside a path are
+ignored. Odometry has its own frame, so it is first aligned with the truth (or the fixes) by the
+best rigid motion, which is the most favourable comparison for it. So is the truth with the path:
+its map may begin elsewhere, as where only a part of a recording is replayed.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+import json
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
+from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
+from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.geometry.se2 import (
+    BoolArray,
+    Covariances,
+    FloatArray,
+    IntArray,
+    Points,
+    PoseVector,
+)
+from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
+from pose_graph_ros.core.io.path_files import write_tum
+from pose_graph_ros.core.judgement.texts import Key
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
+from pose_graph_ros.core.quantities import StampNs
+
+MOST_SAMPLES = 200_000  # of a path that are kept; an even number
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorRow:
+    """Statistics of at least one error of one kind."""
+
+    name: str
+    count: int
+    median: float
+    rms: float
+    p95: float
+    maximum: float
+    unit: str = 'm'
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Input and result of the pose graph, and the truth if it is known; all finite."""
+
+    odometry: Trajectory  # raw, `T_odom_base`
+    fix_stamps_ns: IntArray  # (M,)
+    fix_positions: Points  # in the map, (M, 2)
+    fix_held_out: BoolArray  # whether a fix was kept out of the pose graph, (M,)
+    corrected: Trajectory  # result, `T_map_base`
+    truth: Trajectory | None  # `T_map_base`; None if unknown
+    loop_stamps_ns: IntArray  # of both ends of the loop closures, (L, 2)
+    map_axes: tuple[str, str] = ('x', 'y')
+    fix_unused: BoolArray | None = None  # whether it is doubted or waits; None: all are believed
+    fix_refused: BoolArray | None = None  # whether it is not in the graph; None: all are
+    fix_sources: Sequence[str] = ()  # none if unknown
+    loop_states: Sequence[State] = ()  # none if all are believed
+    loop_sources: Sequence[str] = ()  # none if unknown
+    truth_moved: tuple[float, float] | None = None  # to fit the path [m, rad]; None: it was not
+
+    @property
+    def fix_kinds(self) -> dict[str, BoolArray]:
+        """Which fixes are used, doubted and held out, shape (M,) each; others are refused."""
+        nothing = np.zeros_like(self.fix_held_out)
+        refused = nothing if self.fix_refused is None else self.fix_refused
+        doubted = nothing if self.fix_unused is None else self.fix_unused
+        rest = ~self.fix_held_out & ~refused
+        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': self.fix_held_out}
+
+    def loops(self, state: State) -> BoolArray:
+        """Return which loop closures are in a state, shape (L,)."""
+        known = self.loop_states or [State.BELIEVED] * len(self.loop_stamps_ns)
+        return np.array([each is state for each in known], dtype=bool)
+
+    @cached_property
+    def placed_odometry(self) -> Trajectory:
+        """Odometry laid over truth, else fixes, else result; as it is if none overlaps."""
+        anchors = [(self.fix_stamps_ns, self.fix_positions),
+                   (self.corrected.stamps_ns, self.corrected.poses[:, :2])]
+        if self.truth is not None:
+            anchors.insert(0, (self.truth.stamps_ns, self.truth.poses[:, :2]))
+        for stamps, positions in anchors:
+            inside = self.odometry.covers(stamps)
+            if np.any(inside):
+                odometry = self.odometry.at(stamps[inside])[:, :2]
+                pose = fit_motion(odometry, positions[inside])
+                return Trajectory(
+                    self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
+        return self.odometry
+
+    @cached_property
+    def rows(self) -> list[ErrorRow]:
+        """The errors of odometry, fixes and path; a row without any is left out."""
+        rows: list[ErrorRow] = []
+        paths = {'odometry alone': self.placed_odometry, 'corrected path': self.corrected}
+        truth, stamps, positions = self.truth, self.fix_stamps_ns, self.fix_positions
+        if truth is not None:
+            for name, path in paths.items():
+                _, errors = distances(path, truth.stamps_ns, truth.poses[:, :2])
+                rows += error_rows(f'{name} to truth', errors)
+            doubted = self.fix_kinds['doubted']
+            rows[1:1] = [row for name, chosen in (('fixes', ~doubted), ('doubted fixes', doubted))
+                         for row in error_rows(f'{name} to truth', distances(
+                             truth, stamps[chosen], positions[chosen])[1])]
+            inside = self.corrected.covers(truth.stamps_ns)
+            turns = se2.wrap(
+                self.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
+            rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
+        for kind, chosen in self.fix_kinds.items():
+            for name, path in paths.items():
+                _, errors = distances(path, stamps[chosen], positions[chosen])
+                rows += error_rows(f'{name} to fixes {kind}', errors)
+        return rows
+
+
+def place_truth(drive: Drive) -> Drive:
+    """Return a drive with the truth moved rigidly to where it fits the corrected path best."""
+    truth = drive.truth
+    if truth is None or not np.any(inside := drive.corrected.covers(truth.stamps_ns)):
+        return drive
+    before = truth.poses[inside, :2]
+    pose = fit_motion(before, drive.corrected.at(truth.stamps_ns[inside])[:, :2])
+    placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
+    shift = np.mean(placed.poses[inside, :2] - before, axis=0)
+    return replace(drive, truth=placed, truth_moved=(
+        float(np.hypot(*shift)), abs(float(pose[2]))))
+
+
+def distances(
+    path: Trajectory, stamps_ns: IntArray, positions: Points,
+) -> tuple[IntArray, FloatArray]:
+    """Return the stamps that a path covers, and its distances from positions at these [m]."""
+    inside = path.covers(stamps_ns)
+    offsets = path.at(stamps_ns[inside])[:, :2] - positions[inside]
+    return stamps_ns[inside], np.hypot(offsets[:, 0], offsets[:, 1])
+
+
+def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]:
+    """Return a list with the statistics of errors; an empty one without errors."""
+    return [] if len(errors) == 0 else [ErrorRow(
+        name, len(errors), float(np.median(errors)), float(np.sqrt(np.mean(np.square(errors)))),
+        float(np.percentile(errors, 95.0)), float(np.max(errors)), unit)]
+
+
+def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, Any] | None]:
+    """
+    Return the NEES of the corrected path to the truth, of positions and of poses, for JSON.
+
+    It is None if there is no valid covariance. Covariances are in map axes, and NaN where there is
+    none. Where they are relative to a fixed node, whose own is zero, the errors are, too. Else the
+    truth was moved to fit the path, which makes errors and so the NEES smaller. Errors along a
+    path are not independent, so that the true interval is wider.
+    """
+    truth, path = drive.truth, drive.corrected
+    assert truth is not None, 'only a truth tells errors'
+    inside = truth.covers(path.stamps_ns) & np.all(np.isfinite(covariances), axis=(1, 2))
+    true, poses = truth.at(path.stamps_ns[inside]), path.poses[inside]
+    if np.any(inside) and np.any(np.all(covariances == 0.0, axis=(1, 2))):
+        # a truth may begin just after the fixed node: the surest one that it covers is as good
+        surest = int(np.argmin(np.trace(covariances[inside], axis1=1, axis2=2)))
+        true = se2.compose(se2.compose(poses[surest], se2.inverse(true[surest])), true)
+    errors = poses - true
+    errors[:, 2] = se2.wrap(errors[:, 2])
+    found: dict[str, dict[str, Any] | None] = {}
+    for name, size in (('position', 2), ('pose', 3)):
+        blocks = covariances[inside][:, :size, :size]
+        valid = np.linalg.eigvalsh(blocks)[:, 0] > 0.0
+        e, n = errors[valid, :size, None], int(np.sum(valid))
+        nees = np.sum(e * np.linalg.solve(blocks[valid], e), axis=(1, 2))
+        # quantiles of chi-square
+        interval = 2.0 * gammaincinv(0.5 * max(n, 1) * size, (0.025, 0.975)) / max(n, 1)
+        found[name] = None if n == 0 else {
+            'mean': float(np.mean(nees)), 'expected': size, 'interval': interval.tolist(),
+            'within': float(np.mean(nees < 2.0 * gammaincinv(0.5 * size, 0.95))), 'count': n}
+    return found
+
+
+def consistency_lines(found: Mapping[str, dict[str, Any] | None]) -> list[str]:
+    """Return the NEES as text."""
+    return [f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
+        f'{each["mean"]:.4g}, expected {each["expected"]}, {each["interval"][0]:.4f} to '
+        f'{each["interval"][1]:.4f} if errors were independent; {100.0 * each["within"]:.1f} % '
+        f'below the 95 % quantile')) for name, each in found.items()]
+
+
+def format_table(rows: Sequence[ErrorRow]) -> str:
+    """Return the rows as a plain text table of less than 80 columns."""
+    if len(rows) == 0:
+        return 'nothing to compare: neither truth nor fixes overlap with the paths in time'
+    width = max(len(row.name) for row in rows)
+    lines = [f'{"":{width}}  {"median":>7} {"rms":>7} {"95 %":>7} {"max":>7}      {"count":>7}']
+    for row in rows:
+        values = ' '.join(f'{v:7.2f}' for v in (row.median, row.rms, row.p95, row.maximum))
+        lines.append(f'{row.name:{width}}  {values} {row.unit:<4} {row.count:7}')
+    return '\n'.join(lines)
+
+
+def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of a drive as plain Python values, ready for JSON."""
+    stamps, positions = drive.corrected.stamps_ns, drive.corrected.poses[:, :2]
+    steps = np.diff(positions, axis=0)
+    return {
+        'duration_s': float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0,
+        'distance_m': float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))),
+        'odometry': len(drive.odometry), 'poses': len(drive.corrected),
+        **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
+           for kind, chosen in drive.fix_kinds.items()},
+        'fixes_refused': 0 if drive.fix_refused is None else int(np.sum(drive.fix_refused)),
+        'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
+        'errors': [asdict(row) for row in drive.rows], **extra}
+
+
+def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, Any]) -> str:
+    """Return a table of errors, after writing `path.tum`, `drive.png` and `summary.json`."""
+    # matplotlib takes half a second to load, and wrong input needs none of it
+    from pose_graph_ros.cli.picture import draw_drive  # noqa: PLC0415
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tum(drive.corrected, folder / 'path.tum')
+    draw_drive(drive, folder / 'drive.png', title)
+    text = json.dumps(summary(drive, facts), indent=2)
+    (folder / 'summary.json').write_text(text + '\n', encoding='utf-8')
+    return format_table(drive.rows)
+
+
+class PathCollector:
+    """Samples of a path; of very many, only every second one is kept, or fewer."""
+
+    def __init__(self) -> None:
+        self._stamps, self._poses = list[int](), list[PoseVector]()
+        self._count, self._stride = 0, 1
+
+    def add(self, stamp_ns: StampNs, pose: PoseVector) -> None:
+        """Add a sample."""
+        if self._count % self._stride == 0:
+            self._stamps.append(stamp_ns)
+            self._poses.append(pose)
+        self._count += 1
+        if len(self._stamps) == MOST_SAMPLES:
+            self._stamps, self._poses = self._stamps[::2], self._poses[::2]
+            self._stride *= 2
+
+    def path(self) -> Trajectory:
+        """Return the samples by stamp; of several with the same stamp the first one."""
+        stamps, first = np.unique(np.array(self._stamps, dtype=np.int64), return_index=True)
+        return Trajectory(stamps, np.array(self._poses).reshape(-1, 3)[first])
+
+
+class _Fix(NamedTuple):
+    """A measured position."""
+
+    source: str
+    stamp_ns: StampNs
+    measured: Fix | FloatArray  # a fix is not in the map yet
+    arm: FloatArray  # of the antenna, (2,) [m]
+    held_out: bool
+
+
+def collect_drive(
+    bag: Bag, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
+    truth_topic: str | None, *, origin: MapOrigin | None = None,
+    states: Mapping[Key, State] = MappingProxyType({}),
+) -> Drive:
+    """
+    Return the corrected path together with the measurements of the bag that went into the graph.
+
+    The truth is moved to where it fits the path best. What has none of the `states` is believed;
+    without the `origin` of the graph's map, the first fix on the path makes it. Raises `BagError`
+    if `truth_topic` is missing or of an unsupported type.
+    """
+    reader = reader_of(bag, values)
+    if origin is not None:
+        reader.datum.keep(origin)
+    preferred = inputs.of(*ODOMETRY_KINDS)[0]
+    odometry, fixes, loops = PathCollector(), list[_Fix](), list[Key]()
+    for source, message, held_out in read_inputs(bag, inputs):
+        try:
+            measurement = reader.read(source, message.decode())
+        except MessageError:
+            continue
+        match measurement:
+            case Fix(stamp, _, _, lever_arm):
+                fixes.append(_Fix(source, stamp, measurement, lever_arm, held_out))
+            case GlobalPose(stamp, pose, _):
+                fixes.append(_Fix(source, stamp, pose[:2], np.zeros(2), held_out))
+            case LoopClosure(stamp, _, _, int(reference)):
+                loops.append((source, stamp, reference))
+            case OdometrySample(stamp, pose) if source == preferred:
+                odometry.add(stamp, pose)
+    stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
+    arms = np.array([each.arm for each in fixes]).reshape(-1, 2)
+    inside, positions = corrected.covers(stamps), np.zeros((len(fixes), 2))
+    # a fix that can have been used makes the datum, if there is none
+    for k in sorted(range(len(fixes)), key=lambda k: fixes[k].held_out or not inside[k]):
+        measured = fixes[k].measured
+        positions[k] = measured.place() if isinstance(measured, Fix) else measured
+    if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
+        turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
+        positions[inside] -= se2.transform(turn, arms[inside])
+    return place_truth(Drive(
+        odometry.path(), stamps, positions,
+        np.array([each.held_out for each in fixes], dtype=bool), corrected,
+        None if truth_topic is None else read_truth(bag, truth_topic, inputs.span),
+        np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
+        map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
+        else ('x', 'y'),
+        fix_unused=np.array([not states.get((each.source, each.stamp_ns, None),
+                                            State.BELIEVED).in_graph for each in fixes], bool),
+        fix_sources=[each.source for each in fixes],
+        loop_states=[states.get(key, State.BELIEVED) for key in loops],
+        loop_sources=[source for source, _, _ in loops]))
+
+
+def with_refused(drive: Drive, backend: PoseGraphBackend) -> Drive:
+    """Return a drive with the measurements in the map that its graph has not, where it could."""
+    estimate = backend.estimate(with_path=False)
+    assert estimate is not None, 'a drive has a hidden node'
+    stamps, begin_ns = drive.fix_stamps_ns, backend.node_stamps_ns[estimate.n_frozen]
+    refused = ~drive.fix_held_out & (stamps >= begin_ns)
+    names = np.array(drive.fix_sources, dtype=str)
+    for source, added in backend.measured().items():
+        at = np.flatnonzero((names == source) & np.isin(stamps, added) & ~drive.fix_held_out)
+        # of several with one stamp the first one was added
+        refused[at[np.unique(stamps[at], return_index=True)[1]]] = False
+    return replace(drive, fix_refused=refused)
+
+
+def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
+    """
+    Return the true poses that were recorded in a span; invalid messages are ignored.
+
+    Raises `BagError` if the topic is missing or of an unsupported type.
+    """
+    info = bag.topics.get(topic)
+    if info is None or info.type not in POSE_TYPES:
+        what = 'no topic' if info is None else f'type {info.type} of'
+        raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
+                       f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
+    poses = PathCollector()
+    for stamp, pose in poses_on(bag, topic, span):
+        poses.add(stamp, pose)
+    return poses.path()

@@ -1,0 +1,127 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What several tools share: topics, parameters and times by their options; progress bars."""
+
+import argparse
+from collections.abc import Collection, Iterable, Iterator, Mapping
+import math
+from pathlib import Path
+import sys
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import yaml
+
+from pose_graph_ros.adapters.bag_inputs import OPTIONS
+from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, one_line, Span
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.core.exceptions import ConfigError
+
+DELAY = 0.5  # after which a bar appears [s]
+Item = TypeVar('Item')
+def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
+    """Return the topics given by the options, by name of the source; None if not given."""
+    return {source: getattr(options, source) for source in OPTIONS}
+
+
+def parameter_values(
+    options: argparse.Namespace, usual: Mapping[str, Any] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
+    given = {**usual, **({} if options.params_file is None else _read_file(options.params_file))}
+    for text in options.param:
+        name, separator, value = text.partition(':=')
+        if separator == '':
+            raise ConfigError(f'--param: expected NAME:=VALUE, got {text!r}')
+        try:
+            given[name] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f'--param {name}: {value!r} is not YAML') from error
+    return checked(given)
+
+
+def ros_arguments(options: argparse.Namespace) -> list[str]:
+    """Return the command line arguments that give the node the same parameters."""
+    arguments = ['--ros-args']
+    if options.params_file is not None:
+        arguments += ['--params-file', str(options.params_file.resolve())]
+    for text in options.param:
+        arguments += ['-p', text]
+    return arguments
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """Return the parameters for the node in a ROS 2 parameter file."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f'{path}: cannot be read as yaml: {one_line(error)}') from error
+    given: dict[str, Any] = {}
+    for name, section in (content if isinstance(content, Mapping) else {}).items():
+        if str(name).rpartition('/')[2] not in ('**', '*', 'pose_graph'):
+            continue
+        parameters = section.get('ros__parameters') if isinstance(section, Mapping) else None
+        if not isinstance(parameters, Mapping):
+            raise ConfigError(f'{path}: {name}: expected ros__parameters')
+        _flatten(parameters, '', given)
+    # `ros2 param dump` writes null for what is not set, and what every node has
+    of_rclpy = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+    return {name: value for name, value in given.items()
+            if value is not None and not name.startswith(of_rclpy)}
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            _flatten(value, f'{prefix}{name}.', flat)
+        else:
+            flat[prefix + name] = value
+
+
+def span_of(bag: Bag, options: argparse.Namespace) -> Span:
+    """Return the time of recording that the options ask for; raises `BagError` if it is empty."""
+    limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
+              for seconds in (options.begin, options.until)]
+    span, length = Span(*limits), (bag.end_ns - bag.start_ns) * 1e-9
+    until = math.inf if options.until is None else options.until
+    if (options.begin or 0.0) >= min(length, until):
+        raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
+                       f'recording is {max(length, 0.0):.3f} s long')
+    return span
+
+
+def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
+    """Return the same items, with a bar on standard error if that is a terminal."""
+    if not sys.stderr.isatty():
+        return items
+    from tqdm import tqdm  # noqa: PLC0415  (not needed without a terminal)
+
+    return tqdm(items, leave=False, delay=DELAY, **looks)
+
+
+class WatchedBag(Bag):
+    """A bag that shows on a terminal how far its messages have been read."""
+
+    def __init__(self, bag: Bag, title: str) -> None:
+        self.path, self.topics = bag.path, bag.topics
+        self.start_ns, self.end_ns = bag.start_ns, bag.end_ns
+        self._bag, self._title = bag, title
+
+    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
+        messages = self._bag.messages(topics, span)
+        return self._watched(messages, span) if sys.stderr.isatty() else messages
+
+    def _watched(self, messages: Iterator[BagMessage], span: Span) -> Iterator[BagMessage]:
+        from tqdm import tqdm  # noqa: PLC0415  (not needed without a terminal)
+
+        shown_ns = self.start_ns if span.begin_ns is None else span.begin_ns
+        end_ns = self.end_ns if span.end_ns is None else min(span.end_ns, self.end_ns)
+        length_ns = max(end_ns - shown_ns, 1)
+        with tqdm(desc=self._title, total=length_ns * 1e-9, leave=False, delay=DELAY, bar_format=(
+                '{desc}: {percentage:3.0f} % |{bar}| {n:.0f} of {total:.0f} s [{remaining} left]'
+                )) as bar:
+            for message in messages:
+                if message.recorded_ns - shown_ns >= length_ns // 500:
+                    bar.update((message.recorded_ns - shown_ns) * 1e-9)
+                    shown_ns = message.recorded_ns
+                yield message

@@ -1,0 +1,291 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which ids are in use, and checks of all that goes into a graph; they raise GraphUpdateError."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import (
+    EdgeKind,
+    Edges,
+    FACTORS,
+    NodeKind,
+    ObservedKind,
+    ObservedNodes,
+)
+from pose_graph_ros.core.graph.priors import Prior
+
+# How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
+# below zero and its triangles may differ, because files print few digits.
+SEMIDEFINITE_TOLERANCE = 1e-5
+# Shapes of the rows of columns that are not of numbers.
+_ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
+
+
+class Ids(NamedTuple):
+    """Which permanent ids of nodes, edges or observed nodes are in use."""
+
+    end: int                            # id of the next new row
+    present: IntArray | None = None     # by row, ascending; None where they are 0..end - 1
+
+    @classmethod
+    def of(cls, end: int, present: IntArray) -> 'Ids':
+        """Return the ids of a table."""
+        return cls(end, None if len(present) == end else present)
+
+    def rows(self, ids: npt.ArrayLike) -> IntArray:
+        """Return the row of each id, in the shape of `ids`, -1 where it is in none."""
+        wanted = np.asarray(ids, dtype=np.int64)
+        if self.present is None:
+            return np.where((wanted >= 0) & (wanted < self.end), wanted, -1)
+        if len(self.present) == 0:
+            return np.full(wanted.shape, -1)
+        rows = np.minimum(np.searchsorted(self.present, wanted), len(self.present) - 1)
+        return np.where(self.present[rows] == wanted, rows, -1)
+
+    def known(self, ids: npt.ArrayLike, what: str) -> IntArray:
+        """Return the row of each id; raise ValueError where it is in none."""
+        rows = self.rows(ids)
+        if np.any(rows < 0):
+            gone = np.asarray(ids)[rows < 0].flat[0]
+            raise ValueError(f'{what} {gone} is not in the graph')
+        return rows
+
+    def by_row(self) -> IntArray:
+        """Return the ids of all rows, a copy."""
+        return np.arange(self.end) if self.present is None else self.present.astype(np.int64)
+
+    def extended(self, n: int) -> 'Ids':
+        """Return the ids with n more rows."""
+        if self.present is None:
+            return Ids(self.end + n)
+        return Ids(self.end + n, np.append(self.present, self.end + np.arange(n)))
+
+
+# --- tables of constraints ----------------------------------------------------------------------
+
+def check(
+    table: Edges | ObservedNodes, kind: npt.NDArray[Any], dimension: IntArray | None = None,
+    nodes: Ids | None = None,
+) -> None:
+    """
+    Raise for invalid constraints, with the row, what was expected and the value.
+
+    Invalid are wrong shapes, kinds or nodes, negative weights, an edge from a node to itself, a
+    node of a kind that the kind of edge does not have for this end, numbers that are not finite,
+    numbers in rows that an error has not, an information matrix that is zero, not symmetric or not
+    positive semidefinite. `kind` has the `NodeKind` of the hidden nodes, by row; by default
+    `dimension` is 2 for landmarks and 3 for others, and ids are rows.
+    """
+    name, ids = type(table).__name__, Ids(len(kind)) if nodes is None else nodes
+    columns = {item.name: getattr(table, item.name) for item in fields(table)}
+    for key, column in columns.items():
+        expected = (len(table), *_ROW_SHAPES.get(key, ()))
+        if column.shape != expected:
+            raise GraphUpdateError(
+                f'{name}.{key}: expected shape {expected}, got {column.shape}')
+    for key, column in columns.items():
+        _refuse_rows(~np.isfinite(column), f'{name}.{key} is not finite', column)
+    ends = ((table.i, table.j, table.k[table.k != -1])
+            if isinstance(table, Edges) else (table.node,))
+    for end in ends:
+        _refuse_rows((end < 0) | (end >= ids.end),
+                     f'{name}: expected a hidden node in 0..{ids.end - 1}', end)
+        gone = np.flatnonzero(ids.rows(end) < 0)
+        if len(gone) > 0:
+            raise GraphUpdateError(
+                f'{name}: hidden node {end[gone[0]]} has left the graph; row {gone[0]}')
+    known = tuple(FACTORS) if isinstance(table, Edges) else tuple(ObservedKind)
+    _refuse_rows(~np.isin(table.kind, known),
+                 f'{name}.kind is none of {", ".join(each.name for each in known)}', table.kind)
+    _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
+    if dimension is None:
+        dimension = np.where(kind == NodeKind.LANDMARK, 2, 3)
+    if isinstance(table, Edges):
+        _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
+        _check_ends(table, kind, ids)
+        rows = np.array([np.isin(range(3), factor.rows) for factor in FACTORS.values()])
+        missing = ~rows[table.kind]
+        _refuse_rows(missing & (table.mean != 0.0),
+                     f'{name}.mean: expected 0 in rows that the error has not', table.mean)
+        least = np.where(table.kind == EdgeKind.BIAS, np.minimum(
+            dimension[ids.rows(table.i)], dimension[ids.rows(table.j)]), 3)
+    else:
+        least, missing = dimension[ids.rows(table.node)], np.zeros((len(table), 3), dtype=bool)
+    missing = missing | (np.arange(3) >= least[:, None])
+    diagonal = np.diagonal(table.information, axis1=1, axis2=2)
+    _refuse_rows(missing & (diagonal != 0.0), f'{name}.information: expected 0 in rows that the '
+                 'error or the node has not', diagonal)
+    _check_information(f'{name}.information', table.information)
+
+
+def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
+    """Raise if an edge has a node of the wrong kind for an end."""
+    for each, factor in FACTORS.items():
+        rows = edges.kind == each
+        for end, allowed in (('i', factor.i), ('j', factor.j), ('k', factor.k)):
+            node = getattr(edges, end)
+            wrong = rows & (node >= 0) & ~np.isin(kind[ids.rows(node)], allowed)
+            expected = ' or '.join(item.name.lower() for item in allowed) or 'none'
+            _refuse_rows(wrong, f'Edges.{end}: expected an edge of kind {each.name} to have '
+                         f'{expected} for this end', node)
+
+
+def _check_information(name: str, matrix: FloatArray) -> None:
+    """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
+    diagonal, scaled = np.diagonal(matrix, axis1=1, axis2=2), _scaled(matrix)
+    skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)
+    _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
+    smallest = np.zeros(len(matrix))
+    doubtful = ~_are_definite(scaled)
+    smallest[doubtful] = np.min(
+        np.linalg.eigvalsh(scaled[doubtful]), axis=-1, initial=np.inf)
+    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
+    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
+                 f'{name} is not positive semidefinite, or zero', matrix)
+
+
+def are_definite(information: FloatArray) -> BoolArray:
+    """Tell which matrices, shape (M, 3, 3), are clearly positive definite, whatever their unit."""
+    return _are_definite(_scaled(information))
+
+
+def _scaled(matrix: FloatArray) -> FloatArray:
+    """Return matrices with 1 in place of each positive number on the diagonal."""
+    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    with np.errstate(over='ignore'):
+        scaled = matrix / root[:, :, None] / root[:, None, :]
+    # correlations beyond 1 are invalid however large they are, and might overflow
+    return np.clip(scaled, -2.0, 2.0)
+
+
+def _are_definite(scaled: FloatArray) -> BoolArray:
+    """Tell for which matrices with 1 on the diagonal the leading minors are clearly positive."""
+    a, b, c = scaled[:, 0, 1], scaled[:, 0, 2], scaled[:, 1, 2]
+    diagonal = np.diagonal(scaled, axis1=1, axis2=2)
+    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
+    return np.asarray(np.all(np.abs(diagonal - 1.0) < 1e-12, axis=1)
+                      & (1.0 - a * a > 1e-9) & (determinant > 1e-9))
+
+
+def _refuse_rows(bad: BoolArray, reason: str, values: npt.NDArray[np.generic]) -> None:
+    """Raise with the first bad row, if there is one."""
+    if np.any(bad):
+        row = int(np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0])
+        raise GraphUpdateError(f'{reason}; row {row}: {values[row].tolist()}')
+
+
+# --- other parts of an update -------------------------------------------------------------------
+
+def checked_poses(name: str, poses: FloatArray) -> FloatArray:
+    """Return poses of a part of an update as an array of floats."""
+    array = np.asarray(poses, dtype=np.float64)
+    has_shape = array.ndim == 2 and array.shape[1:] == (3,)
+    if not has_shape or not np.all(np.isfinite(array)):
+        raise GraphUpdateError(
+            f'{name}: expected finite poses, shape (N, 3), got shape {array.shape}'
+            + ' with numbers that are not finite' * has_shape)
+    return array
+
+
+# Types of some new biases, to save making them.
+_BIASES = np.full(64, NodeKind.BIAS, np.uint8)
+
+
+def node_types(kind: npt.NDArray[Any], dimension: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the NODE_TYPE of nodes, given their `NodeKind` and numbers of coordinates."""
+    return kind + 4 * (3 - dimension)
+
+
+def other_nodes(
+    biases: FloatArray, dimensions: Sequence[int], landmarks: FloatArray,
+) -> tuple[npt.NDArray[Any], ...]:
+    """Return values, shape (S + L, 3), and types of new nodes that are no poses."""
+    n = len(biases)
+    if len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
+        return biases, _BIASES[:n]
+    biases, points = checked_poses('biases', biases), np.asarray(landmarks, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise GraphUpdateError(f'landmarks: expected shape (L, 2), got {points.shape}')
+    given = np.asarray(dimensions if len(dimensions) > 0 else np.full(n, 3))
+    if given.shape != (n,) or not np.all(np.isin(given, (1, 2, 3))):
+        raise GraphUpdateError(
+            f'dimensions: expected 1, 2 or 3 for each of {n} biases, got {given.tolist()}')
+    dimension = np.concatenate((given, np.full(len(points), 2))).astype(np.uint8)
+    values = np.concatenate((biases, np.pad(points, ((0, 0), (0, 1)))))
+    kind = np.repeat(np.array((NodeKind.BIAS, NodeKind.LANDMARK), np.uint8), (n, len(points)))
+    return (np.where(np.arange(3) < dimension[:, None], values, 0.0),
+            node_types(kind, dimension))
+
+
+def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
+    """Raise unless all ids are in use."""
+    if len(ids) == 0:
+        return
+    array = np.array(list(ids))
+    wrong = ((array < 0) | (array >= known.end) if array.dtype.kind in 'iu'
+             else np.ones(len(array), dtype=bool))
+    if np.any(wrong):
+        raise GraphUpdateError(
+            f'{name}: expected {what}s in 0..{known.end - 1}, got {array[wrong][0]}')
+    gone = known.rows(array) < 0
+    if np.any(gone):
+        raise GraphUpdateError(f'{name}: {what} {array[gone][0]} has left the graph')
+
+
+def check_weights(name: str, weights: Mapping[int, float], what: str, known: Ids) -> None:
+    """Raise unless ids and weights are valid."""
+    check_ids(name, weights, what, known)
+    numbers = np.fromiter(weights.values(), np.float64, len(weights))
+    if not np.all(np.isfinite(numbers) & (numbers >= 0.0)):
+        number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
+        raise GraphUpdateError(
+            f'{name}: expected a finite weight that is not negative, got {weight} '
+            f'for number {number}')
+
+
+def check_measured(means: FloatArray, informations: FloatArray, n: int) -> None:
+    """Raise unless these are means and informations of n edges."""
+    shapes = means.shape, informations.shape
+    if shapes != ((n, 3), (n, 3, 3)):
+        raise GraphUpdateError(f'measure_edges: expected the shapes {(n, 3)} and {(n, 3, 3)}, '
+                               f'got {shapes[0]} and {shapes[1]}')
+    if not np.all(np.isfinite(means)):
+        raise GraphUpdateError('measure_edges: expected finite means')
+    _check_information('measure_edges', informations)
+
+
+def check_priors(priors: Sequence[Prior], leaving: Sequence[int]) -> None:
+    """Raise for wrong shapes and numbers; nodes are not looked up."""
+    for n, prior in enumerate(priors):
+        k = len(prior.nodes)
+        shapes = [np.shape(part) for part in (prior.reference, prior.information, prior.vector)]
+        if k == 0 or shapes != [(k, 3), (3 * k, 3 * k), (3 * k,)]:
+            raise GraphUpdateError(
+                f'priors[{n}]: expected shapes (k, 3), (3k, 3k) and (3k,) for k = {k} nodes, '
+                f'got {shapes}')
+        if len(np.unique(prior.nodes)) < k:
+            raise GraphUpdateError(
+                f'priors[{n}]: a node is there twice: {np.asarray(prior.nodes).tolist()}')
+        if np.any(np.isin(prior.nodes, np.fromiter(leaving, np.int64))):
+            raise GraphUpdateError(f'priors[{n}]: a node leaves with the same update')
+        if not all(np.all(np.isfinite(part)) for part in (
+                prior.reference, prior.information, prior.vector, prior.energy)):
+            raise GraphUpdateError(f'priors[{n}]: a number is not finite')
+        # small numbers on the diagonal may be what rounding leaves of zero
+        diagonal = np.diagonal(prior.information)
+        root = np.sqrt(np.maximum(diagonal, max(1e-8 * np.max(diagonal), 1e-300)))
+        scaled = prior.information / np.outer(root, root)
+        skew = float(np.max(np.abs(scaled - scaled.T)))
+        smallest = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
+        if skew > SEMIDEFINITE_TOLERANCE or smallest < -SEMIDEFINITE_TOLERANCE:
+            raise GraphUpdateError(
+                f'priors[{n}].information is not symmetric and positive semidefinite: '
+                f'asymmetry {skew:.1e}, smallest eigenvalue {smallest:.1e}')

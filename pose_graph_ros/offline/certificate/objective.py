@@ -1,0 +1,277 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The objective to which certificates of global optimality apply, from the constraints of a graph.
+
+With the heading of node i as a unit complex number z_i, its position as a complex number t_i, and
+an edge from i to j with the measured pose (t_e, th_e), the objective is
+
+    f = sum_e  kappa_e |z_j - z_i exp(i th_e)|^2  +  tau_e |t_j - t_i - z_i t_e|^2,
+
+a Hermitian quadratic form in (t, z). `kappa` is the entry of the information for the heading and
+`tau = 2 / trace(inverse of its block for the position)`, both as in D. Rosen et al., "SE-Sync: a
+certifiably correct algorithm for synchronization over the special Euclidean group", IJRR 2019,
+section 3.1. (In the plane their chordal distance of rotations is 2 |z - z'|^2; here a small error
+counts as in chi2.) chi2, with the errors (3.48) and (3.52), differs by the angle itself in place
+of the chord, 2 sin(e/2), which is never longer, and by information on the position that differs
+with the direction or is correlated with the heading. Without these f is nowhere above chi2.
+
+The map is unknown 0, with z = 1 and t = 0 at the origin. Fixed nodes are parts of it: their z and
+t are constants times z_0. An observed node is an edge from the map, a position one with kappa = 0.
+So every constraint is, with arms a and b (0 unless the end is fixed or observed with an offset),
+
+    kappa |z_j - z_i r|^2 + tau |t_j + z_j b - t_i - z_i a|^2.
+
+`QuadraticForm` is this objective in the headings alone, positions eliminated. With whitened
+residuals `C_t t + C_z z` the best positions for given headings solve a real linear system,
+`L t = -C_t^T C_z z`, L a weighted Laplacian. What remains is f = z^H Q z, with
+`Q = C_z^H (C_z + C_t (positions per z))`, which is dense, but never formed: a product with it
+takes one sparse solve. M is the sparse form in (t, z) whose Schur complement Q is, with a block
+for each node. Headings may also be rows of r complex numbers each (`riemannian`): then t has r
+columns as well.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pose_graph_ros.core.batch.linear_starts import complex_of, Constrained, Terms
+from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph.constraints import NodeKind
+from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, Blocks, components, order_of
+
+
+class NotCoveredError(PoseGraphError):
+    """The objective does not cover a graph; the message is the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Formulation:
+    """Terms of the objective, M of them; unknown 0 is the map."""
+
+    i: IntArray
+    j: IntArray
+    rotation: ComplexArray  # unit numbers r
+    arm_i: ComplexArray  # a [m]
+    arm_j: ComplexArray  # b [m]
+    kappa: FloatArray  # [1/rad^2]
+    tau: FloatArray  # [1/m^2]
+    number: IntArray  # unknown of each hidden node, shape (N,), 0 for fixed ones
+    fixed: Poses  # of all hidden nodes; those of fixed ones are used
+    # whether f is nowhere above chi2, as no information depends on the direction or is correlated:
+    # a lower bound of f is one of chi2 then
+    below_chi2: bool
+    origin: complex  # where the positions begin in the map [m]
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of unknown headings, with that of the map."""
+        return int(np.max(self.number, initial=0)) + 1
+
+    def headings(self, poses: FloatArray) -> ComplexArray:
+        """Return z, shape (n_unknowns,), of poses of all hidden nodes, shape (N, 3)."""
+        z = np.ones(self.n_unknowns, dtype=np.complex128)
+        free = self.number > 0
+        z[self.number[free]] = np.exp(1j * poses[free, 2])
+        return z
+
+    def poses(self, positions: ComplexArray, headings: ComplexArray) -> FloatArray:
+        """Return poses of all hidden nodes in the map, given t and z, shape (n_unknowns,)."""
+        turn = headings[0].conjugate()
+        t, z = positions * turn + self.origin, headings * turn
+        poses = np.stack((t.real, t.imag, np.angle(z)), axis=1)[self.number]
+        return np.where(self.number[:, None] > 0, poses, self.fixed)
+
+
+def formulate(graph: Constrained) -> Formulation:
+    """
+    Return the objective for a graph, or raise NotCoveredError with the reason.
+
+    Weights count as they are, also those that a robust loss gave. Not covered are biases,
+    landmarks, priors of marginalisation, and parts of a graph that nothing holds.
+    """
+    for each, name in ((NodeKind.LANDMARK, 'landmarks'), (NodeKind.BIAS, 'biases')):
+        if np.any(graph.node_kind == each):
+            raise NotCoveredError(f'the graph has {name}, which have no heading')
+    if graph.n_priors > 0:
+        raise NotCoveredError('the graph has priors on several nodes, which are not isotropic')
+    edges, observed = graph.edges_by_row, graph.observed_by_row
+    edges = edges.rows(edges.weight > 0.0)
+    observed = observed.rows(observed.weight > 0.0)
+    poses, fixed = graph.poses, graph.fixed
+    information = np.concatenate((edges.weighted_information, observed.weighted_information))
+    with np.errstate(over='ignore', invalid='ignore'):
+        kappa, tau = _kappa_tau(information)
+    terms = Terms.joined(*Terms.of_both(edges, observed, len(poses)))
+    places = np.concatenate((complex_of(poses[fixed]), terms.arm_i[len(edges):][
+        tau[len(edges):] > 0.0]))
+    origin = complex(np.mean(places)) if len(places) > 0 else 0j
+    # of all nodes, and of the map behind them: unknown, its heading and position as far as known
+    number = np.append(np.where(fixed, 0, np.cumsum(~fixed)), 0)
+    own = np.append(np.where(fixed, np.exp(1j * poses[:, 2]), 1.0), 1.0)
+    at = np.append(np.where(fixed, complex_of(poses) - origin, 0.0), -origin)
+    arm_i, arm_j = (at[end] + own[end] * arm for end, arm in (
+        (terms.i, terms.arm_i), (terms.j, terms.arm_j)))
+    # squares of longer distances may overflow
+    if not (np.all(np.isfinite(tau)) and np.all(np.abs(arm_i) < 1e100)):
+        raise NotCoveredError('the numbers are too large')
+    form = Formulation(
+        number[terms.i], number[terms.j], own[terms.i] * terms.turn * own[terms.j].conj(),
+        arm_i, arm_j, kappa, tau, number[:-1], poses.copy(),
+        _is_below(information, kappa, tau), origin)
+    _check_held(form)
+    return form
+
+
+def _kappa_tau(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the weights of heading and position, shape (M,) each; see the top of the module."""
+    xx, yy, xy = information[:, 0, 0], information[:, 1, 1], information[:, 0, 1]
+    trace = xx + yy
+    tau = 2.0 * (xx * yy - xy * xy) / np.where(trace > 0.0, trace, 1.0)
+    return np.maximum(information[:, 2, 2], 0.0), np.maximum(tau, 0.0)
+
+
+def _is_below(information: FloatArray, kappa: FloatArray, tau: FloatArray) -> bool:
+    """Tell whether `diag(tau, tau, kappa)` is nowhere above the information."""
+    rest = information.copy()
+    rest[:, (0, 1, 2), (0, 1, 2)] -= np.stack((tau, tau, kappa), axis=1)
+    # as far as the six numbers of a file tell
+    least = np.sqrt(np.maximum(np.einsum('mii->mi', information), np.finfo(float).tiny))
+    scaled = rest / least[:, :, None] / least[:, None, :]
+    return bool(np.min(np.linalg.eigvalsh(scaled), initial=0.0) > -1e-9)
+
+
+def _check_held(form: Formulation) -> None:
+    """Raise NotCoveredError unless constraints on positions join all unknowns to the map."""
+    joining = form.tau > 0.0
+    part = components(form.i[joining], form.j[joining], form.n_unknowns)
+    if np.any(part != 0):
+        raise NotCoveredError(
+            f'constraints on positions join {int(np.sum(part != 0))} nodes to nothing fixed '
+            f'and nothing observed')
+
+
+class QuadraticForm:
+    """
+    The objective as a function of headings; t of the map is 0.
+
+    `places` are those of all unknowns in an order of elimination with little fill; without them
+    one is found.
+    """
+
+    def __init__(self, form: Formulation, places: IntArray | None = None) -> None:
+        self.n = form.n_unknowns
+        """Number of headings."""
+        self._i, self._j = form.i, form.j
+        self._root_tau, root_kappa = np.sqrt(form.tau), np.sqrt(form.kappa)
+        # what the residuals are of z_i and z_j
+        self._upper = -self._root_tau * form.arm_i, self._root_tau * form.arm_j
+        self._lower = -root_kappa * form.rotation, root_kappa + 0j
+        # of the blocks (i, i), (i, j), (j, i) and (j, j) of each term
+        self._rows = form.i, form.i, form.j, form.j
+        self._columns = form.i, form.j, form.i, form.j
+        nodes = np.arange(self.n)
+        self._pattern = BlockPattern(
+            np.concatenate((*self._rows, nodes)), np.concatenate((*self._columns, nodes)),
+            order_of(form.i, form.j, self.n) if places is None else places)
+        self._blocks = self._matrix_blocks()
+        laplacian = [block[:, :1, :1].real for block in self._blocks]
+        self._laplacian = self._pattern.factors((
+            *self._without_map(laplacian, 0), _unit(self.n, 1, 0).real))
+        self.diagonal: FloatArray = np.zeros(self.n)
+        """Entries of M at the headings, shape (n,)."""
+        for row, column, block in zip(self._rows, self._columns, self._blocks, strict=True):
+            self.diagonal += _scattered(row, block[:, 1, 1] * (row == column), self.n).real
+
+    def _matrix_blocks(self) -> list[ComplexArray]:
+        """Return the parts of M in (t, z) of the ends: (i, i), (i, j), (j, i) and (j, j)."""
+        rows = []
+        for sign, upper, lower in zip((-1.0, 1.0), self._upper, self._lower, strict=True):
+            row = np.zeros((len(self._i), 2, 2), dtype=np.complex128)
+            row[:, 0, 0], row[:, 0, 1], row[:, 1, 1] = sign * self._root_tau, upper, lower
+            rows.append(row)
+        return [a.conj().swapaxes(1, 2) @ b for a in rows for b in rows]
+
+    def _without_map(self, blocks: Sequence[Blocks], component: int) -> list[Blocks]:
+        """Return the blocks of the terms with zeros in the map's row and column of a component."""
+        left = []
+        for row, column, block in zip(self._rows, self._columns, blocks, strict=True):
+            kept = block.copy()
+            kept[row == 0, component, :] = 0.0
+            kept[column == 0, :, component] = 0.0
+            left.append(kept)
+        return left
+
+    def factors(self, shift: FloatArray, *, turned: bool = True) -> BlockFactors:
+        """
+        Return the factors of M with numbers added to the diagonal at the headings.
+
+        The position of the map is held, and its heading unless `turned`. Raises LinearSolveError
+        if the matrix is singular.
+        """
+        blocks, single = self._without_map(self._blocks, 0), _unit(self.n, 2, 0)
+        single[:, 1, 1] = shift
+        if not turned:
+            blocks = self._without_map(blocks, 1)
+            single[0, 1, 1] = 1.0
+        return self._pattern.factors((*blocks, single))
+
+    def inverse(self, factors: BlockFactors, v: ComplexArray) -> ComplexArray:
+        """
+        Return the headings, shape (n, r), of the solution for a right-hand side.
+
+        The latter is v, shape (n, r), at the headings, and zero at the positions.
+        """
+        right = np.zeros((2 * self.n, v.shape[1]), dtype=np.complex128)
+        right[1::2] = v
+        return factors.solve(right)[1::2]
+
+    def positions(self, z: ComplexArray) -> ComplexArray:
+        """Return the best positions, shape (n, r), for headings of this shape; 0 of the map."""
+        upper = self._root_tau[:, None] * self._of(self._upper, z)
+        right = _scattered(self._j, upper, self.n) - _scattered(self._i, upper, self.n)
+        right[0] = 0.0
+        # a complex column as two real ones
+        solved = self._laplacian.solve(-right.view(np.float64))
+        return np.ascontiguousarray(solved).view(np.complex128)
+
+    def _of(self, factors: tuple[ComplexArray, ComplexArray], z: ComplexArray) -> ComplexArray:
+        return factors[0][:, None] * z[self._i] + factors[1][:, None] * z[self._j]
+
+    def residuals(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return the whitened residuals of positions and headings, shape (M, r) each."""
+        t = self.positions(z)
+        return (self._of(self._upper, z) + self._root_tau[:, None] * (t[self._j] - t[self._i]),
+                self._of(self._lower, z))
+
+    def cost(self, z: ComplexArray) -> float:
+        """Return f for headings z of shape (n, r)."""
+        return float(sum(np.sum(np.abs(part)**2) for part in self.residuals(z)))
+
+    def product(self, z: ComplexArray) -> ComplexArray:
+        """Return Q z, half the gradient of f, for z of shape (n, r)."""
+        # the residuals are orthogonal to the columns of C_t
+        upper, lower = self.residuals(z)
+        return sum((_scattered(end, self._upper[k].conj()[:, None] * upper
+                               + self._lower[k].conj()[:, None] * lower, self.n)
+                    for k, end in enumerate((self._i, self._j))), np.zeros_like(z))
+
+
+def _scattered(nodes: IntArray, values: ComplexArray, n: int) -> ComplexArray:
+    """Return the sums of complex values at each of n nodes, shape (n,) or (n, r)."""
+    sums = np.empty((n, *values.shape[1:]), dtype=np.complex128)
+    # bincount takes one column of real numbers
+    for source, target in ((values, sums),) if values.ndim == 1 else zip(
+            values.T, sums.T, strict=True):
+        target.real = np.bincount(nodes, source.real, n)
+        target.imag = np.bincount(nodes, source.imag, n)
+    return sums
+
+
+def _unit(n: int, size: int, component: int) -> ComplexArray:
+    """Return blocks of single nodes, shape (n, size, size), 1 for a component of the map."""
+    blocks = np.zeros((n, size, size), dtype=np.complex128)
+    blocks[0, component, component] = 1.0
+    return blocks

@@ -1,0 +1,364 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The factors on the variances of several sources that all residuals together show, with intervals.
+
+Residuals y of the estimate, with the Jacobian J, have the covariance `V = sum_k theta_k V_k` about
+J times an unknown step. With `P = V^-1 - V^-1 J (J^T V^-1 J)^-1 J^T V^-1`, restricted maximum
+likelihood takes the theta where, of all components, `y^T P V_k P y = tr(P V_k)`; the information
+on them is `tr(P V_k P V_l) / 2` (D. A. Harville, "Maximum likelihood approaches to variance
+component estimation and to related problems", JASA 1977). Fisher's scoring finds it, on logarithms
+of sigmas; the traces are means over random signs z of `z^T L^T P L z`, with `V_k = L L^T` (M. F.
+Hutchinson, 1989).
+
+A source has two components, the way and the turn: an error of the heading with what it does to the
+position, and what is left of the covariance without it. What odometry alone adds to a loop
+closure, from its stamps to the nodes, varies with the components of odometry.
+
+Where the covariances of a source are wrong, the estimate follows it too much or too little, and
+the residuals of the others show it as well. So the factors of all sources are found in one
+estimate, in which each may be above and below 1 (`analyse`). Sources whose correlated errors the
+graph has as a bias keep their covariances, and what their residuals at the estimate show; where
+such errors are taken for independent, nothing is known of the others either.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import bsr_array, csr_array
+from scipy.sparse.linalg import splu
+
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray
+from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.measurements import Answer
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.parts import Parts
+from pose_graph_ros.core.sources.measurement_constraints import attach, closure_covariance
+from pose_graph_ros.offline.residuals.scale import (
+    bounded,
+    fit,
+    LEAST_INDEPENDENT,
+    ScaleFit,
+    whiteness,
+)
+from pose_graph_ros.offline.residuals.source_residuals import (
+    collect,
+    inverse,
+    scales_in_use,
+    SourceResiduals,
+)
+
+# Random signs for each trace: its error is half of that of the squares that it is compared to.
+PROBES = 4
+# Spread of the logarithm of the factor on a sigma before it is seen: it keeps finite what the
+# residuals do not show.
+SPREAD = 1.5
+
+
+class Constraints(NamedTuple):
+    """All constraints of a graph that are used, edges first."""
+
+    errors: FloatArray  # shape (M, 3)
+    measured: BoolArray  # which coordinates are measured, shape (M, 3)
+    information: FloatArray  # as claimed, shape (M, 3, 3)
+    weight: FloatArray
+    jacobian: csr_array  # by all free coordinates of hidden nodes, 3 M rows
+    prior: csr_array  # information of dense priors
+    rows: IntArray  # row of each in its table, edges first and then, counted on, observed nodes
+
+
+class Found(NamedTuple):
+    """The factor on the sigmas of each component."""
+
+    ratios: FloatArray  # shape (K,)
+    redundancies: FloatArray
+    covariance: FloatArray  # of the logarithms of the ratios, shape (K, K)
+
+    def of(self, which: Sequence[int]) -> tuple[float, float, float, float]:
+        """Return factor, ends of its interval, and independent residuals of some together."""
+        k = list(which)
+        share = np.maximum(self.redundancies[k], 0.0) * self.ratios[k]**2
+        total, count = float(np.sum(share)), float(np.sum(self.redundancies[k]))
+        if not (total > 0.0 and count > 0.0):
+            return math.nan, math.nan, math.nan, 0.0
+        variance = float(share @ self.covariance[np.ix_(k, k)] @ share) / total**2
+        independent = 0.5 / variance
+        if independent < LEAST_INDEPENDENT:
+            return math.nan, math.nan, math.nan, independent
+        ratio, width = math.sqrt(total / count), math.exp(1.96 * math.sqrt(variance))
+        return ratio, ratio / width, ratio * width, independent
+
+
+def split(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
+    """Return the parts of covariances without an error of the heading, and with its effects."""
+    column, heading = covariances[:, :, 2], covariances[:, 2, 2]
+    turn = column[:, :, None] * column[:, None, :] / np.where(
+        heading > 0.0, heading, 1.0)[:, None, None]
+    return covariances - turn, turn
+
+
+def constraints(graph: Graph) -> Constraints:
+    """Return the constraints of a graph with a weight above 0, linear at its estimate."""
+    poses = graph.poses
+    tables: tuple[Any, ...] = graph.edges_by_row, graph.observed_by_row
+    parts = [_linearized(edge_errors, poses, tables[0].rows(tables[0].weight > 0.0), 'ijk'),
+             _linearized(observed_errors, poses, tables[1].rows(tables[1].weight > 0.0),
+                         ['node'])]
+    errors, values, columns = (np.concatenate(each) for each in zip(*(
+        (error, *(np.concatenate((each, np.zeros((len(each), 3, 9 - each.shape[2]), each.dtype)),
+                                 axis=2) for each in rest)) for error, *rest in parts),
+        strict=True))
+    n = 3 * len(errors)
+    size = 3 * len(poses)
+    jacobian = csr_array((values.reshape(n, 9).ravel(), columns.reshape(n, 9).ravel(),
+                          np.arange(0, 9 * n + 1, 9)), shape=(n, size))
+    free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
+    information, weight = (np.concatenate([getattr(table, name)[table.weight > 0.0]
+                                           for table in tables])
+                           for name in ('information', 'weight'))
+    rows = [np.flatnonzero(table.weight > 0.0) for table in tables]
+    return Constraints(
+        errors, np.diagonal(information, axis1=1, axis2=2) > 0.0, information, weight,
+        jacobian[:, free], _prior(graph, size)[free][:, free],
+        np.concatenate((rows[0], rows[1] + graph.n_edges)))
+
+
+def _linearized(
+    function: Callable[..., FloatArray], poses: FloatArray, table: Any,
+    names: Sequence[str],
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return errors with their derivatives by the nodes of some ends, and the columns of these."""
+    n, errors = len(poses), function(poses, table)
+    values, columns = [], []
+    for name in names:
+        ends = getattr(table, name)
+        for k in range(3):
+            step = np.zeros(3)
+            step[k] = 1e-5   # m or rad
+            moved = np.concatenate((poses, poses + step, poses - step))
+            after, before = (function(moved, replace(table, **{
+                name: np.where(ends < 0, ends, ends + part * n)})) for part in (1, 2))
+            change = after - before
+            change[:, 2] = se2.wrap(change[:, 2])
+            values.append(change / 2e-5)
+            columns.append(np.tile(3 * np.maximum(ends, 0)[:, None] + k, (1, 3)))
+    return errors, np.stack(values, axis=2), np.stack(columns, axis=2)
+
+
+def _prior(graph: Graph, size: int) -> csr_array:
+    """Return the information of the dense priors of a graph, shape (size, size)."""
+    total = csr_array((size, size))
+    for prior in graph.priors:
+        at = (3 * graph.node_rows(prior.nodes)[:, None] + np.arange(3)).ravel()
+        i, j = np.meshgrid(at, at, indexing='ij')
+        total = total + csr_array((prior.information.ravel(), (i.ravel(), j.ravel())),
+                                  shape=(size, size))
+    return total
+
+
+class _Projection:
+    """P for certain covariances of the constraints."""
+
+    def __init__(self, data: Constraints, covariances: FloatArray) -> None:
+        self._weights = inverse(covariances, data.measured)
+        self._data = data
+        n = len(covariances)
+        blocks = bsr_array((self._weights, np.arange(n), np.arange(n + 1)))
+        self._weighted = (blocks @ data.jacobian).tocsr()
+        hessian = data.jacobian.T @ self._weighted + data.prior
+        self._solver = splu(hessian.tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                            options={'SymmetricMode': True})
+
+    def __call__(self, values: FloatArray, right: FloatArray | None = None) -> FloatArray:
+        """Return P v of C vectors, (M, 3, C), with what is added to the step's right-hand side."""
+        flat = values.reshape(-1, values.shape[2])
+        step = self._weighted.T @ flat
+        step = self._solver.solve(step if right is None else step + right[:, None])
+        return np.asarray(self._weights @ values - (self._weighted @ step).reshape(values.shape))
+
+
+def restricted_likelihood(
+    data: Constraints, components: FloatArray, fixed: FloatArray,
+) -> Found | None:
+    """
+    Return the factors on the sigmas of components; None if they cannot be found.
+
+    `components`, shape (K, M, 3, 3), are covariances as claimed, zero where a constraint has no
+    such part; `fixed`, shape (M, 3, 3), those that keep their size.
+    """
+    values, vectors = np.linalg.eigh(components)
+    # what rounding leaves of a zero is none
+    values = np.where(values > 1e-9 * values[..., -1:], values, 0.0)
+    # the symmetric root is the only one that does not depend on the processor's choice of
+    # eigenvectors, and with it the random traces
+    roots: Any = (vectors * np.sqrt(values)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    ranks = np.count_nonzero(values, axis=-1)
+    signs: FloatArray = np.asarray(np.random.default_rng(0).integers(
+        0, 2, size=(len(fixed), 3, PROBES)) * 2.0 - 1.0, dtype=np.float64)
+    # at the optimum, the gradient of priors is the opposite of that of all others
+    weights = data.weight[:, None, None] * data.information
+    right = None if data.prior.nnz == 0 else -data.jacobian.T @ np.einsum(
+        'mij,mj->mi', weights, data.errors).ravel()
+    logs, moved = np.zeros((2, len(components)))
+    try:
+        for _ in range(30):
+            scaled = np.exp(logs)[:, None, None, None] * roots
+            total = fixed + np.einsum('kmij,kmlj->mil', scaled, scaled)
+            traces, information, squares = _statistics(
+                data, total, scaled, ranks, signs, right=right)
+            information += np.eye(len(logs)) / SPREAD**2
+            step = np.linalg.solve(information, squares - traces - logs / SPREAD**2)
+            # where little is known, the information changes with each step, which goes too far
+            moved = np.where(step * moved < 0.0, 0.5, 1.0) * np.clip(step, -1.0, 1.0)
+            logs += moved
+            # a tenth of its uncertainty
+            if step @ information @ step < 0.1**2:
+                return Found(np.exp(logs), traces,
+                             np.asarray((1.0 + 1.0 / PROBES) * np.linalg.inv(information)))
+    except (np.linalg.LinAlgError, RuntimeError):
+        # covariances or the matrix of the normal equations are singular
+        return None
+    return None
+
+
+def _statistics(
+    data: Constraints, total: FloatArray, roots: FloatArray, ranks: IntArray,
+    signs: FloatArray, *, right: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return tr(P V_k), the information on the logarithms of sigmas, and squared residuals."""
+    project, n = _Projection(data, total), len(roots)
+    residuals = project(data.errors[:, :, None], right)[:, :, 0]
+    traces, squares, products = np.zeros(n), np.zeros(n), np.zeros((n, n))
+    there = [np.flatnonzero(np.any(each != 0.0, axis=(1, 2))) for each in roots]
+    own = [each[rows] for each, rows in zip(roots, there, strict=True)]
+    back = [np.swapaxes(each, 1, 2) for each in own]
+    for k, rows in enumerate(there):
+        drawn = np.zeros_like(signs)
+        drawn[rows] = own[k] @ signs[rows]
+        drawn = project(drawn)
+        for m, others in enumerate(there):
+            spread = back[m] @ drawn[others]
+            products[m, k] = np.sum(spread**2) / PROBES
+            if m == k:
+                traces[k] = np.sum(spread * signs[rows]) / PROBES
+        energies = np.sum(np.einsum('mij,mj->mi', back[k], residuals[rows])**2, axis=1)
+        freedom = ranks[k, rows]
+        squares[k] = np.sum(bounded(
+            energies, traces[k] / np.sum(freedom) * freedom, freedom))
+    return traces, products + products.T, squares
+
+
+class Analysis(NamedTuple):
+    """The residuals of each source, and how large its true sigmas are."""
+
+    residuals: Mapping[str, SourceResiduals]  # at the estimate
+    at_estimate: Mapping[str, ScaleFit]  # how large they are
+    together: Mapping[str, ScaleFit]  # the same, with the factors of all sources in one estimate
+    # Sources with correlated errors that the graph takes for independent: the residuals do not
+    # show how large these are, and what those of other sources show may be because of them.
+    correlated: frozenset[str]
+
+
+def analyse(parts: Parts) -> Analysis:
+    """
+    Return the residuals of each source, and the factors on sigmas that they show together.
+
+    All edits of the engine have been solved for.
+    """
+    smoother, nodes, factors = parts.smoother, parts.nodes, parts.factors
+    residuals = collect(smoother, nodes, factors, scales_in_use(parts.graph, parts.reweighting))
+    if nodes.primary in residuals:
+        # its edges have the noise that was found, and a ratio is one to what is claimed
+        of_odometry = residuals[nodes.primary]
+        residuals[nodes.primary] = of_odometry._replace(
+            scale=of_odometry.scale * nodes.errors.mean_sigma)
+    at_estimate = {source: fit(each, factors.errors_in_use(source))
+                   for source, each in residuals.items()}
+    white = {source: each for source, each in residuals.items()
+             if each.kind != 'map' or not np.any(each.is_edge)}
+    correlated = frozenset(
+        source for source, each in white.items() if each.kind == 'map'
+        and (found := whiteness(each)) is not None and found.tau > 0.0)
+    together = dict(at_estimate)
+    if len(correlated) == 0:
+        together |= _together(parts, at_estimate, white)
+    return Analysis(residuals, at_estimate, together, correlated)
+
+
+def _together(
+    parts: Parts, at_estimate: Mapping[str, ScaleFit], sources: Mapping[str, SourceResiduals],
+) -> dict[str, ScaleFit]:
+    """Return the fits of some sources with the factors of all of them in one estimate."""
+    graph, nodes = parts.graph, parts.nodes
+    data = constraints(graph)
+    try:
+        claimed = inverse(data.information, data.measured)
+    except np.linalg.LinAlgError:   # what thinning leaves has no covariance
+        return {source: at_estimate[source].unknown for source in sources}
+    place = np.full(graph.n_edges + graph.n_observed, -1)
+    place[data.rows] = np.arange(len(data.rows))
+    own, shares = claimed.copy(), {source: np.zeros_like(claimed) for source in sources}
+    for source, row, motion in _motions(graph, nodes, parts.judge.closures()):
+        # of a graph that was loaded, less is known of what odometry has added
+        if (k := place[row]) >= 0 and source in shares and (
+                np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0):
+            shares[source][k], own[k] = motion, claimed[k] - motion
+    fixed = claimed / data.weight[:, None, None]
+    rows = {source: place[graph.edge_rows(each.ids) if np.all(each.is_edge)
+                          else graph.n_edges + graph.observed_rows(each.ids)][each.used]
+            for source, each in sources.items()}
+    for source, at in rows.items():
+        shares[source][at] += own[at]
+        fixed[at] = 0.0
+    components = {(source, kind): part for source, whole in shares.items()
+                  for kind, part in enumerate(split(whole)) if np.any(part)}
+    found = restricted_likelihood(data, np.array(list(components.values())), fixed)
+    if found is None:
+        return {source: at_estimate[source].unknown for source in sources}
+    return {source: _with_factors(
+        at_estimate[source], own[at], found,
+        {kind: k for k, (name, kind) in enumerate(components) if name == source},
+        in_use=nodes.errors.mean_sigma if source == nodes.primary else 1.0)
+        for source, at in rows.items() if len(at) > 0}
+
+
+def _motions(
+    graph: Graph, nodes: HiddenNodes, closures: tuple[IntArray, IntArray],
+) -> Iterator[tuple[str, int, FloatArray]]:
+    """
+    Yield source, row of the edge, and covariance of what odometry adds to loop closures.
+
+    These are given by the ids of their edges, and stamps of each and of its other end [ns].
+    """
+    ids, stamps_ns = closures
+    for row, mean, (stamp, other) in zip(graph.edge_rows(ids).tolist(), graph.edges_at(
+            ids).mean, stamps_ns.tolist(), strict=True):
+        reference, attachment = attach(nodes, other), attach(nodes, stamp)
+        if isinstance(reference, Answer) or isinstance(attachment, Answer):
+            continue
+        pose = se2.compose(se2.compose(se2.inverse(reference.motion), mean), attachment.motion)
+        yield nodes.primary_at(stamp), row, closure_covariance(
+            np.zeros((3, 3)), pose, reference, attachment)
+
+
+def _with_factors(
+    present: ScaleFit, claimed: Covariances, found: Found, parts: Mapping[int, int], *,
+    in_use: float,
+) -> ScaleFit:
+    """Return a fit with other factors."""
+    sigmas = np.sqrt(np.mean(np.diagonal(claimed, axis1=1, axis2=2), axis=0)).tolist()
+    rows = []
+    for row in present.rows:
+        part = parts.get(row.coordinate // 2)
+        ratio, low, high, _ = found.of([] if part is None else [part])
+        rows.append(row._replace(
+            sigma=sigmas[row.coordinate], ratio=ratio, low=low, high=high))
+    ratio, low, high, independent = found.of(list(parts.values()))
+    return present._replace(
+        rows=tuple(rows), ratio=in_use * ratio, low=in_use * low, high=in_use * high,
+        independent=independent)

@@ -1,0 +1,169 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Linear starts: exact without noise, in any gauge, independent of the present poses."""
+
+from hypothesis import given, strategies as st
+import numpy as np
+import numpy.typing as npt
+import pytest
+from random_graphs import consistent_graph, random_graph, random_observed, random_poses
+
+from pose_graph_ros.core.batch.linear_starts import chordal, joint
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+
+# Absolute error of two linear solves with condition numbers of some 1e3 [m, rad].
+EXACT = 1e-11
+
+TO_COMPLEX = np.array([1.0, 1j, 0.0])
+ComplexArray = npt.NDArray[np.complex128]
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def assert_poses_equal(poses: FloatArray, expected: FloatArray) -> None:
+    np.testing.assert_allclose(poses[:, :2], expected[:, :2], atol=EXACT)
+    np.testing.assert_allclose(se2.wrap(poses[:, 2] - expected[:, 2]), 0.0, atol=EXACT)
+
+
+def scattered(graph: Graph, rng: np.random.Generator) -> None:
+    """Replace all poses but those of the fixed nodes by random ones."""
+    poses = random_poses(rng, graph.n_nodes, 100.0)
+    graph.set_poses(np.where(graph.fixed[:, None], graph.poses, poses))
+
+
+def observe_exactly(graph: Graph, nodes: list[int], rng: np.random.Generator) -> None:
+    """Add observed nodes with offsets that agree with the poses; the first is a position."""
+    observed = random_observed(rng, nodes)
+    mean = se2.compose(graph.poses[nodes], observed.offset)
+    mean[::3, 2] = 0.0
+    graph.apply(GraphUpdate(observed=ObservedNodes(
+        observed.node, observed.offset, mean, observed.information, observed.kind)))
+
+
+@given(seeds, st.integers(0, 7))
+def test_without_noise_it_is_exact_whichever_node_is_fixed(seed: int, fixed: int) -> None:
+    graph = consistent_graph(seed)
+    truth = graph.poses.copy()
+    graph.apply(GraphUpdate(free=(0,)))
+    graph.apply(GraphUpdate(fix=(fixed,)))
+    scattered(graph, np.random.default_rng(seed))
+    start = chordal(graph)
+    assert_poses_equal(start, truth)
+    assert np.all((start[:, 2] >= -np.pi) & (start[:, 2] < np.pi))
+
+
+@given(seeds)
+def test_without_noise_it_is_exact_with_observed_nodes_and_offsets_alone(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = consistent_graph(seed)
+    truth = graph.poses.copy()
+    graph.apply(GraphUpdate(free=(0,)))
+    observe_exactly(graph, [5, 2, 7, 2], rng)
+    scattered(graph, rng)
+    assert_poses_equal(chordal(graph), truth)
+
+
+@given(seeds)
+def test_it_reads_no_pose_that_is_not_fixed(seed: int) -> None:
+    graph = consistent_graph(seed, noise=0.3)
+    first = chordal(graph)
+    scattered(graph, np.random.default_rng(seed))
+    before = graph.poses.copy()
+    np.testing.assert_array_equal(chordal(graph), first)
+    np.testing.assert_array_equal(graph.poses, before)     # nor does it write any
+    np.testing.assert_array_equal(first[0], graph.poses[0])
+
+
+def dense_solution(
+    graph: Graph, known: ComplexArray, weight: FloatArray, unary_weight: FloatArray, *,
+    factor: ComplexArray, shift: ComplexArray, target: ComplexArray,
+) -> ComplexArray:
+    """Minimise sum w |v_j - factor v_i - shift|^2 + sum w |v_node - target|^2."""
+    m, rows = graph.n_edges, graph.n_edges + graph.n_observed
+    matrix, right = np.zeros((rows, graph.n_nodes), complex), np.zeros(rows, complex)
+    for k, (i, j) in enumerate(zip(graph.edges.i, graph.edges.j, strict=True)):
+        matrix[k, j] += np.sqrt(weight[k])
+        matrix[k, i] -= np.sqrt(weight[k]) * factor[k]
+        right[k] = np.sqrt(weight[k]) * shift[k]
+    for k, node in enumerate(graph.observed.node):
+        matrix[m + k, node] = np.sqrt(unary_weight[k])
+        right[m + k] = np.sqrt(unary_weight[k]) * target[k]
+    v = known.copy()
+    free = ~graph.fixed
+    right -= matrix[:, graph.fixed] @ known[graph.fixed]
+    v[free] = np.linalg.lstsq(matrix[:, free], right, rcond=None)[0]
+    return v
+
+
+@given(seeds, st.integers(2, 25), st.integers(0, 30), st.sets(st.integers(0, 1), min_size=1))
+def test_it_solves_two_linear_problems(
+    seed: int, n_nodes: int, extra: int, fix: set[int],
+) -> None:
+    graph = random_graph(seed, n_nodes, n_nodes - 1 + extra, 5, tuple(fix))
+    graph.apply(GraphUpdate(weigh_edges={0: 0.5, n_nodes - 1: 0.0}, weigh_observed={1: 3.0}))
+    edges, observed, poses = graph.edges, graph.observed, graph.poses
+    tables = edges.weighted_information, observed.weighted_information
+    heading = [table[:, 2, 2] for table in tables]
+    position = [0.5 * (table[:, 0, 0] + table[:, 1, 1]) for table in tables]
+    u = dense_solution(
+        graph, np.exp(1j * poses[:, 2]), *heading, factor=np.exp(1j * edges.mean[:, 2]),
+        shift=np.zeros(len(edges), complex),
+        target=np.exp(1j * (observed.mean[:, 2] - observed.offset[:, 2])))
+    if np.min(np.abs(u)) < 1e-2:
+        return  # the headings nearly cancel each other out
+    u /= np.abs(u)
+    t = dense_solution(
+        graph, poses @ TO_COMPLEX, *position, factor=np.ones(len(edges)),
+        shift=u[edges.i] * (edges.mean @ TO_COMPLEX),
+        target=observed.mean @ TO_COMPLEX - u[observed.node] * (observed.offset @ TO_COMPLEX))
+    start = chordal(graph)
+    np.testing.assert_allclose(np.exp(1j * start[:, 2]), u, atol=1e-7)
+    np.testing.assert_allclose(start @ TO_COMPLEX, t, atol=1e-6)
+
+
+def test_positions_alone_do_not_determine_it() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), observed=ObservedNodes(
+        [0, 1], None, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 0.0])] * 2,
+        [ObservedKind.POSITION] * 2)))
+    with pytest.raises(LinearSolveError):
+        chordal(graph)
+
+
+def test_headings_that_cancel_are_an_error() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), observed=ObservedNodes(
+        [0, 0], None, [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]], [np.eye(3)] * 2,
+        [ObservedKind.GLOBAL_POSE] * 2)))
+    with pytest.raises(LinearSolveError, match='cancel'):
+        chordal(graph)
+
+
+@given(seeds, st.booleans())
+def test_joint_and_unit_starts_are_exact_without_noise_from_positions_alone(
+    seed: int, unit: bool,
+) -> None:
+    rng = np.random.default_rng(seed)
+    graph = consistent_graph(seed)
+    truth, n = graph.poses.copy(), graph.n_nodes
+    information = rng.uniform(0.1, 10.0, (n, 1, 1)) * np.diag([1.0, 1.0, 0.0])
+    offset = np.column_stack((rng.uniform(-1.0, 1.0, (n, 2)), np.zeros(n)))
+    mean = np.column_stack((se2.transform(truth, offset[:, :2]), np.zeros(n)))
+    graph.apply(GraphUpdate(
+        observed=ObservedNodes(np.arange(n), offset, mean, information,
+                               np.full(n, ObservedKind.POSITION)),
+        free=np.flatnonzero(graph.fixed).tolist()))
+    graph.set_poses(random_poses(rng, n))
+    assert_poses_equal(joint(graph, unit=unit), truth)
+
+
+def test_headings_alone_do_not_determine_positions() -> None:
+    graph = Graph()
+    graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), fix=(0,), edges=Edges(
+        [0], [1], [[1.0, 0.0, 0.5]], [np.diag([0.0, 0.0, 1.0])], [EdgeKind.LOOP_CLOSURE])))
+    with pytest.raises(LinearSolveError, match='singular'):
+        chordal(graph)

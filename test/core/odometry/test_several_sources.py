@@ -1,0 +1,165 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The primary source follows from the stamps; the others have edges between its nodes."""
+
+from collections.abc import Iterable
+from itertools import pairwise
+
+from hypothesis import given, strategies as st
+import numpy as np
+import pytest
+
+from pose_graph_ros.core.config import OdometrySource
+from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.odometry.several_sources import (
+    choose_first,
+    find_silence,
+    SecondaryEdges,
+    Silence,
+)
+from pose_graph_ros.core.odometry.stream import OdometryStream
+
+PATIENCE = 20
+
+increasing = st.lists(st.integers(1, 200), min_size=1, max_size=25, unique=True).map(sorted)
+
+
+def stream(stamps_ns: Iterable[int], settled_ns: int = -1) -> OdometryStream:
+    """Return a stream of a moving robot whose samples are settled up to a stamp."""
+    one = OdometryStream(OdometrySource())
+    for stamp_ns in stamps_ns:
+        one.add(OdometrySample(stamp_ns, np.array([0.02 * stamp_ns, 0.0, 0.0])))
+    one.settle_all(settled_ns)
+    return one
+
+
+# --- The first primary source ----------------------------------------------------------------
+
+def first(wheel: Iterable[int], visual: Iterable[int], settled_ns: int) -> str | None:
+    streams = {'visual': stream(visual), 'wheel': stream(wheel)}
+    return choose_first(streams, ['wheel', 'visual'], 'wheel', settled_ns, PATIENCE)
+
+
+@pytest.mark.parametrize(('begin', 'expected'), [
+    (1, 'wheel'), (20, 'wheel'), (21, 'wheel'), (22, 'visual'), (90, 'visual')])
+def test_another_source_becomes_primary_after_the_patience(begin: int, expected: str) -> None:
+    wheel, visual = range(begin, 100), range(1, 100)
+    assert first(wheel, visual, settled_ns=95) == expected
+
+
+@given(increasing, increasing, st.integers(1, 250), st.data())
+def test_the_first_choice_is_final_and_does_not_depend_on_what_is_settled(
+    wheel: list[int], visual: list[int], settled_ns: int, data: st.DataObject,
+) -> None:
+    chosen = first(wheel, visual, settled_ns)
+    if chosen is not None:
+        assert first(wheel, visual, settled_ns + data.draw(st.integers(0, 100))) == chosen
+        # samples after the stamp do not matter
+        assert first([k for k in wheel if k <= settled_ns], [k for k in visual if k <= settled_ns],
+                     settled_ns) == chosen
+    streams = {'wheel': stream(wheel, data.draw(st.integers(0, 200))),
+               'visual': stream(visual, data.draw(st.integers(0, 200)))}
+    assert choose_first(
+        streams, ['wheel', 'visual'], 'wheel', settled_ns, PATIENCE) == chosen
+
+
+# --- Silences --------------------------------------------------------------------------------
+
+def slow_silence(wheel: list[int], visual: list[int], last_ns: int, until_ns: int) -> int | None:
+    """Return the last stamp before the first silence that another source proves, by a walk."""
+    stamps = [last_ns, *(k for k in wheel if last_ns < k <= until_ns), until_ns + 1]
+    for begin, end in pairwise(stamps):
+        if any(begin + PATIENCE < k < end for k in visual):
+            return begin
+    return None
+
+
+@given(increasing, increasing, st.data())
+def test_silences_are_those_of_a_slow_walk(
+    wheel: list[int], visual: list[int], data: st.DataObject,
+) -> None:
+    last_ns = data.draw(st.sampled_from(wheel))
+    by_visual = [k for k in visual if k > last_ns]
+    if not by_visual:
+        return
+    settled_ns = data.draw(st.sampled_from(by_visual))
+    expected = slow_silence(wheel, visual, last_ns, settled_ns)
+    for until in (-1, last_ns, 200):
+        streams = {'wheel': stream(wheel, until), 'visual': stream(visual, settled_ns)}
+        found = find_silence(
+            streams, ['wheel', 'visual'], last_ns, ('visual', settled_ns), PATIENCE)
+        assert (None if found is None else found.last_ns) == expected
+        if found is not None:
+            assert found.known_ns == min(k for k in visual if k > found.last_ns + PATIENCE)
+
+
+def test_samples_at_rest_that_were_left_out_end_no_silence() -> None:
+    wheel = OdometryStream(OdometrySource())
+    for stamp_ns in (10, 40, 70, 100):
+        wheel.add(OdometrySample(stamp_ns, np.zeros(3)))
+    wheel.settle_all(100)
+    assert wheel.timeline.stamps_ns.tolist() == [10, 100]
+    streams = {'wheel': wheel, 'visual': stream([95])}
+    assert find_silence(
+        streams, ['wheel', 'visual'], 70, ('wheel', 100), PATIENCE) == Silence(70, 95)
+
+
+SECOND = 1_000_000_000
+NODES = np.arange(1, 11) * SECOND
+# Of other nodes than the hidden ones there may be rows in between.
+ROWS = 2 * np.arange(10) + 1
+
+
+def filled(times: Iterable[float]) -> OdometryStream:
+    """Return settled samples at times [s] of a robot with 1 m/s and 0.1 rad/s."""
+    one = OdometryStream(OdometrySource())
+    for t in times:
+        one.add(OdometrySample(
+            round(t * 1e9), np.array([10.0 * np.sin(0.1 * t), 10.0 - 10.0 * np.cos(0.1 * t),
+                                      0.1 * t])))
+    one.settle_all(one.newest_ns)
+    return one
+
+
+def ends(edges: SecondaryEdges) -> list[tuple[int, int]]:
+    """Return the numbers of the hidden nodes that the edges connect."""
+    return [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for _, edge in edges.new]
+
+
+def test_the_edges_do_not_depend_on_how_often_they_are_extended() -> None:
+    times, edges = np.arange(0.55, 12.0, 0.1), SecondaryEdges()
+    edges.skip_to('visual', 0, reached=False)
+    growing = OdometryStream(OdometrySource())
+    for one in filled(times).timeline.stamps_ns.tolist():
+        growing.add(OdometrySample(one, np.array([one * 1e-9, 0.0, 0.0])))
+        growing.settle_all(one)
+        n_nodes = int(np.searchsorted(NODES, one)) + 1
+        edges.extend('visual', growing, NODES[:n_nodes], ROWS[:n_nodes])
+    assert ends(edges) == [(k, k + 1) for k in range(9)]
+    edges.extend('visual', growing, NODES, ROWS)
+    assert len(edges.new) == 9
+
+
+@pytest.mark.parametrize('reached', [True, False])
+def test_no_edge_spans_a_skip(*, reached: bool) -> None:
+    visual = filled(np.arange(0.55, 10.5, 0.1))
+    edges = SecondaryEdges()
+    edges.skip_to('visual', 0, reached=False)
+    edges.extend('visual', visual, NODES[:3], ROWS[:3])
+    edges.skip_to('visual', 5, reached=reached)
+    edges.extend('visual', visual, NODES, ROWS)
+    assert ends(edges) == [(0, 1), (1, 2), (5, 6), (6, 7), (7, 8), (8, 9)]
+
+
+def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:
+    before = filled(np.arange(0.55, 4.5, 0.1))
+    after = OdometryStream(OdometrySource())
+    after.restore(before.saved(NODES[:4], (3, 4)))
+    for t in np.arange(4.6, 10.5, 0.1):      # 1 km away: this is no motion of the robot
+        after.add(OdometrySample(round(t * 1e9), np.array([1000.0 + t, 0.0, 0.0])))
+    after.settle_all(after.newest_ns)
+    assert NODES[3] < after.restarted_ns <= NODES[4]
+    edges = SecondaryEdges()
+    edges.progress['visual'] = 3, 4
+    edges.extend('visual', after, NODES, ROWS)
+    assert ends(edges) == [(k, k + 1) for k in range(4, 9)]
