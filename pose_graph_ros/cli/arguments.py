@@ -13,7 +13,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pose_graph_ros.core.config import CLOSURE_FLOORS
+from pose_graph_ros.core.judgement.settings import BELIEF
 
 ON_EARTH = ('geojson', 'kml', 'gpx')  # whose positions are latitudes and longitudes
 FORMATS = ('kitti', 'csv', *ON_EARTH)  # of a path, also the endings of files
@@ -203,10 +203,11 @@ def solve(parser: argparse.ArgumentParser) -> None:
                              'or for Geman-McClure (gnc-gm); an edge is odometry if no id of a '
                              'pose lies between its two; sightings of landmarks are believed')
     parser.add_argument('--closure-sigma', nargs=2, type=number(0.0), metavar=('M', 'RAD'),
-                        default=(CLOSURE_FLOORS[0], CLOSURE_FLOORS[2]),
+                        default=BELIEF.closure_floors[::2],
                         help='least standard deviations of loop closures for this decision '
-                             f'(default: {CLOSURE_FLOORS[0]} {CLOSURE_FLOORS[2]}); the result '
-                             'has those of the file, times what the residuals show')
+                             '(default: {} {}); the result '
+                             'has those of the file, times what the residuals show'
+                             .format(*BELIEF.closure_floors[::2]))
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file; by default both are tried')
     parser.epilog = """

@@ -11,16 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.measurements import HeadingOnly, LoopClosure, Measurement
+
+if TYPE_CHECKING:  # it loads NumPy, and the tools say how they are used without it
+    from pose_graph_ros.core.measurements import Measurement
 
 # Sigma of a heading that is uniform on the circle [rad].
 FLAT_GUESS = math.pi / math.sqrt(3.0)
-# Least sigmas of loop closures to decide by whether to believe them, as claimed covariances are
-# mostly too small [m, m, rad].
-CLOSURE_FLOORS = (0.3, 0.3, 0.05)
 # Correlation time of a source whose errors tell whether they are correlated, and for how long.
 FOUND = -1.0
 
@@ -410,10 +409,10 @@ class BackendConfig:
         """Factor on the sigmas of odometry of the preferred source; 0 for one that is found."""
         return next((source.sigma_scale for source in self.odometry.values()), 0.0)
 
-    def measurement_source(self, name: str, kind: type[Measurement]) -> MeasurementSource:
+    def measurement_source(self, name: str, kind: 'type[Measurement]') -> MeasurementSource:
         """Return the settings of a source, by default those of its kind of measurement."""
-        defaults = {LoopClosure: LOOP_CLOSURES, HeadingOnly: HEADINGS}
-        return self.measurements.get(name, defaults.get(kind, POSITIONS))
+        defaults = {'LoopClosure': LOOP_CLOSURES, 'HeadingOnly': HEADINGS}
+        return self.measurements.get(name, defaults.get(kind.__name__, POSITIONS))
 
     def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
         """

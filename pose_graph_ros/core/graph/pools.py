@@ -47,7 +47,17 @@ def n_values(n_frontal, n_separator):  # type: ignore[no-untyped-def]
 @kernel
 def _size_class(n):  # type: ignore[no-untyped-def]
     """Return the smallest size class (index in `SIZES`) whose blocks hold n numbers."""
-    return n if n <= 64 else np.searchsorted(_SIZES, n)
+    if n <= 64:
+        return n
+    # not `np.searchsorted`, with which Numba loads its linear algebra and that of SciPy
+    low, high = 64, len(_SIZES) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if _SIZES[middle] < n:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @kernel

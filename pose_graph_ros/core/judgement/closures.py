@@ -18,7 +18,6 @@ import numpy as np
 from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel, MATRICES, NUMBERS, ROWS
-from pose_graph_ros.core.config import CLOSURE_FLOORS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
@@ -30,7 +29,7 @@ from pose_graph_ros.core.judgement.settings import BELIEF
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
 GATE = float(LIMITS[3])
 # Least sigmas of closures to decide by [m, m, rad].
-FLOORS = np.array(CLOSURE_FLOORS)
+FLOORS = np.array(BELIEF.closure_floors)
 
 
 class Closures(NamedTuple):

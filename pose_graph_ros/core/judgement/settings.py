@@ -33,6 +33,8 @@ class BeliefSettings:
     rest_doublings: int = 6
 
     # --- when a closure is believed
+    # least sigmas to decide by, as claimed covariances are mostly too small [m, m, rad]
+    closure_floors: tuple[float, float, float] = (0.3, 0.3, 0.05)
     clique: int = 3  # members of a clique that supports it
     clique_travel: float = 1.0  # way from the first to the last of them [m]
     near: float = 10.0  # closures are neighbours if both ends are so near along the path [m]

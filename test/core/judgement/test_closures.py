@@ -10,13 +10,7 @@ import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    CLOSURE_FLOORS,
-    MeasurementSource,
-    NodePolicy,
-    Robust,
-)
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
@@ -26,6 +20,7 @@ from pose_graph_ros.core.judgement import closures as cl
 from pose_graph_ros.core.judgement.closure_trial import SetSearch
 from pose_graph_ros.core.judgement.closures import claims, forward, GATE
 from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
+from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
@@ -340,7 +335,7 @@ def test_claims_are_floored_and_lead_from_the_earlier_to_the_later_node() -> Non
     # raised in the axes of the later node, whichever it was measured from
     np.testing.assert_array_equal(claim.noise, claims(forward(edges)).noise)
     given = np.linalg.inv(forward(edges).information[0])
-    np.maximum(np.diagonal(given), np.square(CLOSURE_FLOORS), out=np.einsum('ii->i', given))
+    np.maximum(np.diagonal(given), np.square(BELIEF.closure_floors), out=np.einsum('ii->i', given))
     np.testing.assert_allclose(claim.noise[0], given, rtol=1e-3, atol=1e-6)
 
 
