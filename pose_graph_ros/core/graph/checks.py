@@ -28,6 +28,14 @@ SEMIDEFINITE_TOLERANCE = 1e-5
 _ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
 
 
+class RowError(GraphUpdateError):
+    """A row of a table is invalid."""
+
+    def __init__(self, reason: str, row: int, value: object) -> None:
+        super().__init__(f'{reason}; row {row}: {value}')
+        self.row = row
+
+
 class Ids(NamedTuple):
     """Which permanent ids of nodes, edges or observed nodes are in use."""
 
@@ -179,7 +187,7 @@ def _refuse_rows(bad: BoolArray, reason: str, values: npt.NDArray[np.generic]) -
     """Raise with the first bad row, if there is one."""
     if np.any(bad):
         row = int(np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0])
-        raise GraphUpdateError(f'{reason}; row {row}: {values[row].tolist()}')
+        raise RowError(reason, row, values[row].tolist())
 
 
 # --- other parts of an update -------------------------------------------------------------------

@@ -82,50 +82,38 @@ def _touch_ends(head, entry):  # type: ignore[no-untyped-def]
 @kernel
 def _link(head, entry):  # type: ignore[no-untyped-def]
     """Put a constraint at the heads of the lists of its ends; the caller has logged all rows."""
-    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    if entry < 0:
-        row = tb.observed_i(head)[-1 - entry]
-        v = row[tb.OBS_NODE]
-        row[tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], -1 - entry
-        return
+    node_i, (_, row) = tb.node_i(head), factors.rows_of(head, entry)
     for side in range(3):
-        v = edge_i[entry, side]
+        v = row[side]
         if v >= 0:
-            edge_i[entry, tb.NEXT_I + side] = node_i[v, tb.EDGE_LIST]
-            node_i[v, tb.EDGE_LIST] = 4 * entry + side
+            column, name = _listed_as(entry, side)
+            row[tb.NEXT_I + side], node_i[v, column] = node_i[v, column], name
 
 
 @kernel
-def unlink_edge(head, e, side):  # type: ignore[no-untyped-def]
-    """Take an edge out of the list of one of its ends, whose row has been logged."""
-    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    v, after = edge_i[e, side], edge_i[e, tb.NEXT_I + side]
-    entry = node_i[v, tb.EDGE_LIST]
-    if entry == 4 * e + side:
-        node_i[v, tb.EDGE_LIST] = after
+def _listed_as(entry, side):  # type: ignore[no-untyped-def]
+    """Return in which list of an end a constraint is, and as which number."""
+    return (tb.EDGE_LIST, 4 * entry + side) if entry >= 0 else (tb.OBSERVED_LIST, -1 - entry)
+
+
+@kernel
+def unlink(head, entry, side):  # type: ignore[no-untyped-def]
+    """Take a constraint out of the list of one of its ends, whose row has been logged."""
+    node_i, (_, row) = tb.node_i(head), factors.rows_of(head, entry)
+    column, name = _listed_as(entry, side)
+    v, after = row[side], row[tb.NEXT_I + side]
+    at = node_i[v, column]
+    if at == name:
+        node_i[v, column] = after
         return
     while True:
-        before, column = entry >> 2, tb.NEXT_I + (entry & 3)
-        entry = edge_i[before, column]
-        if entry == 4 * e + side:
+        before, link = (at >> 2, tb.NEXT_I + (at & 3)) if entry >= 0 else (-1 - at, tb.NEXT_I)
+        row = factors.rows_of(head, before)[1]
+        at = row[link]
+        if at == name:
             transaction_log.log_constraint(head, before)
-            edge_i[before, column] = after
+            row[link] = after
             return
-
-
-@kernel
-def _unlink_observed(head, k):  # type: ignore[no-untyped-def]
-    """Take an observed node out of the list of its hidden node, whose row has been logged."""
-    node_i, observed_i = tb.node_i(head), tb.observed_i(head)
-    v, after = observed_i[k, tb.OBS_NODE], observed_i[k, tb.OBS_NEXT]
-    before = node_i[v, tb.OBSERVED_LIST]
-    if before == k:
-        node_i[v, tb.OBSERVED_LIST] = after
-        return
-    while observed_i[before, tb.OBS_NEXT] != k:
-        before = observed_i[before, tb.OBS_NEXT]
-    transaction_log.log_constraint(head, -1 - before)
-    observed_i[before, tb.OBS_NEXT] = after
 
 
 @kernel
@@ -154,12 +142,9 @@ def weigh(head, entry, weight):  # type: ignore[no-untyped-def]
         _evaluate(head, entry)
         return
     f[tb.ERROR2] = f[tb.ENERGY] = 0.0
-    if entry < 0:
-        _unlink_observed(head, -1 - entry)
-        return
     for side in range(3):
-        if tb.edge_i(head)[entry, side] >= 0:
-            unlink_edge(head, entry, side)
+        if factors.rows_of(head, entry)[1][side] >= 0:
+            unlink(head, entry, side)
 
 
 @kernel
@@ -168,15 +153,13 @@ def _start(head, entry):  # type: ignore[no-untyped-def]
     f, kind, _, _, _ = factors.parts(head, entry)
     factors.prepare(f, kind)
     f[tb.ERROR2] = f[tb.ENERGY] = 0.0
+    row = factors.rows_of(head, entry)[1]
+    row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
+    row[tb.NEXT_I], row[tb.EDGE_LOGGED] = -1, head[tb.UPDATE]
     if entry >= 0:
-        row = tb.edge_i(head)[entry]
-        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
-        row[tb.NEXT_I], row[tb.EDGE_LOGGED] = -1, head[tb.UPDATE]
         tb.edge_id(head)[entry] = head[tb.NEXT_EDGE]
         head[tb.NEXT_EDGE] += 1
     else:
-        row = tb.observed_i(head)[-1 - entry]
-        row[tb.OBS_WAITS], row[tb.OBS_NEXT], row[tb.OBS_LOGGED] = 0, -1, head[tb.UPDATE]
         tb.observed_id(head)[-1 - entry] = head[tb.NEXT_OBSERVED]
         head[tb.NEXT_OBSERVED] += 1
     weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
@@ -193,11 +176,10 @@ def set_weights(head, ids, weights, of_edges):  # type: ignore[no-untyped-def]
     for m in range(len(ids)):
         entry = rows.entry_of(head, ids[m], of_edges)
         weigh(head, entry, max(weights[m], 0.0))
-        after = (tb.edge_i(head)[entry, tb.NEXT_I:] if of_edges
-                 else tb.observed_i(head)[-1 - entry, tb.OBS_NEXT:])
-        if weights[m] == DROPPED and after[0] != tb.LEAVES:
+        row = factors.rows_of(head, entry)[1]
+        if weights[m] == DROPPED and row[tb.NEXT_I] != tb.LEAVES:
             transaction_log.log_constraint(head, entry)
-            after[0] = tb.LEAVES
+            row[tb.NEXT_I] = tb.LEAVES
             head[tb.N_LEAVING] += 1
 
 
@@ -281,11 +263,10 @@ def add_rows(  # type: ignore[no-untyped-def]
         return UNSOUND
     head[tb.N_NODES] = n_nodes
     _start_nodes(head, first, first_other, types)
-    first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
-    for e in range(first, n_edges):
+    head[tb.N_EDGES], head[tb.N_OBSERVED] = n_edges, n_observed
+    for e in range(n_edges - len(i), n_edges):
         _start(head, e)
-    first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed
-    for row in range(first, n_observed):
+    for row in range(n_observed - len(node), n_observed):
         _start(head, -1 - row)
     return ADDED
 
@@ -303,12 +284,8 @@ def restart(head):  # type: ignore[no-untyped-def]
         node_i[v, tb.CLIQUE] = -1
         node_i[v, tb.TOUCHED] = 0
         touch(head, v)
-    for e in range(head[tb.N_EDGES]):
-        tb.edge_i(head)[e, tb.EDGE_WAITS] = 0
-        if tb.edge_f(head)[e, tb.WEIGHT] > 0.0:
-            _evaluate(head, e)
-    for k in range(head[tb.N_OBSERVED]):
-        tb.observed_i(head)[k, tb.OBS_WAITS] = 0
-        if tb.observed_f(head)[k, tb.WEIGHT] > 0.0:
-            _evaluate(head, -1 - k)
+    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
+        factors.rows_of(head, entry)[1][tb.EDGE_WAITS] = 0
+        if factors.is_used(head, entry):
+            _evaluate(head, entry)
     prior_rows.add_energies(head)

@@ -153,9 +153,9 @@ def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
-    """Write an edge; return whether it is valid, its nodes, kind and bias apart."""
-    f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
+def write_row(head, entry, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    """Write a constraint; return whether it is valid, its nodes, kind and offset apart."""
+    f, row = factors.rows_of(head, entry)
     row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.EDGE_KIND] = i, j, -1, kind
     f[tb.WEIGHT] = weight
     valid = _is_finite(weight) and weight >= 0.0 and i != j
@@ -211,7 +211,7 @@ def write_edges(  # type: ignore[no-untyped-def]
         if third[k] != -1:
             c = node_row(head, third[k])
             valid = valid and c >= 0
-        valid = write_edge(
+        valid = write_row(
             head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
         f = tb.edge_f(head)[e]
         tb.edge_i(head)[e, tb.END_K] = c
@@ -241,13 +241,12 @@ def write_observed(  # type: ignore[no-untyped-def]
     """Write new observed nodes behind the last row, as `write_edges`."""
     valid = True
     for k in range(len(node)):
-        at, v = head[tb.N_OBSERVED] + k, node_row(head, node[k])
-        f, row = tb.observed_f(head)[at], tb.observed_i(head)[at]
-        row[tb.OBS_NODE], row[tb.OBS_KIND], f[tb.WEIGHT] = v, kind[k], weight[k]
+        entry, v = -1 - (head[tb.N_OBSERVED] + k), node_row(head, node[k])
+        f = factors.rows_of(head, entry)[0]
+        valid = write_row(
+            head, entry, v, -1, mean[k], information[k], kind[k], weight[k]) and valid
         valid = _copy_pose(f, tb.OFFSET, offset[k]) and valid
-        valid = write_measurement(f, mean[k], information[k]) and valid
-        valid = (valid and _is_finite(weight[k]) and weight[k] >= 0.0 and 0 <= v < n_nodes
-                 and kind[k] in _OBSERVED_KINDS)
+        valid = valid and 0 <= v < n_nodes and kind[k] in _OBSERVED_KINDS
         if valid:
             dimension = _node(head, v, first_other, types)[1]
             valid = dimension == 3 or _has_rows_only(f, (1 << dimension) - 1, False)

@@ -99,10 +99,15 @@ def read_text(path: Path) -> str:
 
 def read_lines(path: Path) -> GraphText:
     """Return what is in a file; FileFormatError with file and line if a line is malformed."""
+    return lines_of(path, read_text(path))
+
+
+def lines_of(path: Path, text: str) -> GraphText:
+    """Return what is in the text of a file, as `read_lines`."""
     found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in LAYOUT}
     fixes: tuple[list[list[str]], list[int]] = ([], [])
     skipped: dict[str, list[list[str]]] = {}
-    for line, content in enumerate(read_text(path).splitlines(), 1):
+    for line, content in enumerate(text.splitlines(), 1):
         words = content.split()
         if len(words) == 0 or words[0][0] == '#':
             continue
