@@ -21,6 +21,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.io.json_values import MISMATCHES
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.judgement.texts import is_notable, sentence
@@ -109,7 +110,7 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     """
     try:
         _restore(parts, saved)
-    except (LookupError, TypeError, ValueError) as error:
+    except MISMATCHES as error:
         raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
 
 

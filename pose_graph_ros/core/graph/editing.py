@@ -191,15 +191,10 @@ def measure_edges(head, edges, means, informations):  # type: ignore[no-untyped-
         f, kind, _, _, _ = factors.parts(head, e)
         weight = f[tb.WEIGHT]
         transaction_log.log_constraint(head, e)
-        if weight > 0.0:
-            _touch_ends(head, e)
-            rows.scale_by(head, e, -weight)
-            tb.scalars(head)[tb.CHI2] -= f[tb.ENERGY]
+        weigh(head, e, 0.0)
         rows.write_measurement(f, means[m], informations[m])
         factors.prepare(f, kind)
-        if weight > 0.0:
-            rows.scale_by(head, e, weight)
-            _evaluate(head, e)
+        weigh(head, e, weight)
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, FLAG))

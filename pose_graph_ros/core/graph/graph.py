@@ -98,8 +98,6 @@ class Graph(GraphContents):
         checks.check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
         for measured in update.measure_edges:
             checks.check_ids('measure_edges', measured.ids.tolist(), 'edge', edges)
-            checks.check_measured(measured.mean, measured.information, len(measured.ids))
-        checks.check_priors(update.priors, update.remove_nodes)
         for n, prior in enumerate(update.priors):
             checks.check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
 

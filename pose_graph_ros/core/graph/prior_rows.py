@@ -88,13 +88,6 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     """
     node_f, nodes, row = tb.node_f(head), _nodes(head, c), tb.clique_i(head)[c]
     reference = tb.pool_f(head)[_references(row):]
-    if not turns(head, c):
-        for k in range(len(nodes)):
-            f, i = node_f[nodes[k]], 3 * k
-            d[i], d[i + 1] = f[tb.POSE] - reference[i], f[tb.POSE + 1] - reference[i + 1]
-            d[i + 2] = wrap(f[tb.POSE + 2] - reference[i + 2])
-            r[i] = r[i + 1] = r[i + 2] = 0.0
-        return
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[nodes[0]]
     turn = wrap(first[tb.POSE + 2] - reference[2])
@@ -103,6 +96,7 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     px = reference[0] if anchored else first[tb.POSE]
     py = reference[1] if anchored else first[tb.POSE + 1]
     tangent = 1.0 if anchored else 0.0
+    turning = 1.0 if turns(head, c) else 0.0
     for k in range(len(nodes)):
         f, i = node_f[nodes[k]], 3 * k
         dx, dy = f[tb.POSE] - px, f[tb.POSE + 1] - py
@@ -111,7 +105,8 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
         d[i], d[i + 1] = x - rx - tangent * phi * ry, y - ry + tangent * phi * rx
         d[i + 2] = (turn - (1.0 - tangent) * phi
                     + wrap(f[tb.POSE + 2] - reference[i + 2] - turn))
-        r[i], r[i + 1], r[i + 2] = tangent * ry - y, x - tangent * rx, 1.0 - tangent
+        r[i], r[i + 1] = turning * (tangent * ry - y), turning * (x - tangent * rx)
+        r[i + 2] = 1.0 - tangent
 
 
 @kernel

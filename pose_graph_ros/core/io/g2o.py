@@ -56,7 +56,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.checks import check, RowError
+from pose_graph_ros.core.graph.checks import check, RowError, scaled
 from pose_graph_ros.core.graph.constraints import (
     Constraints,
     EdgeKind,
@@ -361,10 +361,7 @@ def read_guessed(path: Path) -> Guess:
 
 def _smallest(rows: GraphRows) -> float:
     """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
-    information = rows.edges.information
-    root = np.sqrt(np.maximum(np.einsum('mii->mi', information), np.finfo(float).tiny))
-    scaled = information / root[:, :, None] / root[:, None, :]
-    return float(np.min(np.linalg.eigvalsh(scaled), initial=1.0))
+    return float(np.min(np.linalg.eigvalsh(scaled(rows.edges.information)), initial=1.0))
 
 
 def _spread(rows: GraphRows) -> float:

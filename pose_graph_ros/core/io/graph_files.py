@@ -40,13 +40,8 @@ from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import edges_of, OBSERVED, observed_of
 from pose_graph_ros.core.io.g2o_text import GraphText, lines_of
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
-from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, optional
-from pose_graph_ros.core.io.old_versions import (
-    with_ids,
-    with_judgement,
-    with_names,
-    without_jumps,
-)
+from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, MISMATCHES
+from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.saved_columns import Flags, Integers, Numbers, Rows3, Rows4, Rows6
@@ -148,15 +143,13 @@ def read_graph(path: Path) -> SavedGraph:
     g2o_path, path, members, g2o = _verified(path)
     try:
         hints = annotations(SavedGraph)
-        rest = {name: decoded(hints[name], members.pop(name), name) for name in _members()
-                if name in members or name not in optional(SavedGraph)}
-        rows: SavedRows = decoded(SavedRows, members.pop('graph'), 'graph')
+        rest = {name: decoded(hints[name], members[name]) for name in _members()
+                if name in members}
+        rows: SavedRows = decoded(SavedRows, members['graph'])
         text = g2o.decode('ascii').partition(STANDING_FOR_PRIORS)[0].replace(NOT_USED, '')
         return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, text)), **rest)
-    except KeyError as error:
-        raise FileFormatError(f'{path}: expected a member {error}') from error
-    except (IndexError, ValueError) as error:
-        raise FileFormatError(f'{path}, with {g2o_path.name}: {error}') from error
+    except MISMATCHES as error:
+        raise FileFormatError(f'{path}, with {g2o_path.name}: {error!r}') from error
 
 
 def read_datum(path: Path) -> MapOrigin | None:
@@ -169,10 +162,10 @@ def read_datum(path: Path) -> MapOrigin | None:
     _, path, members, _ = _verified(path)
     try:
         datum: MapOrigin | None = decoded(
-            annotations(SavedGraph)['datum'], members['datum'], 'datum')
+            annotations(SavedGraph)['datum'], members['datum'])
         if datum is not None:
             TangentPlane(*datum)  # raises if it is no point on the Earth
-    except (KeyError, ValueError) as error:
+    except MISMATCHES as error:
         raise FileFormatError(f'{path}: expected a datum ({error})') from error
     return datum
 
@@ -230,10 +223,10 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
         raise FileFormatError(
             f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
-    members = with_names(members) if version == 1 else dict(members)
-    members = with_judgement(members) if version < 3 else members
-    members = with_ids(members) if version < 4 else members
-    return without_jumps(members) if version < 5 else members
+    try:
+        return upgraded(members, version)
+    except MISMATCHES as error:
+        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:

@@ -123,18 +123,3 @@ def test_what_is_not_simply_believed_is_drawn_apart_though_its_weight_is_0() -> 
     np.testing.assert_array_equal(
         in_any_order(np.concatenate((rows(view.observed), rows(view.unused)))),
         in_any_order(rows(whole.observed)))
-
-
-def test_a_measurement_with_a_bias_that_is_not_used_is_drawn_apart() -> None:
-    graph = random_graph(5, n_edges=10, n_observed=6, n_biases=3)
-    biased = np.flatnonzero(graph.edges.kind == EdgeKind.BIAS)
-    whole = graph_view.view(graph)
-    graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(biased.tolist(), 0.0)))
-    view = graph_view.view(graph, DrawnRows(unused_edges=[
-        row for row in biased.tolist() if not graph.is_bias[graph.edges.i[row]]]))
-    assert view is not None
-    assert whole is not None
-    assert len(view.unused.ends) > 0
-    np.testing.assert_array_equal(
-        in_any_order(np.concatenate((rows(view.observed), rows(view.unused)))),
-        in_any_order(rows(whole.observed)))

@@ -255,13 +255,6 @@ def test_parts_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
             PoseGraphBackend.restored(CORRELATED, read_graph(side))
 
 
-def test_a_loaded_graph_can_be_used_with_other_settings(tmp_path: Path) -> None:
-    write_graph(saved_drive(), tmp_path / 'map')
-    backend = PoseGraphBackend.restored(LINE_ODOMETRY, read_graph(tmp_path / 'map'))
-    assert backend.estimate() is not None
-    backend.optimize()
-
-
 def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -> None:
     saved = small_graph()
     rows, nodes = saved.rows, saved.nodes
