@@ -75,7 +75,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     package.mkdir()
     for name, text in (('__init__', ''), ('inner', INNER), ('outer', OUTER)):
         (package / f'{name}.py').write_text(text)
-    kernel_cache.find_folder.cache_clear()
+    kernel_cache.find_folders.cache_clear()
     kernel_cache._warn_once.cache_clear()
     return package
 
@@ -208,7 +208,7 @@ class Places:
         monkeypatch.setenv('HOME', str(self.home))
 
     def find(self) -> Path | None:
-        found = kernel_cache.find_folder.__wrapped__(self.source)
+        found = kernel_cache.find_folders.__wrapped__(self.source).own
         assert found is None or found.is_dir()
         return found
 
