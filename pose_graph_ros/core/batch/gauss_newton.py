@@ -76,8 +76,9 @@ def _clique(head, c, right):  # type: ignore[no-untyped-def]
     nodes = tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + n]
     x = tb.work_f(head)[:3 * n]
     for k in range(n):
+        v = nodes[k]
         for m in range(3):
-            x[3 * k + m] = right[nodes[k], m]
+            x[3 * k + m] = right[v, m]
     return nodes, row[tb.N_FRONTAL], tb.pool_f(head)[row[tb.VALUES]:], x
 
 
@@ -95,8 +96,9 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
         nodes, n_frontal, values, x = _clique(head, c, right)
         forward_rows(values, 3 * n_frontal, len(x), x)
         for k in range(len(nodes)):
+            v = nodes[k]
             for m in range(3):
-                right[nodes[k], m] = x[3 * k + m]
+                right[v, m] = x[3 * k + m]
     largest = 0.0
     for c in range(n_cliques - 1, n_priors - 1, -1):
         nodes, n_frontal, values, x = _clique(head, c, right)

@@ -210,38 +210,39 @@ def set_fixed(head, nodes, fixed):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyped-def]
-    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and len(kind) == n
-            and len(weight) == n)
+def _lengths_agree(columns):  # type: ignore[no-untyped-def]
+    i, j, mean, information, kind, weight, bias, k = columns
+    n = len(i)
+    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and bias.shape == (n, 4)
+            and len(j) == n and len(kind) == n and len(weight) == n and len(k) == n)
 
 
-@kernel(signature=(
-    tb.HEAD, ROWS, ROWS, BYTES, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS,
-    INTEGERS, INTEGERS, ROWS, ROWS, MATRICES, BYTES, NUMBERS, FLAG))
+_COLUMNS = (INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS, INTEGERS)
+
+
+@kernel(signature=(tb.HEAD, ROWS, ROWS, BYTES, *_COLUMNS, *_COLUMNS, FLAG))
 def add_rows(  # type: ignore[no-untyped-def]
     head, hidden, others, types, i, j, mean, information, kind, weight, bias, k,
-    node, offset, observed_mean, observed_information, observed_kind, observed_weight, checked,
+    node, to, observed_mean, observed_information, observed_kind, observed_weight, offset, third,
+    checked,
 ):
     """
     Return ADDED after adding hidden nodes, edges and observed nodes, all of them, or why none.
 
     NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and
     `checks.check` has not accepted them (`checked`). `others` are values of new nodes that are no
-    poses, with their NODE_TYPEs; from i to k and from `node` on the columns of `Edges` and of
-    `ObservedNodes` follow.
+    poses, with their NODE_TYPEs; the columns of edges follow, and of observed nodes as edges.
     """
+    edges = i, j, mean, information, kind, weight, bias, k
+    observed = (node, to, observed_mean, observed_information, observed_kind, observed_weight,
+                offset, third)
     first = head[tb.N_NODES]
     first_other = first + len(hidden)
     n_nodes = first_other + len(others)
     n_edges = head[tb.N_EDGES] + len(i)
     n_observed = head[tb.N_OBSERVED] + len(node)
     if (hidden.shape[1] != 3 or others.shape[1] != 3 or len(types) != len(others)
-            or len(j) != len(i) or len(k) != len(i)
-            or not _lengths_agree(len(i), mean, information, kind, weight)
-            or bias.shape != (len(i), 4)
-            or offset.shape != (len(node), 3)
-            or not _lengths_agree(len(node), observed_mean, observed_information, observed_kind,
-                                  observed_weight)):
+            or not _lengths_agree(edges) or not _lengths_agree(observed)):
         return UNSOUND
     if (n_nodes + head[tb.N_PRIORS] > head[tb.NODE_ROOM] or n_edges > head[tb.EDGE_ROOM]
             or n_observed > head[tb.OBSERVED_ROOM]):
@@ -249,11 +250,8 @@ def add_rows(  # type: ignore[no-untyped-def]
     # rows behind the ends are not part of the graph yet
     valid = rows.write_nodes(head, first, hidden)
     valid = rows.write_nodes(head, first_other, others) and valid
-    valid = rows.write_edges(head, n_nodes, first_other, types, i, j, mean, information, kind,
-                             weight, bias, k) and valid
-    valid = rows.write_observed(
-        head, n_nodes, first_other, types, node, offset, observed_mean, observed_information,
-        observed_kind, observed_weight) and valid
+    valid = rows.write_rows(head, True, n_nodes, first_other, types, edges) and valid
+    valid = rows.write_rows(head, False, n_nodes, first_other, types, observed) and valid
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes

@@ -31,10 +31,9 @@ def edge_errors(poses: Poses, edges: Edges) -> FloatArray:
 
 def observed_errors(poses: Poses, observed: ObservedNodes) -> FloatArray:
     """Return the errors (3.52) of observed nodes, in their frames, as `edge_errors`."""
-    node, n = observed.node, len(observed)
-    error = -_errors(
-        poses, node, node, np.full(n, -1), observed.mean, np.full(n, OBSERVED, np.uint8),
-        np.pad(observed.offset, ((0, 0), (0, 1))))
+    edges = observed.as_edges
+    error = -_errors(poses, edges.i, edges.i, edges.k, edges.mean,
+                     np.full(len(edges), OBSERVED, np.uint8), edges.bias)
     error[:, 2] = se2.wrap(error[:, 2])
     return error
 

@@ -126,18 +126,3 @@ def test_right_closures_are_believed_and_wrong_ones_not() -> None:
     all_, none = (problem.choice(np.full(len(problem), each)) for each in (True, False))
     assert choices[0].cost < min(all_.cost, none.cost)
     assert none.cost == pytest.approx(np.sum(np.minimum(none.energies, problem.limits)), abs=1e-9)
-
-
-def test_a_retest_takes_in_what_was_left_out_and_throws_out_what_is_wrong() -> None:
-    drive = laps(5, n_wrong=3)
-    problem = problem_of(drive)
-    some = drive.right.copy()
-    some[[2, 9]] = False
-    np.testing.assert_array_equal(
-        problem.improved(problem.choice(some)).believed, drive.right)
-    most = drive.right.copy()
-    most[-1] = True
-    bent = problem.choice(most)
-    better = problem.improved(bent)
-    assert better.cost < bent.cost
-    assert not better.believed[-1]

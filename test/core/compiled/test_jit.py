@@ -183,16 +183,6 @@ def test_damaged_file_costs_time_alone(
     assert loaded(again.total)
 
 
-def test_folder_that_vanishes_costs_time_alone(
-    folder: Path, caplog: pytest.LogCaptureFixture,
-) -> None:
-    module = start()
-    shutil.rmtree(folder / '__pycache__')
-    (folder / '__pycache__').write_text('no folder')
-    assert module.total(ONES) == 6.0
-    assert 'could not be' in caplog.text
-
-
 # --- the folder ---------------------------------------------------------------------------------
 
 class Places:

@@ -5,7 +5,6 @@
 
 from hypothesis import given, strategies as st
 import numpy as np
-import pytest
 from random_graphs import matrix, random_graph
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -81,20 +80,6 @@ def test_the_view_shows_each_row_once_and_no_bias(seed: int, n_biases: int) -> N
         np.testing.assert_allclose(
             in_any_order(rows(getattr(view, name))),
             in_any_order(np.array(wanted).reshape(-1, 5)), **SAME)
-
-
-def test_a_view_does_not_follow_the_graph_and_cannot_be_written() -> None:
-    graph = weighted(0, 2)
-    view = graph_view.view(graph)
-    assert view is not None
-    arrays = [view.nodes, *(array for line in (view.odometry, view.loop_closures, view.observed)
-                            for array in (line.ends, line.sigmas))]
-    before = [array.copy() for array in arrays]
-    graph.set_poses(graph.poses + 1.0)
-    for array, copy in zip(arrays, before, strict=True):
-        np.testing.assert_array_equal(array, copy)
-        with pytest.raises(ValueError, match='read-only'):
-            array[0] = 0.0
 
 
 def test_what_is_not_simply_believed_is_drawn_apart_though_its_weight_is_0() -> None:
