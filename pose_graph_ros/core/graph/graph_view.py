@@ -27,13 +27,10 @@ _OFFSET_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Constraints as straight lines; the arrays are read-only copies."""
+    """Constraints as straight lines; the arrays are copies."""
 
     ends: FloatArray    # both ends of each line in the map, shape (M, 2, 2) [m]
     sigmas: FloatArray  # errors [sigma]
-
-    def __post_init__(self) -> None:
-        self.ends.flags.writeable = self.sigmas.flags.writeable = False
 
 
 NO_LINES = Lines(np.empty((0, 2, 2)), np.empty(0))
@@ -56,9 +53,9 @@ ALL_BELIEVED = DrawnRows()
 
 @dataclass(frozen=True, slots=True)
 class GraphView:
-    """Immutable view of a graph for display."""
+    """View of a graph for display, which does not change with it."""
 
-    nodes: Points   # hidden nodes in the map without biases, read-only
+    nodes: Points   # hidden nodes in the map without biases
     odometry: Lines         # from node to node, as the loop closures
     loop_closures: Lines
     # measured positions (of an antenna, or the robot), from the predicted to the measured one
@@ -68,9 +65,6 @@ class GraphView:
     waiting: Lines = NO_LINES
     doubted: Lines = NO_LINES
     unused: Lines = NO_LINES    # measured positions that are not in the estimate
-
-    def __post_init__(self) -> None:
-        self.nodes.flags.writeable = False
 
 
 def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:

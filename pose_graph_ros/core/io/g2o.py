@@ -127,7 +127,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
 def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
     """Return the graph in the lines of a file, as `read_g2o` does."""
-    ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if tag in text.tags]
+    ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if len(text.rows[tag])]
     if edge2_order is None and len(ambiguous) > 0:
         line, tag = min(ambiguous)
         raise FileFormatError(
@@ -329,7 +329,7 @@ def read_guessed(path: Path) -> Guess:
     read.
     """
     text = read_lines(path)
-    if text.tags.isdisjoint(AMBIGUOUS):
+    if not any(len(text.rows[tag]) for tag in AMBIGUOUS):
         return Guess(graph_of(text), None, '')
     files: dict[str, GraphFile] = {}
     errors: dict[str, FileFormatError] = {}
@@ -340,7 +340,7 @@ def read_guessed(path: Path) -> Guess:
             errors[order] = error
     if len(files) == 0:
         raise errors[EDGE2_ORDERS[0]]
-    if 'LANDMARK' in text.tags and 'isam' in files:
+    if len(text.rows['LANDMARK']) > 0 and 'isam' in files:
         return Guess(files['isam'], 'isam', 'LANDMARK is a tag of iSAM')
     worst = {order: _smallest(file.rows) for order, file in files.items()}
     definite = [order for order, value in worst.items() if value > 1e-9]

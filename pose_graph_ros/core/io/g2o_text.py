@@ -77,7 +77,6 @@ class GraphText:
     rows: dict[str, Lines]  # by tag, for all of `LAYOUT`
     fixes: Lines  # ids behind `FIX`, one a row
     skipped: dict[str, int]  # number of lines with other tags
-    tags: frozenset[str]  # all of `LAYOUT` that are in the file
 
     def where(self, line: int) -> str:
         """Return the name of the file with that of a line."""
@@ -132,8 +131,7 @@ def lines_of(path: Path, text: str) -> GraphText:
         fixed = _lines(*fixes, 1, 0)
     except (ValueError, OverflowError):
         _raise_first(path, {**found, 'FIX': fixes})
-    return GraphText(path, tables, fixed, {tag: len(each) for tag, each in skipped.items()},
-                     frozenset(tag for tag, table in tables.items() if len(table) > 0))
+    return GraphText(path, tables, fixed, {tag: len(each) for tag, each in skipped.items()})
 
 
 def _lines(words: list[list[str]], lines: list[int], n_ids: int, n_numbers: int) -> Lines:
