@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
-from pose_graph_ros.core.exceptions import NothingToSaveError
+from pose_graph_ros.core.exceptions import FileFormatError, NothingToSaveError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.io.json_values import MISMATCHES
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.judgement.texts import is_notable, sentence
@@ -104,8 +105,16 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     Fill the parts of a new engine from a saved graph.
 
     Poses and weights equal the saved ones bit for bit. Whether odometry continues where it was
-    saved is decided at its first sample; see `odometry.stream`.
+    saved is decided at its first sample; see `odometry.stream`. Raises FileFormatError where the
+    parts of the saved graph contradict each other.
     """
+    try:
+        _restore(parts, saved)
+    except MISMATCHES as error:
+        raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
+
+
+def _restore(parts: Parts, saved: SavedGraph) -> None:
     parts.graph.fill(saved.rows)
     parts.nodes.restore(saved.nodes)
     for name, source in saved.sources.items():

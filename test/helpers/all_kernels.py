@@ -59,6 +59,4 @@ def call_all_kernels(n_samples: int, max_iterations: int = 10) -> None:
     graph = backend.graph
     optimizer.optimize_from_linear_start(graph, SolverConfig())
     # the optimiser calls these only if it stalls or takes many iterations
-    right = np.zeros((graph.n_nodes, 3))
-    gauss_newton.product_with_step(graph.memory.head, right)
-    gauss_newton.chord_step(graph.memory.head, right)
+    gauss_newton.step(graph.memory.head, np.zeros((graph.n_nodes, 3)), True)

@@ -98,15 +98,14 @@ def from_linear_start(
     if answer is not None:
         return answer
     poses, cliques = graph.poses.copy(), _analysed(graph)
-    head = graph.memory.head
     few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
     yield
     best, best_poses = _failed('', chi2), poses
     result = best
     for start in starts:
-        gauss_newton.put_poses(head, poses)
+        gauss_newton.put_poses(graph.memory, poses)
         try:
-            gauss_newton.put_poses(head, _start(graph, start))
+            gauss_newton.put_poses(graph.memory, _start(graph, start))
         except LinearSolveError:
             continue
         yield
@@ -124,7 +123,7 @@ def from_linear_start(
     if best is not result or best.status is Status.MAX_ITERATIONS:
         if best.status is Status.FAILED:
             return _finished(graph, poses, chi2, result)
-        gauss_newton.put_poses(head, best_poses)
+        gauss_newton.put_poses(graph.memory, best_poses)
         rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
         result = yield from _minimize(graph, rest, cliques, best.chi2)
         result = replace(result, start=best.start, iterations=best.iterations + result.iterations)
@@ -212,7 +211,7 @@ def _minimize(
     """Optimise from the present poses; the poses after a failure have no meaning."""
     head = graph.memory.head
     symbolic.plant(head, cliques)
-    result = yield from minimize(gauss_newton.CompiledSystem(head), chi2, config)
+    result = yield from minimize(gauss_newton.CompiledSystem(graph.memory), chi2, config)
     if result.status is Status.FAILED:
         node = graph.node_ids[head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
@@ -222,7 +221,7 @@ def _minimize(
 def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult) -> BatchResult:
     """Return the result of the whole call; restore the poses if it has failed."""
     if result.status is Status.FAILED:
-        gauss_newton.put_poses(graph.memory.head, poses)
+        gauss_newton.put_poses(graph.memory, poses)
         editing.restart(graph.memory.head)
         return _failed(result.reason, chi2)
     return result

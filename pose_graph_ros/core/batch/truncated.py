@@ -42,6 +42,7 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph.checks import scaled
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
@@ -82,11 +83,6 @@ class Choice:
     energies: FloatArray  # r^2 of the same at the poses
     cost: float  # the truncated cost
     poses: Poses  # those that minimise chi2 of what is believed
-    known: float  # chi2 of all that is known to be right
-
-    def cost_by(self, limits: FloatArray) -> float:
-        """Return the truncated cost with other limits, shape (M,)."""
-        return self.known + float(np.sum(np.minimum(self.energies, limits)))
 
 
 class TruncatedProblem:
@@ -168,7 +164,7 @@ class TruncatedProblem:
         squares = self.energies()
         known = chi2_of(self.graph) - float(np.sum(squares[believed]))
         cost = known + float(np.sum(np.minimum(squares, self.limits)))
-        return Choice(believed.copy(), squares, cost, self.graph.poses.copy(), known)
+        return Choice(believed.copy(), squares, cost, self.graph.poses.copy())
 
     def near_start(self) -> Choice | None:
         """Return a set with poses of no higher truncated cost than the start; None as `choice`."""
@@ -240,8 +236,5 @@ class TruncatedProblem:
 
 def _ranks(information: FloatArray) -> IntArray:
     """Return the ranks of information matrices, shape (M,), whatever units they have."""
-    diagonal = np.einsum('mii->mi', information)
-    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    scaled = information / root[:, :, None] / root[:, None, :]
-    ranks: IntArray = np.sum(np.linalg.eigvalsh(scaled) > 1e-9, axis=1)
+    ranks: IntArray = np.sum(np.linalg.eigvalsh(scaled(information)) > 1e-9, axis=1)
     return ranks

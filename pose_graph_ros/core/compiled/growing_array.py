@@ -32,7 +32,7 @@ class GrowingArray:
 
     def append(self, rows: npt.ArrayLike) -> None:
         """Append rows, shape (M, *row_shape)."""
-        rows = np.asarray(rows)
+        rows = np.asarray(rows, dtype=self._data.dtype)
         end = self._size + len(rows)
         if end > len(self._data):
             grown = np.empty((max(end, 2 * len(self._data)), *self._data.shape[1:]),
@@ -45,7 +45,7 @@ class GrowingArray:
     def append_one(self, row: npt.ArrayLike) -> None:
         """Append a single row, shape `row_shape`."""
         if self._size == len(self._data):
-            self.append(np.asarray(row)[None])
+            self.append(np.asarray(row, dtype=self._data.dtype)[None])
         else:
             self._data[self._size] = row
             self._size += 1

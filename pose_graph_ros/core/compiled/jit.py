@@ -17,6 +17,7 @@ is defined.
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+import functools
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -63,13 +64,7 @@ def kernel(
     override `OPTIONS`.
     """
     if function is None:
-        return lambda function: _kernel(function, signature, allocates, options)
-    return _kernel(function, signature, allocates, options)
-
-
-def _kernel(
-    function: Function, signature: Signature | None, allocates: bool, options: dict[str, Any],
-) -> Any:
+        return functools.partial(kernel, signature=signature, allocates=allocates, **options)
     ownership = OWNS if allocates else BORROWS
     compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are

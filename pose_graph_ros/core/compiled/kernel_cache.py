@@ -25,14 +25,13 @@ from collections.abc import Iterator
 from enum import Enum
 import functools
 import hashlib
-from itertools import takewhile
 import logging
 import os
 from pathlib import Path
 import pickle
 import tempfile
 from types import CodeType, FunctionType, ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -56,28 +55,31 @@ SETTINGS = ('OPT', 'LOOP_VECTORIZE', 'SLP_VECTORIZE', 'BOUNDSCHECK', 'DEBUGINFO_
 
 # --- the folder ---------------------------------------------------------------------------------
 
+class Folders(NamedTuple):
+    """Where the code of the modules in a source folder is kept."""
+
+    own: Path | None    # the first one that can be written to
+    others: tuple[Path, ...]    # before it, from which code is only loaded
+
+
 @functools.cache
-def find_folder(source: Path) -> Path | None:
-    """Return the cache folder for the modules in a source folder; None if none is writeable."""
-    tried = []
+def find_folders(source: Path) -> Folders:
+    """Return the cache folders for the modules in a source folder."""
+    others, tried = [], []
     for folder in _candidates(source):
         try:
             _make_writable(folder)
         except OSError as error:
             tried.append(f'{folder} ({error.strerror or error})')
+            if folder.is_dir() and os.access(folder, os.R_OK):
+                others.append(folder)
         else:
-            return folder
-    if len(read_only_folders(source, None)) == 0:
+            return Folders(folder, tuple(others))
+    if len(others) == 0:
         logger.warning(
             'compiled kernels cannot be kept, every start compiles them again; set '
             'NUMBA_CACHE_DIR to a folder that can be written to; tried: %s', ', '.join(tried))
-    return None
-
-
-def read_only_folders(source: Path, own: Path | None) -> list[Path]:
-    """Return the folders with code that come before our own one; all of them if there is none."""
-    before = takewhile(lambda folder: folder != own, _candidates(source))
-    return [folder for folder in before if folder.is_dir() and os.access(folder, os.R_OK)]
+    return Folders(None, tuple(others))
 
 
 def _candidates(source: Path) -> Iterator[Path]:
@@ -192,8 +194,8 @@ class _Locator:
         if not source.is_file():
             _warn_once(f'compiled kernels of {py_file} cannot be kept: it is no file')
             return None
-        folder = find_folder(source.parent) or next(
-            iter(read_only_folders(source.parent, None)), None)
+        own, others = find_folders(source.parent)
+        folder = own or next(iter(others), None)
         return None if folder is None else cls(source, folder)
 
     def ensure_cache_path(self) -> None:
@@ -239,13 +241,13 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         self._impl.dispatcher = dispatcher
         self._dispatcher = dispatcher
         source = Path(dispatcher.py_func.__code__.co_filename).absolute().parent
-        own = find_folder(source)
-        self.is_writable = own is not None
+        folders = find_folders(source)
+        self.is_writable = folders.own is not None
         # its own files first
         self._files = [self._cache_file, *(
             IndexDataCacheFile(
                 str(folder), self._impl.filename_base, self._impl.locator.get_source_stamp())
-            for folder in read_only_folders(source, own) if str(folder) != self.cache_path)]
+            for folder in folders.others if str(folder) != self.cache_path)]
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the cached code for a signature; None if there is no valid entry."""

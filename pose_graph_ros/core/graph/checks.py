@@ -19,13 +19,20 @@ from pose_graph_ros.core.graph.constraints import (
     ObservedKind,
     ObservedNodes,
 )
-from pose_graph_ros.core.graph.priors import Prior
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
 SEMIDEFINITE_TOLERANCE = 1e-5
 # Shapes of the rows of columns that are not of numbers.
 _ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
+
+
+class RowError(GraphUpdateError):
+    """A row of a table is invalid."""
+
+    def __init__(self, reason: str, row: int, value: object) -> None:
+        super().__init__(f'{reason}; row {row}: {value}')
+        self.row = row
 
 
 class Ids(NamedTuple):
@@ -139,13 +146,14 @@ def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
 
 def _check_information(name: str, matrix: FloatArray) -> None:
     """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
-    diagonal, scaled = np.diagonal(matrix, axis1=1, axis2=2), _scaled(matrix)
-    skew = np.max(np.abs(scaled - np.swapaxes(scaled, 1, 2)), axis=(1, 2), initial=0.0)
+    diagonal, correlation = np.diagonal(matrix, axis1=1, axis2=2), scaled(matrix)
+    skew = np.max(
+        np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
     _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
     smallest = np.zeros(len(matrix))
-    doubtful = ~_are_definite(scaled)
+    doubtful = ~are_definite(matrix)
     smallest[doubtful] = np.min(
-        np.linalg.eigvalsh(scaled[doubtful]), axis=-1, initial=np.inf)
+        np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
     negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
     _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
                  f'{name} is not positive semidefinite, or zero', matrix)
@@ -153,33 +161,30 @@ def _check_information(name: str, matrix: FloatArray) -> None:
 
 def are_definite(information: FloatArray) -> BoolArray:
     """Tell which matrices, shape (M, 3, 3), are clearly positive definite, whatever their unit."""
-    return _are_definite(_scaled(information))
+    correlation = scaled(information)
+    a, b, c = correlation[:, 0, 1], correlation[:, 0, 2], correlation[:, 1, 2]
+    diagonal = np.diagonal(correlation, axis1=1, axis2=2)
+    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
+    # the leading minors
+    return np.asarray(np.all(np.abs(diagonal - 1.0) < 1e-12, axis=1)
+                      & (1.0 - a * a > 1e-9) & (determinant > 1e-9))
 
 
-def _scaled(matrix: FloatArray) -> FloatArray:
+def scaled(matrix: FloatArray) -> FloatArray:
     """Return matrices with 1 in place of each positive number on the diagonal."""
     diagonal = np.diagonal(matrix, axis1=1, axis2=2)
     root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     with np.errstate(over='ignore'):
-        scaled = matrix / root[:, :, None] / root[:, None, :]
+        divided = matrix / root[:, :, None] / root[:, None, :]
     # correlations beyond 1 are invalid however large they are, and might overflow
-    return np.clip(scaled, -2.0, 2.0)
-
-
-def _are_definite(scaled: FloatArray) -> BoolArray:
-    """Tell for which matrices with 1 on the diagonal the leading minors are clearly positive."""
-    a, b, c = scaled[:, 0, 1], scaled[:, 0, 2], scaled[:, 1, 2]
-    diagonal = np.diagonal(scaled, axis1=1, axis2=2)
-    determinant = 1.0 + 2.0 * a * b * c - a * a - b * b - c * c
-    return np.asarray(np.all(np.abs(diagonal - 1.0) < 1e-12, axis=1)
-                      & (1.0 - a * a > 1e-9) & (determinant > 1e-9))
+    return np.clip(divided, -2.0, 2.0)
 
 
 def _refuse_rows(bad: BoolArray, reason: str, values: npt.NDArray[np.generic]) -> None:
     """Raise with the first bad row, if there is one."""
     if np.any(bad):
         row = int(np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))[0])
-        raise GraphUpdateError(f'{reason}; row {row}: {values[row].tolist()}')
+        raise RowError(reason, row, values[row].tolist())
 
 
 # --- other parts of an update -------------------------------------------------------------------
@@ -249,43 +254,3 @@ def check_weights(name: str, weights: Mapping[int, float], what: str, known: Ids
         raise GraphUpdateError(
             f'{name}: expected a finite weight that is not negative, got {weight} '
             f'for number {number}')
-
-
-def check_measured(means: FloatArray, informations: FloatArray, n: int) -> None:
-    """Raise unless these are means and informations of n edges."""
-    shapes = means.shape, informations.shape
-    if shapes != ((n, 3), (n, 3, 3)):
-        raise GraphUpdateError(f'measure_edges: expected the shapes {(n, 3)} and {(n, 3, 3)}, '
-                               f'got {shapes[0]} and {shapes[1]}')
-    if not np.all(np.isfinite(means)):
-        raise GraphUpdateError('measure_edges: expected finite means')
-    _check_information('measure_edges', informations)
-
-
-def check_priors(priors: Sequence[Prior], leaving: Sequence[int]) -> None:
-    """Raise for wrong shapes and numbers; nodes are not looked up."""
-    for n, prior in enumerate(priors):
-        k = len(prior.nodes)
-        shapes = [np.shape(part) for part in (prior.reference, prior.information, prior.vector)]
-        if k == 0 or shapes != [(k, 3), (3 * k, 3 * k), (3 * k,)]:
-            raise GraphUpdateError(
-                f'priors[{n}]: expected shapes (k, 3), (3k, 3k) and (3k,) for k = {k} nodes, '
-                f'got {shapes}')
-        if len(np.unique(prior.nodes)) < k:
-            raise GraphUpdateError(
-                f'priors[{n}]: a node is there twice: {np.asarray(prior.nodes).tolist()}')
-        if np.any(np.isin(prior.nodes, np.fromiter(leaving, np.int64))):
-            raise GraphUpdateError(f'priors[{n}]: a node leaves with the same update')
-        if not all(np.all(np.isfinite(part)) for part in (
-                prior.reference, prior.information, prior.vector, prior.energy)):
-            raise GraphUpdateError(f'priors[{n}]: a number is not finite')
-        # small numbers on the diagonal may be what rounding leaves of zero
-        diagonal = np.diagonal(prior.information)
-        root = np.sqrt(np.maximum(diagonal, max(1e-8 * np.max(diagonal), 1e-300)))
-        scaled = prior.information / np.outer(root, root)
-        skew = float(np.max(np.abs(scaled - scaled.T)))
-        smallest = float(np.linalg.eigvalsh(0.5 * (scaled + scaled.T))[0])
-        if skew > SEMIDEFINITE_TOLERANCE or smallest < -SEMIDEFINITE_TOLERANCE:
-            raise GraphUpdateError(
-                f'priors[{n}].information is not symmetric and positive semidefinite: '
-                f'asymmetry {skew:.1e}, smallest eigenvalue {smallest:.1e}')

@@ -236,6 +236,15 @@ class ObservedNodes(_Table):
     def __len__(self) -> int:
         return len(self.node)
 
+    @property
+    def as_edges(self) -> Edges:
+        """The same as edges to the map, -1, whose column `bias` begins with the offset."""
+        n = len(self)
+        bias = np.zeros((n, 4))
+        bias[:, :3] = self.offset
+        return Edges(self.node, _filled(n, -1, _INT), self.mean, self.information, self.kind,
+                     self.weight, bias)
+
     def weighted(self, weight: float) -> 'ObservedNodes':
         """Return the same observed nodes with another weight."""
         return replace(self, weight=np.full(len(self), weight))

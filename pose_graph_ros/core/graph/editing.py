@@ -82,50 +82,38 @@ def _touch_ends(head, entry):  # type: ignore[no-untyped-def]
 @kernel
 def _link(head, entry):  # type: ignore[no-untyped-def]
     """Put a constraint at the heads of the lists of its ends; the caller has logged all rows."""
-    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    if entry < 0:
-        row = tb.observed_i(head)[-1 - entry]
-        v = row[tb.OBS_NODE]
-        row[tb.OBS_NEXT], node_i[v, tb.OBSERVED_LIST] = node_i[v, tb.OBSERVED_LIST], -1 - entry
-        return
+    node_i, (_, row) = tb.node_i(head), factors.rows_of(head, entry)
     for side in range(3):
-        v = edge_i[entry, side]
+        v = row[side]
         if v >= 0:
-            edge_i[entry, tb.NEXT_I + side] = node_i[v, tb.EDGE_LIST]
-            node_i[v, tb.EDGE_LIST] = 4 * entry + side
+            column, name = _listed_as(entry, side)
+            row[tb.NEXT_I + side], node_i[v, column] = node_i[v, column], name
 
 
 @kernel
-def unlink_edge(head, e, side):  # type: ignore[no-untyped-def]
-    """Take an edge out of the list of one of its ends, whose row has been logged."""
-    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    v, after = edge_i[e, side], edge_i[e, tb.NEXT_I + side]
-    entry = node_i[v, tb.EDGE_LIST]
-    if entry == 4 * e + side:
-        node_i[v, tb.EDGE_LIST] = after
+def _listed_as(entry, side):  # type: ignore[no-untyped-def]
+    """Return in which list of an end a constraint is, and as which number."""
+    return (tb.EDGE_LIST, 4 * entry + side) if entry >= 0 else (tb.OBSERVED_LIST, -1 - entry)
+
+
+@kernel
+def unlink(head, entry, side):  # type: ignore[no-untyped-def]
+    """Take a constraint out of the list of one of its ends, whose row has been logged."""
+    node_i, (_, row) = tb.node_i(head), factors.rows_of(head, entry)
+    column, name = _listed_as(entry, side)
+    v, after = row[side], row[tb.NEXT_I + side]
+    at = node_i[v, column]
+    if at == name:
+        node_i[v, column] = after
         return
     while True:
-        before, column = entry >> 2, tb.NEXT_I + (entry & 3)
-        entry = edge_i[before, column]
-        if entry == 4 * e + side:
+        before, link = (at >> 2, tb.NEXT_I + (at & 3)) if entry >= 0 else (-1 - at, tb.NEXT_I)
+        row = factors.rows_of(head, before)[1]
+        at = row[link]
+        if at == name:
             transaction_log.log_constraint(head, before)
-            edge_i[before, column] = after
+            row[link] = after
             return
-
-
-@kernel
-def _unlink_observed(head, k):  # type: ignore[no-untyped-def]
-    """Take an observed node out of the list of its hidden node, whose row has been logged."""
-    node_i, observed_i = tb.node_i(head), tb.observed_i(head)
-    v, after = observed_i[k, tb.OBS_NODE], observed_i[k, tb.OBS_NEXT]
-    before = node_i[v, tb.OBSERVED_LIST]
-    if before == k:
-        node_i[v, tb.OBSERVED_LIST] = after
-        return
-    while observed_i[before, tb.OBS_NEXT] != k:
-        before = observed_i[before, tb.OBS_NEXT]
-    transaction_log.log_constraint(head, -1 - before)
-    observed_i[before, tb.OBS_NEXT] = after
 
 
 @kernel
@@ -154,12 +142,9 @@ def weigh(head, entry, weight):  # type: ignore[no-untyped-def]
         _evaluate(head, entry)
         return
     f[tb.ERROR2] = f[tb.ENERGY] = 0.0
-    if entry < 0:
-        _unlink_observed(head, -1 - entry)
-        return
     for side in range(3):
-        if tb.edge_i(head)[entry, side] >= 0:
-            unlink_edge(head, entry, side)
+        if factors.rows_of(head, entry)[1][side] >= 0:
+            unlink(head, entry, side)
 
 
 @kernel
@@ -168,15 +153,13 @@ def _start(head, entry):  # type: ignore[no-untyped-def]
     f, kind, _, _, _ = factors.parts(head, entry)
     factors.prepare(f, kind)
     f[tb.ERROR2] = f[tb.ENERGY] = 0.0
+    row = factors.rows_of(head, entry)[1]
+    row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
+    row[tb.NEXT_I], row[tb.EDGE_LOGGED] = -1, head[tb.UPDATE]
     if entry >= 0:
-        row = tb.edge_i(head)[entry]
-        row[tb.EDGE_CHECKED] = row[tb.EDGE_WAITS] = 0
-        row[tb.NEXT_I], row[tb.EDGE_LOGGED] = -1, head[tb.UPDATE]
         tb.edge_id(head)[entry] = head[tb.NEXT_EDGE]
         head[tb.NEXT_EDGE] += 1
     else:
-        row = tb.observed_i(head)[-1 - entry]
-        row[tb.OBS_WAITS], row[tb.OBS_NEXT], row[tb.OBS_LOGGED] = 0, -1, head[tb.UPDATE]
         tb.observed_id(head)[-1 - entry] = head[tb.NEXT_OBSERVED]
         head[tb.NEXT_OBSERVED] += 1
     weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
@@ -193,11 +176,10 @@ def set_weights(head, ids, weights, of_edges):  # type: ignore[no-untyped-def]
     for m in range(len(ids)):
         entry = rows.entry_of(head, ids[m], of_edges)
         weigh(head, entry, max(weights[m], 0.0))
-        after = (tb.edge_i(head)[entry, tb.NEXT_I:] if of_edges
-                 else tb.observed_i(head)[-1 - entry, tb.OBS_NEXT:])
-        if weights[m] == DROPPED and after[0] != tb.LEAVES:
+        row = factors.rows_of(head, entry)[1]
+        if weights[m] == DROPPED and row[tb.NEXT_I] != tb.LEAVES:
             transaction_log.log_constraint(head, entry)
-            after[0] = tb.LEAVES
+            row[tb.NEXT_I] = tb.LEAVES
             head[tb.N_LEAVING] += 1
 
 
@@ -209,15 +191,10 @@ def measure_edges(head, edges, means, informations):  # type: ignore[no-untyped-
         f, kind, _, _, _ = factors.parts(head, e)
         weight = f[tb.WEIGHT]
         transaction_log.log_constraint(head, e)
-        if weight > 0.0:
-            _touch_ends(head, e)
-            rows.scale_by(head, e, -weight)
-            tb.scalars(head)[tb.CHI2] -= f[tb.ENERGY]
+        weigh(head, e, 0.0)
         rows.write_measurement(f, means[m], informations[m])
         factors.prepare(f, kind)
-        if weight > 0.0:
-            rows.scale_by(head, e, weight)
-            _evaluate(head, e)
+        weigh(head, e, weight)
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, FLAG))
@@ -233,38 +210,39 @@ def set_fixed(head, nodes, fixed):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _lengths_agree(n, mean, information, kind, weight):  # type: ignore[no-untyped-def]
-    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and len(kind) == n
-            and len(weight) == n)
+def _lengths_agree(columns):  # type: ignore[no-untyped-def]
+    i, j, mean, information, kind, weight, bias, k = columns
+    n = len(i)
+    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and bias.shape == (n, 4)
+            and len(j) == n and len(kind) == n and len(weight) == n and len(k) == n)
 
 
-@kernel(signature=(
-    tb.HEAD, ROWS, ROWS, BYTES, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS,
-    INTEGERS, INTEGERS, ROWS, ROWS, MATRICES, BYTES, NUMBERS, FLAG))
+_COLUMNS = (INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS, ROWS, INTEGERS)
+
+
+@kernel(signature=(tb.HEAD, ROWS, ROWS, BYTES, *_COLUMNS, *_COLUMNS, FLAG))
 def add_rows(  # type: ignore[no-untyped-def]
     head, hidden, others, types, i, j, mean, information, kind, weight, bias, k,
-    node, offset, observed_mean, observed_information, observed_kind, observed_weight, checked,
+    node, to, observed_mean, observed_information, observed_kind, observed_weight, offset, third,
+    checked,
 ):
     """
     Return ADDED after adding hidden nodes, edges and observed nodes, all of them, or why none.
 
     NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and
     `checks.check` has not accepted them (`checked`). `others` are values of new nodes that are no
-    poses, with their NODE_TYPEs; from i to k and from `node` on the columns of `Edges` and of
-    `ObservedNodes` follow.
+    poses, with their NODE_TYPEs; the columns of edges follow, and of observed nodes as edges.
     """
+    edges = i, j, mean, information, kind, weight, bias, k
+    observed = (node, to, observed_mean, observed_information, observed_kind, observed_weight,
+                offset, third)
     first = head[tb.N_NODES]
     first_other = first + len(hidden)
     n_nodes = first_other + len(others)
     n_edges = head[tb.N_EDGES] + len(i)
     n_observed = head[tb.N_OBSERVED] + len(node)
     if (hidden.shape[1] != 3 or others.shape[1] != 3 or len(types) != len(others)
-            or len(j) != len(i) or len(k) != len(i)
-            or not _lengths_agree(len(i), mean, information, kind, weight)
-            or bias.shape != (len(i), 4)
-            or offset.shape != (len(node), 3)
-            or not _lengths_agree(len(node), observed_mean, observed_information, observed_kind,
-                                  observed_weight)):
+            or not _lengths_agree(edges) or not _lengths_agree(observed)):
         return UNSOUND
     if (n_nodes + head[tb.N_PRIORS] > head[tb.NODE_ROOM] or n_edges > head[tb.EDGE_ROOM]
             or n_observed > head[tb.OBSERVED_ROOM]):
@@ -272,20 +250,16 @@ def add_rows(  # type: ignore[no-untyped-def]
     # rows behind the ends are not part of the graph yet
     valid = rows.write_nodes(head, first, hidden)
     valid = rows.write_nodes(head, first_other, others) and valid
-    valid = rows.write_edges(head, n_nodes, first_other, types, i, j, mean, information, kind,
-                             weight, bias, k) and valid
-    valid = rows.write_observed(
-        head, n_nodes, first_other, types, node, offset, observed_mean, observed_information,
-        observed_kind, observed_weight) and valid
+    valid = rows.write_rows(head, True, n_nodes, first_other, types, edges) and valid
+    valid = rows.write_rows(head, False, n_nodes, first_other, types, observed) and valid
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
     _start_nodes(head, first, first_other, types)
-    first, head[tb.N_EDGES] = head[tb.N_EDGES], n_edges
-    for e in range(first, n_edges):
+    head[tb.N_EDGES], head[tb.N_OBSERVED] = n_edges, n_observed
+    for e in range(n_edges - len(i), n_edges):
         _start(head, e)
-    first, head[tb.N_OBSERVED] = head[tb.N_OBSERVED], n_observed
-    for row in range(first, n_observed):
+    for row in range(n_observed - len(node), n_observed):
         _start(head, -1 - row)
     return ADDED
 
@@ -303,12 +277,8 @@ def restart(head):  # type: ignore[no-untyped-def]
         node_i[v, tb.CLIQUE] = -1
         node_i[v, tb.TOUCHED] = 0
         touch(head, v)
-    for e in range(head[tb.N_EDGES]):
-        tb.edge_i(head)[e, tb.EDGE_WAITS] = 0
-        if tb.edge_f(head)[e, tb.WEIGHT] > 0.0:
-            _evaluate(head, e)
-    for k in range(head[tb.N_OBSERVED]):
-        tb.observed_i(head)[k, tb.OBS_WAITS] = 0
-        if tb.observed_f(head)[k, tb.WEIGHT] > 0.0:
-            _evaluate(head, -1 - k)
+    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
+        factors.rows_of(head, entry)[1][tb.EDGE_WAITS] = 0
+        if factors.is_used(head, entry):
+            _evaluate(head, entry)
     prior_rows.add_energies(head)

@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.graph.factors import model, OBSERVED, prepare, wrap
+from pose_graph_ros.core.graph.factors import model, OBSERVED, prepare
 
 
 def edge_errors(poses: Poses, edges: Edges) -> FloatArray:
@@ -25,17 +26,21 @@ def edge_errors(poses: Poses, edges: Edges) -> FloatArray:
 
     They are in the frames of the measured poses, those of edges to a bias in map axes.
     """
-    error = np.empty((len(edges), 3))
-    _edge_errors(*map(_writable, (
-        poses, edges.i, edges.j, edges.k, edges.mean, edges.kind, edges.bias)), error)
-    return error
+    return _errors(poses, edges.i, edges.j, edges.k, edges.mean, edges.kind, edges.bias)
 
 
 def observed_errors(poses: Poses, observed: ObservedNodes) -> FloatArray:
     """Return the errors (3.52) of observed nodes, in their frames, as `edge_errors`."""
-    error = np.empty((len(observed), 3))
-    _observed_errors(*map(_writable, (
-        poses, observed.node, observed.offset, observed.mean)), error)
+    edges = observed.as_edges
+    error = -_errors(poses, edges.i, edges.i, edges.k, edges.mean,
+                     np.full(len(edges), OBSERVED, np.uint8), edges.bias)
+    error[:, 2] = se2.wrap(error[:, 2])
+    return error
+
+
+def _errors(*columns: npt.NDArray[Any]) -> FloatArray:
+    error = np.empty((len(columns[1]), 3))
+    _write_errors(*map(_writable, columns), error)
     return error
 
 
@@ -54,23 +59,13 @@ def write_data(f, kind, mean, bias):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS), allocates=True)
-def _edge_errors(poses, i, j, k, mean, kind, bias, error):  # type: ignore[no-untyped-def]
+def _write_errors(poses, i, j, k, mean, kind, bias, error):  # type: ignore[no-untyped-def]
     f = np.empty(tb.EDGE_F)
     for e in range(len(i)):
         write_data(f, kind[e], mean[e], bias[e])
         third = bias[e, 3] * poses[k[e], 0] if k[e] >= 0 else 0.0
         error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
             f, kind[e], poses[i[e]], poses[j[e]], third)
-
-
-@kernel(signature=(ROWS, INTEGERS, ROWS, ROWS, ROWS), allocates=True)
-def _observed_errors(poses, node, offset, mean, error):  # type: ignore[no-untyped-def]
-    f = np.empty(tb.OBS_F)
-    for k in range(len(node)):
-        for m in range(3):
-            f[tb.MEAN + m], f[tb.OFFSET + m] = mean[k, m], offset[k, m]
-        x, y, th, _, _, _, _ = model(f, OBSERVED, poses[node[k]], poses[node[k]], 0.0)
-        error[k, 0], error[k, 1], error[k, 2] = -x, -y, wrap(-th)
 
 
 def energies(error: FloatArray, information: FloatArray) -> FloatArray:

@@ -117,14 +117,26 @@ def rotation(f, kind, heading):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
+def rows_of(head, entry):  # type: ignore[no-untyped-def]
+    """Return the rows of floats and of integers of a constraint."""
+    if entry >= 0:
+        return tb.edge_f(head)[entry], tb.edge_i(head)[entry]
+    return tb.observed_f(head)[-1 - entry], tb.observed_i(head)[-1 - entry]
+
+
+@kernel(forceinline=True)
+def is_used(head, entry):  # type: ignore[no-untyped-def]
+    """Tell whether a constraint has a weight."""
+    return rows_of(head, entry)[0][tb.WEIGHT] > 0.0
+
+
+@kernel(forceinline=True)
 def parts(head, entry):  # type: ignore[no-untyped-def]
     """Return row, kind, and ends i, j and k of a constraint; i = j where a node is observed."""
+    f, row = rows_of(head, entry)
     if entry >= 0:
-        row = tb.edge_i(head)[entry]
-        return (tb.edge_f(head)[entry], row[tb.EDGE_KIND],
-                row[tb.END_I], row[tb.END_J], row[tb.END_K])
-    v = tb.observed_i(head)[-1 - entry, tb.OBS_NODE]
-    return tb.observed_f(head)[-1 - entry], np.int32(OBSERVED), v, v, np.int32(-1)
+        return f, row[tb.EDGE_KIND], row[tb.END_I], row[tb.END_J], row[tb.END_K]
+    return f, np.int32(OBSERVED), row[tb.END_I], row[tb.END_I], np.int32(-1)
 
 
 @kernel(forceinline=True)

@@ -64,10 +64,11 @@ class Graph(GraphContents):
         if edits:
             self._check_edits(update)
         others = checks.other_nodes(update.biases, update.dimensions, update.landmarks)
-        columns: tuple[npt.NDArray[Any], ...] = (
-            update.hidden, *others, *update.edges.columns, *update.observed.columns)
+        columns: tuple[npt.NDArray[Any], ...] = ()
         checked = False
         try:
+            columns = (update.hidden, *others, *update.edges.columns,
+                       *update.observed.as_edges.columns)
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
             code = editing.UNSOUND  # arrays of types that the kernel is not compiled for
@@ -98,8 +99,6 @@ class Graph(GraphContents):
         checks.check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
         for measured in update.measure_edges:
             checks.check_ids('measure_edges', measured.ids.tolist(), 'edge', edges)
-            checks.check_measured(measured.mean, measured.information, len(measured.ids))
-        checks.check_priors(update.priors, update.remove_nodes)
         for n, prior in enumerate(update.priors):
             checks.check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
 
@@ -146,7 +145,8 @@ class Graph(GraphContents):
         for table in (edges, observed):
             checks.check(table, kind, dimension, nodes)
         return tuple(np.array(column, order='C')
-                     for column in (hidden, *others, *edges.columns, *observed.columns))
+                     for column in (
+                         hidden, *others, *edges.columns, *observed.as_edges.columns))
 
     def ensure(self, n_nodes: int, n_edges: int, n_observed: int) -> None:
         """Make the tables and the transaction log large enough for a graph of this size."""

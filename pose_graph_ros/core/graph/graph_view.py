@@ -27,13 +27,10 @@ _OFFSET_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """Constraints as straight lines; the arrays are read-only copies."""
+    """Constraints as straight lines; the arrays are copies."""
 
     ends: FloatArray    # both ends of each line in the map, shape (M, 2, 2) [m]
     sigmas: FloatArray  # errors [sigma]
-
-    def __post_init__(self) -> None:
-        self.ends.flags.writeable = self.sigmas.flags.writeable = False
 
 
 NO_LINES = Lines(np.empty((0, 2, 2)), np.empty(0))
@@ -56,9 +53,9 @@ ALL_BELIEVED = DrawnRows()
 
 @dataclass(frozen=True, slots=True)
 class GraphView:
-    """Immutable view of a graph for display."""
+    """View of a graph for display, which does not change with it."""
 
-    nodes: Points   # hidden nodes in the map without biases, read-only
+    nodes: Points   # hidden nodes in the map without biases
     odometry: Lines         # from node to node, as the loop closures
     loop_closures: Lines
     # measured positions (of an antenna, or the robot), from the predicted to the measured one
@@ -68,9 +65,6 @@ class GraphView:
     waiting: Lines = NO_LINES
     doubted: Lines = NO_LINES
     unused: Lines = NO_LINES    # measured positions that are not in the estimate
-
-    def __post_init__(self) -> None:
-        self.nodes.flags.writeable = False
 
 
 def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
@@ -94,23 +88,18 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
         for rows in (rows_of(np.array(part, dtype=np.int64)),))
     in_graph[weak] = in_graph[doubted] = False
     # a measurement with a time-correlated error is an edge to a bias
-    biased = np.flatnonzero(
-        (kinds == EdgeKind.BIAS) & edges.tells_position & ~is_bias[edges.integers[:, tb.END_I]])
-    seen = np.flatnonzero(
-        observed.tells_position & ~is_bias[observed.integers[:, tb.OBS_NODE]])
+    biased, seen = (np.flatnonzero(
+        of_kind & table.tells_position & ~is_bias[table.integers[:, tb.END_I]])
+        for of_kind, table in ((kinds == EdgeKind.BIAS, edges), (True, observed)))
     return GraphView(
         nodes=positions.take(np.flatnonzero(~is_bias), axis=0),
         odometry=lines(np.flatnonzero(in_graph & (kinds == EdgeKind.ODOMETRY))),
         loop_closures=lines(np.flatnonzero(in_graph & (kinds == EdgeKind.LOOP_CLOSURE))),
         observed=_measured(graph, tables, biased, seen), weak=lines(weak),
         waiting=lines(waiting), doubted=lines(doubted),
-        unused=_measured(graph, tables, _positions_in(edges, unused_edges),
-                         _positions_in(observed, unused_observed)))
-
-
-def _positions_in(table: 'ConstraintTable', rows: IntArray) -> IntArray:
-    """Return those rows of a table that measure positions."""
-    return rows[table.numbers[rows, tb.INFO] > 0.0]
+        unused=_measured(graph, tables, *(
+            rows[table.numbers[rows, tb.INFO] > 0.0]
+            for table, rows in zip(tables, (unused_edges, unused_observed), strict=True))))
 
 
 def _measured(
@@ -118,14 +107,12 @@ def _measured(
     seen: IntArray,
 ) -> Lines:
     """Return measured positions, given the rows of edges to biases and of observed nodes."""
-    edges, observed = tables
-    nodes = np.concatenate((
-        observed.integers[seen, tb.OBS_NODE], edges.integers[biased, tb.END_I]))
-    offsets, measured = np.concatenate((observed.numbers[seen], edges.numbers[biased]))[
-        :, _OFFSET_AND_MEAN].reshape(-1, 2, 2).swapaxes(0, 1)
+    nodes, numbers, sigmas = map(np.concatenate, zip(*(
+        (table.integers[rows, tb.END_I], table.numbers[rows], table.sigmas[rows])
+        for table, rows in zip(tables[::-1], (seen, biased), strict=True)), strict=True))
+    offsets, measured = numbers[:, _OFFSET_AND_MEAN].reshape(-1, 2, 2).swapaxes(0, 1)
     predicted = se2.transform(graph.poses[nodes], offsets)
-    return Lines(np.stack((predicted, measured), axis=1),
-                 np.concatenate((observed.sigmas[seen], edges.sigmas[biased])))
+    return Lines(np.stack((predicted, measured), axis=1), sigmas)
 
 
 class ConstraintTable(NamedTuple):

@@ -88,13 +88,6 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     """
     node_f, nodes, row = tb.node_f(head), _nodes(head, c), tb.clique_i(head)[c]
     reference = tb.pool_f(head)[_references(row):]
-    if not turns(head, c):
-        for k in range(len(nodes)):
-            f, i = node_f[nodes[k]], 3 * k
-            d[i], d[i + 1] = f[tb.POSE] - reference[i], f[tb.POSE + 1] - reference[i + 1]
-            d[i + 2] = wrap(f[tb.POSE + 2] - reference[i + 2])
-            r[i] = r[i + 1] = r[i + 2] = 0.0
-        return
     cos, sin = math.cos(phi), math.sin(phi)
     first = node_f[nodes[0]]
     turn = wrap(first[tb.POSE + 2] - reference[2])
@@ -103,6 +96,7 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
     px = reference[0] if anchored else first[tb.POSE]
     py = reference[1] if anchored else first[tb.POSE + 1]
     tangent = 1.0 if anchored else 0.0
+    turning = 1.0 if turns(head, c) else 0.0
     for k in range(len(nodes)):
         f, i = node_f[nodes[k]], 3 * k
         dx, dy = f[tb.POSE] - px, f[tb.POSE + 1] - py
@@ -111,7 +105,8 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
         d[i], d[i + 1] = x - rx - tangent * phi * ry, y - ry + tangent * phi * rx
         d[i + 2] = (turn - (1.0 - tangent) * phi
                     + wrap(f[tb.POSE + 2] - reference[i + 2] - turn))
-        r[i], r[i + 1], r[i + 2] = tangent * ry - y, x - tangent * rx, 1.0 - tangent
+        r[i], r[i + 1] = turning * (tangent * ry - y), turning * (x - tangent * rx)
+        r[i + 2] = 1.0 - tangent
 
 
 @kernel
@@ -300,47 +295,27 @@ def all_priors(head):  # type: ignore[no-untyped-def]
     return found[:n]
 
 
-@kernel
-def _move(head, row, nodes, values, back):  # type: ignore[no-untyped-def]
-    """Copy nodes and numbers of a prior out of the pools, or back; return how many."""
-    n, size = row[tb.N_SEPARATOR], pools.n_values(0, row[tb.N_SEPARATOR])
-    of_nodes = tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + n]
-    of_values = tb.pool_f(head)[row[tb.VALUES]:row[tb.VALUES] + size]
-    if back:
-        copied(nodes, of_nodes)
-        copied(values, of_values)
-    else:
-        copied(of_nodes, nodes[:n])
-        copied(of_values, values[:size])
-    return n, size
-
-
 @kernel(allocates=True)
 def remove_cliques(head):  # type: ignore[no-untyped-def]
     """Remove all cliques but the priors, which become loose and take the first rows."""
     clique_i, clique_f, priors = tb.clique_i(head), tb.clique_f(head), all_priors(head)
     rows, numbers = clique_i[priors], clique_f[priors]
-    n_nodes = n_values = 0
-    for row in rows:
-        n_nodes += row[tb.N_SEPARATOR]
-        n_values += pools.n_values(0, row[tb.N_SEPARATOR])
-    nodes, values = np.empty(n_nodes, np.int32), np.empty(n_values)
-    n_nodes = n_values = 0
-    for row in rows:
-        n, size = _move(head, row, nodes[n_nodes:], values[n_values:], False)
-        n_nodes, n_values = n_nodes + n, n_values + size
+    kept = 1 if len(priors) > 0 else 0
+    nodes = tb.pool_i(head)[:kept * head[tb.POOL_I_END]].copy()
+    values = tb.pool_f(head)[:kept * head[tb.POOL_F_END]].copy()
     head[tb.N_CLIQUES] = head[tb.POOL_F_END] = head[tb.POOL_I_END] = 0
     head[tb.FREE_CLIQUE] = head[tb.LOOSE] = -1
     head[tb.FREE_F:] = -1
     head[tb.N_PRIORS] = head[tb.N_FREED] = 0
     end = head[tb.LOG_I_END]
-    n_nodes = n_values = 0
     for k in range(len(rows)):
-        c = transaction_log.take_clique(head, 0, rows[k, tb.N_SEPARATOR])
-        n, size = _move(head, clique_i[c], nodes[n_nodes:], values[n_values:], True)
-        n_nodes, n_values = n_nodes + n, n_values + size
-        clique_i[c, tb.ANCHORED] = rows[k, tb.ANCHORED]
-        f, before = clique_f[c], numbers[k]
+        old, before = rows[k], numbers[k]
+        c = transaction_log.take_clique(head, 0, old[tb.N_SEPARATOR])
+        at, size = clique_i[c, tb.VALUES], pools.n_values(0, old[tb.N_SEPARATOR])
+        copied(nodes[old[tb.NODES]:], _nodes(head, c))
+        copied(values[old[tb.VALUES]:], tb.pool_f(head)[at:at + size])
+        clique_i[c, tb.ANCHORED] = old[tb.ANCHORED]
+        f = clique_f[c]
         f[tb.TURN_SEEN] = f[tb.DRIFT] = 0.0
         f[tb.PRIOR_ENERGY], f[tb.SLIP_SCALE] = before[tb.PRIOR_ENERGY], before[tb.SLIP_SCALE]
         make_loose(head, c)

@@ -83,14 +83,14 @@ def compact(memory: tb.Memory) -> Left:
     head = memory.head
     if head[tb.N_LEAVING] == 0:
         return NOTHING_LEFT
-    node_i, edge_i, observed_i = _rows_in_use(memory)
+    node_i, *tables = _rows_in_use(memory)
     stays = node_i[:, tb.EDGE_LIST] != tb.LEAVES
-    with_ends = np.append(stays, True)[edge_i[:, tb.END_I:tb.END_K + 1]]  # -1: no third node
+    with_ends = np.append(stays, True)  # -1: no such end
     gone, moved = zip(*(_moved_up(memory, name, counter, which) for name, counter, which in (
-        ('node', tb.N_NODES, stays),
-        ('edge', tb.N_EDGES, (edge_i[:, tb.NEXT_I] != tb.LEAVES) & np.all(with_ends, axis=1)),
-        ('observed', tb.N_OBSERVED, (observed_i[:, tb.OBS_NEXT] != tb.LEAVES)
-         & stays[observed_i[:, tb.OBS_NODE]]))), strict=True)
+        ('node', tb.N_NODES, stays), *((name, counter, (table[:, tb.NEXT_I] != tb.LEAVES) & np.all(
+            with_ends[table[:, tb.END_I:tb.END_K + 1]], axis=1)) for name, counter, table in zip(
+                ('edge', 'observed'), (tb.N_EDGES, tb.N_OBSERVED), tables, strict=True)))),
+        strict=True)
     _rewrite_rows(memory, *moved)
     _rewrite_lists(memory, *moved)
     head[tb.N_LEAVING] = 0
@@ -126,16 +126,15 @@ def _rewrite_rows(
     def entries(old: npt.NDArray[np.int32]) -> IntArray:
         return np.where(old >= 0, 4 * edges[old >> 2] + (old & 3), -1)
 
-    node_i[:, tb.EDGE_LIST] = entries(node_i[:, tb.EDGE_LIST])
-    node_i[:, tb.OBSERVED_LIST] = observed[node_i[:, tb.OBSERVED_LIST]]
-    ends, after = edge_i[:, tb.END_I:tb.END_K + 1], edge_i[:, tb.NEXT_I:tb.NEXT_K + 1]
-    ends[:] = nodes[ends]
-    observed_i[:, tb.OBS_NODE] = nodes[observed_i[:, tb.OBS_NODE]]
-    # those without a weight are in no list
-    listed = (memory['edge_f'][:len(ends), tb.WEIGHT] > 0.0)[:, None] & (ends >= 0)
-    after[listed] = entries(after[listed])
-    seen = memory['observed_f'][:len(observed_i), tb.WEIGHT] > 0.0
-    observed_i[seen, tb.OBS_NEXT] = observed[observed_i[seen, tb.OBS_NEXT]]
+    for column, name, table, renumbered in (
+            (tb.EDGE_LIST, 'edge_f', edge_i, entries),
+            (tb.OBSERVED_LIST, 'observed_f', observed_i, observed.__getitem__)):
+        node_i[:, column] = renumbered(node_i[:, column])
+        ends, after = table[:, tb.END_I:tb.END_K + 1], table[:, tb.NEXT_I:tb.NEXT_K + 1]
+        ends[:] = nodes[ends]
+        # those without a weight are in no list
+        listed = (memory[name][:len(ends), tb.WEIGHT] > 0.0)[:, None] & (ends >= 0)
+        after[listed] = renumbered(after[listed])
 
 
 def _rewrite_lists(

@@ -30,10 +30,11 @@ correlated.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Annotated, assert_never, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, assert_never, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import Loss
@@ -107,51 +108,51 @@ class SavedLosses:
     cursor: int         # index of the older constraint that is reweighted next
 
 
-@dataclass
+# Id of a constraint, index of its loss in `Loss`, its threshold [sigma], and its base weight.
+_ROW = np.dtype([('id', 'i8'), ('loss', 'i8'), ('threshold', 'f8'), ('base', 'f8')])
+
+
 class _Rows:
     """Constraints of one table that have a robust loss, in the order in which they were added."""
 
-    edges: bool     # else they are observed nodes
-    ids: GrowingArray = field(default_factory=lambda: GrowingArray((), np.int64))   # ascending
-    # index of the loss in `Loss`, and its threshold [sigma]
-    losses: GrowingArray = field(default_factory=lambda: GrowingArray((2,), np.float64))
-    base_weights: GrowingArray = field(default_factory=lambda: GrowingArray((), np.float64))
-    cursor: int = 0     # index of the older constraint that is reweighted next
+    def __init__(self, *, edges: bool) -> None:
+        self._edges = edges     # else they are observed nodes
+        self.table = GrowingArray((), _ROW)     # ids ascend
+        self.cursor = 0     # index of the older constraint that is reweighted next
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        column: npt.NDArray[Any] = self.table.values[name]
+        return column
 
     def saved(self) -> SavedLosses:
-        losses = self.losses.values
-        return SavedLosses(
-            self.ids.values.copy(), losses[:, 0].astype(np.int64), losses[:, 1].copy(),
-            self.base_weights.values.copy(), self.cursor)
+        ids, losses, thresholds, base = (
+            self[name].copy() for name in ('id', 'loss', 'threshold', 'base'))
+        return SavedLosses(ids, losses, thresholds, base, self.cursor)
 
     def restore(self, saved: SavedLosses) -> None:
-        self.ids.append(saved.rows)
-        self.losses.append(np.column_stack((saved.losses, saved.thresholds)))
-        self.base_weights.append(saved.shares)
+        rows = np.empty(len(saved.rows), _ROW)
+        rows['id'], rows['loss'] = saved.rows, saved.losses
+        rows['threshold'], rows['base'] = saved.thresholds, saved.shares
+        self.table.append(rows)
         self.cursor = saved.cursor
-
-    def add(self, number: int, loss: IntArray | tuple[int, float], base_weight: float) -> None:
-        self.ids.append_one(number)
-        self.losses.append_one(loss)
-        self.base_weights.append_one(base_weight)
 
     def index(self, number: int) -> int:
         """Return the index of a constraint by its id, -1 if it was not added."""
-        at = int(np.searchsorted(self.ids.values, number))
-        return at if at < len(self.ids) and self.ids.values[at] == number else -1
+        at = int(np.searchsorted(self['id'], number))
+        return at if at < len(self) and self['id'][at] == number else -1
 
     def forget(self, ids: IntArray) -> None:
-        gone = np.isin(self.ids.values, ids)
-        if not np.any(gone):
-            return
-        self.cursor -= int(np.count_nonzero(gone[:self.cursor]))
-        kept = np.flatnonzero(~gone)
-        for column in (self.ids, self.losses, self.base_weights):
-            column.select(kept)
+        gone = np.isin(self['id'], ids)
+        if np.any(gone):
+            self.cursor -= int(np.count_nonzero(gone[:self.cursor]))
+            self.table.select(np.flatnonzero(~gone))
 
     def some(self) -> IntArray:
         """Return the indices of the newest ones and, in turn, of some older ones."""
-        size = len(self.ids)
+        size = len(self)
         begin = max(size - TUNING.window, 0)
         if begin == 0:
             return np.arange(size)
@@ -165,25 +166,26 @@ class _Rows:
         """Return the new weights of indexed constraints that change by more than `least`."""
         if len(index) == 0:
             return {}
-        ids = self.ids.values[index]
+        ids = self['id'][index]
         energy, weight = self.energies(graph, ids)
         wanted = np.empty(len(index))
         for loss, threshold, chosen in self.groups(index):
             _, wanted[chosen] = costs_and_weights(loss, energy[chosen], widened * threshold)
-        wanted *= self.base_weights.values[index]
+        wanted *= self['base'][index]
         changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
         return dict(zip(ids[changed].tolist(), wanted[changed].tolist(), strict=True))
 
     def groups(self, index: IntArray) -> list[tuple[Loss, float, IntArray]]:
         """Return each pair of loss and threshold with the positions in `index` that have it."""
-        kinds, which = np.unique(self.losses.values[index], axis=0, return_inverse=True)
-        return [(_LOSSES[int(kind)], float(threshold), np.flatnonzero(which.ravel() == k))
-                for k, (kind, threshold) in enumerate(kinds)]
+        kinds, which = np.unique(
+            self.table.values[['loss', 'threshold']][index], return_inverse=True)
+        return [(_LOSSES[kind], threshold, np.flatnonzero(which == k))
+                for k, (kind, threshold) in enumerate(kinds.tolist())]
 
     def energies(self, graph: Graph, ids: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return unweighted energies and weights of constraints."""
         some: Edges | ObservedNodes
-        if self.edges:
+        if self._edges:
             some = graph.edges_at(ids)
             errors = graph.edge_errors(some)
         else:
@@ -199,7 +201,7 @@ class Reweighting:
         self._edges, self._observed = self._tables = _Rows(edges=True), _Rows(edges=False)
 
     def __len__(self) -> int:
-        return sum(len(table.ids) for table in self._tables)
+        return sum(map(len, self._tables))
 
     def forget(self, edges: IntArray, observed: IntArray) -> None:
         """Forget constraints that have left the graph."""
@@ -216,7 +218,7 @@ class Reweighting:
         Its id must be above those of its kind that were added before.
         """
         if loss is not Loss.NONE:
-            self._table(edge=edge).add(number, (_LOSSES.index(loss), threshold), 1.0)
+            self._table(edge=edge).table.append_one((number, _LOSSES.index(loss), threshold, 1.0))
 
     def move(self, number: int, to: int, *, edge: bool, to_edge: bool) -> None:
         """
@@ -229,15 +231,14 @@ class Reweighting:
         if at < 0:
             return
         if at_new < 0:
-            at_new = len(new.ids)
-            new.add(to, old.losses.values[at], 0.0)
-        new.base_weights.values[at_new] = old.base_weights.values[at]
-        old.base_weights.values[at] = 0.0
+            at_new = len(new)
+            new.table.append_one((to, old['loss'][at], old['threshold'][at], 0.0))
+        new['base'][at_new] = old['base'][at]
+        old['base'][at] = 0.0
 
     def scale_base_weights(self, ids: IntArray, factor: float) -> None:
         """Multiply the base weights of edges, where they have a loss."""
-        table = self._edges
-        table.base_weights.values[np.isin(table.ids.values, ids)] *= factor
+        self._edges['base'][np.isin(self._edges['id'], ids)] *= factor
 
     def knows(self, number: int, *, edge: bool) -> bool:
         """Tell whether a constraint has a loss."""
@@ -246,24 +247,24 @@ class Reweighting:
     def base_weight(self, number: int) -> float | None:
         """Return the base weight of an observed node, by its id; None without a loss."""
         at = self._observed.index(number)
-        return float(self._observed.base_weights.values[at]) if at >= 0 else None
+        return float(self._observed['base'][at]) if at >= 0 else None
 
     def set_base_weight(self, number: int, weight: float, *, edge: bool = False) -> None:
         """Set the base weight of a constraint, if it was added."""
         table = self._table(edge=edge)
         at = table.index(number)
         if at >= 0:
-            table.base_weights.values[at] = weight
+            table['base'][at] = weight
 
     def base_weights(self) -> tuple[FloatArray, FloatArray]:
         """Return copies of the base weights of edges and of observed nodes."""
-        edges, observed = (table.base_weights.values.copy() for table in self._tables)
+        edges, observed = (table['base'].copy() for table in self._tables)
         return edges, observed
 
     def set_base_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
         """Set what `base_weights` has returned; nothing may have been added in between."""
         for table, values in zip(self._tables, weights, strict=True):
-            table.base_weights.values[:] = values
+            table['base'][:] = values
 
     def saved(self) -> tuple[SavedLosses, SavedLosses]:
         """Return the state of the edges and of the observed nodes."""
@@ -285,7 +286,7 @@ class Reweighting:
     def changes_of_part(self, graph: Graph, begin: int) -> Changes:
         """Return new weights for a refinement, of the constraints from an index on."""
         def of(table: _Rows) -> Mapping[int, float]:
-            size = len(table.ids)
+            size = len(table)
             part = (begin + np.arange(min(TUNING.part, size))) % max(size, 1)
             return table.changes(graph, part, least=TUNING.least_refined)
 
@@ -294,21 +295,20 @@ class Reweighting:
     def all_changes(self, graph: Graph, widened: float = 1.0) -> Changes:
         """Return the new weights of all constraints whose weight changes."""
         return self._each(lambda table: table.changes(
-            graph, np.arange(len(table.ids)), widened=widened))
+            graph, np.arange(len(table)), widened=widened))
 
     def all_alike(self, weight: float) -> Changes:
         """Return the base weights of all times a weight; 1 makes it plain least squares."""
         return self._each(lambda table: dict(zip(
-            table.ids.values.tolist(), (weight * table.base_weights.values).tolist(),
-            strict=True)))
+            table['id'].tolist(), (weight * table['base']).tolist(), strict=True)))
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""
         total = 0.0
         for table in self._tables:
-            energy, weight = table.energies(graph, table.ids.values)
-            for loss, threshold, chosen in table.groups(np.arange(len(table.ids))):
+            energy, weight = table.energies(graph, table['id'])
+            for loss, threshold, chosen in table.groups(np.arange(len(table))):
                 costs, _ = costs_and_weights(loss, energy[chosen], threshold)
-                total += float(np.sum(table.base_weights.values[chosen] * costs
+                total += float(np.sum(table['base'][chosen] * costs
                                       - weight[chosen] * energy[chosen]))
         return total

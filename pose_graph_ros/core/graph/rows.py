@@ -153,9 +153,9 @@ def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_edge(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
-    """Write an edge; return whether it is valid, its nodes, kind and bias apart."""
-    f, row = tb.edge_f(head)[e], tb.edge_i(head)[e]
+def write_row(head, entry, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    """Write a constraint; return whether it is valid, its nodes, kind and offset apart."""
+    f, row = factors.rows_of(head, entry)
     row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.EDGE_KIND] = i, j, -1, kind
     f[tb.WEIGHT] = weight
     valid = _is_finite(weight) and weight >= 0.0 and i != j
@@ -175,7 +175,7 @@ def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
 
 @kernel
 def _node(head, v, first_other, types):  # type: ignore[no-untyped-def]
-    """Return kind and dimension of a node, new ones as in `write_edges`; _NO_NODE, 0 for -1."""
+    """Return kind and dimension of a node, new ones as in `write_rows`; _NO_NODE, 0 for -1."""
     if v < 0:
         return _NO_NODE, 0
     if v < head[tb.N_NODES]:
@@ -196,31 +196,34 @@ def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_edges(  # type: ignore[no-untyped-def]
-    head, n_nodes, first_other, types, i, j, mean, information, kind, weight, bias, third,
-):
+def write_rows(head, of_edges, n_nodes, first_other, types, columns):  # type: ignore[no-untyped-def]
     """
-    Write new edges behind the last row; return whether all are valid.
+    Write new constraints, columns of `Edges`, behind the last row; return whether all are valid.
 
-    The graph will have n_nodes nodes, those from row `first_other` on with these NODE_TYPEs.
+    Observed nodes are edges to -1, with their own kinds. The graph will have n_nodes nodes, those
+    from row `first_other` on with these NODE_TYPEs.
     """
+    i, j, mean, information, kind, weight, bias, third = columns
     valid = True
     for k in range(len(i)):
-        e = head[tb.N_EDGES] + k
-        a, b, c = node_row(head, i[k]), node_row(head, j[k]), -1
-        if third[k] != -1:
-            c = node_row(head, third[k])
-            valid = valid and c >= 0
-        valid = write_edge(
-            head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
-        f = tb.edge_f(head)[e]
-        tb.edge_i(head)[e, tb.END_K] = c
+        entry = head[tb.N_EDGES] + k if of_edges else -1 - head[tb.N_OBSERVED] - k
+        a, b, c = node_row(head, i[k]), node_row(head, j[k]), node_row(head, third[k])
+        valid = write_row(
+            head, entry, a, b, mean[k], information[k], kind[k], weight[k]) and valid
+        f, row = factors.rows_of(head, entry)
+        row[tb.END_K] = c
         f[tb.OFFSET], f[tb.OFFSET + 1] = bias[k, 0], bias[k, 1]
         f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
         for m in range(4):
             valid = _is_finite(bias[k, m]) and valid
-        valid = (valid and 0 <= a < n_nodes and 0 <= b < n_nodes and c < n_nodes
-                 and kind[k] < len(_ROWS))
+        valid = (valid and 0 <= a < n_nodes and b < n_nodes and c < n_nodes
+                 and (c >= 0 or third[k] == -1))
+        if not of_edges:
+            dimension = _node(head, a, first_other, types)[1] if valid else 0
+            valid = valid and kind[k] in _OBSERVED_KINDS and (
+                dimension == 3 or _has_rows_only(f, (1 << dimension) - 1, False))
+            continue
+        valid = valid and b >= 0 and kind[k] < len(_ROWS)
         if valid:
             ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
                     _node(head, c, first_other, types))
@@ -231,24 +234,4 @@ def write_edges(  # type: ignore[no-untyped-def]
                     f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
             elif kind[k] > factors.BIAS:
                 valid = valid and _has_rows_only(f, _ROWS[kind[k]], True)
-    return valid
-
-
-@kernel
-def write_observed(  # type: ignore[no-untyped-def]
-    head, n_nodes, first_other, types, node, offset, mean, information, kind, weight,
-):
-    """Write new observed nodes behind the last row, as `write_edges`."""
-    valid = True
-    for k in range(len(node)):
-        at, v = head[tb.N_OBSERVED] + k, node_row(head, node[k])
-        f, row = tb.observed_f(head)[at], tb.observed_i(head)[at]
-        row[tb.OBS_NODE], row[tb.OBS_KIND], f[tb.WEIGHT] = v, kind[k], weight[k]
-        valid = _copy_pose(f, tb.OFFSET, offset[k]) and valid
-        valid = write_measurement(f, mean[k], information[k]) and valid
-        valid = (valid and _is_finite(weight[k]) and weight[k] >= 0.0 and 0 <= v < n_nodes
-                 and kind[k] in _OBSERVED_KINDS)
-        if valid:
-            dimension = _node(head, v, first_other, types)[1]
-            valid = dimension == 3 or _has_rows_only(f, (1 << dimension) - 1, False)
     return valid

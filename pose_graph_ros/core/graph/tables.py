@@ -97,12 +97,11 @@ OFFSET, FACTOR_T, FACTOR_TH = OWN, LIN_COS, LIN_SIN
 # observed_f has the columns of edge_f, with the observed pose in the map for a mean, and
 #   OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]; it has no LIN_COS
 OBS_F = EDGE_F
-# observed_i
-#   OBS_NODE: hidden node that is observed
-#   OBS_NEXT: next entry of its list of observed nodes; LEAVES if `removal.compact` takes it out
+# observed_i has the columns of edge_i: the observed node is the only end, and
+#   OBS_NEXT: next row of its list of observed nodes
 #   OBS_KIND: `ObservedKind`
-#   OBS_WAITS, OBS_LOGGED: as EDGE_WAITS and EDGE_LOGGED
-OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = range(6)
+OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = (
+    END_I, NEXT_I, EDGE_KIND, EDGE_WAITS, EDGE_LOGGED, EDGE_I)
 # In place of a list's head or next entry: the row leaves the graph, and is in no list.
 LEAVES = -2
 
@@ -213,7 +212,7 @@ COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LI
 STAMPS: Final = {
     'node_i': (FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED),
     'edge_i': (EDGE_CHECKED, EDGE_LOGGED, ENERGY_LOGGED),
-    'observed_i': (OBS_LOGGED,),
+    'observed_i': (EDGE_CHECKED, EDGE_LOGGED, ENERGY_LOGGED),
     'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_LOGGED),
 }
 

@@ -12,12 +12,14 @@ the update began.
 
 from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.graph import pools, tables as tb
+from pose_graph_ros.core.graph.factors import rows_of
 
-# Kinds of entries of the log; an entry ends with its row (but for START) and its kind in log_i.
-NODE, EDGE, OBSERVED, CLIQUE, TAKEN_CLIQUE, SOLUTION, EDGE_ENERGY, START = range(8)
+# Kinds of entries of the log; an entry ends with its row (of constraints the entry, see `factors`;
+# none of START) and its kind in log_i.
+NODE, CONSTRAINT, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
 # Numbers of floats and of integers in the entries of each kind, but for START.
-_FLOATS = (tb.NODE_F, tb.EDGE_F, tb.OBS_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
-_INTEGERS = (tb.NODE_I, tb.EDGE_I, tb.OBS_I, tb.CLIQUE_I, 0, 0, 1)
+_FLOATS = (tb.NODE_F, tb.EDGE_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
+_INTEGERS = (tb.NODE_I, tb.EDGE_I, tb.CLIQUE_I, 0, 0, 1)
 # Counters in the first entry.
 STARTED_WITH = (
     tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST,
@@ -71,20 +73,15 @@ def log_energy(head, e):  # type: ignore[no-untyped-def]
     row = tb.edge_i(head)[e]
     if row[tb.EDGE_LOGGED] != head[tb.UPDATE] and row[tb.ENERGY_LOGGED] != head[tb.UPDATE]:
         row[tb.ENERGY_LOGGED] = head[tb.UPDATE]
-        _append(head, EDGE_ENERGY, e, tb.edge_f(head)[e, tb.ERROR2:tb.ENERGY + 1],
+        _append(head, ENERGY, e, tb.edge_f(head)[e, tb.ERROR2:tb.ENERGY + 1],
                 row[tb.EDGE_WAITS:tb.EDGE_WAITS + 1])
 
 
 @kernel
 def log_constraint(head, entry):  # type: ignore[no-untyped-def]
     """Log the row of a constraint, before it changes."""
-    if entry >= 0:
-        _log_row(head, EDGE, entry, tb.edge_f(head)[entry], tb.edge_i(head)[entry],
-                 tb.EDGE_LOGGED)
-    else:
-        k = -1 - entry
-        _log_row(head, OBSERVED, k, tb.observed_f(head)[k], tb.observed_i(head)[k],
-                 tb.OBS_LOGGED)
+    f, row = rows_of(head, entry)
+    _log_row(head, CONSTRAINT, entry, f, row, tb.EDGE_LOGGED)
 
 
 @kernel
@@ -225,7 +222,6 @@ def _restore_values(head, c, before):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD,))
 def rollback(head):  # type: ignore[no-untyped-def]
     """End an update: restore all rows logged since `begin`, the newest entry first."""
-    edge_f, edge_i = tb.edge_f(head), tb.edge_i(head)
     clique_i, log_f, log_i = tb.clique_i(head), tb.log_f(head), tb.log_i(head)
     end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
     while end_i > 0:
@@ -236,7 +232,7 @@ def rollback(head):  # type: ignore[no-untyped-def]
             break
         end_f -= _FLOATS[code]
         end_i -= 2 + _INTEGERS[code]
-        numbers, integers = edge_f[row, :0], edge_i[row, :0]
+        numbers, integers = log_f[:0], log_i[:0]
         if code == TAKEN_CLIQUE:
             if clique_i[row, tb.N_FRONTAL] >= 0:  # else the same update has given it back
                 give_clique(head, row)
@@ -244,13 +240,11 @@ def rollback(head):  # type: ignore[no-untyped-def]
             numbers, integers = tb.node_f(head)[row], tb.node_i(head)[row]
         elif code == SOLUTION:
             numbers = tb.node_f(head)[row, :tb.SCALE_T]
-        elif code == EDGE:
-            numbers, integers = edge_f[row], edge_i[row]
-        elif code == EDGE_ENERGY:
-            numbers = edge_f[row, tb.ERROR2:tb.ENERGY + 1]
-            integers = edge_i[row, tb.EDGE_WAITS:tb.EDGE_WAITS + 1]
-        elif code == OBSERVED:
-            numbers, integers = tb.observed_f(head)[row], tb.observed_i(head)[row]
+        elif code == CONSTRAINT:
+            numbers, integers = rows_of(head, row)
+        elif code == ENERGY:
+            numbers = tb.edge_f(head)[row, tb.ERROR2:tb.ENERGY + 1]
+            integers = tb.edge_i(head)[row, tb.EDGE_WAITS:tb.EDGE_WAITS + 1]
         else:
             _restore_values(head, row, log_i[end_i + tb.VALUES])
             numbers, integers = tb.clique_f(head)[row], clique_i[row]

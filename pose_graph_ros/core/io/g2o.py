@@ -44,9 +44,7 @@ are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge
 connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
-from bisect import bisect_left
-from dataclasses import dataclass
-import functools
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 from pathlib import Path
@@ -55,11 +53,12 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.exceptions import FileFormatError, GraphUpdateError
+from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.checks import check
+from pose_graph_ros.core.graph.checks import check, RowError, scaled
 from pose_graph_ros.core.graph.constraints import (
+    Constraints,
     EdgeKind,
     Edges,
     FACTORS,
@@ -81,15 +80,14 @@ if TYPE_CHECKING:
 
 # Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
-# Row and column of each of six numbers: of an upper triangle, and of the information in TORO.
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+# Row and column of each of the six numbers of the information in TORO.
 _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 # Kinds of edges to landmarks, that tell where the other end is.
 _TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKind.LANDMARK,)]
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
 _POINT = OWN_TAGS[EdgeKind.POINT]
 _EDGES = ('EDGE_SE2', 'EDGE', *AMBIGUOUS, *OWN_TAGS.values())
-_OBSERVED = ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET')
+OBSERVED = ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET')
 
 
 @dataclass
@@ -129,7 +127,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
 def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
     """Return the graph in the lines of a file, as `read_g2o` does."""
-    ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if tag in text.tags]
+    ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if len(text.rows[tag])]
     if edge2_order is None and len(ambiguous) > 0:
         line, tag = min(ambiguous)
         raise FileFormatError(
@@ -153,14 +151,16 @@ def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
     is_landmark = np.isin(ids, np.concatenate((
         points.ids[:, 0], *(rows[FACTORS[kind].tag].ids[:, 1] for kind in _TO_LANDMARKS))))
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
-    edges = Edges.joined([_edges(tag, rows[tag], ids, edge2_order) for tag in _EDGES])
-    observed = ObservedNodes.joined([_observed(tag, rows[tag], ids) for tag in _OBSERVED])
-    try:
-        check(edges, kind)
-        check(observed, kind)
-    except GraphUpdateError as error:
-        where, error = _first_refused(text, rows, ids, edge2_order, kind) or (text.path, error)
-        raise FileFormatError(f'{where}: {error}') from error
+    edges = _with_rows(Edges.joined(
+        [edges_of(tag, rows[tag], edge2_order) for tag in _EDGES]), ids)
+    observed = _with_rows(ObservedNodes.joined(
+        [observed_of(tag, rows[tag]) for tag in OBSERVED]), ids)
+    for table, tags in ((edges, _EDGES), (observed, OBSERVED)):
+        try:
+            check(table, kind)
+        except RowError as error:
+            line = np.concatenate([rows[tag].lines for tag in tags])[error.row]
+            raise FileFormatError(f'{text.where(line)}: {error}') from error
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
     poses[known] = vertices.numbers[first]
     if not np.all(known):
@@ -214,48 +214,47 @@ def _with_landmarks(
     return Lines.joined((rows[_POINT], Lines(ids, numbers, seen.lines))), notes
 
 
-def _edges(tag: str, lines: Lines, ids: IntArray, edge2_order: str | None) -> Edges:
-    """Return the edges of a tag, with rows for ends."""
-    ends, numbers = lines.ids, lines.numbers
-    i, j = np.searchsorted(ids, ends).T
-    for each, own in OWN_TAGS.items():
-        if tag == own:
-            size = len(FACTORS[each].rows)
-            mean, information = np.zeros((len(ends), 3)), np.zeros((len(ends), 3, 3))
-            mean[:, :size] = numbers[:, :size]
-            for column, (row, col) in enumerate(zip(*np.triu_indices(size), strict=True), size):
-                information[:, row, col] = information[:, col, row] = numbers[:, column]
-            return Edges(i, j, mean, information, np.full(len(ends), each))
+def edges_of(tag: str, lines: Lines, edge2_order: str | None = None) -> Edges:
+    """Return the edges of a tag; their ends are ids of the file."""
+    i, j = lines.ids.T
     order = {'EDGE': 'toro'}.get(tag, edge2_order if tag in AMBIGUOUS else None)
     # the next id; a difference could overflow
-    is_next = ends[:, 1] == ends[:, 0] + 1
-    kind = np.where(is_next, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
-    return Edges(i, j, se2.wrapped(numbers[:, :3]), _information(numbers[:, 3:], order), kind)
+    kind = np.where(j == i + 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    for own, own_tag in OWN_TAGS.items():
+        if tag == own_tag:
+            kind[:] = own
+    return Edges(i, j, *_measured(lines.numbers, order), kind)
 
 
-def _information(numbers: FloatArray, order: str | None) -> FloatArray:
-    """Return information matrices, shape (M, 3, 3), from six numbers each."""
-    matrix = np.zeros((len(numbers), 3, 3))
-    for column, (row, col) in enumerate(_TORO if order == 'toro' else UPPER):
-        matrix[:, row, col] = numbers[:, column]
-        if order != 'isam':
-            matrix[:, col, row] = numbers[:, column]
-    return np.swapaxes(matrix, 1, 2) @ matrix if order == 'isam' else matrix
-
-
-def _observed(tag: str, lines: Lines, ids: IntArray) -> ObservedNodes:
-    """Return the observed nodes of a tag, with rows for their nodes."""
-    numbers, node = lines.numbers, np.searchsorted(ids, lines.ids[:, 0])
-    offset = np.zeros((len(node), 3))
+def observed_of(tag: str, lines: Lines) -> ObservedNodes:
+    """Return the observed nodes of a tag; their nodes are ids of the file."""
+    numbers, offset = lines.numbers, None
     if tag == 'OBSERVED_SE2_OFFSET':
         offset, numbers = numbers[:, :3], numbers[:, 3:]
-    if tag == 'EDGE_PRIOR_SE2_XY':
-        # as a pose with zeros for the heading
-        numbers = np.insert(numbers, (2, 4, 5, 5), 0.0, axis=1)
-    information = _information(numbers[:, 3:], None)
+    mean, information = _measured(numbers)
     kind = np.where(
         information[:, 2, 2] == 0.0, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE)
-    return ObservedNodes(node, offset, se2.wrapped(numbers[:, :3]), information, kind)
+    return ObservedNodes(lines.ids[:, 0], offset, mean, information, kind)
+
+
+def _measured(numbers: FloatArray, order: str | None = None) -> tuple[FloatArray, FloatArray]:
+    """Return means and information matrices from the 2, 5 or 9 numbers for 1 to 3 coordinates."""
+    size = {2: 1, 5: 2, 9: 3}[numbers.shape[1]]
+    mean, matrix = np.zeros((len(numbers), 3)), np.zeros((len(numbers), 3, 3))
+    mean[:, :size] = numbers[:, :size]
+    row, column = np.transpose(_TORO) if order == 'toro' else np.triu_indices(size)
+    matrix[:, row, column] = numbers[:, size:]
+    if order == 'isam':
+        return mean, np.swapaxes(matrix, 1, 2) @ matrix
+    matrix[:, column, row] = numbers[:, size:]
+    return mean, matrix
+
+
+def _with_rows(table: Constraints, ids: IntArray) -> Constraints:
+    """Return constraints with rows in place of ids of the file, and headings wrapped."""
+    table = table.renumbered(lambda names: np.searchsorted(ids, names).astype(np.int64))
+    columns = {'mean': se2.wrapped(getattr(table, 'mean'))}  # noqa: B009
+    return replace(table, **columns)
 
 
 def compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
@@ -310,38 +309,6 @@ def _fixed(text: GraphText, ids: IntArray) -> BoolArray:
     return fixed
 
 
-def _first_refused(
-    text: GraphText, rows: dict[str, Lines], ids: IntArray, edge2_order: str | None,
-    kind: IntArray,
-) -> tuple[str, GraphUpdateError] | None:
-    """Return the place of the first line whose constraint is refused, with the reason."""
-    found = []
-    for tag in (*_EDGES, *_OBSERVED):
-        lines = rows[tag].rows(np.argsort(rows[tag].lines, kind='stable'))
-        table = (_edges(tag, lines, ids, edge2_order) if tag in _EDGES
-                 else _observed(tag, lines, ids))
-        refused = functools.partial(_is_refused, table, kind)
-        n = bisect_left(range(len(lines)), True, key=refused)
-        if n < len(lines) and (reason := _refusal(table.rows(slice(n, n + 1)), kind)) is not None:
-            found.append((int(lines.lines[n]), reason))
-    if len(found) == 0:
-        return None
-    line, reason = min(found, key=lambda each: each[0])
-    return text.where(line), reason
-
-
-def _is_refused(table: Edges | ObservedNodes, kind: IntArray, last: int) -> bool:
-    return _refusal(table.rows(slice(0, last + 1)), kind) is not None
-
-
-def _refusal(table: Edges | ObservedNodes, kind: IntArray) -> GraphUpdateError | None:
-    try:
-        check(table, kind)
-    except GraphUpdateError as error:
-        return error
-    return None
-
-
 class Guess(NamedTuple):
     """A graph that was read, with what was guessed of its format."""
 
@@ -362,7 +329,7 @@ def read_guessed(path: Path) -> Guess:
     read.
     """
     text = read_lines(path)
-    if text.tags.isdisjoint(AMBIGUOUS):
+    if not any(len(text.rows[tag]) for tag in AMBIGUOUS):
         return Guess(graph_of(text), None, '')
     files: dict[str, GraphFile] = {}
     errors: dict[str, FileFormatError] = {}
@@ -373,7 +340,7 @@ def read_guessed(path: Path) -> Guess:
             errors[order] = error
     if len(files) == 0:
         raise errors[EDGE2_ORDERS[0]]
-    if 'LANDMARK' in text.tags and 'isam' in files:
+    if len(text.rows['LANDMARK']) > 0 and 'isam' in files:
         return Guess(files['isam'], 'isam', 'LANDMARK is a tag of iSAM')
     worst = {order: _smallest(file.rows) for order, file in files.items()}
     definite = [order for order, value in worst.items() if value > 1e-9]
@@ -394,10 +361,7 @@ def read_guessed(path: Path) -> Guess:
 
 def _smallest(rows: GraphRows) -> float:
     """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
-    information = rows.edges.information
-    root = np.sqrt(np.maximum(np.einsum('mii->mi', information), np.finfo(float).tiny))
-    scaled = information / root[:, :, None] / root[:, None, :]
-    return float(np.min(np.linalg.eigvalsh(scaled), initial=1.0))
+    return float(np.min(np.linalg.eigvalsh(scaled(rows.edges.information)), initial=1.0))
 
 
 def _spread(rows: GraphRows) -> float:

@@ -77,7 +77,6 @@ class GraphText:
     rows: dict[str, Lines]  # by tag, for all of `LAYOUT`
     fixes: Lines  # ids behind `FIX`, one a row
     skipped: dict[str, int]  # number of lines with other tags
-    tags: frozenset[str]  # all of `LAYOUT` that are in the file
 
     def where(self, line: int) -> str:
         """Return the name of the file with that of a line."""
@@ -99,10 +98,15 @@ def read_text(path: Path) -> str:
 
 def read_lines(path: Path) -> GraphText:
     """Return what is in a file; FileFormatError with file and line if a line is malformed."""
+    return lines_of(path, read_text(path))
+
+
+def lines_of(path: Path, text: str) -> GraphText:
+    """Return what is in the text of a file, as `read_lines`."""
     found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in LAYOUT}
     fixes: tuple[list[list[str]], list[int]] = ([], [])
     skipped: dict[str, list[list[str]]] = {}
-    for line, content in enumerate(read_text(path).splitlines(), 1):
+    for line, content in enumerate(text.splitlines(), 1):
         words = content.split()
         if len(words) == 0 or words[0][0] == '#':
             continue
@@ -127,8 +131,7 @@ def read_lines(path: Path) -> GraphText:
         fixed = _lines(*fixes, 1, 0)
     except (ValueError, OverflowError):
         _raise_first(path, {**found, 'FIX': fixes})
-    return GraphText(path, tables, fixed, {tag: len(each) for tag, each in skipped.items()},
-                     frozenset(tag for tag, table in tables.items() if len(table) > 0))
+    return GraphText(path, tables, fixed, {tag: len(each) for tag, each in skipped.items()})
 
 
 def _lines(words: list[list[str]], lines: list[int], n_ids: int, n_numbers: int) -> Lines:

@@ -11,7 +11,6 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, FACTORS, ObservedNodes, upper
 from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.graph.priors import model
-from pose_graph_ros.core.io.g2o import UPPER
 
 NOT_USED = '# not used '
 """Begin of the line of a constraint with weight 0."""
@@ -91,7 +90,8 @@ def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
     lines, triangles = np.empty(len(edges), dtype=object), upper(edges.information)
     for kind, factor in FACTORS.items():
         chosen = np.flatnonzero(edges.kind == kind)
-        measured = [column for column, pair in enumerate(UPPER) if set(pair) <= set(factor.rows)]
+        measured = [column for column, pair in enumerate(zip(*np.triu_indices(3), strict=True))
+                    if set(pair) <= set(factor.rows)]
         some = edges.rows(chosen)
         lines[chosen] = [f'{begin}{factor.tag} {i} {j} {numbers}' for begin, i, j, numbers in zip(
             _begins(some.weight > 0.0), ids[some.i].tolist(), ids[some.j].tolist(),

@@ -10,7 +10,7 @@ the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 import hashlib
 import json
 import os
@@ -23,7 +23,6 @@ import numpy.typing as npt
 from pose_graph_ros import __version__
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import (
     EdgeKinds,
@@ -38,15 +37,11 @@ from pose_graph_ros.core.graph.constraints import (
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o_text import LAYOUT
+from pose_graph_ros.core.io.g2o import edges_of, OBSERVED, observed_of
+from pose_graph_ros.core.io.g2o_text import GraphText, lines_of
 from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
-from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, optional
-from pose_graph_ros.core.io.old_versions import (
-    with_ids,
-    with_judgement,
-    with_names,
-    without_jumps,
-)
+from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, MISMATCHES
+from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.saved_columns import Flags, Integers, Numbers, Rows3, Rows4, Rows6
@@ -58,9 +53,6 @@ SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
 _DIGITS = 64
 IN_G2O = [kind for kind, factor in FACTORS.items() if factor.tag == 'EDGE_SE2']
-# Columns of the numbers behind a tag in a row of node, offset, mean and information.
-_OBSERVED = {'OBSERVED_SE2_OFFSET': range(13), 'EDGE_PRIOR_SE2': (0, *range(4, 13)),
-             'EDGE_PRIOR_SE2_XY': (0, 4, 5, 7, 8, 10)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,16 +143,13 @@ def read_graph(path: Path) -> SavedGraph:
     g2o_path, path, members, g2o = _verified(path)
     try:
         hints = annotations(SavedGraph)
-        rest = {name: decoded(hints[name], members.pop(name), name) for name in _members()
-                if name in members or name not in optional(SavedGraph)}
-        rows: SavedRows = decoded(SavedRows, members.pop('graph'), 'graph')
-        saved = SavedGraph(rows=_graph_rows(rows, g2o.decode('ascii')), **rest)
-        saved.check()
-    except KeyError as error:
-        raise FileFormatError(f'{path}: expected a member {error}') from error
-    except ValueError as error:
-        raise FileFormatError(f'{path}, with {g2o_path.name}: {error}') from error
-    return saved
+        rest = {name: decoded(hints[name], members[name]) for name in _members()
+                if name in members}
+        rows: SavedRows = decoded(SavedRows, members['graph'])
+        text = g2o.decode('ascii').partition(STANDING_FOR_PRIORS)[0].replace(NOT_USED, '')
+        return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, text)), **rest)
+    except MISMATCHES as error:
+        raise FileFormatError(f'{path}, with {g2o_path.name}: {error!r}') from error
 
 
 def read_datum(path: Path) -> MapOrigin | None:
@@ -173,10 +162,10 @@ def read_datum(path: Path) -> MapOrigin | None:
     _, path, members, _ = _verified(path)
     try:
         datum: MapOrigin | None = decoded(
-            annotations(SavedGraph)['datum'], members['datum'], 'datum')
+            annotations(SavedGraph)['datum'], members['datum'])
         if datum is not None:
             TangentPlane(*datum)  # raises if it is no point on the Earth
-    except (KeyError, ValueError) as error:
+    except MISMATCHES as error:
         raise FileFormatError(f'{path}: expected a datum ({error})') from error
     return datum
 
@@ -234,10 +223,10 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
         raise FileFormatError(
             f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
-    members = with_names(members) if version == 1 else dict(members)
-    members = with_judgement(members) if version < 3 else members
-    members = with_ids(members) if version < 4 else members
-    return without_jumps(members) if version < 5 else members
+    try:
+        return upgraded(members, version)
+    except MISMATCHES as error:
+        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:
@@ -260,117 +249,51 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
         landmarks if len(landmarks) > 0 else None)
 
 
-def _graph_rows(rows: SavedRows, text: str) -> GraphRows:
-    """Return the rows of a graph from both files; raise ValueError if they do not fit together."""
-    lines = [line.removeprefix(NOT_USED)
-             for line in text.partition(STANDING_FOR_PRIORS)[0].split('\n')]
-    vertices = _numbers(lines, 'VERTEX_SE2')
+def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
+    """Return the rows of a graph from both files."""
+    vertices = text.rows['VERTEX_SE2']
     n = len(vertices) + len(rows.biases), len(rows.edge_kind), len(rows.observed_kind)
     node_ids, edge_ids, observed_ids = (
         np.arange(size) if ids is None else ids for size, ids in zip(
             n, (rows.node_ids, rows.edge_ids, rows.observed_ids), strict=True))
-    if (len(node_ids), len(edge_ids), len(observed_ids)) != n:
-        raise ValueError(f'graph: expected {n} ids of nodes, edges and observed nodes')
-    for name, chosen in (('fixed', rows.fixed), ('biases', rows.biases)):
-        if not np.all(np.isin(chosen, node_ids)):
-            raise ValueError(f'graph.{name}: expected hidden nodes')
     is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
-    if not np.array_equal(vertices[:, 0], node_ids[is_pose]):
-        raise ValueError('expected the hidden nodes that are no biases as vertices, in order')
     poses = np.zeros((len(node_ids), 3))
-    poses[is_pose] = vertices[:, 1:]
-    _fill(poses, np.flatnonzero(~is_pose), rows.bias_values, 'biases')
-    next_ids = NextIds(*n) if rows.next_ids is None else rows.next_ids
-    kind, dimension = _kinds_and_dimensions(rows, node_ids, is_pose)
+    poses[is_pose], poses[~is_pose] = vertices.numbers, rows.bias_values
+    kind = np.where(is_pose, NodeKind.POSE, NodeKind.BIAS).astype(np.int32)
+    if rows.landmarks is not None:
+        kind[np.isin(node_ids, rows.landmarks)] = NodeKind.LANDMARK
+    dimension: npt.NDArray[Any] = np.where(kind == NodeKind.LANDMARK, 2, 3).astype(np.int32)
+    if rows.bias_dimensions is not None:
+        dimension[~is_pose] = rows.bias_dimensions
     return GraphRows(
-        poses, kind, fixed, _edges(rows, _numbers(lines, 'EDGE_SE2')), _observed(rows, lines),
-        node_ids, edge_ids, observed_ids, next_ids, dimension,
+        poses, kind, fixed, _edges(rows, text), _observed(rows, text), node_ids, edge_ids,
+        observed_ids, NextIds(*n) if rows.next_ids is None else rows.next_ids, dimension,
         _restored_priors(rows.priors))
 
 
-def _kinds_and_dimensions(
-    rows: SavedRows, node_ids: IntArray, is_pose: BoolArray,
-) -> tuple[IntArray, IntArray]:
-    """Return kinds and dimensions of all hidden nodes."""
-    kind = np.where(is_pose, int(NodeKind.POSE), int(NodeKind.BIAS))
-    if rows.landmarks is not None:
-        if not np.all(np.isin(rows.landmarks, rows.biases)):
-            raise ValueError('graph.landmarks: expected nodes that are no poses')
-        kind[np.isin(node_ids, rows.landmarks)] = int(NodeKind.LANDMARK)
-    is_landmark = kind == NodeKind.LANDMARK
-    dimension = np.where(is_landmark, 2, 3)
-    if rows.bias_dimensions is not None:
-        _fill(dimension, np.flatnonzero(~is_pose), rows.bias_dimensions, 'dimensions')
-    if np.any((dimension < 1) | (dimension > 3) | (is_landmark & (dimension != 2))):
-        raise ValueError('graph.bias_dimensions: expected 1 to 3, and 2 for landmarks')
-    return kind.astype(np.int32), dimension.astype(np.int32)
+def _edges(rows: SavedRows, text: GraphText) -> Edges:
+    in_json = Edges(
+        rows.bias_edge_i, rows.bias_edge_j, rows.bias_edge_mean, full(rows.bias_edge_information),
+        np.zeros(len(rows.bias_edge_i), np.uint8), None, rows.bias_edge_bias, rows.bias_edge_k)
+    both = Edges.joined((edges_of('EDGE_SE2', text.rows['EDGE_SE2']), in_json))
+    # those of the g2o file come first
+    order = np.argsort(np.argsort(~np.isin(rows.edge_kind, IN_G2O), kind='stable'))
+    return replace(both.rows(order), kind=rows.edge_kind.astype(np.uint8),
+                   weight=rows.edge_weight)
 
 
-def _edges(rows: SavedRows, numbers: FloatArray) -> Edges:
-    to_bias = ~np.isin(rows.edge_kind, IN_G2O)
-    in_g2o, in_json = np.flatnonzero(~to_bias), np.flatnonzero(to_bias)
-    bias = np.zeros((len(to_bias), 4))
-    _fill(bias, in_json, rows.bias_edge_bias, 'edges to biases')
-    both = np.zeros((len(to_bias), 11))
-    _fill(both, in_g2o, numbers, 'edges')
-    _fill(both, in_json, np.column_stack(
-        (rows.bias_edge_i, rows.bias_edge_j, rows.bias_edge_mean, rows.bias_edge_information)),
-        'edges to biases')
-    third = np.full(len(to_bias), -1, dtype=np.int64)
-    if rows.bias_edge_k is not None:
-        _fill(third, in_json, rows.bias_edge_k, 'third nodes')
-    return Edges(
-        both[:, 0].astype(np.int64), both[:, 1].astype(np.int64), both[:, 2:5].copy(),
-        full(both[:, 5:]), rows.edge_kind.astype(np.uint8),
-        _weights(rows.edge_weight, len(both)), bias, third)
-
-
-def _observed(rows: SavedRows, lines: list[str]) -> ObservedNodes:
-    size = len(rows.observed_kind)
-    if np.any((rows.observed_on_bias < 0) | (rows.observed_on_bias >= size)):
-        raise ValueError(f'graph.observed_on_bias: expected numbers in 0..{size - 1}')
-    on_bias = np.zeros(size, dtype=bool)
-    on_bias[rows.observed_on_bias] = True
-    lines = [line for line in lines if line.startswith(tuple(_OBSERVED))]
-    tags = np.array([line.partition(' ')[0] for line in lines], dtype=np.str_)
-    numbers = np.zeros((len(lines), 13))
-    for tag, columns in _OBSERVED.items():
-        chosen = np.flatnonzero(tags == tag)
-        numbers[chosen[:, None], list(columns)] = _numbers(lines, tag)
-    both = np.zeros((size, 13))
-    _fill(both, np.flatnonzero(~on_bias), numbers, 'observed nodes')
-    _fill(both, rows.observed_on_bias, np.column_stack((
+def _observed(rows: SavedRows, text: GraphText) -> ObservedNodes:
+    in_json = ObservedNodes(
         rows.bias_observed_node, rows.bias_observed_offset, rows.bias_observed_mean,
-        rows.bias_observed_information)), 'observed nodes on biases')
-    return ObservedNodes(
-        both[:, 0].astype(np.int64), both[:, 1:4].copy(), both[:, 4:7].copy(), full(both[:, 7:]),
-        rows.observed_kind.astype(np.uint8), _weights(rows.observed_weight, size))
-
-
-def _numbers(lines: list[str], tag: str) -> FloatArray:
-    """Return the numbers behind a tag in the lines that begin with it, shape (M, n)."""
-    n = sum(LAYOUT[tag])
-    begin = f'{tag} '
-    words = ' '.join(line[len(begin):] for line in lines if line.startswith(begin)).split(' ')
-    numbers = np.array([float(word) for word in words if word != ''])
-    if len(numbers) % n != 0 or not np.all(np.isfinite(numbers)):
-        raise ValueError(f'expected {n} finite numbers after each {tag}')
-    return numbers.reshape(-1, n)
-
-
-def _fill(
-    table: npt.NDArray[Any], rows: IntArray, numbers: npt.NDArray[Any], name: str,
-) -> None:
-    """Set rows of a table; raise ValueError if their number is wrong."""
-    if len(rows) != len(numbers):
-        raise ValueError(f'graph: expected {len(rows)} {name}, got {len(numbers)}')
-    table[rows] = numbers
-
-
-def _weights(weight: FloatArray, size: int) -> FloatArray:
-    if len(weight) != size:
-        raise ValueError(f'graph: expected {size} weights, got {len(weight)}')
-    return weight
+        full(rows.bias_observed_information), np.zeros(len(rows.bias_observed_node), np.uint8))
+    both = ObservedNodes.joined([*(observed_of(tag, text.rows[tag]) for tag in OBSERVED), in_json])
+    row = np.arange(len(both))
+    in_g2o = np.argsort(np.concatenate([text.rows[tag].lines for tag in OBSERVED]))
+    order = np.empty(len(both), dtype=np.int64)
+    order[np.setdiff1d(row, rows.observed_on_bias)] = in_g2o
+    order[rows.observed_on_bias] = row[len(in_g2o):]
+    return replace(both.rows(order), kind=rows.observed_kind.astype(np.uint8),
+                   weight=rows.observed_weight)
 
 
 def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:
@@ -385,15 +308,11 @@ def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:
 
 
 def _restored_priors(saved: SavedPriors) -> tuple[Prior, ...]:
-    """Return saved priors; raise ValueError if the lengths of the columns do not fit."""
+    """Return saved priors."""
     sizes = saved.sizes
+    if len(sizes) == 0:
+        return ()
     counts = 3 * sizes * (3 * sizes + 3) // 2 + 3 * sizes + 1
-    if (np.any(sizes < 1) or len(saved.anchored) != len(sizes)
-            or len(saved.nodes) != np.sum(sizes) or len(saved.numbers) != np.sum(counts)):
-        raise ValueError('graph.priors: expected columns whose lengths fit the sizes of the '
-                         'priors')
-    of_nodes, of_numbers = np.cumsum(sizes)[:-1], np.cumsum(counts)[:-1]
     return tuple(unpacked(nodes, numbers, anchored=anchored) for nodes, numbers, anchored in zip(
-        np.split(saved.nodes, of_nodes) if len(sizes) > 0 else (),
-        np.split(saved.numbers, of_numbers) if len(sizes) > 0 else (),
-        saved.anchored.tolist(), strict=True))
+        np.split(saved.nodes, np.cumsum(sizes)[:-1]),
+        np.split(saved.numbers, np.cumsum(counts)[:-1]), saved.anchored.tolist(), strict=True))

@@ -17,55 +17,32 @@ NUMBERED = {
     ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
+_NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
+_EMPTY: dict[str, dict[str, Any]] = {
+    'closures': {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
+        'sources', 'scales', 'rows', 'source', 'stamps_ns', 'since_ns', 'distance')}},
+    'fixes': {'decision': _NO_NAMES, **{name: [] for name in (
+        'sources', 'rows', 'edges', 'source', 'stamps_ns', 'believed', 'since_ns', 'observed',
+        'distance', 'loosened', 'weights')}},
+    'odometry': {}}
 
 
-EMPTY_JUDGEMENT: dict[str, Any] = {'closures': {
-    'sources': [], 'scales': [], 'rows': [], 'source': [], 'stamps_ns': [],
-    'state': {'names': [], 'of': []}, 'since_ns': [], 'decision': {'names': [], 'of': []},
-    'distance': []}, 'fixes': {
-    'sources': [], 'rows': [], 'edges': [], 'source': [], 'stamps_ns': [], 'believed': [],
-    'since_ns': [], 'decision': {'names': [], 'of': []}, 'observed': [], 'distance': [],
-    'loosened': [], 'weights': []}, 'odometry': {}}
-
-
-def with_judgement(members: dict[str, Any]) -> dict[str, Any]:
-    """Return the members of a file of version 2 as those of version 3: nothing is judged."""
-    upgraded = {'judgement': EMPTY_JUDGEMENT, 'verdicts': {}, **members}
-    for name in ('waiting', 'set_aside'):
-        edges = upgraded.get(name)
-        if isinstance(edges, dict):
-            upgraded[name] = {'stamps_ns': [[-1, -1]] * len(edges.get('sources', [])), **edges}
-    return upgraded
-
-
-def with_names(members: dict[str, Any]) -> dict[str, Any]:
-    """Return the members of a file of version 1 as those of version 2."""
-    upgraded = dict(members)
-    for (member, field), names in NUMBERED.items():
-        fields = upgraded.get(member)
-        if isinstance(fields, dict) and field in fields:
-            upgraded[member] = {**fields, field: {'names': list(names), 'of': fields[field]}}
-    return upgraded
-
-
-def with_ids(members: dict[str, Any]) -> dict[str, Any]:
-    """Return the members of a file of version 3 as those of version 4."""
-    nodes = members.get('nodes')
-    if not isinstance(nodes, dict) or 'rows' not in nodes:
-        return members
-    renamed = {'ids' if name == 'rows' else name: value for name, value in nodes.items()}
-    return {**members, 'nodes': renamed}
-
-
-def without_jumps(members: dict[str, Any]) -> dict[str, Any]:
-    """
-    Return the members of a file of version 4 as those of version 5.
-
-    Odometry that closures had doubted keeps the weight that it has in the file.
-    """
-    judgement = members.get('judgement')
-    odometry = judgement.get('odometry') if isinstance(judgement, dict) else None
-    if not isinstance(judgement, dict) or not isinstance(odometry, dict):
-        return members
-    kept = {name: odometry[name] for name in odometry.keys() & {'left_sources', 'left'}}
-    return {**members, 'judgement': {**judgement, 'odometry': kept}}
+def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
+    """Return the members of a file of an older version as those of version 5."""
+    for member, name in NUMBERED if version < 2 else ():
+        column = {'names': list(NUMBERED[member, name]), 'of': members[member][name]}
+        members[member] = {**members[member], name: column}
+    if version < 3:
+        members = {'judgement': _EMPTY, 'verdicts': {}, **members}
+        for name in ('waiting', 'set_aside'):
+            members[name] = {'stamps_ns': [[-1, -1]] * len(members[name]['sources']),
+                             **members[name]}
+    if version < 4:
+        nodes = members['nodes']
+        members['nodes'] = {'ids' if name == 'rows' else name: nodes[name] for name in nodes}
+    if version < 5:
+        # odometry that closures had doubted keeps the weight that it has in the file
+        odometry = members['judgement']['odometry']
+        kept = {name: odometry[name] for name in odometry.keys() & {'left_sources', 'left'}}
+        members['judgement'] = {**members['judgement'], 'odometry': kept}
+    return members

@@ -101,7 +101,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     old = clique_i[c]
     if old[tb.N_FRONTAL] != 1 or old[tb.N_SEPARATOR] != 0:
         return NOT_A_CHAIN
-    if not rows.write_edge(head, e, last, v, mean, information, 0, weight):
+    if not rows.write_row(head, e, last, v, mean, information, 0, weight):
         return NOT_A_CHAIN
     head[tb.UPDATE] += 1    # rows are stamped, but not logged: nothing has to be rolled back
     _write_node(head, v, last, mean)

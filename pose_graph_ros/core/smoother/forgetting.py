@@ -16,7 +16,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.editing import unlink_edge
+from pose_graph_ros.core.graph.editing import unlink
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
 from pose_graph_ros.core.smoother.tree_update import (
@@ -155,7 +155,7 @@ def _drop_constraints(head, v, leaves):  # type: ignore[no-untyped-def]
         scale_by(head, e, -f[tb.WEIGHT])
         for m in range(3):
             if edge_i[e, m] >= 0 and not leaves[edge_i[e, m]]:
-                unlink_edge(head, e, m)
+                unlink(head, e, m)
         energy += f[tb.ENERGY]
         f[tb.WEIGHT] = f[tb.ENERGY] = f[tb.ERROR2] = 0.0
     entry = node_i[v, tb.OBSERVED_LIST]

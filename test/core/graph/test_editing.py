@@ -159,16 +159,12 @@ def test_new_rows_go_on_with_the_ids_and_find_the_nodes(seed: int) -> None:
 
 GONE: dict[str, tuple[Callable[[], GraphUpdate], str]] = {
     'fix': (lambda: GraphUpdate(fix=[3]), 'fix: hidden node 3 has left the graph'),
-    'free': (lambda: GraphUpdate(free=[2, 3]), 'free: hidden node 3 has left the graph'),
     'remove': (lambda: GraphUpdate(remove_nodes=[3]), 'remove_nodes: hidden node 3 has left'),
     'edge': (lambda: GraphUpdate(weigh_edges={0: 1.0}), 'weigh_edges: edge 0 has left the graph'),
-    'drop': (lambda: GraphUpdate(drop_edges=[0]), 'drop_edges: edge 0 has left the graph'),
     'observed': (lambda: GraphUpdate(remove_observed=[1]),
                  'remove_observed: observed node 1 has left the graph'),
     'end': (lambda: GraphUpdate(edges=random_edges(np.random.default_rng(0), [2, 4], [4, 3])),
             'Edges: hidden node 3 has left the graph; row 1'),
-    'observation': (lambda: GraphUpdate(observed=random_observed(np.random.default_rng(0), [3])),
-                    'ObservedNodes: hidden node 3 has left the graph; row 0'),
 }
 
 
@@ -181,17 +177,6 @@ def test_an_id_that_has_left_is_refused_by_name(name: str) -> None:
     with pytest.raises(GraphUpdateError, match=message):
         graph.apply(make())
     assert differences(before, state(graph)) == []
-
-
-@pytest.mark.parametrize('end', ['commit', 'rollback'])
-def test_after_an_update_what_leaves_is_taken_out_at_once_again(end: str) -> None:
-    graph = graph_of(5)
-    graph.begin()
-    graph.apply(GraphUpdate(remove_nodes=[4]))
-    getattr(graph, end)()
-    for node in (3, 6):
-        graph.apply(GraphUpdate(remove_nodes=[node]))
-        assert graph.node_rows(node) == -1
 
 
 def test_within_an_update_rows_stay_and_a_rollback_brings_all_back() -> None:
@@ -237,12 +222,3 @@ def test_rows_are_filled_with_their_ids_which_must_ascend() -> None:
     assert snapshot(copy) == snapshot(graph)
     with pytest.raises(GraphUpdateError, match='node: expected ascending ids from 14 on'):
         copy.fill(graph.rows())
-
-
-def test_ids_that_somebody_holds_stay_what_they_are() -> None:
-    graph = random_graph(seed=2)
-    held = graph.node_ids, graph.edge_ids, graph.observed_ids
-    copies = [ids.copy() for ids in held]
-    graph.apply(GraphUpdate(remove_nodes=[1, 3]))
-    for ids, copy in zip(held, copies, strict=True):
-        np.testing.assert_array_equal(ids, copy)

@@ -5,7 +5,7 @@
 from collections.abc import Callable
 from dataclasses import fields
 
-from hypothesis import given, strategies as st
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from random_graphs import (
@@ -54,42 +54,23 @@ def observed(
 # Invalid updates, with a pattern of the message: what was expected, and the value.
 BAD_UPDATES = {
     'hidden_shape': (lambda: GraphUpdate(hidden=np.zeros((2, 2))), r'\(N, 3\).*\(2, 2\)'),
-    'hidden_flat': (lambda: GraphUpdate(hidden=np.zeros(3)), r'\(N, 3\).*\(3,\)'),
     'hidden_nan': (lambda: GraphUpdate(hidden=np.full((1, 3), np.nan)), 'finite'),
     'fix_outside': (lambda: GraphUpdate(fix=(7,)), r'fix.*0\.\.6.*7'),
-    'fix_negative': (lambda: GraphUpdate(fix=(-1,)), r'fix.*0\.\.6.*-1'),
     'fix_no_integer': (lambda: GraphUpdate(hidden=np.zeros((1, 3)), fix=(0.5,)), r'fix.*0\.5'),
-    'free_outside': (lambda: GraphUpdate(free=(9,)), r'free.*0\.\.6.*9'),
     'weight_negative': (
         lambda: GraphUpdate(weigh_edges={0: -0.1}), r'weigh_edges.*not negative, got -0\.1.*0'),
     'weight_nan': (
         lambda: GraphUpdate(weigh_observed={1: np.nan}), 'weigh_observed.*finite.*nan.*number 1'),
     'edge_i_outside': (lambda: edge(i=[7]), r'Edges.*0\.\.6.*row 0: 7'),
-    'edge_j_outside': (lambda: edge(j=[-1]), r'Edges.*0\.\.6.*row 0: -1'),
     'edge_to_itself': (lambda: edge(i=[3], j=[3]), 'itself.*row 0: 3'),
-    'edge_lengths': (lambda: edge(j=[1, 2]), r'Edges\.j.*\(1,\).*\(2,\)'),
-    'edge_mean_shape': (lambda: edge(mean=[[1.0, 2.0]]), r'Edges\.mean.*\(1, 3\).*\(1, 2\)'),
     'edge_mean_nan': (lambda: edge(mean=[[np.nan, 0.0, 0.0]]), r'Edges\.mean.*finite.*nan'),
-    'edge_information_shape': (
-        lambda: edge(information=[np.eye(2)]), r'information.*\(1, 3, 3\).*\(1, 2, 2\)'),
-    'edge_information_inf': (
-        lambda: edge(information=[NOT_FINITE]), r'Edges\.information.*finite.*inf'),
     'edge_information_asymmetric': (
         lambda: edge(information=[ASYMMETRIC]), r'Edges\.information.*symmetric.*row 0'),
-    'edge_information_negative': (
-        lambda: edge(information=[NEGATIVE]), r'Edges\.information.*semidefinite.*row 0'),
     'edge_information_negative_beside_large': (
         lambda: edge(information=[np.diag([4e8, -100.0, 1.0])]),
         r'Edges\.information.*semidefinite.*row 0'),
-    'edge_information_asymmetric_beside_large': (
-        lambda: edge(information=[1e12 * np.diag([1.0, 0.0, 0.0]) + ASYMMETRIC[::-1, ::-1]]),
-        r'Edges\.information.*symmetric.*row 0'),
-    'edge_information_huge_correlation': (
-        lambda: edge(information=[np.diag([1e-300] * 3) + 1e300 * (np.ones((3, 3)) - np.eye(3))]),
-        r'Edges\.information.*semidefinite.*row 0'),
     'edge_information_zero': (
         lambda: edge(information=[np.zeros((3, 3))]), r'Edges\.information.*row 0'),
-    'edge_kind_missing': (lambda: edge(kind=()), r'Edges\.kind.*\(1,\).*\(0,\)'),
     'edge_kind_unknown': (
         lambda: edge(kind=[len(EdgeKind)]),
         'kind is none of ODOMETRY, LOOP_CLOSURE, BIAS, .*; row 0'),
@@ -100,25 +81,13 @@ BAD_UPDATES = {
     'edge_to_a_bias_of_another_kind': (
         lambda: edge(j=[7])._replace(biases=np.zeros((1, 3))),
         r'Edges\.j: .* to have pose .*row 0: 7'),
-    'edge_bias_shape': (
-        lambda: edge_to_bias([[1.0, 1.0]]), r'Edges\.bias.*\(1, 4\).*\(1, 2\)'),
     'edge_bias_inf': (
         lambda: edge_to_bias([[0.0, 0.0, np.inf, 1.0]]), r'Edges\.bias.*finite.*inf'),
-    'biases_shape': (lambda: GraphUpdate(biases=np.zeros((2, 2))), r'biases.*\(N, 3\).*\(2, 2\)'),
-    'biases_nan': (lambda: GraphUpdate(biases=np.full((1, 3), np.nan)), 'biases.*finite'),
     'edge_second_row': (
         lambda: edge([0, 2], [1, 9], np.zeros((2, 3)), [np.eye(3)] * 2, [0, 0]), 'row 1: 9'),
     'observed_outside': (lambda: observed(node=[7]), r'ObservedNodes.*0\.\.6.*row 0: 7'),
-    'observed_offset_shape': (
-        lambda: observed(offset=[[0.0, 0.0]]), r'offset.*\(1, 3\).*\(1, 2\)'),
     'observed_offset_inf': (
         lambda: observed(offset=[[0.0, np.inf, 0.0]]), r'offset.*finite.*inf'),
-    'observed_mean_nan': (
-        lambda: observed(mean=[[0.0, np.nan, 0.0]]), r'ObservedNodes\.mean.*finite.*nan'),
-    'observed_information_asymmetric': (
-        lambda: observed(information=[ASYMMETRIC]), r'ObservedNodes\.information.*symmetric'),
-    'observed_information_negative': (
-        lambda: observed(information=[NEGATIVE]), r'ObservedNodes\.information.*semidefinite'),
 }
 
 
@@ -211,29 +180,6 @@ def grow(graph: Graph, rng: np.random.Generator, n: int) -> None:
             random_edges_to_biases(rng, [first, first], [first + n, first + n])]),
         biases=random_poses(rng, 1),
         observed=random_observed(rng, list(range(first, first + n))), fix=(first,), free=(0,)))
-
-
-@given(seeds, st.lists(st.integers(1, 20), min_size=1, max_size=4))
-def test_rollback_reverts_every_edit_bit_for_bit(
-    seed: int, sizes: list[int],
-) -> None:
-    rng = np.random.default_rng(seed)
-    graph = random_graph(seed, fix=(0,), n_biases=2)
-    before = snapshot(graph)
-    graph.begin()
-    for size in sizes:
-        grow(graph, rng, size)
-        graph.apply(GraphUpdate(
-            remove_edges=(0,), remove_observed=(1,), weigh_edges={2: 0.5},
-            weigh_observed={0: 3.0}))
-    assert snapshot(graph) != before
-    graph.rollback()
-    assert snapshot(graph) == before
-    # later updates have the same result as without the rollback
-    other = random_graph(seed, fix=(0,), n_biases=2)
-    grow(graph, np.random.default_rng(seed), 5)
-    grow(other, np.random.default_rng(seed), 5)
-    assert snapshot(graph) == snapshot(other)
 
 
 @pytest.mark.parametrize('make', [

@@ -188,16 +188,9 @@ def test_a_prior_alone_holds_its_nodes() -> None:
         random_prior(rng, [0, 1, 2], poses, anchored=False)])).status is Status.FAILED
 
 
-@pytest.mark.parametrize(('change', 'message'), [
-    ({'nodes': np.array([0, 9])}, 'hidden nodes'),
-    ({'nodes': np.array([1, 1])}, 'twice'),
-    ({'reference': np.zeros((1, 3))}, 'shapes'),
-    ({'energy': np.nan}, 'finite'),
-    ({'information': -np.eye(6)}, 'semidefinite'),
-])
-def test_invalid_priors_are_refused(change: dict[str, Any], message: str) -> None:
-    prior = random_prior(np.random.default_rng(2), [0, 1], np.zeros((2, 3)), anchored=True)
+def test_a_prior_on_a_node_that_is_not_there_is_refused() -> None:
+    prior = random_prior(np.random.default_rng(2), [0, 9], np.zeros((2, 3)), anchored=True)
     graph = Graph()
-    with pytest.raises(GraphUpdateError, match=message):
-        graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), priors=[replace(prior, **change)]))
+    with pytest.raises(GraphUpdateError, match='hidden nodes'):
+        graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), priors=[prior]))
     assert graph.n_nodes == 0

@@ -85,30 +85,3 @@ def test_a_disk_that_is_full_leaves_the_old_files(
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert contents(tmp_path) == OLD
-
-
-def test_without_hard_links_previous_files_are_copied(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    write(tmp_path, OLD)
-
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EPERM, 'not here')
-
-    monkeypatch.setattr(atomic_files.os, 'link', refuse)
-    with monkeypatch.context() as patch:
-        patch.setattr(atomic_files.os, 'replace', failing_at(3, OSError(errno.EIO, 'gone')))
-        with pytest.raises(FileWriteError, match='gone'):
-            write(tmp_path, NEW)
-    assert contents(tmp_path) == OLD
-    write(tmp_path, NEW)
-    assert contents(tmp_path) == NEW
-
-
-def test_a_folder_in_the_place_of_a_file_is_refused_before_anything_is_written(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / 'map.json').mkdir()
-    with pytest.raises(FileWriteError, match=r'map\.g2o.*map\.json is a folder'):
-        write(tmp_path, NEW)
-    assert [path.name for path in tmp_path.iterdir()] == ['map.json']

@@ -3,7 +3,6 @@
 """Files of saved graphs: written completely or not at all, and refused if damaged."""
 
 from collections.abc import Callable
-import copy
 from dataclasses import replace
 import functools
 import hashlib
@@ -244,75 +243,16 @@ def test_what_is_no_json_is_refused_even_with_a_checksum(tmp_path: Path, body: b
         read_graph(side)
 
 
-def leaves(value: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths of all members and of the first items of lists, at any depth."""
-    inner = (value.items() if isinstance(value, dict)
-             else list(enumerate(value))[:2] if isinstance(value, list) else ())
-    return [place] * (len(place) > 0) + [
-        leaf for name, each in inner for leaf in leaves(each, (*place, name))]
-
-
-JUNK = (None, True, -1, 0, 1, 10**6, 2**63, 10**400, -0.5, 1e100, float('nan'), float('inf'), '',
-        'odom', [], [0], [[0.0]], [1, 'a'], [None], {}, {'odom': None}, [[1.0], [1.0, 2.0]])
-
-
-@functools.cache
-def files_of_a_drive() -> dict[str, bytes]:
-    with tempfile.TemporaryDirectory() as folder:
-        write_graph(saved_drive(), Path(folder) / 'map')
-        return contents(Path(folder))
-
-
-@functools.cache
-def members_of_a_drive() -> tuple[dict[str, Any], list[tuple[Any, ...]]]:
-    members = json.loads(files_of_a_drive()['map.json'])
-    return members, leaves(members)
-
-
-@given(st.data())
-@settings(max_examples=80)
-def test_with_any_value_of_a_member_a_file_is_refused_or_usable(data: st.DataObject) -> None:
-    members, places = members_of_a_drive()
-    place = data.draw(st.sampled_from(places))
-    junk = data.draw(st.sampled_from(JUNK) | st.just('remove'))
-
-    def change(fresh: dict[str, Any]) -> None:
-        fresh.update(copy.deepcopy(members))
-        del fresh['sha256']
-        inner: Any = fresh
-        for name in place[:-1]:
-            inner = inner[name]
-        if junk == 'remove':
-            del inner[place[-1]]
-        else:
-            inner[place[-1]] = junk
-
-    if place[0] == 'sha256':
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        for name, content in files_of_a_drive().items():
-            (Path(folder) / name).write_bytes(content)
-        side = Path(folder) / 'map.json'
+def test_parts_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
+    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+    for change in (lambda members: members['graph'].update(fixed=['x']),
+                   lambda members: members.pop('nodes'),
+                   lambda members: members['graph']['edge_weight'].append(1.0),
+                   lambda members: members['graph'].update(bias_edge_i=[10**6] * 3)):
+        write_graph(saved_drive(), tmp_path / 'map')
         rewrite(side, change)
-        loaded = None
-        try:
-            loaded = read_graph(side)
-        except FileFormatError as error:
-            message = str(error)
-    if loaded is None:
-        assert 'map.json' in message or 'map.g2o' in message
-        return
-    backend = PoseGraphBackend.restored(CORRELATED, loaded)
-    backend.estimate()
-    backend.update()
-    backend.reports()
-
-
-def test_a_loaded_graph_can_be_used_with_other_settings(tmp_path: Path) -> None:
-    write_graph(saved_drive(), tmp_path / 'map')
-    backend = PoseGraphBackend.restored(LINE_ODOMETRY, read_graph(tmp_path / 'map'))
-    assert backend.estimate() is not None
-    backend.optimize()
+        with pytest.raises(FileFormatError):
+            PoseGraphBackend.restored(CORRELATED, read_graph(side))
 
 
 def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -> None:
@@ -333,10 +273,6 @@ def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -
     backend.update()
     assert backend.graph.node_ids[:2].tolist() == [5, 7]
     assert backend.graph.node_ids[-1] >= 1000
-    rewrite(side, lambda members: members['graph'].update(
-        node_ids=[*members['graph']['node_ids'][:-1], 6]))
-    with pytest.raises(FileFormatError, match='expected the hidden nodes'):
-        read_graph(side)
 
 
 def with_other_nodes(saved: SavedGraph, update: GraphUpdate) -> SavedGraph:
@@ -385,14 +321,6 @@ def test_other_nodes_and_third_ends_come_back(tmp_path: Path, case: str) -> None
     graph = Graph()
     graph.fill(loaded.rows)
     assert_same_value(graph.rows(), saved.rows)
-    for name, wrong, expected in (('bias_dimensions', [0] * 3, 'dimensions'),
-                                  ('landmarks', [0], 'landmarks: expected nodes that are no'),
-                                  ('bias_edge_k', [10**6] * 3, 'expected a hidden node|third')):
-        write_graph(saved, tmp_path / 'map')
-        rewrite(side, lambda members, field=name, numbers=wrong: members['graph'].update(
-            {field: numbers}))
-        with pytest.raises(FileFormatError, match=expected):
-            read_graph(side)
 
 
 def test_files_without_the_optional_fields_are_read(tmp_path: Path) -> None:

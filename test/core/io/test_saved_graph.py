@@ -24,9 +24,7 @@ from test_delay_invariance import DRIVES, Event, PLAIN, ROBUST, SAME_PATH
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
-    BackendConfig,
     MeasurementSource,
-    OdometrySource,
 )
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
@@ -265,45 +263,6 @@ def test_odometry_that_was_restarted_makes_a_loose_edge_to_where_the_robot_was(
     assert 0.3 < sigma[2] < 0.32
     old = restored.add_odometry(line_sample(9.05), 'odom')
     assert old.reason == 'out_of_order'
-
-
-def test_another_odometry_may_be_primary_after_a_load_with_one_loose_edge() -> None:
-    config = BackendConfig(odometry={'odom': OdometrySource(), 'visual': OdometrySource()})
-    saved = straight_line(config).saved()
-    restored = PoseGraphBackend.restored(config, through_files(saved))
-    n = len(restored.node_stamps_ns)
-    here = restored.estimate().T_map_base
-    for k in range(20):
-        restored.add_odometry(line_sample(3600.0 + 0.2 * k, at=50.0 + 0.2 * k), 'visual')
-    restored.finish()
-    restored.update()
-    assert restored.estimate().primary == 'visual'
-    edge = restored.graph.edges_at(np.array([n - 1]))
-    cov = np.linalg.inv(edge.information[0])
-    np.testing.assert_allclose(np.sqrt(np.diagonal(cov)), [1.0, 1.0, 0.3], rtol=0.05)
-    np.testing.assert_allclose(
-        restored.estimate().T_map_base, se2.compose(here, np.array([3.8, 0.0, 0.0])), atol=1e-9)
-
-
-def test_two_restarted_odometries_make_one_loose_edge() -> None:
-    config = BackendConfig(odometry={'odom': OdometrySource(), 'visual': OdometrySource()})
-    backend = PoseGraphBackend(config)
-    for begin in (0.0, 3600.0):
-        if begin > 0.0:
-            backend.update()
-            backend = PoseGraphBackend.restored(config, through_files(backend.saved()))
-            n = backend.graph.n_edges
-        for k in range(60):
-            for source in ('odom', 'visual'):
-                backend.add_odometry(line_sample(begin + 1.0 + 0.2 * k, at=0.2 * k), source)
-    backend.finish()
-    backend.update()
-    stamps = backend.node_stamps_ns
-    edges = backend.graph.edges_at(np.arange(n, backend.graph.n_edges))
-    over = (stamps[edges.i] < 3000 * SECOND) & (stamps[edges.j] > 3000 * SECOND)
-    assert np.sum(over) == 1
-    assert np.sum(~over) > 10
-    assert backend.counts['odom', 'jump'] == backend.counts['visual', 'jump'] == 1
 
 
 # --- measurements after a load -------------------------------------------------------------------
