@@ -31,12 +31,12 @@ from pose_graph_ros.adapters.bags import (
     one_line,
     own_types,
 )
+from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
-NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
 
 

@@ -7,12 +7,14 @@ So it reaches /rosout with the node's name, at the level that was asked for. Wha
 an error with each message, is left out and counted.
 """
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import logging
 import math
 import re
 import time
+import traceback
 from typing import Any
 
 from pose_graph_ros.core.judgement.texts import joined, number_of, seconds
@@ -95,14 +97,12 @@ class NodeLog(logging.Handler):
         super().close()
 
 
-def _raised_at(record: logging.LogRecord) -> tuple[str, int] | None:
+def _raised_at(record: logging.LogRecord) -> tuple[str, int | None] | None:
     """Return file and line where the exception of a record was raised."""
-    traceback = record.exc_info[2] if record.exc_info else None
-    if traceback is None:
+    if not record.exc_info or record.exc_info[2] is None:
         return None
-    while traceback.tb_next is not None:
-        traceback = traceback.tb_next
-    return traceback.tb_frame.f_code.co_filename, traceback.tb_lineno
+    raised = traceback.extract_tb(record.exc_info[2])[-1]
+    return raised.filename, raised.lineno
 
 
 # --- what is said when belief changes: once for a change, not for each message
@@ -111,11 +111,50 @@ Line = tuple[int, str]  # level of Python's logging, and text
 
 
 @dataclass(slots=True)
-class _Doubt:
-    """A time in which the newest measurements of a source are doubted."""
+class _Source:
+    """What is not told yet of a source."""
 
-    end_ns: int  # stamp of the newest of these [ns]
-    n: int  # how many there are
+    gathered: dict[str, Change] = field(default_factory=dict)   # by id
+    said_at: Seconds = -math.inf    # when its last line was made
+    doubting: bool = False          # whether its newest measurements are doubted
+    # new ones that are doubted and follow one another: how many, stamps, number of the newest
+    n: int = 0
+    begin_ns: int = 0
+    end_ns: int = 0
+    newest: int = 0
+
+    def add(self, change: Change) -> None:
+        """Gather a change, but for what is back to what the last line said of it."""
+        earlier = self.gathered.pop(change.id, change)
+        if earlier.before is not change.after:
+            self.gathered[change.id] = change._replace(before=earlier.before)
+        if change.kind is not Judged.FIX or change.before is not None or change.after.in_graph:
+            return
+        number = int(change.id.rpartition('/')[2])
+        if not self.doubting and number != self.newest + 1:
+            self.n = 0
+        if self.n == 0:
+            self.begin_ns = self.end_ns = change.stamp_ns
+        self.n, self.newest = self.n + 1, number
+        self.begin_ns = min(self.begin_ns, change.stamp_ns)
+        self.end_ns = max(self.end_ns, change.stamp_ns)
+
+    def doubt(self, source: str, *, doubting: bool) -> Iterator[Line]:
+        """Yield a line where a time begins or ends in which the newest ones are doubted."""
+        if doubting and not self.doubting:
+            since = '' if self.n == 0 else f' since {seconds(self.begin_ns)}'
+            yield logging.WARNING, (f'{source}: its newest measurements are doubted{since}; the '
+                                    'path goes on without them')
+        if doubting or self.doubting:
+            self.gathered = {
+                name: change for name, change in self.gathered.items()
+                if change.after.in_graph or change.before not in {None, State.WAITING}}
+        if self.doubting and not doubting:
+            yield logging.INFO, (
+                f'{source}: its newest measurements are believed again; {self.n} of them, until '
+                f'{seconds(self.end_ns)}, were doubted')
+            self.n = 0
+        self.doubting = doubting
 
 
 class Announcer:
@@ -127,11 +166,7 @@ class Announcer:
     """
 
     def __init__(self) -> None:
-        self._gathered: dict[str, dict[str, Change]] = {}  # not told yet, by source and id
-        self._at: dict[str, float] = {}  # when the last line of each source was made [s]
-        self._doubts: dict[str, _Doubt] = {}
-        # new measurements that are doubted and follow one another, by source
-        self._newest: dict[str, list[Change]] = {}
+        self._sources: defaultdict[str, _Source] = defaultdict(_Source)
 
     def lines(
         self, changes: Sequence[Change], totals: Mapping[str, SourceVerdicts], now: Seconds,
@@ -140,102 +175,37 @@ class Announcer:
         """Return the lines that are due."""
         lines: list[Line] = []
         for change in changes:
-            gathered = self._gathered.setdefault(change.source, {})
-            earlier = gathered.get(change.id)
-            gathered[change.id] = (
-                change if earlier is None else change._replace(before=earlier.before))
-            if gathered[change.id].before is change.after:
-                # back to what the last line said of it; while a source is doubted for long, there
-                # may be many of these
-                del gathered[change.id]
-            if _is_new_doubt(change):
-                self._follow(change)
-        for source, each in totals.items():
-            lines += self._doubt(source, doubting=each.doubting)
-        for source, gathered in self._gathered.items():
-            if source in self._doubts or not (
-                    flush or now - self._at.get(source, -math.inf) >= REPEAT_PERIOD):
+            self._sources[change.source].add(change)
+        for name, each in totals.items():
+            lines += self._sources[name].doubt(name, doubting=each.doubting)
+        for name, source in self._sources.items():
+            if source.doubting or not (flush or now - source.said_at >= REPEAT_PERIOD):
                 continue
-            found = list(_lines(source, list(gathered.values())))
-            gathered.clear()
+            found = list(_lines(name, list(source.gathered.values())))
+            source.gathered.clear()
             if len(found) > 0:
-                self._at[source] = now
+                source.said_at = now
                 lines += found
         return lines
-
-    def _follow(self, change: Change) -> None:
-        """Note a new measurement that is doubted; begin again if one before it is not."""
-        newest = self._newest.setdefault(change.source, [])
-        if len(newest) > 0 and _number(newest[-1]) + 1 != _number(change):
-            newest.clear()
-        newest.append(change)
-        del newest[:-100]
-
-    def _doubt(self, source: str, *, doubting: bool) -> Iterator[Line]:
-        """Yield a line where a time begins or ends in which a source is doubted."""
-        doubt, gathered = self._doubts.get(source), self._gathered.get(source, {})
-        new = [change for change in gathered.values() if _is_new_doubt(change)]
-        if doubting and doubt is None:
-            # some of these may not be gathered any more
-            begin = self._newest.get(source, [])
-            stamps = [change.stamp_ns for change in begin]
-            doubt = self._doubts[source] = _Doubt(
-                max(stamps, default=0), sum(change.id not in gathered for change in begin))
-            since = '' if len(stamps) == 0 else f' since {seconds(min(stamps))}'
-            yield logging.WARNING, (f'{source}: its newest measurements are doubted{since}; the '
-                                    'path goes on without them')
-        if doubt is None:
-            return
-        doubt.n += len(new)
-        doubt.end_ns = max([doubt.end_ns, *(change.stamp_ns for change in new)])
-        for change in list(gathered.values()):
-            if change.before in (None, State.WAITING) and not change.after.in_graph:
-                del gathered[change.id]
-        if not doubting:
-            del self._doubts[source]
-            yield logging.INFO, (
-                f'{source}: its newest measurements are believed again; {doubt.n} of them, until '
-                f'{seconds(doubt.end_ns)}, were doubted')
 
 
 def _lines(source: str, changes: Sequence[Change]) -> Iterator[Line]:
     """Yield a line for each way in which the state of constraints has changed."""
-    for kind in Judged:
-        own = [change for change in changes if change.kind is kind]
-        out = [change for change in own if _was_in(change) and not change.after.in_graph]
-        back = [change for change in own
-                if change.before is State.DOUBTED and change.after.in_graph]
-        new = [] if kind is Judged.FIX else [
-            change for change in own if not _was_in(change)
-            and change.before is not State.DOUBTED and change.after is State.DOUBTED]
-        if len(out) > 0:
-            yield logging.WARNING, (
-                f'{source}: {number_of(len(out), kind)} that had been believed '
-                f'{_are(out)} thrown out: {_which(out)}')
-        if len(new) > 0:
-            yield logging.INFO, (
-                f'{source}: {number_of(len(new), kind)} {_are(new)} now doubted: {_which(new)}')
-        if len(back) > 0:
-            yield logging.INFO, (
-                f'{source}: {number_of(len(back), kind)} that had been doubted {_are(back)} now '
-                f'believed: {_which(back)}')
-
-
-def _is_new_doubt(change: Change) -> bool:
-    return change.kind is Judged.FIX and change.before is None and not change.after.in_graph
-
-
-def _number(change: Change) -> int:
-    """Return which constraint of its source it is."""
-    return int(change.id.rpartition('/')[2])
-
-
-def _was_in(change: Change) -> bool:
-    return change.before is not None and change.before.in_graph
-
-
-def _are(changes: Sequence[Change]) -> str:
-    return 'is' if len(changes) == 1 else 'are'
+    ways: dict[tuple[Judged, int, str], list[Change]] = {}
+    for change in changes:
+        if change.before is not None and change.before.in_graph:
+            if not change.after.in_graph:
+                way = logging.WARNING, 'that had been believed {} thrown out'
+                ways.setdefault((change.kind, *way), []).append(change)
+        elif change.before is State.DOUBTED:
+            if change.after.in_graph:
+                way = logging.INFO, 'that had been doubted {} now believed'
+                ways.setdefault((change.kind, *way), []).append(change)
+        elif change.after is State.DOUBTED and change.kind is not Judged.FIX:
+            ways.setdefault((change.kind, logging.INFO, '{} now doubted'), []).append(change)
+    for (kind, level, way), found in ways.items():
+        how = way.format('is' if len(found) == 1 else 'are')
+        yield level, f'{source}: {number_of(len(found), kind)} {how}: {_which(found)}'
 
 
 def _which(changes: Sequence[Change]) -> str:
