@@ -193,16 +193,16 @@ def _lines(source: str, changes: Sequence[Change]) -> Iterator[Line]:
     """Yield a line for each way in which the state of constraints has changed."""
     ways: dict[tuple[Judged, int, str], list[Change]] = {}
     for change in changes:
-        if change.before is not None and change.before.in_graph:
-            if not change.after.in_graph:
-                way = logging.WARNING, 'that had been believed {} thrown out'
-                ways.setdefault((change.kind, *way), []).append(change)
-        elif change.before is State.DOUBTED:
-            if change.after.in_graph:
-                way = logging.INFO, 'that had been doubted {} now believed'
-                ways.setdefault((change.kind, *way), []).append(change)
-        elif change.after is State.DOUBTED and change.kind is not Judged.FIX:
-            ways.setdefault((change.kind, logging.INFO, '{} now doubted'), []).append(change)
+        was_in = change.before is not None and change.before.in_graph
+        if was_in and not change.after.in_graph:
+            key = change.kind, logging.WARNING, 'that had been believed {} thrown out'
+        elif change.before is State.DOUBTED and change.after.in_graph:
+            key = change.kind, logging.INFO, 'that had been doubted {} now believed'
+        elif change.kind is not Judged.FIX and change.after is State.DOUBTED:
+            key = change.kind, logging.INFO, '{} now doubted'
+        else:
+            continue
+        ways.setdefault(key, []).append(change)
     for (kind, level, way), found in ways.items():
         how = way.format('is' if len(found) == 1 else 'are')
         yield level, f'{source}: {number_of(len(found), kind)} {how}: {_which(found)}'

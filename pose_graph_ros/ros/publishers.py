@@ -39,22 +39,24 @@ from pose_graph_ros.adapters.output_cdr import (
 )
 from pose_graph_ros.adapters.sources import (
     IN_MAP,
+    JUDGE,
     NANOSECONDS,
     OUTPUTS as OUTPUT_TOPICS,
     source_list,
 )
 from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.graph_view import GraphView
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
 from pose_graph_ros.ros.transforms import Slew, TF_QOS, TFMessage, TOPIC, TransformPublisher
+from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
@@ -159,7 +161,6 @@ class Publishers:
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = tuple(values['transform_slew'])
         self._path_period = values['path_period']
-        self.graph_period = max(2.0 * self._path_period, 0.1)   # of markers and verdicts [s]
 
     def publish_pose(
         self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,
@@ -214,37 +215,38 @@ class Publishers:
         """Let the next transform be published without limits: the robot was put elsewhere."""
         self._slew.forget()
 
-    def path_is_due(self, estimate: Estimate) -> bool:
-        """Tell whether to publish the path of an estimate."""
-        return (estimate is not self.path.shown and not self._holds(estimate)
-                and self.path.is_due(None, self._path_period))
-
-    def publish_path(
-        self, estimate: Estimate, path: Trajectory, graph: int, n_frozen: int = 0,
+    def publish_views(
+        self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
     ) -> None:
-        """Publish a path, the first poses of which may have left the graph, if it is present."""
-        shown = thinned(path, n_frozen)
-        with self._lock:
-            if graph == self.graph and not self._holds(estimate):
-                self.path.publish(estimate, estimate.stamp_ns, lambda stamp_ns: path_cdr(
-                    shown, stamp_ns, self.map_frame))
+        """
+        Publish path, markers and verdicts that are due; the path and verdicts also `at_once`.
 
-    def publish_graph(self, view: GraphView, stamp_ns: StampNs, graph: int) -> None:
-        """Publish the markers of a graph, if it is the present one."""
-        with self._lock:
-            if graph == self.graph:
-                self.markers.publish(None, stamp_ns, lambda stamp_ns: markers_cdr(
-                    view, stamp_ns, self.map_frame))
+        For the thread of a worker, which may no longer be the one of the present graph.
+        """
+        estimate, status = worker.estimate, worker.status
+        if estimate is None or graph != self.graph:
+            return
 
-    def publish_verdicts(
-        self, verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], stamp_ns: StampNs,
-        graph: int, *, state: object,
-    ) -> None:
-        """Publish the verdicts on the constraints of a graph, if it is the present one."""
-        with self._lock:
-            if graph == self.graph:
-                self.verdicts.publish(state, stamp_ns, lambda stamp_ns: verdicts_message(
-                    verdicts, totals, self._header(stamp_ns)))
+        def publish(view: View, state: object, message_at: Callable[[StampNs], object]) -> None:
+            with self._lock:
+                if graph == self.graph:
+                    view.publish(state, estimate.stamp_ns, message_at)
+
+        is_due = estimate is not self.path.shown and self.path.is_due(None, self._path_period)
+        if (is_due or at_once) and not self._holds(estimate):
+            newest = backend.estimate()
+            assert newest is not None
+            path = thinned(newest.path, newest.n_frozen)
+            publish(self.path, estimate, lambda at: path_cdr(path, at, self.map_frame))
+        period = max(2.0 * self._path_period, 0.1)
+        if self.markers.is_due(None, period) and (view := backend.view()) is not None:
+            publish(self.markers, None, lambda at: markers_cdr(view, at, self.map_frame))
+        state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
+        if self.verdicts.is_due(state, 0.0 if at_once else period):
+            # of those that are believed, the newest of each source
+            verdicts = backend.verdicts(50)
+            publish(self.verdicts, state, lambda at: verdicts_message(
+                verdicts, status.verdicts, self._header(at)))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, Message, PLANAR, planar_pose, stamp_ns
 from pose_graph_ros.adapters.fixes import datum_of
-from pose_graph_ros.adapters.sources import SET_POSE
+from pose_graph_ros.adapters.sources import JUDGE, SET_POSE
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate
@@ -38,7 +38,6 @@ from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
 
-JUDGE = 'judge'  # name under which decisions are counted
 # Stamps that stand for the newest odometry (if the message has no stamp), and for the first
 # odometry (if the message came before it) [ns].
 NEWEST, FIRST = 2**62, 1

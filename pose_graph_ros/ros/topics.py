@@ -42,23 +42,27 @@ from pose_graph_ros.ros.transforms import other_publishers, STATIC_TOPIC, TFMess
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
 
-CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
-           Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
-           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped,
-           Kind.TWIST: TwistWithCovarianceStamped, Kind.GYRO: Imu}
-"""Class of the messages by kind of source."""
 # Profiles are reliable if they do not say otherwise.
 # The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
 # best-effort writers.
 SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not get lost
-# Late subscribers receive the newest message of every broadcaster.
-STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-SET_POSE_QOS = QoSProfile(depth=1)
-JUDGE_QOS = QoSProfile(depth=100)
-
-SET_POSE_TOPICS = ('initialpose', 'set_pose')
+SOURCES = {
+    Kind.ODOMETRY: (Odometry, SENSOR_QOS), Kind.FIX: (NavSatFix, SENSOR_QOS),
+    Kind.IMU: (Imu, SENSOR_QOS), Kind.GLOBAL_POSE: (PoseWithCovarianceStamped, SENSOR_QOS),
+    # a loop closure is rare and must not get lost
+    Kind.LOOP_CLOSURE: (PoseWithCovarianceStamped, QoSProfile(depth=100)),
+    Kind.TWIST: (TwistWithCovarianceStamped, SENSOR_QOS), Kind.GYRO: (Imu, SENSOR_QOS)}
+"""Messages and quality of service by kind of source."""
 JUDGE_TOPIC = '~/judge'
+INPUTS = {
+    'initialpose': (PoseWithCovarianceStamped, QoSProfile(depth=1)),
+    'set_pose': (PoseWithCovarianceStamped, QoSProfile(depth=1)),
+    JUDGE_TOPIC: (KeyValue, QoSProfile(depth=100))}
+"""The same by topic of the other inputs."""
+if TFMessage is not None:   # late subscribers receive the newest message of every broadcaster
+    INPUTS[STATIC_TOPIC] = TFMessage, QoSProfile(
+        depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+
 OUTPUT = 'the output'
 OVERRIDES = 'qos_overrides.'  # prefix of the parameters for the quality of service
 CHOICES = {
@@ -78,7 +82,7 @@ def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, 
     used: dict[str, tuple[str, str, bool]] = {}
     entities: set[tuple[str, str]] = set()
     for user, name, message_type, published in _endpoints(values):
-        topic, kind = node.resolve_topic_name(name), _type_name(message_type)
+        topic, kind = node.resolve_topic_name(name), type_name(message_type)
         first, other, output = used.setdefault(topic, (user, kind, published))
         if other != kind:
             raise ConfigError(f'{user}: expected a topic of {kind}, got {topic}, which {first} '
@@ -109,15 +113,14 @@ def _endpoints(values: Mapping[str, Any]) -> Iterator[tuple[str, str, type, bool
         yield f'{OUTPUT} {topic}', values[f'outputs.{name}'], OUTPUTS[topic][0], True
     if TFMessage is not None:
         yield f'{OUTPUT} {TOPIC}', TOPIC, TFMessage, True
-        yield f'the input {STATIC_TOPIC}', STATIC_TOPIC, TFMessage, False
-    for topic in SET_POSE_TOPICS:
-        yield f'the input {topic}', topic, PoseWithCovarianceStamped, False
-    yield f'the input {JUDGE_TOPIC}', JUDGE_TOPIC, KeyValue, False
+    for topic, (message_type, _) in INPUTS.items():
+        yield f'the input {topic}', topic, message_type, False
     for source in source_list(values):
-        yield f'parameter {source.name}.topic', source.topic, CLASSES[source.kind], False
+        yield f'parameter {source.name}.topic', source.topic, SOURCES[source.kind][0], False
 
 
-def _type_name(message_type: type) -> str:
+def type_name(message_type: type) -> str:
+    """Return the name of a type as bags and ROS write it."""
     return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
 
 

@@ -130,10 +130,6 @@ class Worker:
             self._backend.interrupt_refinement()
             self._condition.notify()
 
-    def request_final_optimization(self) -> 'Future[UpdateReport]':
-        """Request a full optimisation with all posted measurements."""
-        return self.call(self.optimize_fully, 'the full optimisation')
-
     def call(self, job: Job[Result], what: str = 'a job') -> 'Future[Result]':
         """
         Return the future answer of a job, done in the thread after all posted measurements.

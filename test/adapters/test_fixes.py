@@ -90,20 +90,6 @@ def test_covariances_are_handed_on_by_their_type(
     assert not np.any(reader.position(message).covariance)
 
 
-@pytest.mark.parametrize(('latitude', 'longitude', 'altitude', 'reason'), [
-    (math.nan, 11.6, 1.0, 'not_finite'), (48.1, math.inf, 1.0, 'not_finite'),
-    (90.1, 11.6, 1.0, 'out_of_range'), (48.1, -360.5, 1.0, 'out_of_range'),
-    (48.1, 11.6, math.inf, 'out_of_range'), (48.1, 11.6, 1e300, 'out_of_range')])
-def test_what_is_no_place_is_refused_and_no_datum(
-    latitude: float, longitude: float, altitude: float, reason: str,
-) -> None:
-    reader = fixes()
-    message = fix(1.0, latitude, longitude)
-    message.altitude = altitude
-    assert reader.position(message).reason == reason
-    assert placed(reader, fix(2.0, 10.0, 20.0)).position == pytest.approx([0.0, 0.0], abs=1e-9)
-
-
 def test_fixes_wait_for_a_datum_if_they_are_told_to() -> None:
     datum = Datum(wait=True)
     reader = FixReader(Source('fix', Kind.FIX, 'fix'), datum, StaticFrames(), 'base_link')

@@ -94,20 +94,6 @@ def test_each_answer_to_a_person_is_logged(lines: Lines) -> None:
     assert lines == [('warning', 'there is no closure 7'), ('warning', 'there is no closure 8')]
 
 
-def test_the_same_line_may_fail_in_different_ways(lines: Lines) -> None:
-    def one() -> None:
-        raise ValueError('one')
-
-    def other() -> None:
-        raise ValueError('other')
-    for call in (one, other, one):
-        try:
-            call()
-        except ValueError:
-            core.exception('a callback failed')
-    assert [text.rpartition(' ')[2] for _, text in lines] == ['one', 'other']
-
-
 def test_at_the_end_python_logs_as_before(clock: Clock) -> None:
     package, before = logging.getLogger('pose_graph_ros'), list(logging.getLogger().handlers)
     lines, others = Lines(), Lines()

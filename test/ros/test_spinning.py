@@ -14,7 +14,6 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from harness import PATIENCE, RELIABLE
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -88,15 +87,3 @@ def test_no_exception_of_a_callback_ends_it(
         spun.wait(lambda k=k: len(heard) > k, 'the next one comes')
     spun.wait(lambda: 'w2 is wrong' in caplog.text, 'the last one is logged')
     assert heard == ['w0', 'w1', 'w2']
-
-
-def test_timers_come_and_go_while_it_runs(spun: Spun) -> None:
-    clock, ticks = Clock(clock_type=ClockType.STEADY_TIME), []
-
-    def replace() -> None:
-        nonlocal timer
-        ticks.append(time.monotonic())
-        spun.node.destroy_timer(timer)
-        timer = spun.node.create_timer(0.01, replace, clock=clock)
-    timer = spun.node.create_timer(0.01, replace, clock=clock)
-    spun.wait(lambda: len(ticks) > 20, 'many have been made')
