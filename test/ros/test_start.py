@@ -92,6 +92,6 @@ def test_a_signal_at_any_moment_of_the_start_ends_the_node(tmp_path: Path) -> No
         folder.mkdir()
         with NodeProcess(folder, program=AS_A_USER) as node:
             wait_until(lambda: catches(node.process.pid, signal.SIGTERM))
-            wait_until(lambda: processor_time(node.process.pid) > used)
+            wait_until(lambda used=used: processor_time(node.process.pid) > used)
             assert node.signal_and_wait(signal.SIGINT, signal.SIGTERM) == 0
             assert 'Traceback' not in node.stderr()
