@@ -197,17 +197,16 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
         return
     transforms, silent = session.out.transforms, session.input.silent
     if transforms is not None and transforms.other != '':
-        yield warn, transforms.other[0].upper() + transforms.other[1:] + '.'
+        yield warn, _said(transforms.other)
     if len(silent) > 0:
         yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent '
                      'while other sources are not: check the drivers.')
-    yield from ((warn, f'{sentence[0].upper()}{sentence[1:]}.') for sentence in session.doubts)
-    yield from ((warn, f'{text}.') for text in session.input.delays.wrong.values())
+    yield from ((warn, _said(text)) for text in (
+        *session.doubts, *session.input.delays.wrong.values()))
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
                      'metres while fixes come in.')
     yield from ((warn, text) for _, text in disagreements(session))
-    yield from _doubted_sources(session)
     yield from _doubts(session)
     if estimate.alignment is AlignmentState.LOCAL:
         yield good, ('Running without measurements in the map: its frame is that of the first '
@@ -235,22 +234,21 @@ def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
                      'a bag has ended'
                      + ('; the graph has been optimised.' if ended else '.'))
     if len(refused) > 0:
-        text = '; '.join(refused.values())
-        yield warn, f'{text[0].upper()}{text[1:]}.'
+        yield warn, _said('; '.join(refused.values()))
 
 
-def _doubted_sources(session: 'Session') -> Iterator[tuple[bytes, str]]:
-    """Yield what is to be said while the newest measurements of sources are not believed."""
-    doubted = [name for name, each in session.worker.status.verdicts.items() if each.doubting]
-    if len(doubted) > 0:
-        yield DiagnosticStatus.WARN, (
-            f'The newest measurements of {" and ".join(doubted)} are doubted and not used, as '
-            'they contradict the others: see ~/verdicts.')
+def _said(text: str) -> str:
+    """Return a text as a sentence."""
+    return f'{text[0].upper()}{text[1:]}.'
 
 
 def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
     """Yield what is to be said of a node that works, but with wrong settings or errors."""
     warn, status = DiagnosticStatus.WARN, session.worker.status
+    doubted = [name for name, each in status.verdicts.items() if each.doubting]
+    if len(doubted) > 0:
+        yield warn, (f'The newest measurements of {" and ".join(doubted)} are doubted and not '
+                     'used, as they contradict the others: see ~/verdicts.')
     for name, fit in status.sources.items():
         if fit.wrongly_white:
             yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
@@ -267,7 +265,7 @@ def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
     status, estimate = session.worker.status, session.worker.estimate
     found = session.searches.contradiction.found
     if found is not None:
-        yield f'{found.source}.contradiction', f'{found.text[0].upper()}{found.text[1:]}.'
+        yield f'{found.source}.contradiction', _said(found.text)
     for name, source in session.input.reader.sources.items():
         if source.kind is not Kind.GYRO or estimate is None:
             continue

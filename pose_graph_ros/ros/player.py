@@ -18,8 +18,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path as PathMessage
+from nav_msgs.msg import Path as PathMessage
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.client import Client
@@ -39,9 +38,8 @@ from pose_graph_ros.adapters.bag_inputs import (
 )
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
-from pose_graph_ros.adapters.sources import Kind, NANOSECONDS
-from pose_graph_ros.ros.topics import SOURCES, type_name
-from pose_graph_ros.ros.transforms import TFMessage
+from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, OUTPUTS
+from pose_graph_ros.ros.transforms import message_class, TF_TYPE, TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
 VERDICTS = f'{NODE_NAME}/verdicts'
@@ -79,8 +77,9 @@ class Player(Node):
         self._inputs = inputs
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._writers = {source: self.create_publisher(SOURCES[kind][0], topics[source], RELIABLE)
-                         for source, kind in inputs.kinds.items()}
+        self._writers = {source: self.create_publisher(
+            message_class(kind.message_type), topics[source], RELIABLE)
+            for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
             TFMessage, STATIC_FRAMES[0], STATIC)
         self._recorded: list[tuple[str, str, int, bytes]] = []
@@ -88,17 +87,17 @@ class Player(Node):
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}
         """The same of the newest message on a latched topic, by its name."""
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        for topic, kind, keep in (
-                ('pose', PoseWithCovarianceStamped, self._recorded.append),
-                ('odometry/filtered', Odometry, self._recorded.append),
-                ('/tf', TFMessage, self._recorded.append),
-                ('/diagnostics', DiagnosticArray, self._diagnose),
-                ('path', PathMessage, partial(self._newest.__setitem__, 'path')),
-                (VERDICTS, DiagnosticArray, partial(self._newest.__setitem__, VERDICTS))):
-            if kind is not None:
-                named = self.resolve_topic_name(topic), type_name(kind)
+        types = {topic: name for topic, name, _ in OUTPUTS.values()}
+        types |= {VERDICTS: types['~/verdicts']} | ({} if TFMessage is None else {'/tf': TF_TYPE})
+        for topic, keep in (
+                ('pose', self._recorded.append), ('odometry/filtered', self._recorded.append),
+                ('/tf', self._recorded.append), ('/diagnostics', self._diagnose),
+                ('path', partial(self._newest.__setitem__, 'path')),
+                (VERDICTS, partial(self._newest.__setitem__, VERDICTS))):
+            if topic in types:
+                named = self.resolve_topic_name(topic), types[topic]
                 self.create_subscription(
-                    kind, topic,
+                    message_class(types[topic]), topic,
                     lambda raw, keep=keep, named=named: keep((*named, time.time_ns(), raw)),
                     LATCHED if topic in {'path', VERDICTS} else RELIABLE, raw=True)
         self._optimize = self.create_client(Trigger, f'{NODE_NAME}/optimize')

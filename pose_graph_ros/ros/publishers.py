@@ -17,8 +17,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -41,7 +40,7 @@ from pose_graph_ros.adapters.sources import (
     IN_MAP,
     JUDGE,
     NANOSECONDS,
-    OUTPUTS as OUTPUT_TOPICS,
+    OUTPUTS,
     source_list,
 )
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -55,22 +54,22 @@ from pose_graph_ros.core.judgement.texts import details, sentence, total_values,
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
-from pose_graph_ros.ros.transforms import Slew, TF_QOS, TFMessage, TOPIC, TransformPublisher
+from pose_graph_ros.ros.transforms import (
+    message_class,
+    Slew,
+    TF_QOS,
+    TF_TYPE,
+    TFMessage,
+    TOPIC,
+    TransformPublisher,
+)
 from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
 LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
-OUTPUTS = {
-    'pose': (PoseWithCovarianceStamped, OUTPUT_QOS),
-    'odometry/filtered': (Odometry, OUTPUT_QOS),
-    'gps/filtered': (NavSatFix, OUTPUT_QOS),
-    'path': (Path, LATCHED_QOS),
-    'graph': (MarkerArray, LATCHED_QOS),
-    '~/verdicts': (DiagnosticArray, LATCHED_QOS),
-    '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
-"""Messages and quality of service by default topic, but for /tf."""
+LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
 UNPLACED = np.diag((UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
 LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
@@ -116,14 +115,13 @@ class Publishers:
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
-        given = {topic: values[f'outputs.{name}'] for name, (topic, *_) in OUTPUT_TOPICS.items()}
         self._publishers = {
-            topic: self._publisher(message_type, given[topic], qos)
-            for topic, (message_type, qos) in OUTPUTS.items()}
+            name: self._publisher(type_name, values[f'outputs.{name}'],
+                                  LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
+            for name, (_, type_name, _) in OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
-            self._publishers[topic] for topic in ('pose', 'odometry/filtered', 'gps/filtered'))
-        self.path, self.markers, self.verdicts = (
-            View(self._publishers[topic]) for topic in ('path', 'graph', '~/verdicts'))
+            self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))
+        self.path, self.markers, self.verdicts = (View(self._publishers[name]) for name in LATCHED)
         # None if `publish_tf` is false or tf2_msgs is not installed
         self.transforms: TransformPublisher | None = None
         self._on_other = on_other
@@ -138,9 +136,9 @@ class Publishers:
         self._lock = threading.Lock()
         self.configure(values)
 
-    def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
+    def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
-            message_type, topic, copy(qos),  # rclpy writes the overrides into it
+            message_class(type_name), topic, copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def configure(self, values: Mapping[str, Any]) -> None:
@@ -151,7 +149,7 @@ class Publishers:
                 once=True)
         elif values['publish_tf'] and self.transforms is None:
             self.transforms = TransformPublisher(
-                self._node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame,
+                self._node, self._publisher(TF_TYPE, TOPIC, TF_QOS), self.map_frame,
                 self.odom_frame, self._on_other)
             self._slew.forget()
         elif not values['publish_tf'] and self.transforms is not None:
@@ -273,7 +271,7 @@ class Publishers:
         status = DiagnosticStatus(
             level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph', message=text,
             hardware_id='pose_graph', values=_key_values(values))
-        self._publishers['/diagnostics'].publish(DiagnosticArray(
+        self._publishers['diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
     def close(self) -> None:

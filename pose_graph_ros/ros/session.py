@@ -49,8 +49,8 @@ from pose_graph_ros.ros.requests import (
     SetPoseInput,
 )
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.topics import doubts, INPUTS, JUDGE_TOPIC, SOURCES
-from pose_graph_ros.ros.transforms import STATIC_TOPIC
+from pose_graph_ros.ros.topics import CLOSURE_QOS, doubts, INPUTS, JUDGE_TOPIC, SENSOR_QOS
+from pose_graph_ros.ros.transforms import message_class, STATIC_TOPIC
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -146,7 +146,9 @@ class Session:
                 self._subscribe(topic, *given, callbacks[topic])
         for source in sources:
             self._subscribe(
-                source.topic, *SOURCES[source.kind], partial(self._on_message, source))
+                source.topic, source.kind.message_type,
+                CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS,
+                partial(self._on_message, source))
         self._watch_time()
         self.input.liveness.resume(time.monotonic())
         self.active, self.activated_at = True, time.monotonic()
@@ -191,10 +193,10 @@ class Session:
             self._watch_time()
 
     def _subscribe(
-        self, topic: str, message_type: type, qos: QoSProfile, callback: Callable[[Any], None],
+        self, topic: str, type_name: str, qos: QoSProfile, callback: Callable[[Any], None],
     ) -> None:
         self._subscriptions.append(self.node.create_subscription(
-            message_type, topic, guarded(callback, lambda: self.active),
+            message_class(type_name), topic, guarded(callback, lambda: self.active),
             copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies()))
 

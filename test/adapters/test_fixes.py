@@ -137,13 +137,15 @@ def test_frames_are_composed_along_any_chain() -> None:
         # the mast leans back by 90 degrees about y: its z points to the robot's x
         transform('base_link', '/mast', (1.0, 0.0, 0.5), (0.0, HALF, 0.0, HALF)),
         transform('mast', 'gps', (0.0, 0.25, 2.0))))
-    np.testing.assert_allclose(frames.transform('gps', 'base_link')[1], [3.0, 0.25, 0.5], atol=1e-12)
+    np.testing.assert_allclose(
+        frames.transform('gps', 'base_link')[1], [3.0, 0.25, 0.5], atol=1e-12)
     # a root above the base, turned to the left
     frames.receive(Transforms(
         transform('base_footprint', 'base_link', (0.0, 0.0, 0.3)),
         transform('base_footprint', 'roof', (0.0, 1.0, 2.0), (0.0, 0.0, HALF, HALF)),
         transform('roof', 'other', (0.5, 0.0, 0.0))))
-    np.testing.assert_allclose(frames.transform('other', 'base_link')[1], [0.0, 1.5, 1.7], atol=1e-12)
+    np.testing.assert_allclose(
+        frames.transform('other', 'base_link')[1], [0.0, 1.5, 1.7], atol=1e-12)
     np.testing.assert_allclose(frames.transform('base_link', 'base_link')[1], 0.0, atol=1e-12)
     np.testing.assert_allclose(
         frames.transform('gps', 'base_footprint')[1], [3.0, 0.25, 0.8], atol=1e-12)

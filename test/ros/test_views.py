@@ -18,11 +18,12 @@ import yaml
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from pose_graph_ros.adapters.output_cdr import NAMESPACES
+from pose_graph_ros.adapters.sources import OUTPUTS
 from pose_graph_ros.ros import diagnostics, publishers
 from pose_graph_ros.ros.topics import INPUTS
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
-TOPICS = publishers.OUTPUTS.keys() | INPUTS.keys()
+TOPICS = {topic for topic, *_ in OUTPUTS.values()} | INPUTS.keys()
 
 
 # --- RViz ------------------------------------------------------------------------------------
@@ -45,8 +46,7 @@ def test_rviz_shows_what_the_node_publishes() -> None:
 
 
 def test_rviz_asks_for_what_is_latched_and_for_nothing_that_is_not_offered() -> None:
-    latched_outputs = {topic for topic, (_, qos) in publishers.OUTPUTS.items()
-                       if qos.durability.name == 'TRANSIENT_LOCAL'}
+    latched_outputs = {OUTPUTS[name][0] for name in publishers.LATCHED}
     assert latched_outputs == {'graph', 'path', '~/verdicts'}
     for topic in rviz_topics():
         latched = topic['Value'] in latched_outputs
