@@ -154,21 +154,6 @@ def test_a_full_inbox_is_a_reason_and_no_measurement() -> None:
     assert 'the solver does not keep up' in given.log[0]
 
 
-def test_messages_are_held_back_while_a_jump_of_time_is_in_doubt() -> None:
-    given = Given()
-    for step in range(20):
-        given.receive('odom', odometry(100.0 + 0.1 * step))
-    sent = [('odom', odometry(50.0 + 0.1 * step)) for step in range(11)]
-    sent.insert(2, ('fix', fix(50.15)))
-    decisions = [given.receive(source, message) for source, message in sent]
-    assert [len(decision.released) for decision in decisions] == [0] * 11 + [12]
-    assert [decision.jump_ns > 0 for decision in decisions] == [False] * 11 + [True]
-    assert decisions[-1].jump_ns == round(51.9 * SECOND)
-    assert [(each.source, each.message) for each in decisions[-1].released] == sent
-    # held back or not, all of them have come
-    assert given.input.received == {'odom': 31, 'fix': 1}
-
-
 @pytest.mark.parametrize(('ahead', 'told'), [(100.0, True), (18.0, True), (3.0, False)])
 def test_fixes_ahead_of_odometry_are_told_once_with_what_to_do(ahead: float, told: bool) -> None:
     given = Given()
@@ -226,11 +211,3 @@ def test_a_new_graph_forgets_all_but_what_is_held_back() -> None:
     # what was logged before is not logged again
     given.use('fix', fix(101.0, status=-1))
     assert len(given.log) == 1
-
-
-def test_fixes_while_odometry_is_silent_are_not_called_ahead() -> None:
-    given = Given()
-    given.use('odom', odometry(100.0))
-    for step in range(60):
-        given.use('fix', fix(100.0 + step))
-    assert given.log == []

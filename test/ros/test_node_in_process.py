@@ -27,9 +27,10 @@ from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, requests, services
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED
+from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
-SUCCESS, RAISED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.ERROR
+SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
 @pytest.fixture(autouse=True, scope='module')
@@ -74,6 +75,29 @@ def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]
     with LocalNode(tmp_path, make) as local:
         yield Managed(local)
         local.node.close()
+
+
+def test_what_fails_is_answered_and_a_transition_leaves_the_node_unconfigured(
+    managed: Managed, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError('no memory')
+    node = managed.local.node
+    assert node.trigger_configure() is SUCCESS
+    with monkeypatch.context() as patch:
+        patch.setattr(Session, 'activate', fail)
+        assert node.trigger_activate() is TransitionCallbackReturn.ERROR
+    assert node.failure == 'MemoryError: no memory'
+    assert node._session is None
+    managed.start()
+    managed.drive(2.0)
+    monkeypatch.setattr(managed.session.worker._backend, 'optimize', fail)
+    answer = managed.call('optimize')
+    assert (answer.success, answer.message) == (False, 'failed: no memory')
+    monkeypatch.setattr(managed.session.out, 'configure', fail)
+    result = node.set_parameters_atomically([Parameter('odom.maximum_speed', value=4.0)])
+    assert (result.successful, result.reason) == (False, 'failed: MemoryError: no memory')
+    assert managed.session.worker.alive
 
 
 @pytest.mark.parametrize('managed', [

@@ -200,6 +200,8 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     level, text = active.health()
     assert (level, text.startswith('Running without measurements in the map')) == (OK, True)
     session = active.session
+    final = session.optimize()
+    active.wait(final.done, 'it is optimised')
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
@@ -209,48 +211,38 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
                  searches=Space(contradiction=Space(found=None)),
                  out=Space(transforms=Space(other='')))
 
-    def said(expected: bytes, *words: str) -> None:
+    def status(**changes: object) -> dict[str, object]:
+        return {'status': replace(worker.status, **changes)}
+    correlated = Space(wrongly_white=True, errors=Space(tau=12.0))
+    # each is more urgent than the one before
+    for owner, changes, expected, words in (
+            (worker, lambda: status(sources={'fix': correlated}), WARN,
+             'set fix.correlation_time to about 12 s'),
+            (worker, lambda: status(verdicts={
+                'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)}), WARN,
+             'The newest measurements of fix are doubted and not used'),
+            (worker, lambda: {'estimate': replace(
+                worker.estimate, alignment=AlignmentState.UNALIGNED)}, WARN, 'Unaligned'),
+            (received.delays, {'wrong': {'fix': 'The stamps of fix are 18.0 s ahead'}}, WARN,
+             'The stamps of fix are 18.0 s ahead.'),
+            (received, {'silent': ['fix']}, WARN, 'fix is silent'),
+            (received, {'silent': ['fix', 'imu']}, WARN, 'fix and imu are silent'),
+            (seen.out.transforms, {'other': 'another node publishes map -> odom'}, WARN,
+             'Another node publishes map -> odom.'),
+            (received, {'refused': {'fix': 'the newest 7 messages of fix were refused'}}, WARN,
+             'The newest 7 messages of fix were refused.'),
+            (received, {'quiet': 12.3}, WARN, 'or a bag has ended.'),
+            (seen, {'final': final}, WARN, 'or a bag has ended; the graph has been optimised.'),
+            (worker, {'prepared': False}, WARN, 'Loading compiled kernels'),
+            (seen, {'compiling': True}, WARN, 'measurements wait'),
+            (seen, {'active': False}, OK, 'Inactive'),
+            (worker, lambda: status(report=UpdateReport(Status.FAILED, 'singular', 0, 0, 0.0)),
+             ERROR, 'solver failed'),
+            (worker, {'alive': False}, ERROR, 'restart')):
+        vars(owner).update(changes() if callable(changes) else changes)
         level, text = diagnostics.health(seen)
         assert level == expected
-        assert all(word in text for word in words), text
-
-    correlated = Space(wrongly_white=True, errors=Space(tau=12.0))
-    worker.estimate, worker.status = session.worker.estimate, replace(
-        session.worker.status, sources={'fix': correlated})
-    said(WARN, 'set fix.correlation_time to about 12 s')
-    worker.status = replace(worker.status, verdicts={
-        'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)})
-    said(WARN, 'The newest measurements of fix are doubted and not used')
-    worker.estimate = replace(worker.estimate, alignment=AlignmentState.UNALIGNED)
-    said(WARN, 'Unaligned')
-    # each is more urgent than the one before
-    received.delays.wrong = {'fix': 'The stamps of fix are 18.0 s ahead'}
-    said(WARN, 'The stamps of fix are 18.0 s ahead.')
-    received.silent = ['fix']
-    said(WARN, 'fix is silent', 'check the drivers')
-    received.silent = ['fix', 'imu']
-    said(WARN, 'fix and imu are silent')
-    seen.out.transforms.other = 'another node publishes map -> odom on /tf'
-    said(WARN, 'Another node publishes map -> odom on /tf.')
-    received.refused = {'fix': 'the newest 7 messages of fix were refused: no_fix (none)'}
-    said(WARN, 'The newest 7 messages of fix were refused: no_fix (none).')
-    received.quiet = 12.3
-    said(WARN, 'Nothing has been received for 12 s')
-    assert 'optimised' not in diagnostics.health(seen)[1]
-    seen.final = session.optimize()
-    active.wait(seen.final.done, 'it is optimised')
-    said(WARN, 'Nothing has been received for 12 s', 'has been optimised.')
-    worker.prepared = False
-    said(WARN, 'Loading compiled kernels')
-    seen.compiling = True
-    said(WARN, 'Compiling kernels', 'measurements wait')
-    seen.active = False
-    said(OK, 'Inactive')
-    worker.status = replace(worker.status, report=UpdateReport(
-        Status.FAILED, 'singular', 0, 0, 0.0))
-    said(ERROR, 'solver failed', 'log')
-    worker.alive = False
-    said(ERROR, 'restart')
+        assert words in text
 
 
 def test_it_is_said_once_that_nothing_comes_in_any_more(

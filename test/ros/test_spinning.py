@@ -21,7 +21,7 @@ from std_msgs.msg import String
 
 from pose_graph_ros.cli.demo import isolated_environment
 from pose_graph_ros.ros import spinning
-from pose_graph_ros.ros.spinning import Spinner
+from pose_graph_ros.ros.spinning import guarded, Spinner
 
 
 class Spun:
@@ -87,3 +87,19 @@ def test_no_exception_of_a_callback_ends_it(
         spun.wait(lambda k=k: len(heard) > k, 'the next one comes')
     spun.wait(lambda: 'w2 is wrong' in caplog.text, 'the last one is logged')
     assert heard == ['w0', 'w1', 'w2']
+
+
+def test_a_guarded_callback_never_raises_and_does_nothing_when_it_is_not_due(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    heard, due = [], True
+
+    def hear(word: str) -> None:
+        heard.append(word)
+        raise ValueError(f'{word} is wrong')
+    callback = guarded(hear, lambda: due)
+    callback('one')
+    due = False
+    callback('two')
+    assert heard == ['one']
+    assert 'one is wrong' in caplog.text

@@ -15,7 +15,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, OdometrySource, SmootherConfig
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, OdometrySample
+from pose_graph_ros.core.measurements import Answer, GlobalPose, OdometrySample
 from pose_graph_ros.core.smoother.incremental import Refinement
 from pose_graph_ros.ros.worker import Worker
 
@@ -63,23 +63,6 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other(star
     assert worker.status.counts['pose', 'accepted'] == 100
     assert worker.estimate.stamp_ns == estimates[-1].stamp_ns
     assert worker.estimate.n_observed == 100
-
-
-def test_each_reason_is_logged_once_also_if_it_shows_late(
-    start: Start, caplog: pytest.LogCaptureFixture,
-) -> None:
-    worker = start()
-    worker.post('odom', sample(1))
-    for step in (5, 6):     # before odometry is there
-        worker.post('loop', LoopClosure(
-            step * 100_000_000, np.zeros(3), np.eye(3), reference_node=999))
-    for step in range(2, 20):
-        worker.post('odom', sample(step))
-    wait_until(lambda: worker.status.counts['loop', 'unknown_node'] == 2)
-    assert worker.stop(PATIENCE)
-    said = [text for text in caplog.messages if 'unknown_node' in text]
-    assert said == ['loop: unknown_node: there is no hidden node 999 (logged once, counted in '
-                    'diagnostics)']
 
 
 def test_posting_never_waits_for_the_solver(start: Start) -> None:
