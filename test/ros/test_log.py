@@ -88,6 +88,16 @@ def test_what_differs_in_more_than_numbers_is_another_message(lines: Lines) -> N
         'gps1: not_finite: got 7', 'the pose is set to 1', 'the pose is set to 2']
 
 
+def test_lines_of_one_way_are_left_out_though_they_differ(lines: Lines, clock: Clock) -> None:
+    for names in ('loop/1', 'loop/2, loop/3'):
+        core.info('thrown out: %s', names, extra={'way': ('loop', 'out')})
+    core.info('believed: loop/4', extra={'way': ('loop', 'back')})
+    clock.now += REPEAT_PERIOD
+    core.info('thrown out: %s', 'loop/5', extra={'way': ('loop', 'out')})
+    assert [text for _, text in lines] == [
+        'thrown out: loop/1', 'believed: loop/4', 'thrown out: loop/5 (1 more like it before)']
+
+
 def test_each_answer_to_a_person_is_logged(lines: Lines) -> None:
     for number in (7, 8):
         core.warning('there is no closure %d', number, extra=ANSWER)
