@@ -281,16 +281,6 @@ def test_a_change_is_refused_with_a_reason_whole(wanted: dict[str, object], said
     assert before == PRESENT
 
 
-def test_what_is_taken_at_configuration_can_be_changed_before() -> None:
-    wanted = {'map_frame': 'world', 'datum': (48, 11), 'fix.topic': '/fix', 'odom.noise': 'twist'}
-    assert changed(PRESENT, wanted, configured=False) == {
-        **PRESENT, **wanted, 'datum': [48.0, 11.0]}
-    with pytest.raises(ConfigError, match='datum: expected latitude'):
-        changed(PRESENT, {'datum': [91.0, 0.0]}, configured=False)
-    with pytest.raises(ConfigError, match='read at the start'):
-        changed(PRESENT, {'autostart': False}, configured=False)
-
-
 @pytest.mark.parametrize('name', ['node_heartbeat', 'odom.robust_loss'])
 def test_what_has_become_of_a_parameter_is_said(name: str) -> None:
     with pytest.raises(ConfigError, match=f'parameter {name} no longer exists: .*CHANGELOG'):

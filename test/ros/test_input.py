@@ -11,7 +11,6 @@ import harness
 import pytest
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
 from pose_graph_ros.ros.input import Decision, Input, LONGEST_DOUBT
 
@@ -85,20 +84,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     return made
 
 
-def test_every_message_is_counted_and_each_measurement_reaches_the_engine() -> None:
-    given = Given()
-    for step in range(20):
-        given.use('odom', odometry(1.0 + 0.1 * step, 0.1 * step))
-    given.use('fix', fix(1.5))
-    given.use('global_pose', pose(2.0))
-    assert given.input.received == {'odom': 20, 'fix': 1, 'global_pose': 1}
-    assert given.input.posted == len(given.engine.posted) == 22
-    assert given.rejected() == {}
-    assert given.log == []
-    kinds = {source: type(measurement) for source, measurement in given.engine.posted}
-    assert kinds == {'odom': OdometrySample, 'fix': Fix, 'global_pose': GlobalPose}
-
-
 def not_finite(seconds: float) -> Any:
     return odometry(seconds, math.nan)
 
@@ -125,22 +110,6 @@ def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
     (sentence,) = given.log
     assert sentence.startswith(f'{source}: {reason}: ')
     assert sentence.endswith('(logged once, counted in diagnostics)')
-
-
-def test_while_paused_measurements_are_read_but_not_posted() -> None:
-    given = Given()
-    given.input.paused = True
-    for step in range(5):
-        given.use('odom', odometry(1.0 + 0.1 * step))
-    given.use('fix', fix(1.2))
-    assert given.engine.posted == []
-    assert given.rejected() == {'odom.paused': 5, 'fix.paused': 1}
-    assert not given.input.is_streaming
-    assert given.input.reader.datum.plane is None
-    given.input.paused = False
-    given.use('odom', odometry(1.6))
-    assert given.input.posted == 1
-    assert given.input.is_streaming
 
 
 def test_a_full_inbox_is_a_reason_and_no_measurement() -> None:

@@ -247,10 +247,3 @@ def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     managed.wait(answer.done, 'it answers')
     assert (answer.result().success, answer.result().message) == (False, REPLACED)
     assert managed.session.worker.estimate is None
-    # a datum that came while the file was read, of another site
-    with held(monkeypatch, 'read_graph', requests) as reading:
-        answer = managed.request('load_graph')
-        managed.wait(reading.is_set, 'the file is read')
-        managed.session.input.reader.datum.plane_for(50.0, 8.0, 0.0)
-    managed.wait(answer.done, 'it answers')
-    assert 'another site' in answer.result().message

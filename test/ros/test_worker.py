@@ -86,20 +86,6 @@ def test_posting_never_waits_for_the_solver(start: Start) -> None:
     wait_until(lambda: worker.status.processed == 39)
 
 
-def test_what_comes_in_while_the_worker_is_prepared_waits(start: Start) -> None:
-    release = threading.Event()
-    worker = start(prepare=lambda stopped: release.wait(PATIENCE))
-    for step in range(1, 50):
-        assert worker.post('odom', sample(step))
-    closing = worker.call(worker.optimize_fully)
-    assert not worker.prepared
-    assert worker.status.processed == 0
-    release.set()
-    assert closing.result(PATIENCE).status is Status.CONVERGED
-    assert worker.prepared
-    assert worker.status.processed == 49
-
-
 def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker(start: Start) -> None:
     def fail(stopped: Callable[[], bool]) -> None:
         raise OSError('no space')
