@@ -2,19 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values and summary of the node's status in /diagnostics; imports only messages of ROS."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 import math
 import os
 from pathlib import Path
 import time
-from typing import Generic, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.core.alignment.monitor import AlignmentState
-from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
@@ -25,8 +24,6 @@ from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
-
-Answer = TypeVar('Answer')
 
 
 def values(session: 'Session') -> dict[str, object]:
@@ -68,54 +65,41 @@ def _state(session: 'Session') -> dict[str, object]:
             'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
             'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
             'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
-    for rank, largest in enumerate(session.searches.energies.found, 1):
+    for rank, largest in enumerate(session.searches.energies, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (
             '' if largest.unweighted == largest.energy else
             f', without its loss {short(largest.unweighted, 4)}')
     return found
 
 
-class Asked(Generic[Answer]):
-    """What the worker is asked for now and then, with its newest answer."""
-
-    def __init__(
-        self, found: Answer, what: str, ask: Callable[[PoseGraphBackend], Answer],
-    ) -> None:
-        self.found = found
-        self._what, self._ask = what, ask
-        self._asked: Future[Answer] | None = None
-        self.due = 0.0  # time [s], or number of measurements, from which on it is asked again
-
-    def update(self, worker: Worker, now: float, following: float) -> None:
-        """Take the newest answer of the worker, and ask again if that is due."""
-        asked = self._asked
-        if asked is not None and asked.done():
-            self._asked = None
-            if not asked.cancelled() and asked.exception() is None:
-                self.found = asked.result()
-        if self._asked is None and worker.prepared and now >= self.due:
-            self.due = following
-            self._asked = worker.call(self._ask, self._what)
-
-
 class Searches:
     """The constraints with the largest energies, and a source that contradicts the others."""
 
     def __init__(self) -> None:
-        self.energies: Asked[Sequence[ConstraintEnergy]] = Asked(
-            (), 'the largest energies', lambda backend: backend.largest_energies(3))
-        self.contradiction: Asked[Disagreement | None] = Asked(
-            None, 'the source that contradicts the others', lambda backend: backend.disagreement())
+        self.energies: Sequence[ConstraintEnergy] = ()
+        self.contradiction: Disagreement | None = None
+        self.due = 0.0  # time from which on the worker is asked again [s]
+        self._n = 0     # number of measurements from which on a contradiction is searched again
+        self._asked: Future[tuple[Sequence[ConstraintEnergy], Disagreement | None]] | None = None
 
     def update(self, worker: Worker) -> None:
         """Search every 5 s; while measurements fit badly, when there are twice as many."""
         now, reports = time.monotonic(), worker.status.sources.values()
-        self.energies.update(worker, now, now + 5.0)
-        if any(report.fits_badly for report in reports):
-            n = sum(report.n for report in reports)
-            self.contradiction.update(worker, n, 2 * n)
-        else:
-            self.contradiction.found, self.contradiction.due = None, 0
+        if self._asked is not None and self._asked.done():
+            if not self._asked.cancelled() and self._asked.exception() is None:
+                self.energies, self.contradiction = self._asked.result()
+            self._asked = None
+        if not any(report.fits_badly for report in reports):
+            self.contradiction, self._n = None, 0
+        if self._asked is not None or not worker.prepared or now < self.due:
+            return
+        self.due, n, known = now + 5.0, sum(report.n for report in reports), self.contradiction
+        badly = any(report.fits_badly for report in reports)
+        is_new = badly and n >= self._n
+        self._n = 2 * n if is_new else self._n
+        self._asked = worker.call(lambda backend: (
+            backend.largest_energies(3), backend.disagreement() if is_new else known),
+            'the largest energies')
 
 
 def memory() -> int:
@@ -263,7 +247,7 @@ def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
 def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
     """Yield who disagrees with others, by a key, and what is probably wrong with them."""
     status, estimate = session.worker.status, session.worker.estimate
-    found = session.searches.contradiction.found
+    found = session.searches.contradiction
     if found is not None:
         yield f'{found.source}.contradiction', _said(found.text)
     for name, source in session.input.reader.sources.items():

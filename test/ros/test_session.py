@@ -102,8 +102,8 @@ def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
     active.wait(lambda: stamp_ns(paths[-1]) > newest_ns, 'the optimised path comes')
     n_hidden = active.session.worker.estimate.n_hidden
     assert len(paths[-1].poses) == n_hidden + 1
-    active.session.searches.energies.due = 0.0
-    active.wait(lambda: len(active.session.searches.energies.found) == 3, 'energies are known')
+    active.session.searches.due = 0.0
+    active.wait(lambda: len(active.session.searches.energies) == 3, 'energies are known')
     values = active.values()
     assert (values['received'], values['processed']) == ('120', '120')
     assert (values['odom.accepted'], values['fix.accepted']) == ('100', '20')
@@ -208,7 +208,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
                      delays=Space(wrong={}), reader=Space(sources={}))
     seen = Space(worker=worker, active=True, input=received, odometry_topics={}, final=None,
                  is_loaded=False, compiling=False, doubts=[],
-                 searches=Space(contradiction=Space(found=None)),
+                 searches=Space(contradiction=None),
                  out=Space(transforms=Space(other='')))
 
     def status(**changes: object) -> dict[str, object]:
