@@ -31,12 +31,12 @@ from pose_graph_ros.adapters.bags import (
     one_line,
     own_types,
 )
+from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
-NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
 
 
@@ -95,8 +95,12 @@ class BagWriter:
 
     def write(self, topic: str, type_name: str, recorded_ns: int, message: Any) -> None:
         """Append a message of a type of ROS 2 Jazzy: CDR bytes, or an object with its fields."""
-        if (topic, type_name) not in self._connections:
-            self._connections[topic, type_name] = self._connect(topic, type_name)
+        key = topic, type_name
+        if key not in self._connections:
+            if type_name not in self._types.fielddefs:
+                raise BagError(
+                    f'{self.folder}: {topic}: type {type_name} is unknown to ROS 2 Jazzy')
+            self._connect(key, self._types, _qos(latched=topic in self._latched))
         if not isinstance(message, bytes):
             try:
                 message = self._types.serialize_cdr(message, type_name)
@@ -104,7 +108,7 @@ class BagWriter:
                 raise BagError(
                     f'{self.folder}: {topic}: no valid {type_name}: {one_line(error)}',
                 ) from error
-        self._writer.write(self._connections[topic, type_name], recorded_ns, message)
+        self._writer.write(self._connections[key], recorded_ns, message)
 
     def copy(self, message: BagMessage) -> None:
         """
@@ -126,24 +130,21 @@ class BagWriter:
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
-                types = _ros2_types(source, self._types)
-                qos = [_qos(latched=message.topic in self._latched or bool(source.ext.latching))]
+                self._connect(key, _ros2_types(source, self._types), _qos(
+                    latched=message.topic in self._latched or bool(source.ext.latching)))
             else:
-                types = own_types(source) or self._types
-                qos = list(source.ext.offered_qos_profiles)
-            known = type_name in types.fielddefs
-            # without a definition the type is left to the reader, as rosbag2 itself does
-            self._connections[key] = self._writer.add_connection(
-                *key, typestore=types if known else None, msgdef=None if known else '',
-                rihs01=None if known else source.digest or NO_HASH, offered_qos_profiles=qos)
+                self._connect(key, own_types(source) or self._types,
+                              *source.ext.offered_qos_profiles, digest=source.digest)
         self._writer.write(self._connections[key], message.recorded_ns, data)
 
-    def _connect(self, topic: str, type_name: str) -> Connection:
-        if type_name not in self._types.fielddefs:
-            raise BagError(f'{self.folder}: {topic}: type {type_name} is unknown to ROS 2 Jazzy')
-        return self._writer.add_connection(
-            topic, type_name, typestore=self._types,
-            offered_qos_profiles=[_qos(latched=topic in self._latched)])
+    def _connect(
+        self, key: tuple[str, str], types: Typestore, *qos: Qos, digest: str = '',
+    ) -> None:
+        known = key[1] in types.fielddefs
+        # without a definition the type is left to the reader, as rosbag2 itself does
+        self._connections[key] = self._writer.add_connection(
+            *key, typestore=types if known else None, msgdef=None if known else '',
+            rihs01=None if known else digest or NO_HASH, offered_qos_profiles=qos)
 
 
 def _qos(*, latched: bool) -> Qos:

@@ -17,8 +17,10 @@ from dataclasses import dataclass, field
 from functools import partial
 import glob
 import heapq
+from itertools import groupby
 import logging
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, Self
 
 from rosbags.interfaces import Connection, MessageDefinitionFormat
@@ -27,7 +29,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-from pose_graph_ros.adapters.damaged_bags import salvage, Salvaged
+from pose_graph_ros.adapters.damaged_bags import repair
 from pose_graph_ros.core.exceptions import PoseGraphError
 
 logger = logging.getLogger(__name__)
@@ -84,8 +86,11 @@ class Span(NamedTuple):
 WHOLE = Span()
 
 
+Reader = Rosbag1Reader | Rosbag2Reader
+
+
 class Bag(ABC):
-    """What a bag and several in a row have in common."""
+    """What a bag and one that is watched have in common."""
 
     path: Path | str
     topics: dict[str, TopicInfo]  # topics by name
@@ -114,82 +119,86 @@ class Bag(ABC):
         """Iterate over the messages of topics that the bag has."""
 
 
-class OpenBag(Bag):
-    """A bag that is closed as a context manager; made by `open_bag` and `open_bags`."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    @abstractmethod
-    def __exit__(self, *exception: object) -> None:
-        """Close the files; messages that were read before can still be decoded."""
-
-
 def _absolute(connection: Connection) -> str:
     """Return the topic of a connection with a slash, which recorders of ROS 1 may leave out."""
     return '/' + connection.topic.removeprefix('/')
 
 
-class BagReader(OpenBag):
-    """A bag whose files one reader reads."""
+class OpenBag(Bag):
+    """Bags that follow each other, or one, read as one; a context manager."""
 
-    def __init__(self, path: Path, reader: Rosbag1Reader | Rosbag2Reader | Salvaged) -> None:
-        self.path = path
-        self._reader: Rosbag1Reader | Rosbag2Reader | Salvaged = reader
-        self._decoders: dict[str, Callable[[bytes], Any]] = {}
+    def __init__(self, paths: Sequence[Path]) -> None:
+        with ExitStack() as stack:
+            parts = [(path, _reader(path, stack)) for path in paths]
+            self._stack = stack.pop_all()
+        self._parts = sorted(parts, key=lambda part: part[1].start_time)
+        self._decoders: dict[tuple[Path, str], Callable[[bytes], Any]] = {}
+        self.path = ', '.join(str(path) for path, _ in self._parts)
+        connections = sorted((c for _, reader in parts for c in reader.connections), key=_absolute)
         self.topics = {}
-        for name in sorted({_absolute(c) for c in reader.connections}):
-            connections = [c for c in reader.connections if _absolute(c) == name]
-            types = ' | '.join(sorted({c.msgtype for c in connections}))
-            self.topics[name] = TopicInfo(types, sum(c.msgcount for c in connections))
-        self.start_ns, self.end_ns = reader.start_time, reader.end_time
+        for name, group in groupby(connections, key=_absolute):
+            found = list(group)
+            types = ' | '.join(sorted({c.msgtype for c in found}))
+            self.topics[name] = TopicInfo(types, sum(c.msgcount for c in found))
+        self.start_ns = min(reader.start_time for _, reader in parts)   # an empty one begins late
+        self.end_ns = max(reader.end_time for _, reader in parts)
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(self, *exception: object) -> None:
-        self._reader.close()
+        """Close the files; messages that were read before can still be decoded."""
+        self._stack.close()
 
     def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
-        connections = [c for c in self._reader.connections if _absolute(c) in topics]
+        parts = [self._read(*part, topics, span) for part in self._parts]
+        return heapq.merge(*parts, key=lambda message: message.recorded_ns)
+
+    def _read(
+        self, path: Path, reader: Reader, topics: Collection[str], span: Span,
+    ) -> Iterator[BagMessage]:
+        """Iterate over the messages of a reader; where it fails, over what can be repaired."""
+        connections = [c for c in reader.connections if _absolute(c) in topics]
         if len(connections) == 0:  # rosbags reads all topics if it is given none
             return
         seen: Counter[str] = Counter()
         last_ns: int | None = None
-        source = self._reader.messages(connections, *span)
-        while True:
-            try:
-                connection, recorded_ns, raw = next(source)
-            except StopIteration:
-                break
-            except Exception as error:  # the parsers can raise anything on a damaged file
-                text = f'damaged after {seen.total()} messages: {one_line(error)}'
-                if isinstance(self._reader, Rosbag1Reader | Salvaged) or (
-                        rest := _rest_of(Path(self.path), text)) is None:
-                    raise BagError(f'{self.path}: {text}') from error
-                with rest:
-                    yield from rest.messages(
-                        [topic for topic in topics if topic in rest.topics],
-                        span if last_ns is None else Span(last_ns + 1, span.end_ns))
-                return
-            seen[_absolute(connection)] += 1
-            last_ns = recorded_ns
-            yield BagMessage(
-                _absolute(connection), connection.msgtype, recorded_ns, bytes(raw), connection,
-                self._decoder(connection))
-        if span != WHOLE or isinstance(self._reader, Salvaged):
+        try:
+            for connection, recorded_ns, raw in reader.messages(connections, *span):
+                topic, last_ns = _absolute(connection), recorded_ns
+                seen[topic] += 1
+                yield BagMessage(topic, connection.msgtype, recorded_ns, bytes(raw), connection,
+                                 self._decoder(path, reader, connection))
+        except Exception as error:  # the parsers can raise anything on a damaged file
+            text = f'damaged after {seen.total()} messages: {one_line(error)}'
+            with ExitStack() as stack:
+                rest = None if path.suffix == '.bag' else _repaired(path, text, stack)
+                if rest is None:
+                    raise BagError(f'{path}: {text}') from error
+                yield from self._read(path, rest, topics, span if last_ns is None else Span(
+                    last_ns + 1, span.end_ns))
             return
-        for topic in sorted({_absolute(c) for c in connections}):
-            if seen[topic] != self.topics[topic].count:
-                logger.warning('%s: %s should have %d messages, %d were found',
-                               self.path, topic, self.topics[topic].count, seen[topic])
+        if span == WHOLE:
+            expected: Counter[str] = Counter()
+            for connection in connections:
+                expected[_absolute(connection)] += connection.msgcount
+            for topic, count in sorted(expected.items()):
+                if seen[topic] != count:
+                    logger.warning('%s: %s should have %d messages, %d were found',
+                                   path, topic, count, seen[topic])
 
-    def _decoder(self, connection: Connection) -> Callable[[bytes], Any]:
+    def _decoder(
+        self, path: Path, reader: Reader, connection: Connection,
+    ) -> Callable[[bytes], Any]:
         """Return the decoder of a type, by its definition in the bag, else by the standard one."""
-        name, is_ros1 = connection.msgtype, isinstance(self._reader, Rosbag1Reader)
-        if name not in self._decoders:
+        key = path, connection.msgtype
+        if key not in self._decoders:
+            is_ros1 = isinstance(reader, Rosbag1Reader)
             types = own_types(connection) or get_typestore(
                 Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
             decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-            self._decoders[name] = partial(decode, typename=name)
-        return self._decoders[name]
+            self._decoders[key] = partial(decode, typename=connection.msgtype)
+        return self._decoders[key]
 
 
 def open_bag(path: str | Path) -> OpenBag:
@@ -198,42 +207,60 @@ def open_bag(path: str | Path) -> OpenBag:
 
     Raises `BagError` for a path that is no bag, or a bag that is damaged or not supported.
     """
-    path = Path(path)
+    return open_bags([path])
+
+
+def open_bags(paths: Sequence[str | Path]) -> OpenBag:
+    """Open bags that follow each other, in any order; raises `BagError` as `open_bag` does."""
+    return OpenBag([Path(path) for path in paths])
+
+
+def _reader(path: Path, stack: ExitStack) -> Reader:
+    """Return an open reader, which the stack closes."""
     if not path.exists():
         raise BagError(f'{path}: does not exist')
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
-        if (rest := _rest_of(path, 'the recording was not ended, it has no metadata.yaml')):
-            return rest
-        inside = sorted(p.name for p in path.iterdir() if p.suffix in BAG_FILE_SUFFIXES)
-        hint = f'; name a file in it: {", ".join(inside)}' if inside else ''
-        raise BagError(f'{path}: no rosbag2 folder, it has no metadata.yaml{hint}')
     if path.is_file() and path.suffix not in BAG_FILE_SUFFIXES:
         raise BagError(
             f'{path}: no bag, expected a rosbag2 folder or a file ending in '
             f'{", ".join(BAG_FILE_SUFFIXES)}')
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        rest = _repaired(path, 'the recording was not ended, it has no metadata.yaml', stack)
+        if rest is None:
+            inside = sorted(p.name for p in path.iterdir() if p.suffix in BAG_FILE_SUFFIXES)
+            hint = f'; name a file in it: {", ".join(inside)}' if inside else ''
+            raise BagError(f'{path}: no rosbag2 folder, it has no metadata.yaml{hint}')
+        return rest
     files = path.iterdir() if path.is_dir() else path.parent.glob(f'{glob.escape(path.name)}-*')
     if any(each.name.endswith(JOURNALS) and each.stat().st_size > 0 for each in files) and (
-            rest := _rest_of(path, 'the recording was not ended, it has a journal')):
+            rest := _repaired(path, 'the recording was not ended, it has a journal', stack)):
         return rest
     try:
-        reader: Rosbag1Reader | Rosbag2Reader = (
-            Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path))
-        reader.open()
+        return _opened(Rosbag1Reader(path) if path.suffix == '.bag' else Rosbag2Reader(path),
+                       stack)
     except Exception as error:  # the parsers can raise anything on a damaged file
         if path.suffix != '.bag' and (
-                rest := _rest_of(path, f'damaged or cut short: {one_line(error)}')):
+                rest := _repaired(path, f'damaged or cut short: {one_line(error)}', stack)):
             return rest
         raise BagError(
             f'{path}: damaged, cut short or not supported: {one_line(error)}') from error
-    return BagReader(path, reader)
 
 
-def _rest_of(path: Path, reason: str) -> OpenBag | None:
-    """Return what can be read of a damaged rosbag2; None if nothing can."""
-    files = [BagReader(path, each) for each in salvage(path, reason)]
-    if len(files) <= 1:
-        return files[0] if files else None
-    return BagSequence(files)
+def _opened(reader: Reader, stack: ExitStack) -> Reader:
+    reader.open()
+    stack.callback(reader.close)
+    return reader
+
+
+def _repaired(path: Path, reason: str, stack: ExitStack) -> Reader | None:
+    """Return a reader of a copy of what can be read of a rosbag2; None if nothing can."""
+    folder = stack.enter_context(TemporaryDirectory(prefix='pose_graph_'))
+    copy = Path(folder, 'bag')
+    try:
+        found = repair(path, reason, copy)
+    except OSError as error:
+        raise BagError(f'{path}: {reason}; what can be read of it cannot be copied to '
+                       f'{folder}: {one_line(error)}') from error
+    return _opened(Rosbag2Reader(copy), stack) if found else None
 
 
 def own_types(connection: Connection) -> Typestore | None:
@@ -262,38 +289,3 @@ def own_types(connection: Connection) -> Typestore | None:
 def one_line(error: Exception) -> str:
     """Return the text of an error on one line."""
     return ' '.join(str(error).split()) or type(error).__name__
-
-
-class BagSequence(OpenBag):
-    """Several bags, merged: their messages come in the order in which they were recorded."""
-
-    def __init__(self, bags: Sequence[OpenBag]) -> None:
-        self._bags = sorted(bags, key=lambda bag: bag.start_ns)
-        self.path = ', '.join(str(bag.path) for bag in self._bags)
-        self.topics = {}
-        for name in sorted({name for bag in bags for name in bag.topics}):
-            found = [bag.topics[name] for bag in bags if name in bag.topics]
-            types = sorted({part for info in found for part in info.type.split(' | ')})
-            self.topics[name] = TopicInfo(' | '.join(types), sum(info.count for info in found))
-        self.start_ns = min(bag.start_ns for bag in self._bags)  # an empty one begins late
-        self.end_ns = max(bag.end_ns for bag in self._bags)
-
-    def __exit__(self, *exception: object) -> None:
-        with ExitStack() as stack:
-            for bag in self._bags:
-                stack.push(bag)
-
-    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
-        parts = [bag.messages([topic for topic in topics if topic in bag.topics], span)
-                 for bag in self._bags]
-        return heapq.merge(*parts, key=lambda message: message.recorded_ns)
-
-
-def open_bags(paths: Sequence[str | Path]) -> OpenBag:
-    """Open bags that follow each other, in any order; raises `BagError` as `open_bag` does."""
-    if len(paths) == 1:
-        return open_bag(paths[0])
-    with ExitStack() as stack:
-        bags = [stack.enter_context(open_bag(path)) for path in paths]
-        stack.pop_all()
-    return BagSequence(bags)

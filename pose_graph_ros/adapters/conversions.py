@@ -187,25 +187,7 @@ class StaticFrames:
             rotation = _rotation(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
             self._frames[child] = parent, rotation, translation
 
-    def position(self, name: str, base: str) -> FloatArray | None:
-        """Return the origin of a frame in a base frame, shape (3,) [m]; None if it is unknown."""
-        found = self._transform(name, base)
-        return None if found is None else found[1]
-
-    def rotation(self, name: str, base: str) -> FloatArray | None:
-        """Return the rotation from a frame to a base frame, shape (3, 3); None if unknown."""
-        found = self._transform(name, base)
-        return None if found is None else found[0]
-
-    def planar(self, name: str, base: str) -> Pose | None:
-        """Return the pose of a frame in the plane of another one [m, m, rad]; None if unknown."""
-        found = self._transform(name, base)
-        if found is None:
-            return None
-        rotation, (x, y, _) = found
-        return float(x), float(y), math.atan2(rotation[1, 0], rotation[0, 0])
-
-    def _transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
+    def transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
         """Return rotation and translation of a frame in another one; None if unknown."""
         of_name, of_base = self._chain(name), self._chain(base)
         for ancestor, (turn, point) in of_name.items():

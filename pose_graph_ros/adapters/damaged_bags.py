@@ -1,19 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What can still be read of a damaged .mcap or .db3 file, as after the recorder was killed.
+Copy what can still be read of damaged .mcap or .db3 files, as after the recorder was killed.
 
 An mcap file is walked through from its start, as its index is at the end; where a record makes no
 sense, the next one that does is looked for. The rows of an sqlite3 file are read in their order;
-those on damaged pages are left out.
+those on damaged pages are left out. The copy is a whole bag, which is read like any other.
 """
 
-from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
-from functools import partial
-import heapq
 from io import BytesIO
 import logging
 import mmap
@@ -26,18 +22,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    Qos,
-)
-from rosbags.rosbag2 import metadata, ReaderError, storage_mcap
+from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag2 import metadata, storage_mcap, StoragePlugin, Writer
 import yaml
-
-from pose_graph_ros.core.quantities import StampNs
 
 logger = logging.getLogger(__name__)
 
+NO_HASH = 'RIHS01_' + 64 * '0'  # of a type whose definition is unknown
 # Kinds of records of an mcap file, and what they begin with.
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = range(2, 7)
 _ANY, _IN_CHUNK = range(1, 16), range(_SCHEMA, _CHUNK)
@@ -45,93 +36,44 @@ _CHUNK_HEAD = struct.Struct('<QQQII')   # first and last stamp, size, checksum, 
 _MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, number, when recorded, when published
 # Kind and length of a record that may have content: no message has 16 MB, and no chunk 4 GB.
 _RECORD = re.compile(rb'[\x03-\x05].{3}\0{5}|\x06.{4}\0{4}', re.DOTALL)
-_INVALID = (struct.error, ValueError, IndexError, EOFError)
-_NO_SCHEMA = storage_mcap.Schema(0, '', '', '')
 
 
-class _Message(NamedTuple):
-    recorded_ns: int
-    topic: int  # its number in the file
-    data: bytes
+class _Topic(NamedTuple):
+    name: str
+    type: str
+    serialization: str
+    definition: str
+    qualities: list[Qos]
 
 
-class Salvaged(ABC):
-    """What a damaged file still has; used like a reader of rosbags."""
-
-    complete = False  # whether the end is there
-    n_damaged = 0  # number of places that were left out
-
-    def __init__(self) -> None:
-        self.connections: list[Connection] = []
-        self.start_time, self.end_time = 2**63 - 1, 0
-
-    def _count(self) -> Counter[int]:
-        """Read all messages for the first time; return their numbers by topic."""
-        count: Counter[int] = Counter()
-        for recorded_ns, topic, _ in self._in_order():
-            count[topic] += 1
-            self.start_time = min(self.start_time, recorded_ns)
-            self.end_time = max(self.end_time, recorded_ns + 1)
-        return count
-
-    def _connect(
-        self, number: int, topic: str, serialization: str, schema: storage_mcap.Schema,
-        *, qualities: Callable[[], list[Qos]], count: int,
-    ) -> None:
-        definition, found = storage_mcap.get_msgdef(None), list[Qos]()
-        with suppress(Exception):   # the parsers can raise anything
-            definition = storage_mcap.get_msgdef(schema)
-        with suppress(Exception):
-            found = qualities()
-        self.connections.append(Connection(
-            number, topic, schema.name, definition, '', count,
-            ConnectionExtRosbag2(serialization, found), self))
-
-    def messages(
-        self, connections: Collection[Connection], start: StampNs | None = None,
-        stop: StampNs | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Iterate over messages, in the order in which they were recorded."""
-        known = {connection.id: connection for connection in connections}
-        for recorded_ns, topic, data in self._in_order():
-            if topic in known and (start is None or recorded_ns >= start) and (
-                    stop is None or recorded_ns < stop):
-                yield known[topic], recorded_ns, data
-
-    @abstractmethod
-    def _in_order(self) -> Iterator[_Message]:
-        """Iterate over all messages, in the order in which they were recorded."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the file."""
+_Message = tuple[_Topic, int, bytes]    # and when it was recorded [ns]
 
 
-class SalvagedMcap(Salvaged):
+class _Mcap:
     """An mcap file, cut short or with damaged bytes."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__()
+        self.complete, self.n_damaged = False, 0
+        self._types: dict[int, tuple[str, str]] = {}    # names and definitions
+        self.topics: dict[int, _Topic] = {}
         with path.open('rb') as file:
             self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        # least stamp of a chunk, or of a message outside of one, and where that begins and ends
-        self._blocks: list[tuple[int, int, int, int]] = []
-        self._schemas: dict[int, storage_mcap.Schema] = {}
-        self._channels: dict[int, tuple[int, str, str, bytes]] = {}
+        self.close = self._file.close
+
+    def messages(self) -> Iterator[_Message]:
+        """Yield all messages; what defines them may stand behind them, where the index is."""
+        blocks = []
         for kind, begin, end in self._records(self._file, 8, _ANY):
             self.complete |= kind == _FOOTER
-            if kind in {_SCHEMA, _CHANNEL}:
+            if kind in {_CHUNK, _MESSAGE}:
+                blocks.append((kind, begin, end))
+            else:
                 self._define(kind, self._file[begin:end])
-            elif kind in {_CHUNK, _MESSAGE}:
-                with suppress(*_INVALID):
-                    first = (_CHUNK_HEAD.unpack_from(self._file, begin)[0] if kind == _CHUNK
-                             else _MESSAGE_HEAD.unpack_from(self._file, begin)[2])
-                    self._blocks.append((first, kind, begin, end))
-        count = self._count()
-        for number, (schema, topic, serialization, more) in self._channels.items():
-            self._connect(
-                number, topic, serialization, self._schemas.get(schema, _NO_SCHEMA),
-                qualities=partial(storage_mcap.get_qos, more), count=count[number])
+        for kind, begin, end in blocks:
+            if kind == _CHUNK:
+                yield from self._in_chunk(self._file[begin:end])
+            else:
+                yield from self._message(self._file[begin:end])
 
     def _records(
         self, data: bytes | mmap.mmap, at: int, kinds: range,
@@ -149,62 +91,45 @@ class SalvagedMcap(Salvaged):
                 return
             at = following.start()
 
-    def _in_chunk(self, begin: int, end: int) -> Iterator[_Message]:
-        """Iterate over the messages of a chunk; none if its content cannot be decompressed."""
+    def _in_chunk(self, chunk: bytes) -> Iterator[_Message]:
+        """Yield the messages of a chunk; none if its content cannot be decompressed."""
         try:
-            first, last, size, checksum, n = _CHUNK_HEAD.unpack_from(self._file, begin)
-            name, at = self._file[begin + 32:begin + 32 + n].decode(), begin + 40 + n
-            data = self._file[at:end]
-            if len(data) < int.from_bytes(self._file[at - 8:at], 'little'):
+            first, last, size, checksum, n = _CHUNK_HEAD.unpack_from(chunk)
+            name, data = chunk[32:32 + n].decode(), chunk[40 + n:]
+            if len(data) < int.from_bytes(chunk[32 + n:40 + n], 'little'):
                 content = _begin_of(name, data)
             else:
                 content = storage_mcap.decompress(data, name, size, checksum)
         except Exception:   # decompression can raise anything
             self.n_damaged += 1
             return
-        for kind, start, stop in self._records(content, 0, _IN_CHUNK):
-            if kind != _MESSAGE:
-                self._define(kind, content[start:stop])
-            elif (message := _message(content[start:stop])) is not None and (
-                    first <= message.recorded_ns <= last):
-                yield message
+        for kind, begin, end in self._records(content, 0, _IN_CHUNK):
+            if kind == _MESSAGE:
+                yield from (message for message in self._message(content[begin:end])
+                            if first <= message[1] <= last)
+            else:
+                self._define(kind, content[begin:end])
 
     def _define(self, kind: int, data: bytes) -> None:
         """Note what a record of a schema or a channel says, unless another one said it."""
-        with suppress(ReaderError, struct.error, ValueError):   # a damaged one
+        with suppress(Exception):   # the parsers can raise anything on a damaged one
             stream, number = BytesIO(data[2:]), int.from_bytes(data[:2], 'little')
             if kind == _SCHEMA:
-                name, form, text = (storage_mcap.read_string(stream) for _ in range(3))
-                self._schemas.setdefault(number, storage_mcap.Schema(number, name, form, text))
-            else:
-                schema = int.from_bytes(stream.read(2), 'little')
-                topic, form = (storage_mcap.read_string(stream) for _ in range(2))
-                self._channels.setdefault(
-                    number, (schema, topic, form, storage_mcap.read_bytes(stream)))
+                name, _, text = (storage_mcap.read_string(stream) for _ in range(3))
+                self._types.setdefault(number, (name, text))
+            elif kind == _CHANNEL:
+                of_type, text = self._types[int.from_bytes(stream.read(2), 'little')]
+                name, form = (storage_mcap.read_string(stream) for _ in range(2))
+                self.topics.setdefault(number, _Topic(
+                    name, of_type, form, text,
+                    storage_mcap.get_qos(storage_mcap.read_bytes(stream))))
 
-    def _in_order(self) -> Iterator[_Message]:
-        # a chunk may begin before the one that was written before it ends
-        waiting: list[_Message] = []
-        for first, kind, begin, end in sorted(self._blocks):
-            while len(waiting) > 0 and waiting[0].recorded_ns < first:
-                yield heapq.heappop(waiting)
-            messages = self._in_chunk(begin, end) if kind == _CHUNK else filter(
-                None, [_message(self._file[begin:end])])
-            for message in messages:
-                heapq.heappush(waiting, message)
-        while len(waiting) > 0:
-            yield heapq.heappop(waiting)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def _message(data: bytes) -> _Message | None:
-    if len(data) < _MESSAGE_HEAD.size:
-        return None
-    channel, _, recorded_ns, _ = _MESSAGE_HEAD.unpack_from(data)
-    return _Message(recorded_ns, channel, data[_MESSAGE_HEAD.size:])
+    def _message(self, data: bytes) -> Iterator[_Message]:
+        """Yield the message in a record, if it is of a known topic."""
+        if len(data) >= _MESSAGE_HEAD.size:
+            channel, _, recorded_ns, _ = _MESSAGE_HEAD.unpack_from(data)
+            if channel in self.topics:
+                yield self.topics[channel], recorded_ns, data[_MESSAGE_HEAD.size:]
 
 
 def _begin_of(name: str, data: bytes) -> bytes:
@@ -214,11 +139,11 @@ def _begin_of(name: str, data: bytes) -> bytes:
     return bytes(LZ4FrameDecompressor().decompress(data)) if name == 'lz4' else data
 
 
-class SalvagedSqlite(Salvaged):
+class _Sqlite:
     """An sqlite3 file, cut short, with damaged bytes, or with a journal that was not applied."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__()
+        self.complete, self.n_damaged = False, 0
         self._folder = TemporaryDirectory()
         copy = Path(self._folder.name, path.name)
         # SQLite writes to the file where it applies what a recorder has left beside it
@@ -227,26 +152,18 @@ class SalvagedSqlite(Salvaged):
                 shutil.copyfile(path.with_name(path.name + end), copy.with_name(copy.name + end))
         _pad(copy)
         self._database = sqlite3.connect(copy)
-        self._database.row_factory = sqlite3.Row
         self._database.text_factory = lambda text: text.decode(errors='replace')
-        topics = [dict(row) for row in self._database.execute('SELECT * FROM topics')]
-        count = self._count()
-        self.complete = self.n_damaged == 0
-        schemas: dict[str, storage_mcap.Schema] = {}
-        with suppress(sqlite3.Error):
-            schemas = {name: storage_mcap.Schema(0, name, form, text) for name, form, text in (
-                self._database.execute('SELECT topic_type, encoding, encoded_message_definition '
-                                       'FROM message_definitions'))}
-        for topic in topics:
-            self._connect(
-                topic['id'], topic['name'], topic['serialization_format'],
-                schemas.get(topic['type'], _NO_SCHEMA._replace(name=topic['type'])),
-                qualities=partial(metadata.parse_qos, topic.get('offered_qos_profiles', '')),
-                count=count[topic['id']])
+        self.topics: dict[int, _Topic] = {}
 
-    def _in_order(self) -> Iterator[_Message]:
+    def close(self) -> None:
+        """Close the file, and remove the copy."""
+        self._database.close()
+        self._folder.cleanup()
+
+    def messages(self) -> Iterator[_Message]:
+        """Yield all messages; where rows cannot be read, the next ones are looked for."""
+        self._read_topics()
         last, step = 0, 1
-        self.n_damaged = 0
         while step < 2**40:
             try:
                 with closing(self._database.execute(
@@ -259,19 +176,28 @@ class SalvagedSqlite(Salvaged):
                         if number <= last:
                             raise sqlite3.DatabaseError('rows are not in their order')
                         n, step, last = n + 1, 1, number
-                        if all(isinstance(each, int) for each in (recorded_ns, topic)) and (
+                        if topic in self.topics and isinstance(recorded_ns, int) and (
                                 isinstance(data, bytes)):
-                            yield _Message(recorded_ns, topic, data)
+                            yield self.topics[topic], recorded_ns, data
                     if n == 0:
-                        return
+                        break
             except (sqlite3.Error, OverflowError):
                 self.n_damaged += step == 1
                 last, step = last + step, 2 * step
+        self.complete = self.n_damaged == 0
 
-    def close(self) -> None:
-        """Close the file, and remove the copy."""
-        self._database.close()
-        self._folder.cleanup()
+    def _read_topics(self) -> None:
+        definitions: dict[str, str] = {}
+        with suppress(sqlite3.Error):   # older ones have none
+            definitions = dict(self._database.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions'))
+        for number, name, of_type, form, profiles in self._database.execute(
+                'SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics'):
+            qualities: list[Qos] = []
+            with suppress(Exception):   # the parser can raise anything
+                qualities = metadata.parse_qos(profiles)
+            self.topics[number] = _Topic(
+                name, of_type, form, definitions.get(of_type, ''), qualities)
 
 
 def _pad(path: Path) -> None:
@@ -285,9 +211,9 @@ def _pad(path: Path) -> None:
             file.truncate(length)   # the rest takes no room on the disk
 
 
-def salvage(path: Path, reason: str) -> list[Salvaged]:
+def repair(path: Path, reason: str, copy: Path) -> bool:
     """
-    Return what can be read of an .mcap or .db3 file or a folder of them, file by file.
+    Write what can be read of an .mcap or .db3 file or a folder of them as a bag, if anything can.
 
     A warning says how much time is missing, as far as the metadata beside the files tell.
     """
@@ -296,22 +222,36 @@ def salvage(path: Path, reason: str) -> list[Salvaged]:
         text = ((path if path.is_dir() else path.parent) / 'metadata.yaml').read_text('utf-8')
         about = dict(yaml.safe_load(text)['rosbag2_bagfile_information'])
     if about.get('compression_format'):
-        return []   # what rosbag2 itself has compressed is not unpacked here
+        return False    # what rosbag2 itself has compressed is not unpacked here
     listed = [Path(str(name)).name for name in about.get('relative_file_paths') or ()]
     files = [path]
     if path.is_dir():
         files = [path / name for name in listed if (path / name).is_file()] or sorted(
             path.iterdir())
     files = [each for each in files if each.suffix in {'.mcap', '.db3'}]
-    found: list[Salvaged] = []
-    for each in files:
-        with suppress(sqlite3.Error, *_INVALID):
-            found.append((SalvagedSqlite if each.suffix == '.db3' else SalvagedMcap)(each))
-    end_ns = max((each.end_time for each in found), default=0)
-    if end_ns == 0 or not any(each.connections for each in found):
-        for file in found:
-            file.close()
-        return []
+    found: list[_Mcap | _Sqlite] = []
+    connections: dict[tuple[str, str], Connection] = {}
+
+    def connection(topic: _Topic) -> Connection:
+        if (key := topic[:2]) not in connections:
+            connections[key] = writer.add_connection(
+                *key, msgdef=topic.definition, rihs01=NO_HASH,
+                serialization_format=topic.serialization, offered_qos_profiles=topic.qualities)
+        return connections[key]
+
+    with Writer(copy, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for file in files:
+            with suppress(sqlite3.Error, ValueError), closing(
+                    (_Sqlite if file.suffix == '.db3' else _Mcap)(file)) as damaged:
+                found.append(damaged)
+                for topic, recorded_ns, data in damaged.messages():
+                    if 0 <= recorded_ns < 2**63:
+                        writer.write(connection(topic), recorded_ns, data)
+                for topic in damaged.topics.values():   # also those without messages
+                    connection(topic)
+    n, end_ns = sum(writer.counts.values()), writer.max_timestamp + 1
+    if n == 0:
+        return False
     missing = 'how much is missing is not known'
     if path.is_dir() or listed == [path.name]:
         with suppress(KeyError, TypeError, ValueError):
@@ -323,7 +263,6 @@ def salvage(path: Path, reason: str) -> list[Salvaged]:
         missing = 'its end is there'
     logger.warning(
         '%s: %s; what can be read of it is used: %d messages in %.1f s, %d damaged parts are left '
-        'out, %s', path, reason, sum(one.msgcount for each in found for one in each.connections),
-        1e-9 * (end_ns - min(each.start_time for each in found)),
+        'out, %s', path, reason, n, 1e-9 * (end_ns - writer.min_timestamp),
         sum(each.n_damaged for each in found), missing)
-    return found
+    return True

@@ -118,7 +118,7 @@ class FixReader:
         self.antenna: Antenna | None = None  # antenna of the newest fix; None before the first
         self.without_lever_arm = 0  # number of fixes that were read while the antenna was unknown
 
-    def position(self, message: Message) -> Fix | Answer:
+    def read(self, message: Message) -> Fix | Answer:
         """
         Return the fix in a sensor_msgs/NavSatFix, or the reason for rejecting it.
 
@@ -153,5 +153,5 @@ class FixReader:
         given = np.array(self.source.lever_arm, dtype=np.float64)
         if np.any(given):
             return Antenna(given, 'parameter')
-        place = self._frames.position(frame_id, self._base_frame)
-        return Antenna(given, 'none') if place is None else Antenna(place[:2], 'tf_static')
+        found = self._frames.transform(frame_id, self._base_frame)
+        return Antenna(given, 'none') if found is None else Antenna(found[1][:2], 'tf_static')

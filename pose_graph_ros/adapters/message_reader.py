@@ -25,7 +25,7 @@ from pose_graph_ros.adapters.sources import (
     Source,
     source_list,
 )
-from pose_graph_ros.core.geometry.se2 import compose_one, exp_one, Pose
+from pose_graph_ros.core.geometry.se2 import compose_one, exp_one, FloatArray, Pose
 from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected, YawRate
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
 
@@ -48,9 +48,11 @@ class MessageReader:
         self.fixes = {
             source.name: FixReader(source, self.datum, self.frames, base_frame)
             for source in self.sources.values() if source.kind is Kind.FIX}
-        self._velocities: dict[str, GyroReader | TwistReader] = {
-            name: VELOCITY_READERS[source.kind](source, self.frames, base_frame)
-            for name, source in self.sources.items() if source.kind in VELOCITY_READERS}
+        self._readers: dict[str, FixReader | GyroReader | TwistReader] = {**self.fixes}
+        for name, source in self.sources.items():
+            if source.kind in {Kind.GYRO, Kind.TWIST}:
+                kind = GyroReader if source.kind is Kind.GYRO else TwistReader
+                self._readers[name] = kind(source, self.frames, base_frame)
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """
@@ -62,10 +64,8 @@ class MessageReader:
             before = self.sources[source.name]
             self.keeper.shift(source.name, source.time_offset_ns - before.time_offset_ns)
             self.sources[source.name] = source
-            if (reader := self._velocities.get(source.name)) is not None:
-                reader.source = source
-            if source.kind is Kind.FIX:
-                self.fixes[source.name].source = source
+            if source.name in self._readers:
+                self._readers[source.name].source = source
 
     def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
         """Return the measurement in a message of a source, or the reason for rejecting it."""
@@ -84,19 +84,17 @@ class MessageReader:
         return measurement
 
     def _convert(self, source: Source, message: Message) -> OdometrySample | Measurement | Answer:
-        name, offset_ns = source.name, source.time_offset_ns
+        offset_ns = source.time_offset_ns
         match source.kind:
             case Kind.ODOMETRY:
                 return conversions.odometry_sample(
                     message, offset_ns, with_twist=source.integrates_twist)
             case Kind.GLOBAL_POSE:
                 return conversions.global_pose(message, self._map_frame, offset_ns)
-            case Kind.FIX:
-                return self.fixes[name].position(message)
             case Kind.IMU:
                 return conversions.heading(message, self.datum.yaw, source.yaw_offset, offset_ns)
-            case Kind.TWIST | Kind.GYRO:
-                return self._velocities[name].read(message)
+            case Kind.FIX | Kind.TWIST | Kind.GYRO:
+                return self._readers[source.name].read(message)
             case Kind.LOOP_CLOSURE:
                 return conversions.loop_closure(message, offset_ns)
 
@@ -118,12 +116,12 @@ class GyroReader:
         if mounting != 'tf' or name in ('', self._base_frame):
             rate, variance = -velocity.z if mounting == 'down' else velocity.z, values[8]
         else:
-            rotation = self._frames.rotation(name, self._base_frame)
-            if rotation is None:
+            found = self._frames.transform(name, self._base_frame)
+            if found is None:
                 return rejected('unknown_frame', (
                     f'no transform from {name!r} to {self._base_frame!r} on /tf_static: publish '
                     f'it, or set {self.source.name}.mounting'))
-            up = rotation[2]
+            up = found[0][2]
             rate = float(up @ (velocity.x, velocity.y, velocity.z))
             variance = up @ np.asarray(values, dtype=float).reshape(3, 3) @ up
         if not math.isfinite(rate):
@@ -153,12 +151,12 @@ class TwistReader:
             return twist
         name = frame(message.header.frame_id)
         if name not in ('', self._base_frame):
-            place = self._frames.planar(name, self._base_frame)
-            if place is None:
+            found = self._frames.transform(name, self._base_frame)
+            if found is None:
                 return rejected('wrong_frame', (
                     f'expected frame {self._base_frame!r} or one with a transform to it on '
                     f'/tf_static, got {name!r}'))
-            twist = _at_base(twist, place)
+            twist = _at_base(twist, *found)
         stamp = stamp_ns(message, self.source.time_offset_ns)
         if stamp > self._stamp_ns:
             time = (stamp - self._stamp_ns) * 1e-9 if self._stamp_ns > 0 else 0.0
@@ -170,13 +168,9 @@ class TwistReader:
                               twist_variance(message.twist.covariance), twist)
 
 
-VELOCITY_READERS: dict[Kind, type[GyroReader] | type[TwistReader]] = {
-    Kind.GYRO: GyroReader, Kind.TWIST: TwistReader}
-"""Classes of readers, which all take the same arguments, by kind of source."""
-
-
-def _at_base(twist: Pose, place: Pose) -> Pose:
+def _at_base(twist: Pose, rotation: FloatArray, place: FloatArray) -> Pose:
     """Return the twist of the robot from that of a sensor at a place in its frame."""
     x, y, rate = twist
-    c, s = math.cos(place[2]), math.sin(place[2])
-    return c * x - s * y + rate * place[1], s * x + c * y - rate * place[0], rate
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    return (c * x - s * y + rate * float(place[1]), s * x + c * y - rate * float(place[0]), rate)

@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 import re
 import sys
-from typing import Any
+from typing import Any, cast
 
 import yaml
 
@@ -151,47 +151,40 @@ def is_own(name: str, known: Collection[str]) -> bool:
 
 def checked_value(parameter: Parameter, value: Any) -> Any:
     """Return the value of a parameter with the type in the table, such as a float for 5."""
-    default = parameter.default
-    if isinstance(default, list):
-        return _checked_list(parameter, value)
-    if not isinstance(default, bool | str):
-        return _number(parameter, value)
+    if not isinstance(parameter.default, list):
+        return _checked(parameter, parameter.default, value)
+    item: Value = '' if parameter.name == 'sources' else 0.0
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        raise _wrong(parameter, f'a list of {"names" if item == "" else "numbers"}', value)
+    if len(parameter.sizes) > 0 and len(value) not in parameter.sizes:
+        sizes = ' or '.join(map(str, parameter.sizes))
+        raise _wrong(parameter, f'{sizes} numbers [{parameter.unit}]', list(value))
+    return [_checked(parameter, item, each) for each in value]
+
+
+def _checked(parameter: Parameter, default: Value, value: Any) -> Value:
+    """Return a value, or one of a list, with the type of a default."""
+    if isinstance(default, float):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise _wrong(parameter, 'a number', value)
+        low = -sys.float_info.max if parameter.smallest is None else parameter.smallest
+        high = sys.float_info.max if parameter.largest is None else parameter.largest
+        if not low <= value <= high:
+            raise _wrong(parameter, 'a finite number' if parameter.smallest is None
+                         else f'a number in [{low:g}, {high:g}]', value)
+        return float(value)
     if type(value) is not type(default):
         raise _wrong(parameter, type(default).__name__, value)
     if len(parameter.choices) > 0 and value not in parameter.choices:
         raise _wrong(parameter, f'one of {", ".join(parameter.choices)}', value)
-    if (parameter.name.endswith('.topic') or parameter.name.startswith('outputs.')) and (
-            _TOPIC.fullmatch(str(value)) is None):
+    is_topic = parameter.name.endswith('.topic') or parameter.name.startswith('outputs.')
+    if is_topic and _TOPIC.fullmatch(str(value)) is None:
         raise _wrong(parameter, 'the name of a topic', value)
-    return value
+    return cast('Value', value)
 
 
 def _wrong(parameter: Parameter, expected: str, value: object) -> ConfigError:
     return ConfigError(f'parameter {parameter.name}: expected {expected}, got {value!r}')
-
-
-def _checked_list(parameter: Parameter, value: Any) -> Value:
-    sizes, of_names = parameter.sizes, parameter.name == 'sources'
-    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or (
-            of_names and not all(isinstance(item, str) for item in value)):
-        raise _wrong(parameter, f'a list of {"names" if of_names else "numbers"}', value)
-    if of_names:
-        return list(value)
-    if len(sizes) > 0 and len(value) not in sizes:
-        expected = f'{" or ".join(map(str, sizes))} numbers [{parameter.unit}]'
-        raise _wrong(parameter, expected, list(value))
-    return [_number(parameter, item) for item in value]
-
-
-def _number(parameter: Parameter, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _wrong(parameter, 'a number', value)
-    low = -sys.float_info.max if parameter.smallest is None else parameter.smallest
-    high = sys.float_info.max if parameter.largest is None else parameter.largest
-    if not low <= value <= high:
-        raise _wrong(parameter, 'a finite number' if parameter.smallest is None
-                     else f'a number in [{low:g}, {high:g}]', value)
-    return float(value)
 
 
 def plain(value: Any) -> Any:

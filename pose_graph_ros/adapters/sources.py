@@ -49,7 +49,7 @@ IN_MAP = (Kind.FIX, Kind.GLOBAL_POSE)
 """Kinds of sources of positions in the map."""
 ODOMETRY_KINDS = (Kind.ODOMETRY, Kind.TWIST)
 
-SET_POSE = 'set_pose'  # name under which poses that a user sets are counted
+SET_POSE, JUDGE = 'set_pose', 'judge'  # names under which what a person asks for is counted
 CLOSURES = 'loop_closure'  # name of the source of loop closures that always exists
 KNOWN_SOURCES = {
     'odom': (Kind.ODOMETRY, 'odom'), 'global_pose': (Kind.GLOBAL_POSE, 'global_pose'),

@@ -153,20 +153,13 @@ class Delays:
 INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
 
 
-@dataclass(frozen=True, slots=True)
-class _Accepted:
-    """The state when the newest message was accepted."""
-
-    count: int = 0
-    at: float = 0.0  # [s]
-    refused: Mapping[str, int] = field(default_factory=dict)  # by reason
-
-
 class Refusals:
     """Follows the counts of all sources, to tell those that nothing is accepted from any more."""
 
     def __init__(self) -> None:
-        self._accepted: dict[str, _Accepted] = {}
+        # of each source, when its newest message was accepted: how many were, the time [s], and
+        # how many were refused by reason
+        self._accepted: dict[str, tuple[int, Seconds, Counter[str]]] = {}
 
     def update(
         self, received: Mapping[str, int], counts: Counter[tuple[str, str]],
@@ -175,16 +168,17 @@ class Refusals:
         """Return what to say of the sources of which the newest messages were all refused."""
         said = {}
         for source, total in received.items():
-            refused = {reason: counts[name, reason] for name, reason in details
-                       if name == source and reason not in INTENDED}
-            accepted, before = counts[source, 'accepted'], self._accepted.get(source, _Accepted())
-            if accepted > before.count:
-                self._accepted[source] = before = _Accepted(accepted, now, refused)
-            newest = Counter({reason: count - before.refused.get(reason, 0)
-                              for reason, count in refused.items()})
+            refused = Counter({reason: counts[name, reason] for name, reason in details
+                               if name == source and reason not in INTENDED})
+            accepted = counts[source, 'accepted']
+            before, at, until_then = self._accepted.get(source, (0, 0.0, Counter()))
+            if accepted > before:
+                at, until_then = now, refused
+                self._accepted[source] = accepted, at, until_then
+            newest = refused - until_then
             count = newest.total()
             if count >= EXPECTED.refusals and (
-                    accepted == 0 or now - before.at > EXPECTED.refused_for):
+                    accepted == 0 or now - at > EXPECTED.refused_for):
                 begin = f'{count} of {total}' if accepted == 0 else f'the newest {count}'
                 said[source] = (f'{begin} messages of {source} were refused: '
                                 f'{_reasons(source, newest, details)}')
@@ -193,7 +187,6 @@ class Refusals:
 
 def _reasons(source: str, counts: Counter[str], details: Mapping[tuple[str, str], str]) -> str:
     """Return all reasons with the newest detail of each, the most frequent first."""
-    found = [(reason, count) for reason, count in counts.most_common() if count > 0]
     return '; '.join(
-        (f'{count} times ' if len(found) > 1 else '') + f'{reason} ({details[source, reason]})'
-        for reason, count in found)
+        (f'{count} times ' if len(counts) > 1 else '') + f'{reason} ({details[source, reason]})'
+        for reason, count in counts.most_common())

@@ -2,19 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values and summary of the node's status in /diagnostics; imports only messages of ROS."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 import math
 import os
 from pathlib import Path
 import time
-from typing import Generic, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.core.alignment.monitor import AlignmentState
-from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
@@ -25,8 +24,6 @@ from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
-
-Answer = TypeVar('Answer')
 
 
 def values(session: 'Session') -> dict[str, object]:
@@ -68,54 +65,41 @@ def _state(session: 'Session') -> dict[str, object]:
             'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
             'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
             'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
-    for rank, largest in enumerate(session.searches.energies.found, 1):
+    for rank, largest in enumerate(session.searches.energies, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (
             '' if largest.unweighted == largest.energy else
             f', without its loss {short(largest.unweighted, 4)}')
     return found
 
 
-class Asked(Generic[Answer]):
-    """What the worker is asked for now and then, with its newest answer."""
-
-    def __init__(
-        self, found: Answer, what: str, ask: Callable[[PoseGraphBackend], Answer],
-    ) -> None:
-        self.found = found
-        self._what, self._ask = what, ask
-        self._asked: Future[Answer] | None = None
-        self.due = 0.0  # time [s], or number of measurements, from which on it is asked again
-
-    def update(self, worker: Worker, now: float, following: float) -> None:
-        """Take the newest answer of the worker, and ask again if that is due."""
-        asked = self._asked
-        if asked is not None and asked.done():
-            self._asked = None
-            if not asked.cancelled() and asked.exception() is None:
-                self.found = asked.result()
-        if self._asked is None and worker.prepared and now >= self.due:
-            self.due = following
-            self._asked = worker.call(self._ask, self._what)
-
-
 class Searches:
     """The constraints with the largest energies, and a source that contradicts the others."""
 
     def __init__(self) -> None:
-        self.energies: Asked[Sequence[ConstraintEnergy]] = Asked(
-            (), 'the largest energies', lambda backend: backend.largest_energies(3))
-        self.contradiction: Asked[Disagreement | None] = Asked(
-            None, 'the source that contradicts the others', lambda backend: backend.disagreement())
+        self.energies: Sequence[ConstraintEnergy] = ()
+        self.contradiction: Disagreement | None = None
+        self.due = 0.0  # time from which on the worker is asked again [s]
+        self._n = 0     # number of measurements from which on a contradiction is searched again
+        self._asked: Future[tuple[Sequence[ConstraintEnergy], Disagreement | None]] | None = None
 
     def update(self, worker: Worker) -> None:
         """Search every 5 s; while measurements fit badly, when there are twice as many."""
         now, reports = time.monotonic(), worker.status.sources.values()
-        self.energies.update(worker, now, now + 5.0)
-        if any(report.fits_badly for report in reports):
-            n = sum(report.n for report in reports)
-            self.contradiction.update(worker, n, 2 * n)
-        else:
-            self.contradiction.found, self.contradiction.due = None, 0
+        if self._asked is not None and self._asked.done():
+            if not self._asked.cancelled() and self._asked.exception() is None:
+                self.energies, self.contradiction = self._asked.result()
+            self._asked = None
+        if not any(report.fits_badly for report in reports):
+            self.contradiction, self._n = None, 0
+        if self._asked is not None or not worker.prepared or now < self.due:
+            return
+        self.due, n, known = now + 5.0, sum(report.n for report in reports), self.contradiction
+        badly = any(report.fits_badly for report in reports)
+        is_new = badly and n >= self._n
+        self._n = 2 * n if is_new else self._n
+        self._asked = worker.call(lambda backend: (
+            backend.largest_energies(3), backend.disagreement() if is_new else known),
+            'the largest energies')
 
 
 def memory() -> int:
@@ -197,17 +181,16 @@ def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
         return
     transforms, silent = session.out.transforms, session.input.silent
     if transforms is not None and transforms.other != '':
-        yield warn, transforms.other[0].upper() + transforms.other[1:] + '.'
+        yield warn, _said(transforms.other)
     if len(silent) > 0:
         yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent '
                      'while other sources are not: check the drivers.')
-    yield from ((warn, f'{sentence[0].upper()}{sentence[1:]}.') for sentence in session.doubts)
-    yield from ((warn, f'{text}.') for text in session.input.delays.wrong.values())
+    yield from ((warn, _said(text)) for text in (
+        *session.doubts, *session.input.delays.wrong.values()))
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
                      'metres while fixes come in.')
     yield from ((warn, text) for _, text in disagreements(session))
-    yield from _doubted_sources(session)
     yield from _doubts(session)
     if estimate.alignment is AlignmentState.LOCAL:
         yield good, ('Running without measurements in the map: its frame is that of the first '
@@ -235,22 +218,21 @@ def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
                      'a bag has ended'
                      + ('; the graph has been optimised.' if ended else '.'))
     if len(refused) > 0:
-        text = '; '.join(refused.values())
-        yield warn, f'{text[0].upper()}{text[1:]}.'
+        yield warn, _said('; '.join(refused.values()))
 
 
-def _doubted_sources(session: 'Session') -> Iterator[tuple[bytes, str]]:
-    """Yield what is to be said while the newest measurements of sources are not believed."""
-    doubted = [name for name, each in session.worker.status.verdicts.items() if each.doubting]
-    if len(doubted) > 0:
-        yield DiagnosticStatus.WARN, (
-            f'The newest measurements of {" and ".join(doubted)} are doubted and not used, as '
-            'they contradict the others: see ~/verdicts.')
+def _said(text: str) -> str:
+    """Return a text as a sentence."""
+    return f'{text[0].upper()}{text[1:]}.'
 
 
 def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
     """Yield what is to be said of a node that works, but with wrong settings or errors."""
     warn, status = DiagnosticStatus.WARN, session.worker.status
+    doubted = [name for name, each in status.verdicts.items() if each.doubting]
+    if len(doubted) > 0:
+        yield warn, (f'The newest measurements of {" and ".join(doubted)} are doubted and not '
+                     'used, as they contradict the others: see ~/verdicts.')
     for name, fit in status.sources.items():
         if fit.wrongly_white:
             yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
@@ -265,9 +247,9 @@ def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
 def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
     """Yield who disagrees with others, by a key, and what is probably wrong with them."""
     status, estimate = session.worker.status, session.worker.estimate
-    found = session.searches.contradiction.found
+    found = session.searches.contradiction
     if found is not None:
-        yield f'{found.source}.contradiction', f'{found.text[0].upper()}{found.text[1:]}.'
+        yield f'{found.source}.contradiction', _said(found.text)
     for name, source in session.input.reader.sources.items():
         if source.kind is not Kind.GYRO or estimate is None:
             continue

@@ -11,14 +11,14 @@ import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 import sys
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path as PathMessage
+from nav_msgs.msg import Path as PathMessage
 from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.client import Client
@@ -38,13 +38,11 @@ from pose_graph_ros.adapters.bag_inputs import (
 )
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
-from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.ros.topics import CLASSES
-from pose_graph_ros.ros.transforms import TFMessage
+from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, OUTPUTS
+from pose_graph_ros.ros.transforms import message_class, TF_TYPE, TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
 VERDICTS = f'{NODE_NAME}/verdicts'
-DIAGNOSTICS_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 # Profiles are reliable if they do not say otherwise.
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
@@ -79,47 +77,41 @@ class Player(Node):
         self._inputs = inputs
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._writers = {
-            source: self.create_publisher(CLASSES[inputs.kinds[source]], topics[source], RELIABLE)
-            for source in inputs.topics}
+        self._writers = {source: self.create_publisher(
+            message_class(kind.message_type), topics[source], RELIABLE)
+            for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
             TFMessage, STATIC_FRAMES[0], STATIC)
-        self.recorded: list[tuple[str, str, int, bytes]] = []
+        self._recorded: list[tuple[str, str, int, bytes]] = []
         """Topic, type, time of arrival [ns] and bytes of the node's messages."""
-        self.path = b''  # the newest path
-        self._path_at = -float('inf')
+        self._newest: dict[str, tuple[str, str, int, bytes]] = {}
+        """The same of the newest message on a latched topic, by its name."""
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        self._verdicts = b''
-        self._record('pose', PoseWithCovarianceStamped, Kind.GLOBAL_POSE.message_type)
-        self._record('odometry/filtered', Odometry, Kind.ODOMETRY.message_type)
-        if TFMessage is not None:
-            self._record('/tf', TFMessage, 'tf2_msgs/msg/TFMessage')
-        self.create_subscription(PathMessage, 'path', self._on_path, LATCHED, raw=True)
-        self.create_subscription(
-            DiagnosticArray, VERDICTS, self._on_verdicts, LATCHED, raw=True)
-        self.create_subscription(
-            DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE, raw=True)
+        types = {topic: name for topic, name, _ in OUTPUTS.values()}
+        types |= {VERDICTS: types['~/verdicts']} | ({} if TFMessage is None else {'/tf': TF_TYPE})
+        for topic, keep in (
+                ('pose', self._recorded.append), ('odometry/filtered', self._recorded.append),
+                ('/tf', self._recorded.append), ('/diagnostics', self._diagnose),
+                ('path', partial(self._newest.__setitem__, 'path')),
+                (VERDICTS, partial(self._newest.__setitem__, VERDICTS))):
+            if topic in types:
+                named = self.resolve_topic_name(topic), types[topic]
+                self.create_subscription(
+                    message_class(types[topic]), topic,
+                    lambda raw, keep=keep, named=named: keep((*named, time.time_ns(), raw)),
+                    LATCHED if topic in {'path', VERDICTS} else RELIABLE, raw=True)
         self._optimize = self.create_client(Trigger, f'{NODE_NAME}/optimize')
 
-    def _record(self, topic: str, message_type: type, type_name: str) -> None:
-        name = self.resolve_topic_name(topic)
-        self.create_subscription(
-            message_type, topic,
-            lambda raw: self.recorded.append((name, type_name, time.time_ns(), raw)),
-            RELIABLE, raw=True)
-
-    def _on_path(self, raw: bytes) -> None:
-        self.path, self._path_at = raw, time.monotonic()
-
-    def _on_verdicts(self, raw: bytes) -> None:
-        self._verdicts = raw
-
-    def _on_diagnostics(self, raw: bytes) -> None:
-        for status in deserialize_message(raw, DiagnosticArray).status:
+    def _diagnose(self, received: tuple[str, str, int, bytes]) -> None:
+        for status in deserialize_message(received[-1], DiagnosticArray).status:
             if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME:
                 self.diagnostics = {value.key: value.value for value in status.values}
-                self.recorded.append(
-                    ('/diagnostics', DIAGNOSTICS_TYPE, time.time_ns(), raw))
+                self._recorded.append(received)
+
+    @property
+    def n_poses(self) -> int:
+        """Number of poses of the newest path."""
+        return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
 
     @property
     def processed(self) -> int:
@@ -197,14 +189,16 @@ class Player(Node):
 
     def request_final_optimization(self) -> tuple[bool, str]:
         """Call ~/optimize, and wait for the path after it; return success and message."""
-        asked_at = time.monotonic()
+        asked_ns = time.time_ns()
         response = self._call(self._optimize, Trigger.Request(), 'the optimisation')
-        answered_at = time.monotonic()
-        # an earlier path may still come first: wait until no other one comes
-        self._spin_until(
-            lambda: asked_at < self._path_at
-            and max(answered_at, self._path_at) < time.monotonic() - PATIENCE.path_silence,
-            PATIENCE.answer, 'no path came after the optimisation')
+        answered_ns = time.time_ns()
+
+        def is_last() -> bool:
+            """Tell whether no other path comes: an earlier one may still come first."""
+            path_ns = self._newest['path'][2] if 'path' in self._newest else 0
+            silence_ns = time.time_ns() - max(answered_ns, path_ns)
+            return path_ns > asked_ns and silence_ns > PATIENCE.path_silence * NANOSECONDS
+        self._spin_until(is_last, PATIENCE.answer, 'no path came after the optimisation')
         return bool(response.success), str(response.message)
 
     def save_graph(self, path: Path) -> None:
@@ -226,13 +220,10 @@ class Player(Node):
 
     def write(self, folder: Path) -> None:
         """Write a rosbag2 of all; of path and verdicts the last message."""
-        path_topic, verdicts_topic = map(self.resolve_topic_name, ('path', VERDICTS))
-        with BagWriter(folder, overwrite=True, latched=[path_topic, verdicts_topic]) as writer:
-            for topic, type_name, arrived_ns, raw in self.recorded:
-                writer.write(topic, type_name, arrived_ns, raw)
-            writer.write(path_topic, 'nav_msgs/msg/Path', time.time_ns(), self.path)
-            if self._verdicts != b'':
-                writer.write(verdicts_topic, DIAGNOSTICS_TYPE, time.time_ns(), self._verdicts)
+        newest = list(self._newest.values())
+        with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
+            for message in (*self._recorded, *newest):
+                writer.write(*message)
 
 
 def main(args: list[str] | None = None) -> int:
@@ -258,9 +249,8 @@ def main(args: list[str] | None = None) -> int:
             player.save_graph(options.graph)
         player.write(options.out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
-        n_poses = len(deserialize_message(player.path, PathMessage).poses)
         print(f'the node: processed {player.processed}; optimisation {answer}; '
-              f'path of {n_poses} poses')
+              f'path of {player.n_poses} poses')
         if not success:
             print(f'player: ~/optimize: {answer}', file=sys.stderr)
             return NOT_CONVERGED

@@ -17,8 +17,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -39,36 +38,38 @@ from pose_graph_ros.adapters.output_cdr import (
 )
 from pose_graph_ros.adapters.sources import (
     IN_MAP,
+    JUDGE,
     NANOSECONDS,
-    OUTPUTS as OUTPUT_TOPICS,
+    OUTPUTS,
     source_list,
 )
 from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.graph_view import GraphView
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
-from pose_graph_ros.ros.transforms import Slew, TF_QOS, TFMessage, TOPIC, TransformPublisher
+from pose_graph_ros.ros.transforms import (
+    message_class,
+    Slew,
+    TF_QOS,
+    TF_TYPE,
+    TFMessage,
+    TOPIC,
+    TransformPublisher,
+)
+from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
 LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
-OUTPUTS = {
-    'pose': (PoseWithCovarianceStamped, OUTPUT_QOS),
-    'odometry/filtered': (Odometry, OUTPUT_QOS),
-    'gps/filtered': (NavSatFix, OUTPUT_QOS),
-    'path': (Path, LATCHED_QOS),
-    'graph': (MarkerArray, LATCHED_QOS),
-    '~/verdicts': (DiagnosticArray, LATCHED_QOS),
-    '/diagnostics': (DiagnosticArray, OUTPUT_QOS)}
-"""Messages and quality of service by default topic, but for /tf."""
+LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
 UNPLACED = np.diag((UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
 LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
@@ -114,14 +115,13 @@ class Publishers:
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
         self.base_frame = frame(values['base_link_frame'])
-        given = {topic: values[f'outputs.{name}'] for name, (topic, *_) in OUTPUT_TOPICS.items()}
         self._publishers = {
-            topic: self._publisher(message_type, given[topic], qos)
-            for topic, (message_type, qos) in OUTPUTS.items()}
+            name: self._publisher(type_name, values[f'outputs.{name}'],
+                                  LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
+            for name, (_, type_name, _) in OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
-            self._publishers[topic] for topic in ('pose', 'odometry/filtered', 'gps/filtered'))
-        self.path, self.markers, self.verdicts = (
-            View(self._publishers[topic]) for topic in ('path', 'graph', '~/verdicts'))
+            self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))
+        self.path, self.markers, self.verdicts = (View(self._publishers[name]) for name in LATCHED)
         # None if `publish_tf` is false or tf2_msgs is not installed
         self.transforms: TransformPublisher | None = None
         self._on_other = on_other
@@ -136,9 +136,9 @@ class Publishers:
         self._lock = threading.Lock()
         self.configure(values)
 
-    def _publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
+    def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
-            message_type, topic, copy(qos),  # rclpy writes the overrides into it
+            message_class(type_name), topic, copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def configure(self, values: Mapping[str, Any]) -> None:
@@ -149,7 +149,7 @@ class Publishers:
                 once=True)
         elif values['publish_tf'] and self.transforms is None:
             self.transforms = TransformPublisher(
-                self._node, self._publisher(TFMessage, TOPIC, TF_QOS), self.map_frame,
+                self._node, self._publisher(TF_TYPE, TOPIC, TF_QOS), self.map_frame,
                 self.odom_frame, self._on_other)
             self._slew.forget()
         elif not values['publish_tf'] and self.transforms is not None:
@@ -159,7 +159,6 @@ class Publishers:
         self._tf_offset_ns = round(values['transform_time_offset'] * NANOSECONDS)
         self._slew_limits = tuple(values['transform_slew'])
         self._path_period = values['path_period']
-        self.graph_period = max(2.0 * self._path_period, 0.1)   # of markers and verdicts [s]
 
     def publish_pose(
         self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,
@@ -214,37 +213,38 @@ class Publishers:
         """Let the next transform be published without limits: the robot was put elsewhere."""
         self._slew.forget()
 
-    def path_is_due(self, estimate: Estimate) -> bool:
-        """Tell whether to publish the path of an estimate."""
-        return (estimate is not self.path.shown and not self._holds(estimate)
-                and self.path.is_due(None, self._path_period))
-
-    def publish_path(
-        self, estimate: Estimate, path: Trajectory, graph: int, n_frozen: int = 0,
+    def publish_views(
+        self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
     ) -> None:
-        """Publish a path, the first poses of which may have left the graph, if it is present."""
-        shown = thinned(path, n_frozen)
-        with self._lock:
-            if graph == self.graph and not self._holds(estimate):
-                self.path.publish(estimate, estimate.stamp_ns, lambda stamp_ns: path_cdr(
-                    shown, stamp_ns, self.map_frame))
+        """
+        Publish path, markers and verdicts that are due; the path and verdicts also `at_once`.
 
-    def publish_graph(self, view: GraphView, stamp_ns: StampNs, graph: int) -> None:
-        """Publish the markers of a graph, if it is the present one."""
-        with self._lock:
-            if graph == self.graph:
-                self.markers.publish(None, stamp_ns, lambda stamp_ns: markers_cdr(
-                    view, stamp_ns, self.map_frame))
+        For the thread of a worker, which may no longer be the one of the present graph.
+        """
+        estimate, status = worker.estimate, worker.status
+        if estimate is None or graph != self.graph:
+            return
 
-    def publish_verdicts(
-        self, verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], stamp_ns: StampNs,
-        graph: int, *, state: object,
-    ) -> None:
-        """Publish the verdicts on the constraints of a graph, if it is the present one."""
-        with self._lock:
-            if graph == self.graph:
-                self.verdicts.publish(state, stamp_ns, lambda stamp_ns: verdicts_message(
-                    verdicts, totals, self._header(stamp_ns)))
+        def publish(view: View, state: object, message_at: Callable[[StampNs], object]) -> None:
+            with self._lock:
+                if graph == self.graph:
+                    view.publish(state, estimate.stamp_ns, message_at)
+
+        is_due = estimate is not self.path.shown and self.path.is_due(None, self._path_period)
+        if (is_due or at_once) and not self._holds(estimate):
+            newest = backend.estimate()
+            assert newest is not None
+            path = thinned(newest.path, newest.n_frozen)
+            publish(self.path, estimate, lambda at: path_cdr(path, at, self.map_frame))
+        period = max(2.0 * self._path_period, 0.1)
+        if self.markers.is_due(None, period) and (view := backend.view()) is not None:
+            publish(self.markers, None, lambda at: markers_cdr(view, at, self.map_frame))
+        state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
+        if self.verdicts.is_due(state, 0.0 if at_once else period):
+            # of those that are believed, the newest of each source
+            verdicts = backend.verdicts(50)
+            publish(self.verdicts, state, lambda at: verdicts_message(
+                verdicts, status.verdicts, self._header(at)))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""
@@ -271,7 +271,7 @@ class Publishers:
         status = DiagnosticStatus(
             level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph', message=text,
             hardware_id='pose_graph', values=_key_values(values))
-        self._publishers['/diagnostics'].publish(DiagnosticArray(
+        self._publishers['diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, Message, PLANAR, planar_pose, stamp_ns
 from pose_graph_ros.adapters.fixes import datum_of
-from pose_graph_ros.adapters.sources import SET_POSE
+from pose_graph_ros.adapters.sources import JUDGE, SET_POSE
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate
@@ -38,7 +38,6 @@ from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
 
-JUDGE = 'judge'  # name under which decisions are counted
 # Stamps that stand for the newest odometry (if the message has no stamp), and for the first
 # odometry (if the message came before it) [ns].
 NEWEST, FIRST = 2**62, 1
@@ -49,8 +48,7 @@ class SetPoseInput:
 
     def __init__(self, map_frame: str, odom_frame: str, base_frame: str) -> None:
         self._frames = (map_frame, odom_frame, base_frame)
-        self._waiting: Message | None = None
-        self._early = False
+        self._waiting: tuple[str, GlobalPose] | None = None     # and the frame that it is in
 
     def receive(self, message: Message, *, early: bool = False) -> Answer | None:
         """Return why a message cannot be used; None if it can and is kept for `pop`."""
@@ -62,31 +60,29 @@ class SetPoseInput:
             return rejected('not_finite', 'expected a finite position and a quaternion')
         if (broken := value_defect(pose)) is not None:
             return rejected(broken, f'pose {pose.tolist()}')
-        self._waiting, self._early = message, early
-        return None
-
-    def pop(self, estimate: Estimate) -> GlobalPose | None:
-        """Remove and return the pose, transformed to the map by an estimate; None for none."""
-        message, self._waiting = self._waiting, None
-        if message is None:
-            return None
-        pose = planar_pose(message.pose.pose)
-        assert pose is not None
         cov = np.asarray(message.pose.covariance, dtype=float).reshape(6, 6)[PLANAR]
         variance = np.diagonal(cov)
         if not (np.all(np.isfinite(cov)) and np.all(variance > 0.0)
                 and np.all(variance <= covariance.LARGEST_VARIANCE)):
             cov = np.diag((0.5, 0.5, 0.26)) ** 2    # what RViz sends [m, m, rad]
+        stamp = FIRST if early else stamp_ns(message)
+        self._waiting = named, GlobalPose(stamp if stamp > 0 else NEWEST, pose, cov)
+        return None
+
+    def pop(self, estimate: Estimate) -> GlobalPose | None:
+        """Remove and return the pose, transformed to the map by an estimate; None for none."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is None:
+            return None
+        named, given = waiting
         _, odom_frame, base_frame = self._frames
-        T_map_frame = {odom_frame: estimate.T_map_odom, base_frame: estimate.T_map_base}.get(
-            frame(message.header.frame_id))
-        if T_map_frame is not None:
-            pose = se2.compose(T_map_frame, pose)
-            turn = np.eye(3)
-            turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
-            cov = turn @ cov @ turn.T
-        stamp = FIRST if self._early else stamp_ns(message)
-        return GlobalPose(stamp if stamp > 0 else NEWEST, pose, cov)
+        T_map_frame = {odom_frame: estimate.T_map_odom, base_frame: estimate.T_map_base}.get(named)
+        if T_map_frame is None:
+            return given
+        turn = np.eye(3)
+        turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
+        return GlobalPose(given.stamp_ns, se2.compose(T_map_frame, given.pose),
+                          turn @ given.covariance @ turn.T)
 
     def forget(self) -> None:
         """Discard the pose."""

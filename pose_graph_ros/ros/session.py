@@ -16,8 +16,6 @@ import math
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -47,23 +45,12 @@ from pose_graph_ros.ros.requests import (
     decide,
     initial_graph,
     InitialGraph,
-    JUDGE,
     set_pose,
     SetPoseInput,
 )
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.topics import (
-    CLASSES,
-    doubts,
-    JUDGE_QOS,
-    JUDGE_TOPIC,
-    LOOP_CLOSURE_QOS,
-    SENSOR_QOS,
-    SET_POSE_QOS,
-    SET_POSE_TOPICS,
-    STATIC_QOS,
-)
-from pose_graph_ros.ros.transforms import STATIC_TOPIC, TFMessage
+from pose_graph_ros.ros.topics import CLOSURE_QOS, doubts, INPUTS, JUDGE_TOPIC, SENSOR_QOS
+from pose_graph_ros.ros.transforms import message_class, STATIC_TOPIC
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -124,7 +111,7 @@ class Session:
                 worker.adopt(saved)
 
         self.worker = worker = Worker(
-            backend, lambda backend: self._publish_views(worker, graph, backend),
+            backend, lambda backend: self.out.publish_views(worker, graph, backend),
             None if prepared else prepare)
         self.worker.start()
 
@@ -149,18 +136,19 @@ class Session:
     def activate(self) -> None:
         """Create the subscriptions and start the timers."""
         sources = self.input.reader.sources.values()
-        # first, since the first fix and rates need the transforms
-        if TFMessage is not None and any(
-                source.kind in IN_FRAMES for source in sources):
-            self._subscribe(STATIC_TOPIC, TFMessage, self.input.reader.frames.receive, STATIC_QOS)
-        for topic in SET_POSE_TOPICS:
-            self._subscribe(topic, PoseWithCovarianceStamped, self._on_set_pose, SET_POSE_QOS)
-        self._subscribe(JUDGE_TOPIC, KeyValue, lambda message: decide(message, self.worker),
-                        JUDGE_QOS)
+        callbacks = {
+            'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
+            JUDGE_TOPIC: lambda message: decide(message, self.worker),
+            STATIC_TOPIC: self.input.reader.frames.receive}
+        in_frames = any(source.kind in IN_FRAMES for source in sources)
+        for topic, given in INPUTS.items():
+            if topic != STATIC_TOPIC or in_frames:
+                self._subscribe(topic, *given, callbacks[topic])
         for source in sources:
-            qos = LOOP_CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS
             self._subscribe(
-                source.topic, CLASSES[source.kind], partial(self._on_message, source), qos)
+                source.topic, source.kind.message_type,
+                CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS,
+                partial(self._on_message, source))
         self._watch_time()
         self.input.liveness.resume(time.monotonic())
         self.active, self.activated_at = True, time.monotonic()
@@ -205,10 +193,10 @@ class Session:
             self._watch_time()
 
     def _subscribe(
-        self, topic: str, message_type: type, callback: Callable[[Any], None], qos: QoSProfile,
+        self, topic: str, type_name: str, qos: QoSProfile, callback: Callable[[Any], None],
     ) -> None:
         self._subscriptions.append(self.node.create_subscription(
-            message_type, topic, guarded(callback, lambda: self.active),
+            message_class(type_name), topic, guarded(callback, lambda: self.active),
             copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies()))
 
@@ -339,38 +327,13 @@ class Session:
         silence = time.monotonic() - self.input.posted_at
         if self.input.is_streaming and 0.0 < self.values['closing_silence'] < silence:
             self.input.is_streaming = False
-            self.final = self.worker.request_final_optimization()
+            self.final = self.optimize()
 
     def _on_views_timer(self) -> None:
         """Make the worker's thread publish path and markers that are due."""
         if self.worker.estimate is not None and self.worker.prepared:
-            self.worker.call(partial(self._publish_views, self.worker, self.out.graph),
+            self.worker.call(partial(self.out.publish_views, self.worker, self.out.graph),
                              'the path or the markers')
-
-    def _publish_views(
-        self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
-    ) -> None:
-        """
-        Publish path, markers and verdicts that are due; the path and verdicts also `at_once`.
-
-        For the thread of the worker, which may no longer be the one of the present graph.
-        """
-        estimate = worker.estimate
-        if estimate is None or graph != self.out.graph:
-            return
-        if self.out.path_is_due(estimate) or at_once:
-            newest = backend.estimate()
-            assert newest is not None
-            self.out.publish_path(estimate, newest.path, graph, newest.n_frozen)
-        if self.out.markers.is_due(None, self.out.graph_period) and (
-                view := backend.view()) is not None:
-            self.out.publish_graph(view, estimate.stamp_ns, graph)
-        status = worker.status
-        state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
-        if self.out.verdicts.is_due(state, 0.0 if at_once else self.out.graph_period):
-            # of those that are believed, the newest of each source
-            self.out.publish_verdicts(backend.verdicts(50), status.verdicts,
-                                      estimate.stamp_ns, graph, state=state)
 
     def optimize(self) -> 'Future[UpdateReport]':
         """Request a full optimisation, after which the path is published at once."""
@@ -379,7 +342,7 @@ class Session:
         def job(backend: PoseGraphBackend) -> UpdateReport:
             report = worker.optimize_fully(backend)
             # so that the next path after the answer is the optimised one
-            self._publish_views(worker, graph, backend, at_once=True)
+            self.out.publish_views(worker, graph, backend, at_once=True)
             return report
         return worker.call(job, 'the full optimisation')
 

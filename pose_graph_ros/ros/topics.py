@@ -13,9 +13,6 @@ from collections.abc import Iterator, Mapping
 import time
 from typing import Any, TYPE_CHECKING
 
-from diagnostic_msgs.msg import KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import (
     QoSDurabilityPolicy,
@@ -23,42 +20,44 @@ from rclpy.qos import (
     QoSProfile,
     QoSReliabilityPolicy,
 )
-from sensor_msgs.msg import Imu, NavSatFix
 
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.sources import (
     DEFAULT_SOURCES,
     Kind,
     KNOWN_SOURCES,
-    OUTPUTS as OUTPUT_TOPICS,
+    OUTPUTS,
     Source,
     source_list,
 )
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.arrivals import EXPECTED
-from pose_graph_ros.ros.publishers import OUTPUTS
-from pose_graph_ros.ros.transforms import other_publishers, STATIC_TOPIC, TFMessage, TOPIC
+from pose_graph_ros.ros.transforms import (
+    other_publishers,
+    STATIC_TOPIC,
+    TF_TYPE,
+    TFMessage,
+    TOPIC,
+)
 
 if TYPE_CHECKING:
     from pose_graph_ros.ros.session import Session
 
-CLASSES = {Kind.ODOMETRY: Odometry, Kind.FIX: NavSatFix, Kind.IMU: Imu,
-           Kind.GLOBAL_POSE: PoseWithCovarianceStamped,
-           Kind.LOOP_CLOSURE: PoseWithCovarianceStamped,
-           Kind.TWIST: TwistWithCovarianceStamped, Kind.GYRO: Imu}
-"""Class of the messages by kind of source."""
 # Profiles are reliable if they do not say otherwise.
 # The queue is deep since no odometry may be lost. A best-effort reader matches reliable and
 # best-effort writers.
 SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-LOOP_CLOSURE_QOS = QoSProfile(depth=100)  # a loop closure is rare and must not get lost
-# Late subscribers receive the newest message of every broadcaster.
-STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-SET_POSE_QOS = QoSProfile(depth=1)
-JUDGE_QOS = QoSProfile(depth=100)
-
-SET_POSE_TOPICS = ('initialpose', 'set_pose')
+CLOSURE_QOS = QoSProfile(depth=100)     # a loop closure is rare and must not get lost
 JUDGE_TOPIC = '~/judge'
+INPUTS = {
+    'initialpose': (Kind.GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+    'set_pose': (Kind.GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+    JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
+"""Messages and quality of service by topic, but for the sources."""
+if TFMessage is not None:   # late subscribers receive the newest message of every broadcaster
+    INPUTS[STATIC_TOPIC] = TF_TYPE, QoSProfile(
+        depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+
 OUTPUT = 'the output'
 OVERRIDES = 'qos_overrides.'  # prefix of the parameters for the quality of service
 CHOICES = {
@@ -77,8 +76,8 @@ def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, 
     """
     used: dict[str, tuple[str, str, bool]] = {}
     entities: set[tuple[str, str]] = set()
-    for user, name, message_type, published in _endpoints(values):
-        topic, kind = node.resolve_topic_name(name), _type_name(message_type)
+    for user, name, kind, published in _endpoints(values):
+        topic = node.resolve_topic_name(name)
         first, other, output = used.setdefault(topic, (user, kind, published))
         if other != kind:
             raise ConfigError(f'{user}: expected a topic of {kind}, got {topic}, which {first} '
@@ -95,7 +94,7 @@ def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, 
 
 def _renamed(node: Node, output: str) -> str:
     """Return what to type so that an output has a topic of its own."""
-    for name, (topic, *_) in OUTPUT_TOPICS.items():
+    for name, (topic, *_) in OUTPUTS.items():
         if output == f'{OUTPUT} {topic}':
             other = f'{node.get_fully_qualified_name()}/{name}'
             return (f': move that by {name}:={other} with ros2 launch, or by -p outputs.{name}:='
@@ -103,22 +102,15 @@ def _renamed(node: Node, output: str) -> str:
     return ''
 
 
-def _endpoints(values: Mapping[str, Any]) -> Iterator[tuple[str, str, type, bool]]:
+def _endpoints(values: Mapping[str, Any]) -> Iterator[tuple[str, str, str, bool]]:
     """Yield who uses a topic, the topic, the type of its messages, and whether it is an output."""
-    for name, (topic, *_) in OUTPUT_TOPICS.items():
-        yield f'{OUTPUT} {topic}', values[f'outputs.{name}'], OUTPUTS[topic][0], True
-    if TFMessage is not None:
-        yield f'{OUTPUT} {TOPIC}', TOPIC, TFMessage, True
-        yield f'the input {STATIC_TOPIC}', STATIC_TOPIC, TFMessage, False
-    for topic in SET_POSE_TOPICS:
-        yield f'the input {topic}', topic, PoseWithCovarianceStamped, False
-    yield f'the input {JUDGE_TOPIC}', JUDGE_TOPIC, KeyValue, False
+    for name, (topic, type_name, _) in OUTPUTS.items():
+        yield f'{OUTPUT} {topic}', values[f'outputs.{name}'], type_name, True
+    yield f'{OUTPUT} {TOPIC}', TOPIC, TF_TYPE, True
+    for topic, (type_name, _) in INPUTS.items():
+        yield f'the input {topic}', topic, type_name, False
     for source in source_list(values):
-        yield f'parameter {source.name}.topic', source.topic, CLASSES[source.kind], False
-
-
-def _type_name(message_type: type) -> str:
-    return f'{message_type.__module__.partition(".")[0]}/msg/{message_type.__name__}'
+        yield f'parameter {source.name}.topic', source.topic, source.kind.message_type, False
 
 
 def _check_override(name: str, value: object, entities: set[tuple[str, str]]) -> None:
@@ -154,7 +146,7 @@ def doubts(session: 'Session') -> Iterator[Doubt]:
                 yield from _unpublished(session, topic, source)
     for source in session.input.reader.sources.values():
         yield from _frames(session, source)
-    for name, (default, *_) in OUTPUT_TOPICS.items():
+    for name, (default, *_) in OUTPUTS.items():
         yield from _published_by_others(session, name, default)
 
 

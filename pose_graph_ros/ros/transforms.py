@@ -4,8 +4,10 @@
 
 from collections import Counter, deque
 from collections.abc import Callable
+from importlib import import_module
 import math
 import time
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -20,8 +22,16 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.ros.spinning import guarded
 
+
+def message_class(type_name: str) -> Any:
+    """Return the class of messages of a type, such as nav_msgs/msg/Odometry."""
+    package, _, name = type_name.partition('/msg/')
+    return getattr(import_module(f'{package}.msg'), name)
+
+
+TF_TYPE = 'tf2_msgs/msg/TFMessage'
 try:
-    from tf2_msgs.msg import TFMessage
+    TFMessage = message_class(TF_TYPE)
 except ImportError:  # ROS 2 from PyPI lacks tf2_msgs until it is built
     TFMessage = None
 

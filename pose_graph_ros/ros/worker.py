@@ -25,7 +25,7 @@ from pose_graph_ros.core.measurements import AnswerStatus, Measurement, Odometry
 from pose_graph_ros.core.odometry.turns import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.arrivals import INTENDED
-from pose_graph_ros.ros.log import Announcer
+from pose_graph_ros.ros.log import verdict_lines
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class Worker:
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
         self._warned: set[tuple[str, str]] = set()
         self._jumps = _numbers_of_jumps(backend)
-        self._announcer = Announcer()
+        self._doubted: set[str] = set()  # sources whose newest measurements are doubted
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
         self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
@@ -129,10 +129,6 @@ class Worker:
             self._update_wanted = True
             self._backend.interrupt_refinement()
             self._condition.notify()
-
-    def request_final_optimization(self) -> 'Future[UpdateReport]':
-        """Request a full optimisation with all posted measurements."""
-        return self.call(self.optimize_fully, 'the full optimisation')
 
     def call(self, job: Job[Result], what: str = 'a job') -> 'Future[Result]':
         """
@@ -233,7 +229,7 @@ class Worker:
         """Optimise the whole graph; a job for `call`."""
         report = self._update(backend.optimize)
         self._publish()
-        self._report(report, 0, ends=True)
+        self._report(report, 0)
         return report
 
     def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
@@ -284,9 +280,7 @@ class Worker:
         if self.estimate is not None and not self._stopping:
             self._on_estimate(self._backend)
 
-    def _report(
-        self, report: UpdateReport | None, processed: int, *, ends: bool = False,
-    ) -> int:
+    def _report(self, report: UpdateReport | None, processed: int) -> int:
         """
         Replace the status; return the number of changes of verdicts, which are announced.
 
@@ -300,9 +294,15 @@ class Worker:
                 logger.warning('%s jumped %s: its motion there is not used', source, stream.jump)
             self._jumps[source] = stream.n_jumps
         changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
-        for level, text in self._announcer.lines(
-                changes, verdicts, time.monotonic(), flush=ends):
-            logger.log(level, '%s', text)
+        doubted = {source for source, each in verdicts.items() if each.doubting}
+        for source in sorted(doubted - self._doubted):
+            logger.warning('%s: its newest measurements are doubted; the path goes on without '
+                           'them', source)
+        for source in sorted(self._doubted - doubted):
+            logger.info('%s: its newest measurements are believed again', source)
+        self._doubted = doubted
+        for level, text, way in verdict_lines(changes, doubted):
+            logger.log(level, '%s', text, extra={'way': way})
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
             refusals=dict(backend.refusals),

@@ -27,6 +27,7 @@ TF = [('/tf', 'tf'), ('/tf_static', 'tf_static')]
 def test_defaults_leave_everything_to_the_parameter_file() -> None:
     assert parameters(DEFAULTS) == {}
     assert remappings(DEFAULTS) == display_remappings(DEFAULTS) == TF
+    assert remappings({**DEFAULTS, 'remap_tf': 'False'}) == []
     assert parameter_file(DEFAULTS) == str(TREE / 'config' / 'pose_graph.yaml')
     assert Path(DEFAULTS['rviz_config']).is_file()
     assert not switch(DEFAULTS, 'rviz')
@@ -53,11 +54,6 @@ def test_true_and_false_as_people_write_them(name: str, text: str, value: bool) 
 def test_anything_else_is_refused(name: str, text: str) -> None:
     with pytest.raises(ConfigError, match=f"{name}: expected true or false, got '{text}'"):
         switch({**DEFAULTS, name: text}, name)
-
-
-def test_tf_is_that_of_the_namespace_unless_refused() -> None:
-    assert remappings(DEFAULTS)[-2:] == TF
-    assert remappings({**DEFAULTS, 'remap_tf': 'False'}) == []
 
 
 @pytest.mark.parametrize('output', OUTPUTS)

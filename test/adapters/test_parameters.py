@@ -49,13 +49,6 @@ from pose_graph_ros.core.config import (
     SET_POSES,
 )
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.measurements import (
-    GlobalPose,
-    HeadingOnly,
-    LoopClosure,
-    Measurement,
-    Position,
-)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -116,17 +109,6 @@ def test_defaults_make_the_default_engine_with_a_loss_for_what_is_in_the_map() -
         Source('global_pose', Kind.GLOBAL_POSE, 'global_pose'),
         Source('fix', Kind.FIX, 'gps/fix'),
         Source('loop_closure', Kind.LOOP_CLOSURE, 'loop_closure'))
-
-
-@pytest.mark.parametrize(('kind', 'sends'), [
-    (Kind.GLOBAL_POSE, GlobalPose), (Kind.FIX, Position), (Kind.IMU, HeadingOnly),
-    (Kind.LOOP_CLOSURE, LoopClosure)])
-def test_a_source_has_the_same_defaults_in_the_node_and_in_the_core(
-    kind: Kind, sends: type[Measurement],
-) -> None:
-    config = backend_config(checked({'sources': ['odom', 'mine'], 'mine.type': kind.value}))
-    assert config.measurements['mine'] == BackendConfig().measurement_source('mine', sends)
-    assert config.odometry['odom'] == BackendConfig().odometry_source('odom')
 
 
 NUMBERS = [p for p in (*all_parameters({}), *all_parameters({'sources': ['imu']}))
@@ -299,31 +281,10 @@ def test_a_change_is_refused_with_a_reason_whole(wanted: dict[str, object], said
     assert before == PRESENT
 
 
-def test_what_is_taken_at_configuration_can_be_changed_before() -> None:
-    wanted = {'map_frame': 'world', 'datum': (48, 11), 'fix.topic': '/fix', 'odom.noise': 'twist'}
-    assert changed(PRESENT, wanted, configured=False) == {
-        **PRESENT, **wanted, 'datum': [48.0, 11.0]}
-    with pytest.raises(ConfigError, match='datum: expected latitude'):
-        changed(PRESENT, {'datum': [91.0, 0.0]}, configured=False)
-    with pytest.raises(ConfigError, match='read at the start'):
-        changed(PRESENT, {'autostart': False}, configured=False)
-
-
-@pytest.mark.parametrize('name', [
-    'node_heartbeat', 'fix.correlation_model', 'odom.robust_loss', 'loop_closure.sigma_scale'])
+@pytest.mark.parametrize('name', ['node_heartbeat', 'odom.robust_loss'])
 def test_what_has_become_of_a_parameter_is_said(name: str) -> None:
     with pytest.raises(ConfigError, match=f'parameter {name} no longer exists: .*CHANGELOG'):
         checked({name: 1.0})
-    with pytest.raises(ConfigError, match='no longer exists'):
-        changed(PRESENT, {name: 1.0}, configured=True)
-
-
-def test_what_is_missing_has_its_default_and_what_was_wrong_can_be_mended() -> None:
-    assert changed({'frequency': 5}, {'path_period': 2}, configured=False) == checked(
-        {'frequency': 5.0, 'path_period': 2.0})
-    assert changed({'map_frame': 'odom'}, {'map_frame': 'map'}, configured=False) == checked({})
-    with pytest.raises(ConfigError, match='frequency: expected'):
-        changed({'frequency': 0.0}, {'path_period': 2.0}, configured=False)
 
 
 def some_value(parameter: Parameter) -> st.SearchStrategy[object]:

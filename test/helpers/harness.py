@@ -128,10 +128,8 @@ class Client:
 
     def __init__(
         self, domain: int, namespace: str = '', odom: str = 'odom', *, name: str = 'pose_graph',
-        listens: Sequence[str] = ('odom', 'global_pose', 'fix', 'loop_closure'),
-        more: Mapping[str, type] | None = None,
     ) -> None:
-        self.domain, self._listens, self._name = domain, listens, name
+        self.domain, self._name = domain, name
         self._status = f'/{namespace}/{name}: pose graph'.replace('//', '/')
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
@@ -143,8 +141,6 @@ class Client:
         self.global_pose = create(PoseWithCovarianceStamped, 'global_pose', RELIABLE)
         self.fix = create(NavSatFix, 'gps/fix', RELIABLE)
         self.loop_closure = create(PoseWithCovarianceStamped, 'loop_closure', RELIABLE)
-        self.more = {topic: create(kind, topic, RELIABLE) for topic, kind in (more or {}).items()}
-        """Publishers on further topics that the node subscribes to."""
         self.poses: list[PoseWithCovarianceStamped] = []
         self.filtered: list[Odometry] = []
         self.fixes: list[NavSatFix] = []
@@ -171,7 +167,7 @@ class Client:
 
     def wait_for_the_node(self) -> None:
         """Wait until the node is active, matched, and has compiled its kernels."""
-        inputs = (*(getattr(self, name) for name in self._listens), *self.more.values())
+        inputs = (self.odom, self.global_pose, self.fix, self.loop_closure)
         self.spin_until(lambda: all(p.get_subscription_count() > 0 for p in inputs)
                         and len(self.diagnostics) > 0 and self._optimize.service_is_ready(),
                         'the node listens')
@@ -308,9 +304,6 @@ class Client:
             # the newest odometry is at the newest node, and not a pose of its own
             return len(self.poses) > 0 and stamp_ns(poses[-1]) >= stamp_ns(self.poses[-1])
         return len(poses) == n_nodes + 1
-
-    def set_datum(self) -> Trigger.Response:
-        return self.trigger('set_datum')
 
     def optimize(self) -> Trigger.Response:
         """Have the node optimise; return when its outputs after that have come."""

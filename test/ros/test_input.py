@@ -11,7 +11,6 @@ import harness
 import pytest
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.core.measurements import Fix, GlobalPose, OdometrySample
 from pose_graph_ros.ros import input as input_module
 from pose_graph_ros.ros.input import Decision, Input, LONGEST_DOUBT
 
@@ -85,20 +84,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     return made
 
 
-def test_every_message_is_counted_and_each_measurement_reaches_the_engine() -> None:
-    given = Given()
-    for step in range(20):
-        given.use('odom', odometry(1.0 + 0.1 * step, 0.1 * step))
-    given.use('fix', fix(1.5))
-    given.use('global_pose', pose(2.0))
-    assert given.input.received == {'odom': 20, 'fix': 1, 'global_pose': 1}
-    assert given.input.posted == len(given.engine.posted) == 22
-    assert given.rejected() == {}
-    assert given.log == []
-    kinds = {source: type(measurement) for source, measurement in given.engine.posted}
-    assert kinds == {'odom': OdometrySample, 'fix': Fix, 'global_pose': GlobalPose}
-
-
 def not_finite(seconds: float) -> Any:
     return odometry(seconds, math.nan)
 
@@ -127,22 +112,6 @@ def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
     assert sentence.endswith('(logged once, counted in diagnostics)')
 
 
-def test_while_paused_measurements_are_read_but_not_posted() -> None:
-    given = Given()
-    given.input.paused = True
-    for step in range(5):
-        given.use('odom', odometry(1.0 + 0.1 * step))
-    given.use('fix', fix(1.2))
-    assert given.engine.posted == []
-    assert given.rejected() == {'odom.paused': 5, 'fix.paused': 1}
-    assert not given.input.is_streaming
-    assert given.input.reader.datum.plane is None
-    given.input.paused = False
-    given.use('odom', odometry(1.6))
-    assert given.input.posted == 1
-    assert given.input.is_streaming
-
-
 def test_a_full_inbox_is_a_reason_and_no_measurement() -> None:
     given = Given(limit=3)
     for step in range(5):
@@ -152,33 +121,6 @@ def test_a_full_inbox_is_a_reason_and_no_measurement() -> None:
     assert given.rejected() == {'odom.inbox_full': 2, 'fix.inbox_full': 1}
     assert given.input.reader.datum.plane is None
     assert 'the solver does not keep up' in given.log[0]
-
-
-def test_the_time_of_the_last_posted_measurement_is_kept(clock: Clock) -> None:
-    given = Given()
-    assert (given.input.posted_at, given.input.is_streaming) == (100.0, False)
-    clock.now = 107.0
-    given.use('odom', odometry(1.0))
-    assert (given.input.posted_at, given.input.is_streaming) == (107.0, True)
-    # a message that cannot be used is as good as none
-    clock.now = 109.0
-    given.use('odom', not_finite(1.1))
-    assert given.input.posted_at == 107.0
-
-
-def test_messages_are_held_back_while_a_jump_of_time_is_in_doubt() -> None:
-    given = Given()
-    for step in range(20):
-        given.receive('odom', odometry(100.0 + 0.1 * step))
-    sent = [('odom', odometry(50.0 + 0.1 * step)) for step in range(11)]
-    sent.insert(2, ('fix', fix(50.15)))
-    decisions = [given.receive(source, message) for source, message in sent]
-    assert [len(decision.released) for decision in decisions] == [0] * 11 + [12]
-    assert [decision.jump_ns > 0 for decision in decisions] == [False] * 11 + [True]
-    assert decisions[-1].jump_ns == round(51.9 * SECOND)
-    assert [(each.source, each.message) for each in decisions[-1].released] == sent
-    # held back or not, all of them have come
-    assert given.input.received == {'odom': 31, 'fix': 1}
 
 
 @pytest.mark.parametrize(('ahead', 'told'), [(100.0, True), (18.0, True), (3.0, False)])
@@ -208,17 +150,6 @@ def test_late_fixes_are_no_mistake_but_odometry_that_is_apart_is() -> None:
     assert '30.0 s behind those of odom' in given.log[0]
 
 
-def test_an_odometry_one_hour_ahead_does_not_get_in_and_is_named() -> None:
-    given = Given(sources=['odom', 'visual', 'fix'], visual__type='odometry')
-    for step in range(100):
-        given.use('odom', odometry(100.0 + 0.1 * step))
-        given.use('visual', odometry(3700.0 + 0.1 * step))
-    assert {source for source, _ in given.engine.posted} == {'odom'}
-    assert given.rejected() == {'visual.stamp_leap': 100}
-    assert '3600.0 s ahead of the stamps of odom' in given.log[0]
-    assert 'visual.time_offset' in given.log[0]
-
-
 def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) -> None:
     given = Given()
     given.receive('odom', odometry(100.0))
@@ -229,17 +160,6 @@ def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) ->
     clock.now += 0.2 * LONGEST_DOUBT
     assert [received.source for received in given.input.release_overdue()] == ['odom', 'fix']
     assert given.input.release_overdue() == []
-
-
-def test_another_time_offset_shifts_measurements_and_is_no_jump() -> None:
-    given = Given()
-    for step in range(20):
-        given.use('odom', odometry(100.0 + 0.1 * step))
-    given.input.configure(checked({'odom.time_offset': -30.0}))
-    for step in range(20, 30):
-        given.use('odom', odometry(100.0 + 0.1 * step))
-    assert given.input.posted == 30
-    assert given.engine.posted[-1][1].stamp_ns == round(72.9 * SECOND)
 
 
 def test_a_new_graph_forgets_all_but_what_is_held_back() -> None:
@@ -260,23 +180,3 @@ def test_a_new_graph_forgets_all_but_what_is_held_back() -> None:
     # what was logged before is not logged again
     given.use('fix', fix(101.0, status=-1))
     assert len(given.log) == 1
-
-
-def test_fixes_while_odometry_is_silent_are_not_called_ahead() -> None:
-    given = Given()
-    given.use('odom', odometry(100.0))
-    for step in range(60):
-        given.use('fix', fix(100.0 + step))
-    assert given.log == []
-
-
-def test_after_a_jump_of_the_clock_messages_of_the_old_time_are_rejected() -> None:
-    given = Given()
-    for step in range(20):
-        given.receive('odom', odometry(100.0 + 0.1 * step))
-    given.input.time_jumps.clock_jumped(50 * SECOND, 52 * SECOND)
-    decision = given.receive('odom', odometry(102.0))
-    assert (decision.is_old, decision.released) == (True, [])
-    assert given.rejected() == {'odom.before_clock_jump': 1}
-    assert len(given.receive('odom', odometry(52.0)).released) == 1
-    assert not given.receive('odom', odometry(52.1)).is_old

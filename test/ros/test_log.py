@@ -88,24 +88,20 @@ def test_what_differs_in_more_than_numbers_is_another_message(lines: Lines) -> N
         'gps1: not_finite: got 7', 'the pose is set to 1', 'the pose is set to 2']
 
 
+def test_lines_of_one_way_are_left_out_though_they_differ(lines: Lines, clock: Clock) -> None:
+    for names in ('loop/1', 'loop/2, loop/3'):
+        core.info('thrown out: %s', names, extra={'way': ('loop', 'out')})
+    core.info('believed: loop/4', extra={'way': ('loop', 'back')})
+    clock.now += REPEAT_PERIOD
+    core.info('thrown out: %s', 'loop/5', extra={'way': ('loop', 'out')})
+    assert [text for _, text in lines] == [
+        'thrown out: loop/1', 'believed: loop/4', 'thrown out: loop/5 (1 more like it before)']
+
+
 def test_each_answer_to_a_person_is_logged(lines: Lines) -> None:
     for number in (7, 8):
         core.warning('there is no closure %d', number, extra=ANSWER)
     assert lines == [('warning', 'there is no closure 7'), ('warning', 'there is no closure 8')]
-
-
-def test_the_same_line_may_fail_in_different_ways(lines: Lines) -> None:
-    def one() -> None:
-        raise ValueError('one')
-
-    def other() -> None:
-        raise ValueError('other')
-    for call in (one, other, one):
-        try:
-            call()
-        except ValueError:
-            core.exception('a callback failed')
-    assert [text.rpartition(' ')[2] for _, text in lines] == ['one', 'other']
 
 
 def test_at_the_end_python_logs_as_before(clock: Clock) -> None:

@@ -7,9 +7,10 @@ Each is a message of the drive with a broken value. Each must be counted, and no
 path: if its defect can be repaired the rest of it is correct, else it is rejected.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 import math
 import random
+from typing import Any
 
 from circle import fix_at, odometry_at, START, true_pose
 from harness import imu, pose
@@ -29,121 +30,53 @@ BEFORE = 60.0
 DRIVE = 20.0
 TOPICS = ('odom', 'global_pose', 'fix', 'imu', 'loop_closure')
 
-Break = Callable[[object, random.Random], None]
-
-NUMBERS = (math.nan, math.inf, -math.inf, 1.7976931348623157e308, -1.0, 1e200, -1e-300)
-
-
-def stamp(seconds: int, nanoseconds: int = 0) -> Break:
-    def broken(message: object, _: random.Random) -> None:
-        message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
-    return broken
-
-
-def frame(name: str) -> Break:
-    def broken(message: object, _: random.Random) -> None:
-        message.header.frame_id = name
-    return broken
-
-
-STAMPS = (stamp(0), stamp(0, 1), stamp(-1, 5), stamp(-2**31), stamp(2**31 - 1, 999_999_999),
-          stamp(2_100_000_000), stamp(1, 4_294_967_295))
-FRAMES = tuple(map(frame, (
+NUMBERS = (math.nan, math.inf, -math.inf, 1.7976931348623157e308, 1e200)
+STAMPS = ((0, 0), (0, 1), (-1, 5), (-2**31, 0), (2**31 - 1, 999_999_999), (2_100_000_000, 0),
+          (1, 4_294_967_295))
+FRAMES = (
     'elsewhere', '/', 'x', '@', 'x99999999999999999999', '@9999999999999999.0', '@-1.0', 'x-1',
-    'a' * 5000, 'Größe 地図', '@nan', '%s%n\\', ' map')))
+    'a' * 5000, 'Größe 地図', '@nan', '%s%n\\', ' map')
 
 
-def covariance(*path: str) -> tuple[Break, ...]:
-    """Return what may be wrong with the covariance that attributes lead to."""
-    def at(message: object) -> object:
-        for name in path[:-1]:
-            message = getattr(message, name)
-        return message
-
-    def all_of(make: Callable[[int, random.Random], object]) -> Break:
-        def broken(message: object, generator: random.Random) -> None:
-            owner = at(message)
-            size = len(getattr(owner, path[-1]))
-            setattr(owner, path[-1], np.asarray(make(size, generator), dtype=float))
-        return broken
-
-    def some_of(message: object, generator: random.Random) -> None:
-        values = getattr(at(message), path[-1])
-        for _ in range(generator.randint(1, 4)):
-            values[generator.randrange(len(values))] = generator.choice(NUMBERS)
-
-    def not_positive_definite(size: int, generator: random.Random) -> np.ndarray:
-        side = math.isqrt(size)
-        return np.where(np.eye(side) > 0.0, 0.01, generator.choice((0.02, -1.0, 5.0))).ravel()
-
-    def asymmetric(size: int, generator: random.Random) -> np.ndarray:
-        side = math.isqrt(size)
-        return (0.01 * np.eye(side)
-                + 0.001 * generator.random() * np.triu(np.ones((side, side)), 1)).ravel()
-
-    constant = (all_of(lambda size, _, number=number: np.full(size, number))
-                for number in (*NUMBERS, 0.0))
-    return (*constant, some_of, some_of, some_of, all_of(not_positive_definite),
-            all_of(asymmetric), all_of(lambda size, _: 1e-300 * np.eye(math.isqrt(size)).ravel()))
+def leaves(message: Any) -> Iterator[tuple[Any, str]]:
+    """Yield each field of a message that is no message, with what it belongs to."""
+    for name in message.get_fields_and_field_types():
+        value = getattr(message, name)
+        if hasattr(value, 'get_fields_and_field_types'):
+            yield from leaves(value)
+        else:
+            yield message, name
 
 
-def quaternion(*path: str) -> tuple[Break, ...]:
-    def broken(message: object, generator: random.Random) -> None:
-        for name in path:
-            message = getattr(message, name)
-        number = generator.choice((*NUMBERS[:4], 1e200))
-        setattr(message, generator.choice('xyzw'), number)
-
-    def zero(message: object, _: random.Random) -> None:
-        for name in path:
-            message = getattr(message, name)
-        message.x = message.y = message.z = message.w = 0.0
-
-    return broken, zero
+def broken_covariance(size: int, generator: random.Random) -> np.ndarray:
+    side, number = math.isqrt(size), generator.choice((*NUMBERS, -1.0, -1e-300, 0.0))
+    good = np.diag(np.full(side, 0.01))
+    some = good.ravel().copy()
+    some[[generator.randrange(size) for _ in range(generator.randint(1, 4))]] = number
+    not_positive_definite = np.where(good > 0.0, 0.01, generator.choice((0.02, -1.0, 5.0)))
+    asymmetric = good + 0.001 * np.triu(np.ones((side, side)), 1)
+    no_answer = np.concatenate(([-1.0], good.ravel()[1:]))
+    return np.ravel(generator.choice((
+        np.full(size, number), some, some, not_positive_definite, asymmetric, 1e-298 * good,
+        np.zeros(size), no_answer)))
 
 
-def position(message: object, generator: random.Random) -> None:
-    setattr(message.pose.pose.position, generator.choice('xy'),
-            generator.choice((*NUMBERS[:4], 1e200, -1e10)))
-
-
-def twist(message: object, generator: random.Random) -> None:
-    setattr(message.twist.twist.linear, generator.choice('xyz'), generator.choice(NUMBERS[:4]))
-    message.twist.twist.angular.z = generator.choice(NUMBERS)
-
-
-def place(message: object, generator: random.Random) -> None:
-    name = generator.choice(('latitude', 'longitude', 'altitude'))
-    setattr(message, name, generator.choice((
-        *NUMBERS[:4], 1e200, 90.0001 if name == 'latitude' else -361.0)
-        if name != 'altitude' else (math.inf, 1e200, -1e300)))
-
-
-def no_fix(message: object, _: random.Random) -> None:
-    message.status.status = -1
-
-
-def unknown(message: object, generator: random.Random) -> None:
-    message.position_covariance_type = generator.choice((0, 200))
-    if message.position_covariance_type == 0:
-        message.position_covariance = np.full(9, math.nan)
-
-
-def no_orientation(message: object, _: random.Random) -> None:
-    message.orientation_covariance[0] = -1.0
-
-
-BREAKS: dict[str, tuple[Break, ...]] = {
-    'odom': (*STAMPS, *FRAMES, *covariance('pose', 'covariance'),
-             *covariance('twist', 'covariance'), *quaternion('pose', 'pose', 'orientation'),
-             position, position, twist, twist),
-    'global_pose': (*STAMPS, *FRAMES, *covariance('pose', 'covariance'),
-                    *quaternion('pose', 'pose', 'orientation'), position, position),
-    'fix': (*STAMPS, *FRAMES, *covariance('position_covariance'), place, place, no_fix, unknown),
-    'imu': (*STAMPS, *FRAMES, *covariance('orientation_covariance'), *quaternion('orientation'),
-            no_orientation),
-    'loop_closure': (*STAMPS, *FRAMES, *covariance('pose', 'covariance'),
-                     *quaternion('pose', 'pose', 'orientation'), position, position)}
+def damage(message: Any, generator: random.Random) -> None:
+    """Put a value that is none into any field of a message."""
+    found = list(leaves(message))
+    found += 4 * [each for each in found if each[1].endswith('covariance')]
+    owner, name = generator.choice(found)
+    value = getattr(owner, name)
+    if owner is message.header.stamp:
+        owner.sec, owner.nanosec = generator.choice(STAMPS)
+    elif isinstance(value, str):
+        setattr(owner, name, generator.choice(FRAMES))
+    elif isinstance(value, float):
+        setattr(owner, name, generator.choice(NUMBERS))
+    elif isinstance(value, int):
+        setattr(owner, name, -1 if name == 'status' else generator.choice((0, 200)))
+    else:
+        setattr(owner, name, broken_covariance(len(value), generator))
 
 
 def right_message(topic: str, index: int, generator: random.Random) -> object:
@@ -171,7 +104,7 @@ def malformed(topic: str) -> list[object]:
             messages.append(messages[-1])
             continue
         message = right_message(topic, index, generator)
-        BREAKS[topic][index % len(BREAKS[topic])](message, generator)
+        damage(message, generator)
         messages.append(message)
     return messages
 

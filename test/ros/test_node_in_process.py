@@ -4,9 +4,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-import logging
 from pathlib import Path
-import re
 import threading
 from types import ModuleType
 from typing import Any
@@ -18,10 +16,8 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from circle import odometry_at, PLANE
 from harness import PATIENCE, PREPARE_PATIENCE
 from local_node import Driver, LocalNode
-from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.logging import LoggingSeverity
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
@@ -34,7 +30,7 @@ from pose_graph_ros.ros.services import CLOSED, REPLACED
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
-SUCCESS, RAISED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.ERROR
+SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
 @pytest.fixture(autouse=True, scope='module')
@@ -81,20 +77,27 @@ def managed(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Managed]
         local.node.close()
 
 
-def test_a_transition_that_raises_leaves_the_node_unconfigured(
+def test_what_fails_is_answered_and_a_transition_leaves_the_node_unconfigured(
     managed: Managed, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError('no memory')
     node = managed.local.node
     assert node.trigger_configure() is SUCCESS
-
-    def fail(_: Session) -> None:
-        raise OSError('no memory')
     with monkeypatch.context() as patch:
         patch.setattr(Session, 'activate', fail)
-        assert node.trigger_activate() is RAISED
-    assert node.failure == 'OSError: no memory'
+        assert node.trigger_activate() is TransitionCallbackReturn.ERROR
+    assert node.failure == 'MemoryError: no memory'
     assert node._session is None
-    node.start()
+    managed.start()
+    managed.drive(2.0)
+    monkeypatch.setattr(managed.session.worker._backend, 'optimize', fail)
+    answer = managed.call('optimize')
+    assert (answer.success, answer.message) == (False, 'failed: no memory')
+    monkeypatch.setattr(managed.session.out, 'configure', fail)
+    result = node.set_parameters_atomically([Parameter('odom.maximum_speed', value=4.0)])
+    assert (result.successful, result.reason) == (False, 'failed: MemoryError: no memory')
+    assert managed.session.worker.alive
 
 
 @pytest.mark.parametrize('managed', [
@@ -115,67 +118,6 @@ def test_parameters_may_be_whole_numbers_and_unknown_ones_are_warned_of(
     assert not node.has_parameter('fix.topic')
 
 
-def test_an_error_of_the_engine_is_answered(
-    managed: Managed, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    managed.start()
-    managed.drive(2.0)
-
-    def fail() -> None:
-        raise MemoryError('no memory')
-    monkeypatch.setattr(managed.session.worker._backend, 'optimize', fail)
-    answer = managed.call('optimize')
-    assert (answer.success, answer.message) == (False, 'failed: no memory')
-    assert managed.session.worker.alive
-
-
-def test_a_change_of_parameters_that_fails_is_answered_and_logged(
-    managed: Managed, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-) -> None:
-    managed.start()
-    engine = managed.session.worker._backend
-
-    def fail(*_: object) -> None:
-        raise MemoryError('no memory')
-    monkeypatch.setattr(engine, 'configure', fail)
-    wanted = SetParameters.Request(
-        parameters=[Parameter('odom.maximum_speed', value=4.0).to_parameter_msg()])
-    assert managed.call('set_parameters', wanted, SetParameters).results[0].successful
-    worker = managed.session.worker
-    managed.wait(lambda: worker.status.counts['worker', 'internal_error'] == 1, 'it is counted')
-    assert caplog.messages == ['a change of parameters failed']
-    monkeypatch.setattr(managed.session.out, 'configure', fail)
-    result = managed.call('set_parameters', wanted, SetParameters).results[0]
-    assert (result.successful, result.reason) == (False, 'failed: MemoryError: no memory')
-    assert caplog.messages == 2 * ['a change of parameters failed']
-
-
-def test_what_the_worker_and_the_core_log_is_the_nodes(
-    managed: Managed, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr('pose_graph_ros.ros.log.REPEAT_PERIOD', 1000.0)
-    managed.start()
-    managed.wait(lambda: managed.session.worker.prepared, 'the kernels are there')
-    worker = managed.session.worker
-
-    def fail(*_: object) -> None:
-        raise ZeroDivisionError('broken')
-    monkeypatch.setattr(worker._backend, 'add_measurement', fail)
-    managed.drive(4.0)
-    assert worker.status.counts['fix', 'internal_error'] == 8
-    logging.getLogger('pose_graph_ros.core.compiled.kernel_cache').warning('no folder')
-    logger = managed.local.node.get_logger()
-    logger.set_level(LoggingSeverity.ERROR)
-    logging.getLogger('pose_graph_ros.core').warning('not asked for')
-    managed.local.node._log.close()
-    logger.set_level(LoggingSeverity.UNSET)
-    said = [line for line in capfd.readouterr().err.splitlines()
-            if re.search('of fix|folder|asked', line)]
-    assert [re.sub(r'\[\d+\.\d+\] ', '', line) for line in said] == [
-        '[ERROR] [pose_graph]: a measurement of fix could not be added',
-        '[WARN] [pose_graph]: no folder']
-
-
 def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> None:
     managed.start()
     assert managed.call('set_datum').success
@@ -191,33 +133,6 @@ def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> 
     assert '4 fixes in the graph refer to the datum [48.' in answer.message
     datum.keep(PLANE.origin)
     assert 'graph that was loaded' in managed.call('set_datum').message
-
-
-def test_a_graph_is_saved_and_loaded(managed: Managed, tmp_path: Path) -> None:
-    managed.start()
-    for name in ('save_graph', 'load_graph'):
-        assert 'ros2 param set /pose_graph graph_file FILE' in managed.call(name).message
-    assert managed.set('graph_file', str(tmp_path / 'map.g2o')) == (True, '')
-    assert not managed.call('load_graph').success
-    assert 'no graph to save' in managed.call('save_graph').message
-    managed.drive(8.0)
-    before = managed.session.worker.estimate
-    answer = managed.call('save_graph')
-    assert answer.success, answer.message
-    assert f'{before.n_hidden} hidden nodes in ' in answer.message
-    assert 'to name another file: ros2 param set /pose_graph graph_file FILE' in answer.message
-    managed.call('reset')
-    answer = managed.call('load_graph')
-    assert answer.success, answer.message
-    assert str(tmp_path / 'map.g2o') in answer.message
-    managed.wait(lambda: managed.session.worker.estimate is not None, 'there is an estimate')
-    assert managed.session.worker.estimate.n_hidden == before.n_hidden
-    # the reset of a graph keeps no datum of it, so that another site is refused
-    managed.call('reset')
-    managed.session.input.reader.datum.plane_for(50.0, 8.0, 0.0)
-    answer = managed.call('load_graph')
-    assert not answer.success
-    assert 'another site' in answer.message
 
 
 def test_a_node_starts_with_a_graph(
@@ -332,10 +247,3 @@ def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     managed.wait(answer.done, 'it answers')
     assert (answer.result().success, answer.result().message) == (False, REPLACED)
     assert managed.session.worker.estimate is None
-    # a datum that came while the file was read, of another site
-    with held(monkeypatch, 'read_graph', requests) as reading:
-        answer = managed.request('load_graph')
-        managed.wait(reading.is_set, 'the file is read')
-        managed.session.input.reader.datum.plane_for(50.0, 8.0, 0.0)
-    managed.wait(answer.done, 'it answers')
-    assert 'another site' in answer.result().message

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.judgement.verdicts import Decision
-from pose_graph_ros.core.measurements import Answer
-from pose_graph_ros.ros.requests import FIRST, NEWEST, read_decision, SetPoseInput
+from pose_graph_ros.ros.requests import NEWEST, SetPoseInput
 
 ESTIMATE = Space(T_map_odom=np.array([10.0, 5.0, 1.0]), T_map_base=np.array([20.0, -3.0, -2.0]))
 
@@ -62,37 +60,3 @@ def test_what_cannot_be_read_is_refused(frame: str, x: float, reason: str) -> No
     assert answer is not None
     assert answer.reason == reason
     assert setting.pop(ESTIMATE) is None
-
-
-def test_what_was_set_before_there_was_odometry_is_for_its_beginning() -> None:
-    setting = SetPoseInput('map', 'odom', 'base_link')
-    setting.receive(message('map', 1.0, 2.0, 0.5, variances=(1.0, 1.0, 1.0), sec=7), early=True)
-    pose = setting.pop(ESTIMATE)
-    assert pose is not None
-    assert pose.stamp_ns == FIRST
-
-
-def test_the_newest_counts_and_forgotten_ones_do_not() -> None:
-    setting = SetPoseInput('map', 'odom', 'base_link')
-    for x in (1.0, 2.0):
-        setting.receive(message('map', x, 0.0, 0.0, variances=(1.0, 1.0, 1.0)))
-    pose = setting.pop(ESTIMATE)
-    assert pose is not None
-    assert pose.pose[0] == 2.0
-    setting.receive(message('map', 1.0, 0.0, 0.0, variances=(1.0, 1.0, 1.0)))
-    setting.forget()
-    assert setting.pop(ESTIMATE) is None
-
-
-@pytest.mark.parametrize(('value', 'expected'), [
-    ('in', Decision.IN), ('OUT', Decision.OUT), (' auto ', Decision.AUTO)])
-def test_a_decision_is_read(value: str, expected: Decision) -> None:
-    assert read_decision(Space(key='loop/7', value=value)) == ('loop/7', expected)
-
-
-def test_another_word_is_answered_with_those_that_are_expected() -> None:
-    answer = read_decision(Space(key='loop/7', value='maybe'))
-    assert isinstance(answer, Answer)
-    assert answer.reason == 'unknown_decision'
-    assert answer.detail == (
-        "expected one of in, out, auto as the value for the key 'loop/7', got 'maybe'")

@@ -6,17 +6,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 import re
-import threading
 from types import SimpleNamespace as Space
 
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import fix_at, odometry_at, START, true_pose
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from circle import fix_at, odometry_at, START
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from harness import imu, LATCHED, odometry, PATIENCE, pose, PREPARE_PATIENCE, stamp_ns
+from harness import imu, LATCHED, odometry, PATIENCE, PREPARE_PATIENCE, stamp_ns
 from local_node import Driver, LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
@@ -30,11 +29,9 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
-from pose_graph_ros.core.measurements import Answer, rejected
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.ros import diagnostics, session as session_module
+from pose_graph_ros.ros import diagnostics
 from pose_graph_ros.ros.arrivals import EXPECTED
-from pose_graph_ros.ros.diagnostics import Searches
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
@@ -105,8 +102,8 @@ def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
     active.wait(lambda: stamp_ns(paths[-1]) > newest_ns, 'the optimised path comes')
     n_hidden = active.session.worker.estimate.n_hidden
     assert len(paths[-1].poses) == n_hidden + 1
-    active.session.searches.energies.due = 0.0
-    active.wait(lambda: len(active.session.searches.energies.found) == 3, 'energies are known')
+    active.session.searches.due = 0.0
+    active.wait(lambda: len(active.session.searches.energies) == 3, 'energies are known')
     values = active.values()
     assert (values['received'], values['processed']) == ('120', '120')
     assert (values['odom.accepted'], values['fix.accepted']) == ('100', '20')
@@ -148,25 +145,6 @@ def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
     active.drive(4.0, 3.0)
 
 
-def test_a_reset_starts_a_new_graph_and_new_counts(active: Robot) -> None:
-    paths = active.local.subscribe(PathMessage, 'path', LATCHED)
-    active.drive(6.0)
-    old = active.session.worker
-    active.session.reset()
-    values = active.values()
-    assert (values['resets'], values['received'], values['datum']) == ('1', '0', 'none')
-    assert values['reset_reason'] == 'a new graph was started: a call of ~/reset'
-    assert active.session.worker is not old
-    assert active.session.worker.estimate is None
-    active.wait(lambda: not old.alive, 'the old worker ends')
-    active.wait(lambda: len(paths) > 0 and len(paths[-1].poses) == 0, 'the path is empty')
-    assert old.call(lambda backend: backend.counts).cancelled()
-    # any stamps may follow
-    active.drive(3.0)
-    assert active.values()['resets'] == '1'
-    assert active.session.worker.estimate.stamp_ns == stamp_ns(odometry_at(2.9))
-
-
 def test_odometry_that_starts_again_starts_a_new_graph_without_a_loss(active: Robot) -> None:
     active.drive(6.0)
     active.send('odom', *(odometry_at(0.1 * step) for step in range(10)))
@@ -179,52 +157,6 @@ def test_odometry_that_starts_again_starts_a_new_graph_without_a_loss(active: Ro
     active.drive(3.0, 1.1)
     assert active.session.worker.status.counts['odom', 'accepted'] == 31
     assert active.session.worker.status.counts['fix', 'accepted'] == 5
-
-
-def test_odometry_behind_that_does_not_continue_is_released_after_a_while(
-    active: Robot, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr('pose_graph_ros.ros.input.LONGEST_DOUBT', 0.05)
-    active.drive(6.0)
-    posted = active.session.input.posted
-    active.send('odom', odometry_at(0.05))
-    active.wait(lambda: active.session.input.posted == posted + 1, 'it is released')
-    assert active.session.n_resets == 0
-
-
-def test_an_error_in_a_callback_costs_one_message_and_is_logged(
-    active: Robot, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-) -> None:
-    active.drive(1.0)
-    outputs = active.local.subscribe(Odometry, 'odometry/filtered')
-
-    def fail(*_: object) -> None:
-        raise RuntimeError('nobody knows why')
-    with monkeypatch.context() as patch:
-        patch.setattr(active.session.out, 'publish_pose', fail)
-        active.send('odom', odometry_at(1.1), odometry_at(1.2))
-    assert 'a callback failed' in caplog.text
-    assert 'nobody knows why' in caplog.text
-    active.send('odom', odometry_at(1.3))
-    active.wait(lambda: len(outputs) == 1, 'only the last one is answered')
-
-
-def test_what_was_under_way_when_it_became_inactive_does_nothing(active: Robot) -> None:
-    active.drive(1.0)
-    (hear,) = (subscription.callback for subscription in active.local.node.subscriptions
-               if subscription.topic_name == '/odom')
-    ticks = {name: timer.callback for name, timer in active.session._timers.items()}
-    states = active.local.subscribe(DiagnosticArray, '/diagnostics')
-    active.wait(lambda: len(states) > 0, 'diagnostics come')
-    active.session.deactivate()
-    hear(odometry_at(1.0))
-    ticks['update']()
-    assert active.session.input.received['odom'] == 10
-    states.clear()
-    ticks['diagnostics']()
-    active.wait(lambda: len(states) > 0, 'they still do')
-    active.session.close()
-    ticks['diagnostics']()
 
 
 @pytest.mark.parametrize(('first', 'second'), [
@@ -246,87 +178,14 @@ def test_no_pose_is_published_over_a_jump_or_a_gap_before_an_update(
     assert active.session.n_resets == 0
 
 
-def test_a_pose_that_is_set_puts_the_robot_there(
-    active: Robot, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    jumps: list[int] = []
-    monkeypatch.setattr(active.session.out, 'jump', lambda: jumps.append(1))
-    setting = active.local.advertise(PoseWithCovarianceStamped, 'initialpose')
-    setting.publish(pose(START, 0.0, 0.0, 0.0, 'elsewhere'))
-    active.wait(lambda: active.values().get('set_pose.wrong_frame') == '1', 'it is rejected')
-    # before any odometry: it is for the first
-    setting.publish(pose(0.0, 30.0, -20.0, 1.0, variances=(1e-6, 1e-6, 1e-6)))
-    active.wait(lambda: active.session._set_pose_input._waiting is not None, 'it waits')
-    active.drive(2.0, fixes=False)
-    worker = active.session.worker
-    active.wait(lambda: worker.estimate.alignment is AlignmentState.ALIGNED, 'it is used')
-    begin, now = true_pose(0.0), true_pose(1.9)
-    active.wait(lambda: np.hypot(*(worker.estimate.T_map_base - [30.0, -20.0, 0.0])[:2])
-                == pytest.approx(np.hypot(*(now - begin)[:2]), abs=0.2), 'the robot is there')
-    # the status follows the estimate
-    active.wait(lambda: worker.status.counts['set_pose', 'accepted'] > 0, 'it is counted')
-    assert worker.status.counts['set_pose', 'accepted'] == len(jumps) == 1
-
-
-def test_a_pose_is_said_to_be_set_only_when_the_engine_has_taken_it(
-    active: Robot, caplog: pytest.LogCaptureFixture,
-) -> None:
-    caplog.set_level('INFO')
-    setting = active.local.advertise(PoseWithCovarianceStamped, 'initialpose')
-    active.drive(4.0)
-    engine = active.session.worker._backend
-    set_pose = engine.set_pose
-    for answer, said in ((rejected('failed', 'the solver failed'),
-                          'the pose is not set to (1.000, 2.000, 0.000) in map: failed: the '
-                          'solver failed'),
-                         (None, 'the pose is set to (1.000, 2.000, 0.000) in map')):
-        running, release = threading.Event(), threading.Event()
-
-        def answered(*given: object, answer=answer, running=running, release=release) -> Answer:
-            running.set()
-            assert release.wait(PATIENCE)
-            return set_pose(*given) if answer is None else answer
-        engine.set_pose = answered
-        caplog.clear()
-        setting.publish(pose(START + 3.9, 1.0, 2.0, 0.0))
-        active.wait(running.is_set, 'the engine has it')
-        assert caplog.messages == []
-        release.set()
-        active.wait(lambda said=said: caplog.messages == [said], said)
-
-
-def test_an_earlier_worker_writes_nothing_into_a_new_graph(active: Robot) -> None:
-    active.drive(4.0)
-    session = active.session
-    paths = active.local.subscribe(PathMessage, 'path', LATCHED)
-    active.wait(lambda: len(paths) > 0, 'a path comes')
-    old, graph = session.worker, session.out.graph
-    running, release = threading.Event(), threading.Event()
-    old.call(lambda _: (running.set(), release.wait(PATIENCE)))
-    assert running.wait(PATIENCE)
-    session.searches = Searches()
-    session.publish_diagnostics()
-    asked, optimisation = session.searches.energies._asked, session.optimize()
-    session.reset()
-    active.drive(2.0, fixes=False)
-    release.set()
-    active.wait(lambda: not old.alive, 'the old worker ends')
-    assert asked.cancelled()
-    assert optimisation.cancelled()
-    # a job that had begun before the reset
-    shown = session.out.path.shown
-    session._publish_views(old, graph, old._backend, at_once=True)
-    assert session.out.path.shown is shown
-
-
 @pytest.mark.parametrize('robot', [{'closing_silence': 0.05}], indirect=True)
 def test_the_graph_is_optimised_once_when_the_stream_ends(active: Robot) -> None:
     finals = []
     active.drive(3.0)
     active.wait(lambda: not active.session.input.is_streaming, 'a silence is noticed')
     worker = active.session.worker
-    request = worker.request_final_optimization
-    worker.request_final_optimization = lambda: finals.append(request())
+    optimize = active.session.optimize
+    active.session.optimize = lambda: finals.append(optimize())
     assert worker.call(lambda backend: backend.n_waiting).result(PATIENCE) == 0
     for _ in range(2):
         active.session._on_silence_timer()
@@ -336,82 +195,54 @@ def test_the_graph_is_optimised_once_when_the_stream_ends(active: Robot) -> None
     assert finals[0].result(PATIENCE).status is Status.CONVERGED
 
 
-def test_the_end_waits_only_so_long_for_a_solve(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(session_module, 'STOP_TIMEOUT', 0.01)
-    running, release = threading.Event(), threading.Event()
-
-    def solve(_: PoseGraphBackend) -> None:
-        running.set()
-        release.wait(PATIENCE)
-    with LocalNode(tmp_path) as local:
-        robot = Robot(local)
-        worker = robot.session.worker
-        worker.call(solve)
-        assert running.wait(PATIENCE)
-        robot.session.close()
-        assert worker.alive
-        release.set()
-        local.spin_until(lambda: not worker.alive, 'it ends after the solve')
-
-
 def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     active.drive(3.0, fixes=False)
     level, text = active.health()
     assert (level, text.startswith('Running without measurements in the map')) == (OK, True)
     session = active.session
+    final = session.optimize()
+    active.wait(final.done, 'it is optimised')
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
                      delays=Space(wrong={}), reader=Space(sources={}))
     seen = Space(worker=worker, active=True, input=received, odometry_topics={}, final=None,
                  is_loaded=False, compiling=False, doubts=[],
-                 searches=Space(contradiction=Space(found=None)),
+                 searches=Space(contradiction=None),
                  out=Space(transforms=Space(other='')))
 
-    def said(expected: bytes, *words: str) -> None:
+    def status(**changes: object) -> dict[str, object]:
+        return {'status': replace(worker.status, **changes)}
+    correlated = Space(wrongly_white=True, errors=Space(tau=12.0))
+    # each is more urgent than the one before
+    for owner, changes, expected, words in (
+            (worker, lambda: status(sources={'fix': correlated}), WARN,
+             'set fix.correlation_time to about 12 s'),
+            (worker, lambda: status(verdicts={
+                'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)}), WARN,
+             'The newest measurements of fix are doubted and not used'),
+            (worker, lambda: {'estimate': replace(
+                worker.estimate, alignment=AlignmentState.UNALIGNED)}, WARN, 'Unaligned'),
+            (received.delays, {'wrong': {'fix': 'The stamps of fix are 18.0 s ahead'}}, WARN,
+             'The stamps of fix are 18.0 s ahead.'),
+            (received, {'silent': ['fix']}, WARN, 'fix is silent'),
+            (received, {'silent': ['fix', 'imu']}, WARN, 'fix and imu are silent'),
+            (seen.out.transforms, {'other': 'another node publishes map -> odom'}, WARN,
+             'Another node publishes map -> odom.'),
+            (received, {'refused': {'fix': 'the newest 7 messages of fix were refused'}}, WARN,
+             'The newest 7 messages of fix were refused.'),
+            (received, {'quiet': 12.3}, WARN, 'or a bag has ended.'),
+            (seen, {'final': final}, WARN, 'or a bag has ended; the graph has been optimised.'),
+            (worker, {'prepared': False}, WARN, 'Loading compiled kernels'),
+            (seen, {'compiling': True}, WARN, 'measurements wait'),
+            (seen, {'active': False}, OK, 'Inactive'),
+            (worker, lambda: status(report=UpdateReport(Status.FAILED, 'singular', 0, 0, 0.0)),
+             ERROR, 'solver failed'),
+            (worker, {'alive': False}, ERROR, 'restart')):
+        vars(owner).update(changes() if callable(changes) else changes)
         level, text = diagnostics.health(seen)
         assert level == expected
-        assert all(word in text for word in words), text
-
-    correlated = Space(wrongly_white=True, errors=Space(tau=12.0))
-    worker.estimate, worker.status = session.worker.estimate, replace(
-        session.worker.status, sources={'fix': correlated})
-    said(WARN, 'set fix.correlation_time to about 12 s')
-    worker.status = replace(worker.status, verdicts={
-        'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)})
-    said(WARN, 'The newest measurements of fix are doubted and not used')
-    worker.estimate = replace(worker.estimate, alignment=AlignmentState.UNALIGNED)
-    said(WARN, 'Unaligned')
-    # each is more urgent than the one before
-    received.delays.wrong = {'fix': 'The stamps of fix are 18.0 s ahead'}
-    said(WARN, 'The stamps of fix are 18.0 s ahead.')
-    received.silent = ['fix']
-    said(WARN, 'fix is silent', 'check the drivers')
-    received.silent = ['fix', 'imu']
-    said(WARN, 'fix and imu are silent')
-    seen.out.transforms.other = 'another node publishes map -> odom on /tf'
-    said(WARN, 'Another node publishes map -> odom on /tf.')
-    received.refused = {'fix': 'the newest 7 messages of fix were refused: no_fix (none)'}
-    said(WARN, 'The newest 7 messages of fix were refused: no_fix (none).')
-    received.quiet = 12.3
-    said(WARN, 'Nothing has been received for 12 s')
-    assert 'optimised' not in diagnostics.health(seen)[1]
-    seen.final = session.optimize()
-    active.wait(seen.final.done, 'it is optimised')
-    said(WARN, 'Nothing has been received for 12 s', 'has been optimised.')
-    worker.prepared = False
-    said(WARN, 'Loading compiled kernels')
-    seen.compiling = True
-    said(WARN, 'Compiling kernels', 'measurements wait')
-    seen.active = False
-    said(OK, 'Inactive')
-    worker.status = replace(worker.status, report=UpdateReport(
-        Status.FAILED, 'singular', 0, 0, 0.0))
-    said(ERROR, 'solver failed', 'log')
-    worker.alive = False
-    said(ERROR, 'restart')
+        assert words in text
 
 
 def test_it_is_said_once_that_nothing_comes_in_any_more(

@@ -30,12 +30,3 @@ def test_the_robot_is_moved_no_faster_than_asked(
     distance, turn = np.hypot(*whole[:2]), abs(se2.wrap(whole[2]))
     assert np.hypot(*step[:2]) == pytest.approx(min(distance, 0.1 * linear), abs=1e-9)
     assert abs(se2.wrap(step[2])) == pytest.approx(min(turn, 0.1 * angular), abs=1e-9)
-
-
-def test_without_limits_or_after_a_jump_it_is_as_estimated() -> None:
-    slew = Slew()
-    target = np.array([100.0, 0.0, 1.0])
-    slew.limited(SECOND, np.zeros(3), np.zeros(3), 0.0, 0.0)
-    assert slew.limited(2 * SECOND, target, np.zeros(3), 0.0, 0.0) is target
-    slew.forget()
-    assert slew.limited(3 * SECOND, 2.0 * target, np.zeros(3), 0.1, 0.1)[0] == 200.0

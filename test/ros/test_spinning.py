@@ -14,7 +14,6 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from harness import PATIENCE, RELIABLE
 import rclpy
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -22,7 +21,7 @@ from std_msgs.msg import String
 
 from pose_graph_ros.cli.demo import isolated_environment
 from pose_graph_ros.ros import spinning
-from pose_graph_ros.ros.spinning import Spinner
+from pose_graph_ros.ros.spinning import guarded, Spinner
 
 
 class Spun:
@@ -90,13 +89,17 @@ def test_no_exception_of_a_callback_ends_it(
     assert heard == ['w0', 'w1', 'w2']
 
 
-def test_timers_come_and_go_while_it_runs(spun: Spun) -> None:
-    clock, ticks = Clock(clock_type=ClockType.STEADY_TIME), []
+def test_a_guarded_callback_never_raises_and_does_nothing_when_it_is_not_due(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    heard, due = [], True
 
-    def replace() -> None:
-        nonlocal timer
-        ticks.append(time.monotonic())
-        spun.node.destroy_timer(timer)
-        timer = spun.node.create_timer(0.01, replace, clock=clock)
-    timer = spun.node.create_timer(0.01, replace, clock=clock)
-    spun.wait(lambda: len(ticks) > 20, 'many have been made')
+    def hear(word: str) -> None:
+        heard.append(word)
+        raise ValueError(f'{word} is wrong')
+    callback = guarded(hear, lambda: due)
+    callback('one')
+    due = False
+    callback('two')
+    assert heard == ['one']
+    assert 'one is wrong' in caplog.text

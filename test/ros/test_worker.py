@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The worker's thread: everything posted is processed, whatever the engine does."""
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 import threading
 import time
 
@@ -15,9 +15,9 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, OdometrySource, SmootherConfig
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.measurements import Answer, GlobalPose, LoopClosure, OdometrySample
+from pose_graph_ros.core.measurements import Answer, GlobalPose, OdometrySample
 from pose_graph_ros.core.smoother.incremental import Refinement
-from pose_graph_ros.ros.worker import GATHERING, Worker
+from pose_graph_ros.ros.worker import Worker
 
 Start = Callable[..., Worker]
 PATIENCE = 60.0
@@ -57,85 +57,12 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other(star
         worker.post('pose', GlobalPose(step * 100_000_000, np.array([0.3 * step, 0.0, 0.0]),
                                        0.01 * np.eye(3)))
         worker.request_update()
-    report = worker.request_final_optimization().result(PATIENCE)
+    report = worker.call(worker.optimize_fully).result(PATIENCE)
     assert report.status is Status.CONVERGED
     wait_until(lambda: worker.status.processed == 200)
     assert worker.status.counts['pose', 'accepted'] == 100
     assert worker.estimate.stamp_ns == estimates[-1].stamp_ns
     assert worker.estimate.n_observed == 100
-
-
-def test_measurements_are_added_many_at_a_time_and_an_update_has_all_of_them(start: Start) -> None:
-    backend, turns = PoseGraphBackend(), []
-    worker = Worker(backend, lambda _: None)
-    process = worker._process
-
-    def count(batch: Collection[object], *, wanted: bool) -> None:
-        turns.append(len(batch))
-        process(batch, wanted=wanted)
-    worker._process = count
-    worker.start()
-    for step in range(5):
-        worker.post('odom', sample(1 + step))
-    wait_until(lambda: worker.estimate is not None and worker.status.processed == 5)
-    turns.clear()
-    begin = time.monotonic()
-    for step in range(6, 206):
-        worker.post('odom', sample(step))
-        time.sleep(0.001)
-    wait_until(lambda: worker.status.processed == 205)
-    assert sum(turns) == 200
-    # of which the first waits for a turn that may have begun before
-    assert len(turns) <= 2 + (time.monotonic() - begin) / GATHERING
-    worker.post('odom', sample(206))
-    worker.request_update()
-    wait_until(lambda: worker.estimate.stamp_ns == 206 * 100_000_000)
-    # an answer of the thread does not wait for more either
-    worker.post('odom', sample(207))
-    worker.call(lambda _: None).result(PATIENCE)
-    assert worker.status.processed == 207
-
-
-def test_each_reason_is_logged_once_also_if_it_shows_late(
-    start: Start, caplog: pytest.LogCaptureFixture,
-) -> None:
-    worker = start()
-    worker.post('odom', sample(1))
-    for step in (5, 6):     # before odometry is there
-        worker.post('loop', LoopClosure(
-            step * 100_000_000, np.zeros(3), np.eye(3), reference_node=999))
-    for step in range(2, 20):
-        worker.post('odom', sample(step))
-    wait_until(lambda: worker.status.counts['loop', 'unknown_node'] == 2)
-    assert worker.stop(PATIENCE)
-    said = [text for text in caplog.messages if 'unknown_node' in text]
-    assert said == ['loop: unknown_node: there is no hidden node 999 (logged once, counted in '
-                    'diagnostics)']
-
-
-def test_every_update_hands_out_a_path_that_is_current(start: Start) -> None:
-    estimates: list[Estimate] = []
-    worker = start(on_estimate=lambda backend: estimates.append(backend.estimate()))
-    worker.post('odom', sample(1))
-    worker.post('pose', GlobalPose(100_000_000, np.array([5.0, 0.0, 0.0]), 0.01 * np.eye(3)))
-    # before that the reorder window of the odometry is not over
-    for step in range(2, 5):
-        worker.post('odom', sample(step))
-    wait_until(lambda: worker.status.processed == 5)
-    for step in range(5, 40):
-        worker.post('odom', sample(step))
-        worker.request_update()
-        wait_until(lambda stamp=step * 100_000_000: (
-            len(estimates) > 0 and estimates[-1].path.stamps_ns[-1] == stamp))
-        path = estimates[-1].path
-        np.testing.assert_allclose(path.poses[-1], [4.7 + 0.3 * step, 0.0, 0.0], atol=1e-9)
-    # late by 3 s, and as certain as all the others together
-    worker.post('pose', GlobalPose(900_000_000, np.array([7.4, 1.0, 0.0]), 0.01 * np.eye(3)))
-    worker.request_update()
-    # the status follows the estimate
-    wait_until(lambda: worker.status.updates == 2)
-    assert estimates[-1].path.poses[-1, 1] > 0.1
-    assert worker.status.report.new_constraints == 1
 
 
 def test_posting_never_waits_for_the_solver(start: Start) -> None:
@@ -149,7 +76,7 @@ def test_posting_never_waits_for_the_solver(start: Start) -> None:
     worker = start(PoseGraphBackend(solve=solve))
     for step in range(1, 20):
         worker.post('odom', sample(step))
-    closing = worker.request_final_optimization()
+    closing = worker.call(worker.optimize_fully)
     assert solving.wait(PATIENCE)
     for step in range(20, 40):
         worker.post('odom', sample(step))
@@ -157,20 +84,6 @@ def test_posting_never_waits_for_the_solver(start: Start) -> None:
     release.set()
     assert closing.result(PATIENCE).status is Status.CONVERGED
     wait_until(lambda: worker.status.processed == 39)
-
-
-def test_what_comes_in_while_the_worker_is_prepared_waits(start: Start) -> None:
-    release = threading.Event()
-    worker = start(prepare=lambda stopped: release.wait(PATIENCE))
-    for step in range(1, 50):
-        assert worker.post('odom', sample(step))
-    closing = worker.request_final_optimization()
-    assert not worker.prepared
-    assert worker.status.processed == 0
-    release.set()
-    assert closing.result(PATIENCE).status is Status.CONVERGED
-    assert worker.prepared
-    assert worker.status.processed == 49
 
 
 def test_a_preparation_that_fails_or_is_stopped_does_not_hold_the_worker(start: Start) -> None:
@@ -233,30 +146,6 @@ def test_nothing_is_begun_after_the_worker_was_stopped(start: Start) -> None:
     assert job.cancelled()
 
 
-class Endless(PoseGraphBackend):
-    """A back end whose refinement is never finished, with the number of its calls."""
-
-    calls = 0
-
-    def refine(self) -> Refinement:
-        self.calls += 1
-        time.sleep(1e-4)
-        return Refinement(finished=False, moved=0.0)
-
-
-def test_a_refinement_lets_everything_else_go_first(start: Start) -> None:
-    backend = Endless()
-    worker = start(backend)
-    worker.request_update()
-    wait_until(lambda: backend.calls > 10)
-    for step in range(1, 40):
-        assert worker.post('odom', sample(step))
-        wait_until(lambda step=step: worker.status.processed == step)
-        assert worker.call(lambda backend: backend.n_waiting).result(PATIENCE) == 0
-    already = backend.calls
-    wait_until(lambda: backend.calls > already)
-
-
 class Recording(PoseGraphBackend):
     """A back end that keeps what its refinement has returned."""
 
@@ -288,5 +177,5 @@ def test_between_updates_the_estimate_is_refined_until_nothing_is_left(start: St
     n = len(backend.refinements)
     time.sleep(0.05)
     assert len(backend.refinements) == n    # the thread sleeps
-    worker.request_final_optimization().result(PATIENCE)
+    worker.call(worker.optimize_fully).result(PATIENCE)
     np.testing.assert_allclose(estimates[-1].path.poses, path.poses, atol=0.001)
