@@ -69,8 +69,8 @@ class Drive:
     truth: Trajectory | None  # `T_map_base`; None if unknown
     loop_stamps_ns: IntArray  # of both ends of the loop closures, (L, 2)
     map_axes: tuple[str, str] = ('x', 'y')
-    fix_unused: BoolArray | None = None  # whether it is doubted or waits; None: all are believed
-    fix_refused: BoolArray | None = None  # whether it is not in the graph; None: all are
+    fix_unused: BoolArray | np.bool_ = np.False_  # whether it is doubted or waits, (M,) or of all
+    fix_refused: BoolArray | np.bool_ = np.False_  # whether it is not in the graph
     fix_sources: Sequence[str] = ()  # none if unknown
     loop_states: Sequence[State] = ()  # none if all are believed
     loop_sources: Sequence[str] = ()  # none if unknown
@@ -78,12 +78,12 @@ class Drive:
 
     @property
     def fix_kinds(self) -> dict[str, BoolArray]:
-        """Which fixes are used, doubted and held out, shape (M,) each; others are refused."""
-        nothing = np.zeros_like(self.fix_held_out)
-        refused = nothing if self.fix_refused is None else self.fix_refused
-        doubted = nothing if self.fix_unused is None else self.fix_unused
-        rest = ~self.fix_held_out & ~refused
-        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': self.fix_held_out}
+        """Which fixes are used, doubted, held out and refused, shape (M,) each."""
+        held_out, refused, doubted = np.broadcast_arrays(
+            self.fix_held_out, self.fix_refused, self.fix_unused)
+        rest = ~held_out & ~refused
+        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': held_out,
+                'refused': refused}
 
     def loops(self, state: State) -> BoolArray:
         """Return which loop closures are in a state, shape (L,)."""
@@ -124,7 +124,8 @@ class Drive:
             turns = se2.wrap(
                 self.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
             rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
-        for kind, chosen in self.fix_kinds.items():
+        for kind in ('used', 'doubted', 'held out'):
+            chosen = self.fix_kinds[kind]
             for name, path in paths.items():
                 _, errors = distances(path, stamps[chosen], positions[chosen])
                 rows += error_rows(f'{name} to fixes {kind}', errors)
@@ -223,7 +224,6 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
         'odometry': len(drive.odometry), 'poses': len(drive.corrected),
         **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
            for kind, chosen in drive.fix_kinds.items()},
-        'fixes_refused': 0 if drive.fix_refused is None else int(np.sum(drive.fix_refused)),
         'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
         'errors': [asdict(row) for row in drive.rows], **extra}
 
