@@ -348,9 +348,9 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
 
 
 def number(
-    least: float = -math.inf, most: float = math.inf, *, whole: bool = False,
+    least: float = -math.inf, most: float = math.inf, *, whole: bool = False, factor: float = 1,
 ) -> Callable[[str], Any]:
-    """Return what reads a finite number, and raises ArgumentTypeError if it cannot."""
+    """Return what reads a finite number, times a factor; it raises ArgumentTypeError."""
     kind = 'a whole number' if whole else 'a number'
     expected = kind if least == -math.inf else f'{kind} of at least {least:g}'
     expected += '' if most == math.inf else f' and at most {most:g}'
@@ -362,7 +362,7 @@ def number(
             value = math.nan
         if not (math.isfinite(value) and least <= value <= most):
             raise argparse.ArgumentTypeError(f'expected {expected}, got {text!r}')
-        return value
+        return value * factor
     return read
 
 

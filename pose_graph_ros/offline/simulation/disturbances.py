@@ -9,16 +9,23 @@ import numpy as np
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.simulation.settings import Jump, LATENCY_S, Outage, Setup
+from pose_graph_ros.offline.simulation.settings import (
+    Jump,
+    LATENCY_S,
+    ODOMETRY,
+    Outage,
+    Setup,
+    START_NS,
+)
 
 AGAIN_S = 1.0  # within which a message that comes twice comes again
 
 
-def jumped(odometry: Trajectory, jumps: Iterable[Jump], start_ns: int) -> Trajectory:
-    """Return odometry with jumps, in the order of their times."""
+def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
+    """Return odometry with its jumps, in the order of their times."""
     poses = odometry.poses.copy()
-    for jump in sorted(jumps, key=lambda each: each.at_s):
-        k = int(np.searchsorted(odometry.stamps_ns, start_ns + round(jump.at_s * 1e9)))
+    for jump in sorted(setup.jumps_of(ODOMETRY), key=lambda each: each.at_s):
+        k = int(np.searchsorted(odometry.stamps_ns, START_NS + round(jump.at_s * 1e9)))
         if k == len(poses):
             continue
         # where it is, moved in the frame of the robot, or the origin
@@ -28,22 +35,12 @@ def jumped(odometry: Trajectory, jumps: Iterable[Jump], start_ns: int) -> Trajec
 
 
 def moved(
-    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray,
-    jumps: Iterable[Jump], start_ns: int,
+    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray, jumps: list[Jump],
 ) -> tuple[FloatArray, BoolArray]:
     """
     Return fixes or global poses with jumps, shape (M, 2 or 3), and which of them are moved, (M,).
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    stamps_ns : ndarray, shape (M,)
-    values : ndarray, shape (M, 2 or 3)
-    jumps : iterable of Jump, of these
-    start_ns : int
-
     """
-    time = (stamps_ns - start_ns) * 1e-9
+    time = (stamps_ns - START_NS) * 1e-9
     values, wrong = values.copy(), np.zeros(len(values), dtype=bool)
     for jump in jumps:
         assert jump.step is not None
@@ -54,12 +51,13 @@ def moved(
     return values, wrong
 
 
-def heard(stamps_ns: IntArray, outages: Iterable[Outage], start_ns: int) -> BoolArray:
-    """Return which measurements are in no outage, shape (M,)."""
-    time = (stamps_ns - start_ns) * 1e-9
+def heard(stamps_ns: IntArray, topic: str, outages: Iterable[Outage]) -> BoolArray:
+    """Return which measurements of a topic are in no outage, shape (M,)."""
+    time = (stamps_ns - START_NS) * 1e-9
     kept = np.ones(len(stamps_ns), dtype=bool)
     for outage in outages:
-        kept &= (time < outage.begin_s) | (time >= outage.end_s)
+        if outage.topic == topic:
+            kept &= (time < outage.begin_s) | (time >= outage.end_s)
     return kept
 
 
