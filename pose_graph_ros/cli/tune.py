@@ -17,8 +17,7 @@ from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
-from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
-from pose_graph_ros.cli.tuning_drive import TuningDrive
+from pose_graph_ros.cli.tuning import Outcome, Tuning, TuningDrive, Verdict
 from pose_graph_ros.offline.tuning.fit import CONTRADICTION
 
 

@@ -10,18 +10,21 @@ fixes that took no part in these. If they are worse, the same is done with the n
 or that of the other sources, as it was.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import islice
 import time
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import Inputs
-from pose_graph_ros.adapters.bags import BagError
+from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
+from pose_graph_ros.adapters.bags import Bag, BagError
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import backend_config, ODOMETRY_KINDS
+from pose_graph_ros.adapters.sources import backend_config, Kind, ODOMETRY_KINDS
+from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.cli.tuned_parameters import (
     changed,
     closure_parameters,
@@ -29,27 +32,123 @@ from pose_graph_ros.cli.tuned_parameters import (
     source_parameters,
     Tuned,
 )
-from pose_graph_ros.cli.tuning_drive import Key, LEAST, TuningDrive
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import Covariances
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.measurements import LoopClosure
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement.texts import states_by_stamps
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.measurements import Fix, LoopClosure, Measurement, OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds
+from pose_graph_ros.offline.tuning import held_out
 from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
-from pose_graph_ros.offline.tuning.drive_rows import drive_rows, timeline
-from pose_graph_ros.offline.tuning.fit import estimate, Fit
-from pose_graph_ros.offline.tuning.held_out import (
-    Errors,
-    fold_of,
-    is_better,
-    joined,
-    NO_ERRORS,
-    proven,
-    shown_variances,
-    stretch_length,
-    Summary,
-    summary,
-    wrong,
+from pose_graph_ros.offline.tuning.drive_rows import (
+    Absolute,
+    drive_rows,
+    Key,
+    LEAST,
+    source_of_poses,
+    SourceOfPoses,
+    timeline,
 )
+from pose_graph_ros.offline.tuning.fit import estimate, Fit
+from pose_graph_ros.offline.tuning.held_out import Errors, NO_ERRORS, proven, Summary
 from pose_graph_ros.offline.tuning.likelihood import Role
+
+
+class Run(NamedTuple):
+    """Result of a run of the engine."""
+
+    path: Trajectory
+    covariances: Covariances  # of the path, in map axes
+    factors: Mapping[str, float]  # of the engine on the variances that a source claims
+    doubted: frozenset[Key]  # measurements that contradict the others
+    graph: Graph
+
+
+class TuningDrive:
+    """The measurements of a bag, the first million, all fixes in the same map."""
+
+    def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
+        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
+        measurements = list(islice(stream, 1_000_000))  # of about 700 bytes each
+        self.is_cut = next(stream, None) is not None  # whether the bag has more
+        self.measurements = _in_the_map(measurements)
+
+    def odometry(self, source: str) -> list[OdometrySample]:
+        """Return the samples of a source of odometry."""
+        return [each for name, each in self.measurements
+                if name == source and isinstance(each, OdometrySample)]
+
+    def closures(self) -> list[tuple[str, LoopClosure]]:
+        """Return the loop closures and their sources."""
+        return [(name, each) for name, each in self.measurements
+                if isinstance(each, LoopClosure)]
+
+    def sources_of_poses(
+        self, inputs: Inputs, values: Mapping[str, Any],
+    ) -> list[SourceOfPoses]:
+        """Return the sources with enough valid measurements in the map."""
+        config, found = backend_config(values), []
+        for name in inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
+            kept = [each for of, each in self.measurements if of == name
+                    and isinstance(each, Absolute)]
+            source = None if len(kept) == 0 else source_of_poses(
+                name, kept, config.measurement_source(name, type(kept[0])))
+            if source is not None:
+                found.append(source)
+        return found
+
+    def run(self, values: Mapping[str, Any], without: Collection[Key] = ()) -> Run | None:
+        """Return the result of the engine without some measurements; None if it has no path."""
+        backend, _ = run_measurements((
+            (name, each) for name, each in self.measurements
+            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
+        estimate = backend.estimate()
+        if estimate is None:
+            return None
+        factors = {
+            name: 1.0 if report.in_use is None else report.in_use.correlated + report.in_use.white
+            for name, report in backend.reports().items()}
+        doubted = frozenset(
+            (name, stamp) for (name, stamp, _), state
+            in states_by_stamps(backend.verdicts()).items() if state is State.DOUBTED)
+        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted,
+                   backend.graph)
+
+    def errors(
+        self, run: Run, values: Mapping[str, Any], inputs: Inputs, left_out: Collection[Key],
+    ) -> list[Errors]:
+        """Return the errors of a path at positions that were held out, for each source."""
+        return [held_out.errors_at(
+            run.path, run.covariances, source.measured.rows(source.is_among(left_out)),
+            run.factors.get(source.name, 1.0)) for source in self.sources_of_poses(inputs, values)]
+
+    def closure_errors(self, run: Run, left_out: Collection[Key]) -> Errors:
+        """Return the errors of a path at closures, in the frames of their references."""
+        chosen = [each for name, each in self.closures()
+                  if (name, each.stamp_ns) in left_out and each.reference_ns is not None]
+        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in chosen],
+                          dtype=np.int64).reshape(-1, 2)
+        inside = np.all(run.path.covers(stamps), axis=1)
+        ends = run.path.at(stamps[inside])
+        measured_poses = np.array([each.pose for each in chosen]).reshape(-1, 3)[inside]
+        errors = measured_poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
+        return Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))
+
+
+def _in_the_map(
+    measurements: list[tuple[str, OdometrySample | Measurement]],
+) -> list[tuple[str, OdometrySample | Measurement]]:
+    """Return measurements with fixes placed; the first one that odometry covers goes first."""
+    start = min((each.stamp_ns for _, each in measurements
+                 if isinstance(each, OdometrySample)), default=0)
+    order = sorted(range(len(measurements)), key=lambda k: measurements[k][1].stamp_ns < start)
+    for k in order:
+        name, each = measurements[k]
+        if isinstance(each, Fix):
+            measurements[k] = name, each.placed()
+    return measurements
 
 
 class Verdict(Enum):
@@ -132,7 +231,7 @@ class Tuning:
         primary = next(iter(fits.values()))
         tau = max((each.value for each in primary.found if each.parameter.role is Role.TAU),
                   default=0.0)
-        stretch = stretch_length(self._duration, self._period(), tau, folds)
+        stretch = held_out.stretch_length(self._duration, self._period(), tau, folds)
         per_fold = 2.5 * seconds + fit_seconds + 1.0
         n_done = int(np.clip((deadline - time.monotonic()) / per_fold, 1, folds))
         changes = len(changed(tuned)) > 0
@@ -142,12 +241,12 @@ class Tuning:
         one, other = self._common(tried, doubted)
         verdict = Verdict.SAME
         if changes:
-            verdict = Verdict.BETTER if is_better(
+            verdict = Verdict.BETTER if held_out.is_better(
                 one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [] if truth is None else np.sqrt(np.mean(np.square(
             [[each.to_truth for each in pair] for pair in tried]), axis=0)).tolist()
-        return Outcome(tuned, verdict, summary(one), summary(other), errors, folds, n_done,
-                       stretch, self._measured(), len(doubted),
+        return Outcome(tuned, verdict, held_out.summary(one), held_out.summary(other), errors,
+                       folds, n_done, stretch, self._measured(), len(doubted),
                        max(each.contradiction for each in fits.values()))
 
     def _begin(self, text: str) -> str:
@@ -182,7 +281,7 @@ class Tuning:
             raise BagError(f'{self._path}: nothing to tune by: no fix or global pose was measured '
                            'while there was odometry')
         rows = drive_rows(self._odometry[next(iter(fits))], measured, self._config)
-        shown = shown_variances(rows, len(measured))
+        shown = held_out.shown_variances(rows, len(measured))
         tuned: list[Tuned] = []
         for name, found in proven(fits, shown, self._duration).items():
             tuned += odometry_parameters(name, found, self._values)
@@ -200,9 +299,9 @@ class Tuning:
             raise BagError(f'{self._path}: too many hidden nodes to tune by loop closures; '
                            f'expected at most {MOST_NODES}')
         problem = ClosureProblem(run.graph, tick)
-        if np.sum(problem.is_closure) < LEAST // 2:
+        if problem.n_closures < LEAST // 2:
             raise BagError(f'{self._path}: nothing to tune by: only '
-                           f'{int(np.sum(problem.is_closure))} loop closures are believed')
+                           f'{problem.n_closures} loop closures are believed')
         found = proven({primary: fit_closures(problem)}, (), self._duration)[primary]
         sources = list(dict.fromkeys(name for name, _ in self._closures))
         return list(closure_parameters(primary, sources, found, self._values)), {primary: found}
@@ -221,26 +320,26 @@ class Tuning:
                  if source.measured.has_positions]
         every += [(name, np.array([each.stamp_ns], dtype=np.int64))
                   for name, each in self._closures]
-        held_out = frozenset(
-            (name, stamp) for name, stamps in every
-            for stamp in stamps[fold_of(stamps, self._start_ns, stretch, folds) == k].tolist())
+        left_out = frozenset(
+            (name, stamp) for name, stamps in every for stamp in stamps[held_out.fold_of(
+                stamps, self._start_ns, stretch, folds) == k].tolist())
         text = f'part {k + 1} of {folds} held out'
-        tuned = self._estimate(held_out | frozenset(doubted), text)[0] if is_tuned else []
+        tuned = self._estimate(left_out | frozenset(doubted), text)[0] if is_tuned else []
         self._begin(f'{text}: running with the settings before')
-        before = after = self._try(self._values, held_out, truth)
+        before = after = self._try(self._values, left_out, truth)
         if is_tuned:
             self._begin(f'{text}: running with the settings after')
-            after = self._try(self._with(tuned), held_out, truth)
+            after = self._try(self._with(tuned), left_out, truth)
         return before, after
 
     def _try(
-        self, values: Mapping[str, Any], held_out: Collection[Key], truth: Trajectory | None,
+        self, values: Mapping[str, Any], left_out: Collection[Key], truth: Trajectory | None,
     ) -> _Tried:
-        run = self._drive.run(values, held_out)
+        run = self._drive.run(values, left_out)
         if run is None:
             return _Tried([], np.nan)
-        errors = ([self._drive.closure_errors(run, held_out)] if len(self._closures) > 0
-                  else self._drive.errors(run, values, self._inputs, held_out))
+        errors = ([self._drive.closure_errors(run, left_out)] if len(self._closures) > 0
+                  else self._drive.errors(run, values, self._inputs, left_out))
         if truth is None or not np.any(inside := run.path.covers(truth.stamps_ns)):
             return _Tried(errors, np.nan)
         apart = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
@@ -257,8 +356,8 @@ class Tuning:
                 common = np.isin(one.stamps_ns, other.stamps_ns) & ~np.isin(one.stamps_ns, stamps)
                 ones.append(one.rows(common))
                 others.append(other.rows(np.isin(other.stamps_ns, one.stamps_ns[common])))
-        first, second = joined(ones), joined(others)
-        right = ~wrong([first, second])
+        first, second = held_out.joined(ones), held_out.joined(others)
+        right = ~held_out.wrong([first, second])
         return first.rows(right), second.rows(right)
 
     def _measured(self) -> str:
