@@ -432,7 +432,7 @@ def test_hostile_texts_are_shown_as_texts(show, width) -> None:
 
 
 def test_a_page_without_data_says_why_in_each_section(show) -> None:
-    opened = show({'title': 'nothing', 'lines': {'corrected': None}})
+    opened = show({'title': 'nothing', 'states': [], 'lines': {'corrected': None}})
     assert opened.page.locator('.nothing').count() == 6
     assert opened.page.locator('canvas').count() == 0
 
@@ -459,15 +459,13 @@ def test_numbers_that_are_not_finite_are_refused() -> None:
 
 # --- colours ------------------------------------------------------------------------------------
 
-def scheme(selector: str) -> dict[str, np.ndarray]:
-    """Return name -> (R, G, B) in 0..1 of a block of variables."""
-    block = re.search(rf'^{re.escape(selector)} {{(.*?)}}', CSS, re.M | re.S)
-    assert block is not None
-    return {name: np.array([int(code[k:k + 2], 16) for k in (0, 2, 4)]) / 255.0
-            for name, code in re.findall(r'--([\w-]+): #(\w{6});', block[1])}
+def scheme(which: int) -> dict[str, np.ndarray]:
+    """Return name -> (R, G, B) in 0..1 of the light (0) or the dark scheme (1)."""
+    return {name: np.array([int(codes[which][k:k + 2], 16) for k in (0, 2, 4)]) / 255.0
+            for name, *codes in re.findall(r'--([\w-]+): light-dark\(#(\w{6}), #(\w{6})\);', CSS)}
 
 
-SCHEMES = {'light': scheme(':root'), 'dark': scheme(":root[data-scheme='dark']")}
+SCHEMES = {'light': scheme(0), 'dark': scheme(1)}
 MARKS = ('path', 'odometry', 'truth', 'believed', 'waiting', 'doubted', 'refused', 'held-out',
          'spring', 'axis')
 
@@ -485,7 +483,7 @@ def contrast(one: np.ndarray, other: np.ndarray) -> float:
 @pytest.mark.parametrize('name', SCHEMES)
 def test_texts_and_marks_have_enough_contrast(name) -> None:
     colours = SCHEMES[name]
-    assert colours.keys() == SCHEMES['light'].keys()
+    assert len(colours) > 20
     for ground, text in itertools.product(
             ('page', 'surface', 'raised'),
             ('ink', 'muted', 'accent', 'warning', 'notice', 'good')):

@@ -4,8 +4,7 @@
 // states, and the one place that knows which time and which measurement the reader looks at.
 
 const DATA = JSON.parse(document.getElementById('data').textContent);
-const STATES = DATA.states ||
-  ['believed', 'believed weakly', 'waiting', 'doubted', 'refused', 'held out'];
+const STATES = DATA.states;
 const CALM = matchMedia('(prefers-reduced-motion: reduce)');
 
 // --- elements -----------------------------------------------------------------------------------
@@ -41,19 +40,8 @@ function section(id, title, lead) {
 /** A line that says why there is nothing to see. */
 const nothing = (why) => make('p', {class: 'nothing'}, why);
 
-/** A link to a place of the page, from which the keyboard goes on. */
-function linkTo(id, text) {
-  return make('a', {href: `#${encodeURIComponent(id)}`, onclick: (event) => {
-    event.preventDefault();
-    const node = document.getElementById(id);
-    if (node) bringIntoView(node, 'start');
-    if (node) node.focus({preventScroll: true});
-  }}, text);
-}
-
-function bringIntoView(node, block) {
-  node.scrollIntoView({behavior: CALM.matches ? 'auto' : 'smooth', block});
-}
+/** A link to a place of the page. */
+const linkTo = (id, text) => make('a', {href: `#${encodeURIComponent(id)}`}, text);
 
 /** A table; the first cell of each row is its heading. */
 function table(look, heads, rows) {
@@ -72,7 +60,8 @@ let palette = {};
 /** The value of a colour of report.css in the scheme that is shown. */
 function colour(name) {
   if (!(name in palette)) {
-    palette[name] = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+    const both = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+    palette[name] = both.match(/#\w+/g)[Number(document.documentElement.dataset.scheme === 'dark')];
   }
   return palette[name];
 }
@@ -99,15 +88,7 @@ function number(value, digits = 3) {
   return String(Number(value.toPrecision(digits)));
 }
 
-/** A length in the unit in which it is easily read. */
-function length(metres, digits = 3) {
-  const size = Math.abs(metres);
-  if (size >= 1000) return `${number(metres / 1000, digits)} km`;
-  if (size < 0.01 && size > 0) return `${number(metres * 1000, digits)} mm`;
-  if (size < 1 && size > 0) return `${number(metres * 100, digits)} cm`;
-  return `${number(metres, digits)} m`;
-}
-
+const length = (metres) => `${number(metres)} m`;
 const degrees = (radians) => (known(radians) ? (radians * 180) / Math.PI : null);
 
 /** Seconds since the start, as `12.3 s` or `2:03.4` or `1:02:03`. */

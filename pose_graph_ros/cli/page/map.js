@@ -80,7 +80,7 @@ function showMap() {
     const half = Math.max(1.4 * apart, Math.min(0.06 * (box.getEast() - box.getWest()), 60), 2);
     const zoom = Math.log2(Math.min(stage.clientWidth, stage.clientHeight) / 2 / half);
     map.setView([y, x], zoom, {animate: !CALM.matches});
-    bringIntoView(stage, 'nearest');
+    stage.scrollIntoView({block: 'nearest'});
   };
   const shown = () => layers.filter((layer) => layer.shown);
   const pick = ({lng, lat}, pixels) => {
@@ -89,7 +89,7 @@ function showMap() {
     if (!item) return;
     lookAtTime(item.times[item.times.length - 1]);
     const panel = document.getElementById('panel');
-    if (panel.getBoundingClientRect().top > window.innerHeight - 120) bringIntoView(panel, 'nearest');
+    if (panel.getBoundingClientRect().top > window.innerHeight - 120) panel.scrollIntoView({block: 'nearest'});
   };
   map.on('click', ({latlng, originalEvent: {pointerType}}) => pick(
     latlng, pointerType === 'touch' || pointerType === 'pen' ? 18 : 9));

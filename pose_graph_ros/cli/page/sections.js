@@ -89,10 +89,8 @@ function showErrorCharts(host, {t, position, odometry, sigma, heading}) {
   const log = top(odometry) > 5 * top(position);
   const floor = log ? Math.max(0.002, top(position) / 300) : 0;
   const claimed = (sigma || []).map((each) => (known(each) ? 2 * each : null));
-  const series = [{name: 'corrected path', y: position, colour: 'path', width: 2}];
-  if (odometry) {
-    series.push({name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]});
-  }
+  const series = [{name: 'corrected path', y: position, colour: 'path', width: 2},
+    {name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]}];
   if (sigma) {
     series.push({name: 'claimed, 2 sigma', y: claimed, colour: 'path', width: 0.5},
       {y: claimed.map((each) => (each === null ? null : floor / 2)), colour: 'path', width: 0});
