@@ -118,14 +118,8 @@ const counted = (count, one, many = `${one}s`) => `${number(count, 6)} ${count =
 
 /** The smallest and the largest of all known values. */
 function extent(...columns) {
-  let [low, high] = [Infinity, -Infinity];
-  for (const column of columns) {
-    for (const value of column || []) {
-      if (known(value) && value < low) low = value;
-      if (known(value) && value > high) high = value;
-    }
-  }
-  return low <= high ? [low, high] : null;
+  const all = columns.flatMap((column) => (column || []).filter(known));
+  return all.length === 0 ? null : [Math.min, Math.max].map((most) => all.reduce((one, other) => most(one, other)));
 }
 
 // --- looks --------------------------------------------------------------------------------------
@@ -159,7 +153,7 @@ function swatch({colour: name, shape, dash, width, area, open}) {
 // --- what the reader looks at -------------------------------------------------------------------
 
 const focus = {time: null, item: null};
-const followers = {time: [], item: []};
+const followers = {time: [], item: [], print: []};
 
 /** Let all charts and the map mark a time [s]. */
 function lookAtTime(time) {

@@ -70,7 +70,7 @@ function showMap() {
   const choose = (item) => {
     const layer = layers.find((each) => (each.items || []).includes(item));
     layer.shown = true;
-    if (layer.states) layer.states.add(item.shown);
+    if (layer.states) layer.states.add(item.state);
     tick();
     below.repaint();
     lookAtItem(item);
@@ -105,7 +105,7 @@ function showMap() {
     stage.classList.toggle('on-item', item !== null);
     if (!item) label.remove();
     else label.setLatLng(latlng).setContent(make('span', {}, make('b', {}, item.id || item.source),
-      make('br'), item.spring ? 'spring' : STATES[item.shown])).addTo(map);
+      make('br'), item.spring ? 'spring' : STATES[item.state])).addTo(map);
     lookAtTime(timeAt(path, latlng, 14 / scale));
   });
   map.on('mouseout', () => label.remove());
@@ -151,39 +151,28 @@ function scrollBeforeZoom(map, stage) {
 /** On paper there is the same part of the map, whatever the size of the paper. */
 function printWhole(map) {
   let seen = null;
-  window.addEventListener('beforeprint', () => {
-    seen = [map.getCenter(), map.getZoom()];
+  followers.print.push((begins) => {
     const bounds = map.getBounds();
-    document.documentElement.classList.add('paper');
+    if (begins) seen = [map.getCenter(), map.getZoom()];
     map.invalidateSize({animate: false});
-    map.fitBounds(bounds, {animate: false});
-  });
-  window.addEventListener('afterprint', () => {
-    document.documentElement.classList.remove('paper');
-    map.invalidateSize({animate: false});
-    map.setView(...seen, {animate: false});
+    if (begins) map.fitBounds(bounds, {animate: false});
+    else map.setView(...seen, {animate: false});
   });
 }
 
 // --- items and layers ---------------------------------------------------------------------------
 
-/** A fix or a closure; `shown` is the state as which it is painted. */
+/** A fix or a closure. */
 function itemOf(kind, source, k) {
   const column = (name) => (source[name] ? source[name][k] : null);
-  const why = column('why');
-  const heldOut = Boolean(column('held_out'));
-  const item = {
-    kind, source: source.source, state: column('state'), id: column('id'), distance: column('d'),
-    reason: why === null || why < 0 ? null : DATA.texts[why], heldOut,
-    shown: heldOut ? HELD_OUT : column('state')};
-  if (kind === 'closure') {
-    return {...item, times: [column('t0'), column('t1')],
-      ends: [[column('x0'), column('y0')], [column('x1'), column('y1')]]};
-  }
-  const at = column('at');
+  const [why, at] = [column('why'), column('at')];
   const {x, y} = DATA.lines.corrected;
-  return {...item, times: [column('t')], ends: [[column('x'), column('y')]],
-    tie: known(at) && at >= 0 ? [x[at], y[at]] : null};
+  return {
+    kind, source: source.source, state: column('state'), id: column('id'), distance: column('d'),
+    reason: why < 0 ? null : DATA.texts[why], ...(kind === 'closure' ? {
+      times: [column('t0'), column('t1')],
+      ends: [[column('x0'), column('y0')], [column('x1'), column('y1')]]} : {
+      times: [column('t')], ends: [[column('x'), column('y')]], tie: at >= 0 ? [x[at], y[at]] : null})};
 }
 
 function springItem(spring) {
@@ -204,7 +193,7 @@ function makeLayers() {
   const ellipses = DATA.ellipses || {x: []};
   const measurements = (kind, sources) => (sources || []).map((source) => {
     const items = source.state.map((_, k) => itemOf(kind, source, k));
-    const counts = STATES.map((_, state) => items.filter((item) => item.shown === state).length);
+    const counts = STATES.map((_, state) => items.filter((item) => item.state === state).length);
     return {id: `${kind}/${source.source}`, kind, items, counts, count: items.length,
       name: `${kind === 'fix' ? 'fixes' : 'closures'}${sources.length > 1 ? ` ${source.source}` : ''}`,
       states: new Set(STATES.keys()), swatch: {...LOOKS[BELIEVED], dash: kind === 'fix' ? null : []}};
@@ -229,9 +218,9 @@ function nearestItem(layers, x, y, scale, pixels) {
   let [best, found] = [pixels / scale, null];
   for (const {items, states} of layers) {
     for (const item of items || []) {
-      if (states && !states.has(item.shown)) continue;
+      if (states && !states.has(item.state)) continue;
       // what is not believed is wanted more often, and there is less of it
-      const bonus = item.shown === BELIEVED || item.shown === HELD_OUT ? 0 : 3;
+      const bonus = item.state === BELIEVED || item.state === HELD_OUT ? 0 : 3;
       const apart = toSegment(x, y, item.ends[0], item.ends[item.ends.length - 1]) - bonus / scale;
       if (apart < best) [best, found] = [apart, item];
     }
@@ -248,13 +237,10 @@ function toSegment(x, y, [p, q], [r, s]) {
 }
 
 /** When the robot was near a place, if it was. */
-function timeAt(path, {lng, lat}, within) {
-  let [best, found] = [within, null];
-  for (let k = 0; k < path.x.length; k += 1) {
-    const apart = Math.hypot(path.x[k] - lng, path.y[k] - lat);
-    if (apart < best) [best, found] = [apart, path.t[k]];
-  }
-  return found;
+function timeAt({t, x, y}, {lng, lat}, within) {
+  const apart = x.map((each, k) => Math.hypot(each - lng, y[k] - lat));
+  const [nearest] = extent(apart);
+  return nearest < within ? t[apart.indexOf(nearest)] : null;
 }
 
 // --- controls -----------------------------------------------------------------------------------
@@ -340,7 +326,7 @@ function makePanel(host, centreOn) {
       make('h3', {}, KINDS[item.kind], ' ', make('span', {class: 'id'}, item.id || item.source)),
       make('button', {type: 'button', class: 'plain', 'aria-label': 'Close',
         onclick: () => lookAtItem(null)}, '×')),
-    make('p', {}, ...[...new Set([item.state, item.shown])].filter(known).map(tag)),
+    make('p', {}, known(item.state) ? tag(item.state) : null),
     make('p', {class: 'reason'}, item.reason || ''),
     make('dl', {}, factsOf(item).flatMap(
       ([name, value]) => [make('dt', {}, name), make('dd', {}, value)])),

@@ -47,7 +47,7 @@ function paintLayers(layers, context, frame) {
   const measured = (order) => shown.filter(({counts}) => counts).forEach((layer) => order
     .filter((state) => layer.states.has(state) && layer.counts[state] > 0)
     .forEach((state) => (layer.kind === 'fix' ? paintFixes : paintClosures)(
-      layer.items.filter((item) => item.shown === state), state, context, frame)));
+      layer.items.filter((item) => item.state === state), state, context, frame)));
   for (const layer of shown) {
     if (layer.ellipses) paintEllipses(layer, context, frame);
     if (layer.line && layer.id !== 'corrected') paintPath(layer, context, frame);
@@ -222,9 +222,9 @@ function paintFocus(path, context, frame) {
 /** A frame around what is chosen, and a line from a fix to where the robot was. */
 function paintChosen(item, context, frame) {
   const places = item.ends.map((end) => frame.place(...end));
-  const name = item.spring ? 'spring' : lookOf(item.shown).colour;
+  const name = item.spring ? 'spring' : lookOf(item.state).colour;
   if (item.tie) paint(context, through([places[0], frame.place(...item.tie)]), [name, 1.5]);
   paint(context, through(places), ['surface', 9], [name, 4.5]);
   for (const [u, v] of places) paint(context, circle(u, v, 10), ['surface', 6], ['ink', 2.4]);
-  if (!item.spring) stamp(item.shown, context, middleOf(places), 1.3);
+  if (!item.spring) stamp(item.state, context, middleOf(places), 1.3);
 }

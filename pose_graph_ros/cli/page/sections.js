@@ -167,10 +167,9 @@ function noChart(host, title, why) {
 
 function showHistogram(host, {histogram}) {
   const title = 'How large they are';
-  if (!histogram || histogram.count.length === 0) {
-    noChart(host, title, 'The optimum follows this source wherever it leads, so that its residuals '
-      + 'say nothing.');
-    return;
+  if (!histogram) {
+    return noChart(host, title, 'The optimum follows this source wherever it leads, so that its '
+      + 'residuals say nothing.');
   }
   const {edges, count} = histogram;
   const wide = edges[1] - edges[0];
@@ -178,7 +177,7 @@ function showHistogram(host, {histogram}) {
   const values = count.map((_, k) => edges[k] + wide / 2);
   const normal = values.map((value) => (
     total * wide * Math.exp(-0.5 * value * value)) / Math.sqrt(2 * Math.PI));
-  makeChart(host, {title, note: 'Larger ones are counted in the outermost bars.',
+  return makeChart(host, {title, note: 'Larger ones are counted in the outermost bars.',
     x: {label: 'residual / expected', values, range: [edges[0], edges[edges.length - 1]]},
     y: {label: 'count'}, series: [{kind: 'bars', name: 'found', y: count, colour: 'path'},
       {name: 'normal, as claimed', y: normal, colour: 'odometry'}]});
@@ -186,9 +185,8 @@ function showHistogram(host, {histogram}) {
 
 function showAutocorrelation(host, {autocorrelation}) {
   const title = 'How long they keep their direction';
-  if (!autocorrelation || autocorrelation.lag.length === 0) {
-    noChart(host, title, 'There are too few residuals, or they say nothing.');
-    return;
+  if (!autocorrelation) {
+    return noChart(host, title, 'There are too few residuals, or they say nothing.');
   }
   const {lag, value, band, fitted, time, in_use: inUse} = autocorrelation;
   const last = lag[lag.length - 1];
@@ -204,7 +202,7 @@ function showAutocorrelation(host, {autocorrelation}) {
   const rules = [{at: time, name: `suggests ${number(time)} s`, colour: 'doubted'},
     {at: inUse, name: `in use ${number(inUse)} s`, dash: [2, 3], colour: 'held-out'}]
     .filter(({at}) => known(at) && at > 0).map((rule) => ({of: 'x', ...rule}));
-  makeChart(host, {title, series, rules, y: {label: 'autocorrelation'},
+  return makeChart(host, {title, series, rules, y: {label: 'autocorrelation'},
     band: known(band) ? [series.length - 1, series.length] : null,
     x: {label: log ? 'lag [s], logarithmic' : 'lag [s]', values: lag, log,
       range: log ? null : [0, farthest]},
@@ -293,18 +291,18 @@ function showSparsity() {
 // on paper the page is light and has all findings, whatever it is on the screen
 let onScreen = null;
 let folded = [];
-window.addEventListener('beforeprint', () => {
-  onScreen = document.documentElement.dataset.scheme;
-  folded = [...document.querySelectorAll('details.good:not([open])')];
-  for (const each of folded) each.open = true;
-  document.documentElement.classList.add('paper');
-  setScheme('light');
-});
-window.addEventListener('afterprint', () => {
-  document.documentElement.classList.remove('paper');
-  for (const each of folded) each.open = false;
-  setScheme(onScreen);
-});
+const print = (begins) => {
+  document.documentElement.classList.toggle('paper', begins);
+  if (begins) {
+    onScreen = document.documentElement.dataset.scheme;
+    folded = [...document.querySelectorAll('details.good:not([open])')];
+  }
+  for (const each of folded) each.open = begins;
+  for (const follow of followers.print) follow(begins);
+  setScheme(begins ? 'light' : onScreen);
+};
+window.addEventListener('beforeprint', () => print(true));
+window.addEventListener('afterprint', () => print(false));
 
 showHead();
 const choose = showMap();
