@@ -66,91 +66,6 @@ class Run(NamedTuple):
     graph: Graph
 
 
-class TuningDrive:
-    """The measurements of a bag, the first million, all fixes in the same map."""
-
-    def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
-        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
-        measurements = list(islice(stream, 1_000_000))  # of about 700 bytes each
-        self.is_cut = next(stream, None) is not None  # whether the bag has more
-        self.measurements = _in_the_map(measurements)
-
-    def odometry(self, source: str) -> list[OdometrySample]:
-        """Return the samples of a source of odometry."""
-        return [each for name, each in self.measurements
-                if name == source and isinstance(each, OdometrySample)]
-
-    def closures(self) -> list[tuple[str, LoopClosure]]:
-        """Return the loop closures and their sources."""
-        return [(name, each) for name, each in self.measurements
-                if isinstance(each, LoopClosure)]
-
-    def sources_of_poses(
-        self, inputs: Inputs, values: Mapping[str, Any],
-    ) -> list[SourceOfPoses]:
-        """Return the sources with enough valid measurements in the map."""
-        config, found = backend_config(values), []
-        for name in inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
-            kept = [each for of, each in self.measurements if of == name
-                    and isinstance(each, Absolute)]
-            source = None if len(kept) == 0 else source_of_poses(
-                name, kept, config.measurement_source(name, type(kept[0])))
-            if source is not None:
-                found.append(source)
-        return found
-
-    def run(self, values: Mapping[str, Any], without: Collection[Key] = ()) -> Run | None:
-        """Return the result of the engine without some measurements; None if it has no path."""
-        backend, _ = run_measurements((
-            (name, each) for name, each in self.measurements
-            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
-        estimate = backend.estimate()
-        if estimate is None:
-            return None
-        factors = {
-            name: 1.0 if report.in_use is None else report.in_use.correlated + report.in_use.white
-            for name, report in backend.reports().items()}
-        doubted = frozenset(
-            (name, stamp) for (name, stamp, _), state
-            in states_by_stamps(backend.verdicts()).items() if state is State.DOUBTED)
-        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted,
-                   backend.graph)
-
-    def errors(
-        self, run: Run, values: Mapping[str, Any], inputs: Inputs, left_out: Collection[Key],
-    ) -> list[Errors]:
-        """Return the errors of a path at positions that were held out, for each source."""
-        return [held_out.errors_at(
-            run.path, run.covariances, source.measured.rows(source.is_among(left_out)),
-            run.factors.get(source.name, 1.0)) for source in self.sources_of_poses(inputs, values)]
-
-    def closure_errors(self, run: Run, left_out: Collection[Key]) -> Errors:
-        """Return the errors of a path at closures, in the frames of their references."""
-        chosen = [each for name, each in self.closures()
-                  if (name, each.stamp_ns) in left_out and each.reference_ns is not None]
-        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in chosen],
-                          dtype=np.int64).reshape(-1, 2)
-        inside = np.all(run.path.covers(stamps), axis=1)
-        ends = run.path.at(stamps[inside])
-        measured_poses = np.array([each.pose for each in chosen]).reshape(-1, 3)[inside]
-        errors = measured_poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
-        return Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))
-
-
-def _in_the_map(
-    measurements: list[tuple[str, OdometrySample | Measurement]],
-) -> list[tuple[str, OdometrySample | Measurement]]:
-    """Return measurements with fixes placed; the first one that odometry covers goes first."""
-    start = min((each.stamp_ns for _, each in measurements
-                 if isinstance(each, OdometrySample)), default=0)
-    order = sorted(range(len(measurements)), key=lambda k: measurements[k][1].stamp_ns < start)
-    for k in order:
-        name, each = measurements[k]
-        if isinstance(each, Fix):
-            measurements[k] = name, each.placed()
-    return measurements
-
-
 class Verdict(Enum):
     """What came of a tuning."""
 
@@ -184,36 +99,42 @@ class _Tried(NamedTuple):
 
 
 class Tuning:
-    """Tunes with the measurements of a drive."""
+    """Tunes with the measurements of a bag, the first million, all fixes in the same map."""
 
     def __init__(
-        self, drive: TuningDrive, inputs: Inputs, values: Mapping[str, Any], path: str,
-        show: Callable[[str], None],
+        self, bag: Bag, inputs: Inputs, values: Mapping[str, Any], show: Callable[[str], None],
     ) -> None:
-        self._drive, self._inputs, self._values, self._show = drive, inputs, values, show
+        self._inputs, self._values, self._show = inputs, values, show
         self._step, self._steps = 0, 0
-        self._config, self._path = backend_config(values), path
+        self._config, self._path = backend_config(values), bag.path
+        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
+        self._measurements = _in_the_map(list(islice(stream, 1_000_000)))  # of 700 bytes each
+        self.is_cut = next(stream, None) is not None  # whether the bag has more
         self._odometry = {}
         for name in inputs.of(*ODOMETRY_KINDS):
-            found = timeline(drive.odometry(name), self._config.odometry_source(name))
+            found = timeline([each for of, each in self._measurements
+                              if of == name and isinstance(each, OdometrySample)],
+                             self._config.odometry_source(name))
             if len(found) > 1:
                 self._odometry[name] = found
         if len(self._odometry) == 0:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
-            raise BagError(f'{path}: no usable odometry on {topics}')
+            raise BagError(f'{self._path}: no usable odometry on {topics}')
         stamps = next(iter(self._odometry.values())).stamps_ns
         self._start_ns, self._duration = int(stamps[0]), float(stamps[-1] - stamps[0]) * 1e-9
-        self._sources = [each for each in drive.sources_of_poses(inputs, values)
+        self._sources = [each for each in self._sources_of_poses(values)
                          if each.measured.has_positions or each.measured.has_headings]
         self._closures: list[tuple[str, LoopClosure]] = []
         if not any(each.measured.has_positions for each in self._sources):
-            self._sources, self._closures = [], drive.closures()
+            self._sources, self._closures = [], [
+                (name, each) for name, each in self._measurements
+                if isinstance(each, LoopClosure)]
             if len(self._closures) < LEAST:
                 topics = ', '.join(f'{topic} ({source})'
                                    for source, topic in inputs.topics.items())
                 raise BagError(
-                    f'{path}: nothing to tune by: at least {LEAST} valid fixes, global poses or '
-                    f'loop closures are needed; used are {topics}')
+                    f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
+                    f'poses or loop closures are needed; used are {topics}')
 
     def tune(self, folds: int, deadline: Seconds, truth: Trajectory | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
@@ -221,7 +142,7 @@ class Tuning:
         tuned, fits = self._estimate(frozenset(), 'estimating noise')
         start = time.monotonic()
         self._begin('running with it')
-        run = self._drive.run(self._with(tuned))
+        run = self._run(self._with(tuned))
         seconds = time.monotonic() - start
         doubted = frozenset() if run is None else run.doubted
         if len(doubted) > 0:
@@ -248,6 +169,47 @@ class Tuning:
         return Outcome(tuned, verdict, held_out.summary(one), held_out.summary(other), errors,
                        folds, n_done, stretch, self._measured(), len(doubted),
                        max(each.contradiction for each in fits.values()))
+
+    def _sources_of_poses(self, values: Mapping[str, Any]) -> list[SourceOfPoses]:
+        """Return the sources with enough valid measurements in the map, by some parameters."""
+        config, found = backend_config(values), []
+        for name in self._inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
+            kept = [each for of, each in self._measurements
+                    if of == name and isinstance(each, Absolute)]
+            source = None if len(kept) == 0 else source_of_poses(
+                name, kept, config.measurement_source(name, type(kept[0])))
+            if source is not None:
+                found.append(source)
+        return found
+
+    def _run(self, values: Mapping[str, Any], without: Collection[Key] = ()) -> Run | None:
+        """Return the result of the engine without some measurements; None if it has no path."""
+        backend, _ = run_measurements((
+            (name, each) for name, each in self._measurements
+            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
+        estimate = backend.estimate()
+        if estimate is None:
+            return None
+        factors = {
+            name: 1.0 if report.in_use is None else report.in_use.correlated + report.in_use.white
+            for name, report in backend.reports().items()}
+        doubted = frozenset(
+            (name, stamp) for (name, stamp, _), state
+            in states_by_stamps(backend.verdicts()).items() if state is State.DOUBTED)
+        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted,
+                   backend.graph)
+
+    def _closure_errors(self, run: Run, left_out: Collection[Key]) -> Errors:
+        """Return the errors of a path at closures, in the frames of their references."""
+        chosen = [each for name, each in self._closures
+                  if (name, each.stamp_ns) in left_out and each.reference_ns is not None]
+        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in chosen],
+                          dtype=np.int64).reshape(-1, 2)
+        inside = np.all(run.path.covers(stamps), axis=1)
+        ends = run.path.at(stamps[inside])
+        measured_poses = np.array([each.pose for each in chosen]).reshape(-1, 3)[inside]
+        errors = measured_poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
+        return Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))
 
     def _begin(self, text: str) -> str:
         """Show what is done next, as which step of all, and return that."""
@@ -294,7 +256,7 @@ class Tuning:
         self, without: Collection[Key], tick: Callable[[], None],
     ) -> tuple[list[Tuned], dict[str, Fit]]:
         """Do the same by loop closures alone."""
-        run, primary = self._drive.run(self._values, without), next(iter(self._odometry))
+        run, primary = self._run(self._values, without), next(iter(self._odometry))
         if run is None or run.graph.n_nodes > MOST_NODES:
             raise BagError(f'{self._path}: too many hidden nodes to tune by loop closures; '
                            f'expected at most {MOST_NODES}')
@@ -335,11 +297,13 @@ class Tuning:
     def _try(
         self, values: Mapping[str, Any], left_out: Collection[Key], truth: Trajectory | None,
     ) -> _Tried:
-        run = self._drive.run(values, left_out)
+        run = self._run(values, left_out)
         if run is None:
             return _Tried([], np.nan)
-        errors = ([self._drive.closure_errors(run, left_out)] if len(self._closures) > 0
-                  else self._drive.errors(run, values, self._inputs, left_out))
+        errors = [self._closure_errors(run, left_out)] if len(self._closures) > 0 else [
+            held_out.errors_at(
+                run.path, run.covariances, source.measured.rows(source.is_among(left_out)),
+                run.factors.get(source.name, 1.0)) for source in self._sources_of_poses(values)]
         if truth is None or not np.any(inside := run.path.covers(truth.stamps_ns)):
             return _Tried(errors, np.nan)
         apart = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
@@ -365,3 +329,17 @@ class Tuning:
         counts = ', '.join([f'{len(each.measured.stamps_ns)} of {each.name}'
                             for each in self._sources] or [f'{len(self._closures)} closures'])
         return f'{self._duration:.0f} s of odometry, {counts}'
+
+
+def _in_the_map(
+    measurements: list[tuple[str, OdometrySample | Measurement]],
+) -> list[tuple[str, OdometrySample | Measurement]]:
+    """Return measurements with fixes placed; the first one that odometry covers goes first."""
+    start = min((each.stamp_ns for _, each in measurements
+                 if isinstance(each, OdometrySample)), default=0)
+    order = sorted(range(len(measurements)), key=lambda k: measurements[k][1].stamp_ns < start)
+    for k in order:
+        name, each = measurements[k]
+        if isinstance(each, Fix):
+            measurements[k] = name, each.placed()
+    return measurements

@@ -254,27 +254,6 @@ def test_the_wheel_zooms_at_the_pointer_and_a_drag_takes_the_map_along(show, rea
     assert opened.view()[2] < scale
 
 
-def test_two_fingers_zoom(show, real) -> None:
-    opened = show(real, NARROW)
-    opened.page.locator('#stage').scroll_into_view_if_needed()
-    x, y = real['lines']['corrected']['x'][90], real['lines']['corrected']['y'][90]
-    u, v = opened.place(x, y)
-    scale = opened.view()[2]
-    fingers = opened.page.context.new_cdp_session(opened.page)
-
-    def touch(kind: str, *places: tuple[float, float]) -> None:
-        points = [{'x': at[0], 'y': at[1], 'id': k} for k, at in enumerate(places)]
-        fingers.send('Input.dispatchTouchEvent', {'type': kind, 'touchPoints': points})
-
-    touch('touchStart', (u - 20, v), (u + 20, v))
-    for apart in (30, 45, 60):
-        touch('touchMove', (u - apart, v), (u + apart, v))
-    touch('touchEnd')
-    opened.settle()
-    assert opened.view()[2] == pytest.approx(3.0 * scale, rel=0.05)
-    assert opened.place(x, y) == pytest.approx((u, v), abs=6.0)
-
-
 @pytest.mark.parametrize('width', [WIDE, NARROW])
 def test_entries_of_lists_centre_the_map(show, real, width) -> None:
     opened = show(real, width)
@@ -387,25 +366,6 @@ def test_a_printed_page_has_its_charts_and_the_whole_map(show, made) -> None:
     assert opened.view()[2] == pytest.approx(before[2])
 
 
-def test_ellipses_that_lie_on_one_another_are_not_all_painted(show, made) -> None:
-    """Else they are a blot that hides the path, as of a drive without measurements in the map."""
-    opened = show(made)
-    strokes = opened.page.evaluate("""(() => {
-        let count = 0;
-        const context = {beginPath() {}, fill() {}, stroke() {}, ellipse() { count += 1; }};
-        const frame = {scale: 1, place: (x, y) => [x, y]};
-        const of = (sigma) => ({x: [...Array(50).keys()].map((k) => 4 * k), y: Array(50).fill(50),
-          xx: Array(50).fill(sigma ** 2), xy: Array(50).fill(0), yy: Array(50).fill(sigma ** 2)});
-        return [1, 40].map((sigma) => {
-          count = 0;
-          paintEllipses({ellipses: of(sigma), factor: 1}, context, frame);
-          return count;
-        });
-    })()""")
-    assert strokes[0] == 50
-    assert 2 <= strokes[1] <= 4
-
-
 @pytest.mark.parametrize('width', [WIDE, NARROW])
 def test_hostile_texts_are_shown_as_texts(show, width) -> None:
     data = example(poses=60, fixes=40, closures=12, title=HOSTILE + '\ud800')
@@ -450,11 +410,6 @@ def test_an_hour_of_driving_is_below_5_mb_and_can_be_panned(show) -> None:
     opened.page.mouse.up()
     assert opened.view()[0] != before[0]
     assert time.process_time() - began < 5.0
-
-
-def test_numbers_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match='float'):
-        render({'duration': float('nan')})
 
 
 # --- colours ------------------------------------------------------------------------------------
