@@ -13,7 +13,6 @@ from pose_graph_ros.cli.drive import (
     consistency,
     distances,
     Drive,
-    format_table,
     place_truth,
     summary,
 )
@@ -23,7 +22,6 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.verdicts import State
 
 NOTHING = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-NO_LOOPS = np.zeros((0, 2), dtype=np.int64)
 SECOND = 10**9
 
 
@@ -175,16 +173,6 @@ def test_what_is_doubted_is_no_reference_and_counted_apart() -> None:
     assert (result['fixes_used'], result['fixes_doubted'], result['fixes_held_out']) == (2, 1, 2)
     assert drive.loops(State.DOUBTED).tolist() == [True]
     assert hand_made_drive().loops(State.BELIEVED).tolist() == [True]
-
-
-def test_the_table_is_aligned_and_fits_a_terminal() -> None:
-    lines = format_table(hand_made_drive().rows).splitlines()
-    assert len(lines) == 9
-    assert len({len(line) for line in lines}) == 1
-    assert len(lines[0]) < 80
-    assert 'corrected path to truth' in lines[3]
-    assert '0.50' in lines[3]
-    assert 'nothing to compare' in format_table([])
 
 
 @pytest.mark.parametrize(('turn', 'shape'), [(0.0, 'wide'), (np.pi / 2.0, 'tall')])

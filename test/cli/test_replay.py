@@ -119,22 +119,6 @@ def test_distances_from_fixes_are_those_of_the_robot_not_of_the_antenna(tmp_path
         assert errors[f'corrected path to fixes {kind}'] < 0.1
 
 
-def test_the_antenna_may_come_from_tf_static_whenever_it_was_recorded(tmp_path) -> None:
-    header, time = TYPES['std_msgs/msg/Header'], TYPES['builtin_interfaces/msg/Time']
-    transform = TYPES['geometry_msgs/msg/TransformStamped'](
-        header(time(0, 0), 'base_link'), 'gps', TYPES['geometry_msgs/msg/Transform'](
-            TYPES['geometry_msgs/msg/Vector3'](*ANTENNA.tolist(), 1.0),
-            TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)))
-    last = int(circle().stamps_ns[-1])
-    write_bag(tmp_path / 'bag', (
-        *odometry(), *fixes(ANTENNA),
-        ('/tf_static', 'tf2_msgs/msg/TFMessage', last - 1, b'\0\1\0\0junk'),
-        ('/tf_static', 'tf2_msgs/msg/TFMessage', last, TYPES['tf2_msgs/msg/TFMessage'](
-            [transform]))))
-    assert run(tmp_path / 'bag', '-o', tmp_path) == 0
-    assert rms(summary_of(tmp_path))['corrected path to fixes used'] < 0.1
-
-
 def test_messages_without_a_measurement_are_counted_and_not_compared_with(tmp_path) -> None:
     bad = fixes(np.zeros(2))[:3]
     for _, _, _, message in bad:

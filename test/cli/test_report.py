@@ -10,14 +10,11 @@ import time
 
 from circle_bag import fixes, odometry
 import numpy as np
-from public_data import PUBLIC
 import pytest
 from run_schema import problems
 
 from pose_graph_ros.cli.bag_messages import write_bag
 from pose_graph_ros.cli.main import main
-
-FALSE_LOOPS = PUBLIC / 'false_loops'
 
 
 def run(*words: object) -> int:

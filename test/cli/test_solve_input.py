@@ -13,7 +13,6 @@ from pose_graph_ros.cli.main import main
 
 I = '1 0 0 1 0 1'   # noqa: E741
 FIRST = f'VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 {I}\n'
-LARGEST = 2**63 - 1
 # Text behind two good lines, and what is said.
 WRONG = {
     'truncated': ('EDGE_SE2 1 2 1 0 0 1 0 0 1 0', ':3: EDGE_SE2 is followed by 11 .*got 10'),

@@ -126,7 +126,7 @@ def test_a_truth_at_other_times_is_null_in_json(tmp_path, capsys) -> None:
     assert facts['to_truth'] == {'before': None, 'after': None}
 
 
-HUSKY, PLAZA = PUBLIC / 'robot/husky_test1_ros2', PUBLIC / 'robot/plaza1'
+HUSKY = PUBLIC / 'robot/husky_test1_ros2'
 
 
 def facts_of(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:

@@ -23,8 +23,6 @@ from pose_graph_ros.offline.simulation.worlds import (
     AISLE_DEPTH,
     AISLE_SPACING,
     AISLES,
-    BLOCK,
-    BLOCKS,
     CART,
     FORKLIFT,
     WORLDS,
@@ -62,16 +60,6 @@ def test_the_robot_stays_in_the_aisles_of_the_hall_for_hours() -> None:
         np.sin(motion.poses[::100][middle, 2]) > 0.0)
     assert np.bincount(visits, minlength=2 * AISLES).min() > 10
     assert np.mean(np.diff(motion.distance) < 1e-6) > 0.1    # it stops to pick up
-
-
-def test_the_walk_covers_the_grid_and_stays_in_its_streets() -> None:
-    motion = course(WORLDS['grid'], 2, 7200.0).motion
-    away = se2.rotation(-0.35) @ motion.poses[::100, :2].T
-    off = np.abs(away / BLOCK - np.round(away / BLOCK)) * BLOCK
-    assert np.all(np.min(off, axis=0) < 1.5)
-    crossings = {tuple(each) for each in np.round(away / BLOCK).astype(int).T.tolist()}
-    assert len(crossings) > 0.8 * (BLOCKS + 1)**2
-    assert np.all((away > -1.0) & (away < BLOCK * BLOCKS + 1.0))
 
 
 def simulated(world: str, seed: int = 1, **changes: object) -> SimulatedGraph:
