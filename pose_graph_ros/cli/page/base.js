@@ -5,6 +5,7 @@
 
 const DATA = JSON.parse(document.getElementById('data').textContent);
 const STATES = DATA.states;
+const isPaper = () => document.documentElement.classList.contains('paper');
 const CALM = matchMedia('(prefers-reduced-motion: reduce)');
 
 // --- elements -----------------------------------------------------------------------------------
@@ -31,7 +32,7 @@ function fill(node, properties, children) {
 
 /** Make a section of the page with a heading, and put it on the page. */
 function section(id, title, lead) {
-  const node = make('section', {id, 'aria-labelledby': `${id}-title`, tabindex: '-1'},
+  const node = make('section', {id, 'aria-labelledby': `${id}-title`},
     make('h2', {id: `${id}-title`}, title), lead ? make('p', {class: 'lead'}, lead) : null);
   document.getElementById('main').append(node);
   return node;

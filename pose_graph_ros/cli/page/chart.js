@@ -50,13 +50,10 @@ function makeChart(host, {title, x, y, series, band, rules = [], note, height = 
 
 /** What a chart shows in words: the title, the axes, and between what its columns are. */
 function described(title, x, y, series, rules) {
-  const spans = series.filter(({name}) => name).map((each) => {
-    const [low, high] = extent(each.y) || [null, null];
-    return `${each.name} from ${number(low)} to ${number(high)}`;
-  });
-  return `${title}: ${y.label} over ${x.label}; ${
-    [...spans, ...rules.map(({name}) => name).filter((name) => name)].join('; ')}. `
-    + 'Arrow keys move the read-out.';
+  const spans = series.filter(({name}) => name).map((each) => (
+    `${each.name} from ${(extent(each.y) || []).map((value) => number(value)).join(' to ')}`));
+  return [`${title}: ${y.label} over ${x.label}`, ...spans, ...rules.map(({name}) => name || ''),
+    'arrow keys move the read-out'].filter((text) => text).join('; ');
 }
 
 /** A scale with all values and rules in it; a linear one of y has zero, a logarithmic one none. */

@@ -7,9 +7,6 @@ const Painted = L.Renderer.extend({
   _initContainer() {
     this._container = make('canvas', {'aria-hidden': 'true'});
   },
-  _destroyContainer() {
-    this._container.remove();
-  },
   /** Leaflet calls this when the map has come to rest. */
   _update() {
     if (this._map._animatingZoom && this._bounds) return;
@@ -30,9 +27,6 @@ const Painted = L.Renderer.extend({
     this.options.paint(context, {
       scale, min, max, visible, place: (x, y) => [x * scale - origin.x, -y * scale - origin.y],
       back: ({x, y}) => [(x + origin.x) / scale, -(y + origin.y) / scale]});
-  },
-  repaint() {
-    this._update();
   },
 });
 
