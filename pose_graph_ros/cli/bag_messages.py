@@ -24,11 +24,9 @@ _IMU = 'sensor_msgs/msg/Imu'
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
-def write_bag(
-    folder: str | Path, messages: Iterable[Message], *, overwrite: bool = False,
-) -> None:
+def write_bag(folder: str | Path, messages: Iterable[Message]) -> None:
     """Write messages as a rosbag2, in the order of their stamps."""
-    with BagWriter(folder, overwrite=overwrite) as bag:
+    with BagWriter(folder) as bag:
         for topic, type_name, stamp, message in sorted(messages, key=lambda item: item[2]):
             bag.write(topic, type_name, stamp, message)
 

@@ -36,17 +36,6 @@ def parsed(*words: str) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def test_topics_are_those_of_the_options() -> None:
-    nothing = {'odom': None, 'fix': None, 'global_pose': None, 'loop_closure': None, 'imu': None,
-               'gyro': None}
-    assert shared.wanted_topics(parsed()) == nothing
-    given = parsed('--odom', '/a', '--global-pose', '/b', '--loop-closure', '/c', '--imu', '/d')
-    assert shared.wanted_topics(given) == {
-        'odom': '/a', 'fix': None, 'global_pose': '/b', 'loop_closure': '/c', 'imu': '/d',
-        'gyro': None}
-    assert (parsed().truth, parsed().hold_out) == (None, 0)
-
-
 def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path) -> None:
     path = tmp_path / 'params.yaml'
     path.write_text(FILE, encoding='utf-8')

@@ -102,7 +102,7 @@ def test_a_sigma_that_is_kept_stays_when_its_factor_becomes_a_part_of_it() -> No
     sigmas = [2.0 * values[f'odom.{name}'] for name in ODOMETRY]
     found = [Found(Parameter(Role.ODOMETRY, k, sigma), 3.0 * sigma if k == 0 else sigma,
                    0.9 * sigma, 4.0 * sigma, k > 0) for k, sigma in enumerate(sigmas)]
-    after = changed(odometry_parameters('odom', Fit(tuple(found), 0.0, 1, 0, 1, 1.0), values))
+    after = changed(odometry_parameters('odom', Fit(tuple(found), 1.0), values))
     assert after.pop('odom.sigma_scale') == 1.0
     expected = [3.0 * sigmas[0], *sigmas[1:]]
     assert after == pytest.approx({

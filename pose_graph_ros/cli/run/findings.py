@@ -328,7 +328,7 @@ def silences(
         moves = kind in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO)
         if not moves and kind not in (Kind.FIX, Kind.GLOBAL_POSE):
             continue
-        gaps = silent(stamps_ns, 0.5 if moves else 4.0, periods=8.0) - start_ns * 1e-9
+        gaps = silent(stamps_ns, 0.5 if moves else 4.0) - start_ns * 1e-9
         if len(gaps) == 0:
             continue
         lengths = gaps[:, 1] - gaps[:, 0]

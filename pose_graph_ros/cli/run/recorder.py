@@ -46,7 +46,7 @@ def thinned(updates: Sequence[Update]) -> list[Update]:
             for group in groups]
 
 
-def silent(stamps_ns: Sequence[StampNs], least_s: Seconds, periods: float) -> FloatArray:
+def silent(stamps_ns: Sequence[StampNs], least_s: Seconds) -> FloatArray:
     """
     Return the longest silences of a source: begin and end [s], shape (K, 2).
 
@@ -59,7 +59,7 @@ def silent(stamps_ns: Sequence[StampNs], least_s: Seconds, periods: float) -> Fl
     longest = np.argsort(lengths, kind='stable')[-MOST_SILENCES:]
     others = np.delete(lengths, longest)
     usual = float(np.mean(others) if len(others) > 0 else np.median(lengths))
-    found = np.sort(longest[lengths[longest] > max(least_s * 1e9, periods * usual)])
+    found = np.sort(longest[lengths[longest] > max(least_s * 1e9, 8.0 * usual)])
     return np.column_stack((newest[found], newest[found + 1])) * 1e-9
 
 

@@ -38,8 +38,7 @@ class ClosureProblem:
     """Costs of a graph of odometry and closures as a function of two factors on sigmas."""
 
     def __init__(self, graph: Graph, tick: Callable[[], None] = lambda: None) -> None:
-        self.n_evaluations, self.n_beyond, self._tick = 0, 0, tick
-        data = constraints(graph)
+        self._tick, data = tick, constraints(graph)
         kinds = np.append(graph.edges_by_row.kind, np.full(graph.n_observed, -1))[data.rows]
         self.n_closures = int(np.sum(kinds == EdgeKind.LOOP_CLOSURE))
         """How many closures are believed."""
@@ -68,7 +67,6 @@ class ClosureProblem:
         """
         given = {each.role: float(value) for each, value in zip(parameters, x, strict=True)}
         logs = [given.get(role, 0.0) for role in (Role.ODOMETRY, Role.CLOSURE)]
-        self.n_evaluations += 1
         self._tick()
         factors = [math.exp(-2.0 * log) for log in logs]
         hessian, gradient, energy = (
@@ -88,4 +86,4 @@ def fit_closures(problem: ClosureProblem) -> Fit:
     """Return the most likely factors on the sigmas of odometry and of closures."""
     parameters = Parameter(Role.ODOMETRY, 0, 1.0), Parameter(Role.CLOSURE, 0, 1.0)
     best = Minimum(parameters, *minimum(problem, parameters, np.zeros(2)))
-    return decided(problem, best, 1.0, problem.n_closures)
+    return decided(problem, best, 1.0)
