@@ -176,8 +176,7 @@ def execute(options: argparse.Namespace) -> int:
         if writer is not None:
             facts['new_bag'] = write_corrected(
                 writer, shared.WatchedBag(bag, 'writing the bag'), inputs, values,
-                estimate=estimate,
-                covariances=covariances(result.backend, estimate))._asdict()
+                estimate=estimate, covariances=covariances(result.backend, estimate))
     return _report(options, result, drive, facts, values=values, kinds=inputs.kinds, live=live)
 
 

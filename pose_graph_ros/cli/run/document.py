@@ -79,7 +79,7 @@ def document(run: Run) -> dict[str, Any]:
         'sources': [source_entry(each, frame) for each in analyses.values()],
         'springs': springs(run.backend, path, analysis.residuals, run.verdicts, frame),
         'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
-        'texts': frame.texts}
+        'texts': list(frame.texts)}
 
 
 def write_document(run: Run, folder: Path) -> dict[str, Any]:

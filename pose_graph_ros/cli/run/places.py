@@ -86,8 +86,7 @@ class Frame:
 
     start_ns: StampNs
     offset: FloatArray  # (2,) [m]
-    texts: list[str] = field(default_factory=list)
-    _known: dict[str, int] = field(default_factory=dict)
+    texts: dict[str, int] = field(default_factory=dict)  # with their numbers, which are in order
 
     def seconds(self, stamps_ns: IntArray) -> list[float]:
         """Return stamps as seconds since the start."""
@@ -100,12 +99,7 @@ class Frame:
 
     def text(self, text: str) -> int:
         """Return the number of a text; -1 for an empty one."""
-        if text == '':
-            return -1
-        if text not in self._known:
-            self._known[text] = len(self.texts)
-            self.texts.append(text)
-        return self._known[text]
+        return -1 if text == '' else self.texts.setdefault(text, len(self.texts))
 
 
 def lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:

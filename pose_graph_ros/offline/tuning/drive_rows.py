@@ -74,10 +74,6 @@ class DriveRows(NamedTuple):
         """Stamps since the first one, shape (N,) [s]."""
         return np.asarray((self.stamps_ns - self.stamps_ns[:1]) * 1e-9, dtype=np.float64)
 
-    def without(self, held_out: BoolArray) -> 'DriveRows':
-        """Return the rows with some measurements left out, but not their motions."""
-        return self._replace(source=np.where(held_out, -1, self.source))
-
 
 class SourceOfPoses(NamedTuple):
     """What a source has measured in the map, by the settings of its covariances."""
