@@ -192,9 +192,9 @@ def solve(parser: argparse.ArgumentParser) -> None:
                              'decision')
     parser.add_argument('--certificate', action=argparse.BooleanOptionalAction, default=True,
                         help='prove whether the minimum is the global one (default: yes)')
-    parser.add_argument('--marginals', metavar='{all,newest,ID[,ID...]}',
-                        help='covariances of these nodes as CSV: the last output, or -o FILE.csv '
-                             '(default, with such a file: all)')
+    parser.add_argument('--marginals', metavar='{all,newest,IDS}',
+                        help='covariances of these nodes, such as 3,7,20:25, as CSV: the last '
+                             'output, or -o FILE.csv (default, with such a file: all)')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
     parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
                         help='decide which loop closures to believe, and leave the others out, by '
