@@ -19,7 +19,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres
-from pose_graph_ros.offline.simulation import disturbances, sensors
+from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.closures import (
     measured,
     Path,
@@ -138,7 +138,7 @@ def _closures(way: Course, path: Path, node_distance: float) -> tuple[Edges, Int
     poses = measured(streams['closures'], path.poses[old], path.poses[new], settings)
     stamps, poses, group, missing = with_false(
         streams['false'], path, settings, path.stamps_ns[np.column_stack((old, new))], poses)
-    kept = disturbances.heard(stamps[:, 1], CLOSURES, way.setup.outages)
+    kept = sensors.heard(stamps[:, 1], CLOSURES, way.setup.outages)
     ends, group = np.searchsorted(path.stamps_ns, stamps[kept]), group[kept]
     sigmas = way.setup.claimed(CLOSURES) * np.array(settings.sigmas)
     edges = Edges(ends[:, 0], ends[:, 1], poses[kept],
@@ -151,7 +151,7 @@ def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[ObservedNodes
     """Return fixes or global poses, each with its error moved to the nearest node; the wrong."""
     setup = way.setup
     stamps, values, wrong = absolute(way, topic, way.truth)
-    kept = disturbances.heard(stamps, topic, setup.outages)
+    kept = sensors.heard(stamps, topic, setup.outages)
     stamps, values, wrong = stamps[kept], values[kept], wrong[kept]
     if len(stamps) == 0:
         return ObservedNodes(), np.empty(0, dtype=np.int64)

@@ -19,7 +19,7 @@ from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Seconds
-from pose_graph_ros.offline.simulation import disturbances, sensors
+from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.closures import (
     measured,
     Path,
@@ -130,7 +130,7 @@ def _states(
     sensors.odometry(state('odometry'), truth, usual.wheels)
     stamps, values = sensors.positions(state('fixes'), truth, fixes)
     ends, poses = _true_closures(state('closures'), truth, path, closures)
-    disturbances.moved(state('jumps'), stamps, values, usual.jumps_of(FIXES))
+    sensors.moved(state('jumps'), stamps, values, usual.jumps_of(FIXES))
     with_false(state('false'), path, closures, ends[:0], poses[:0])
     state('truth')
     return states
@@ -143,11 +143,11 @@ def record(way: Course) -> Recording:
 
     def heard(topic: str, stamps: IntArray) -> BoolArray:
         measured_at[topic] = stamps
-        return disturbances.heard(stamps, topic, setup.outages)
+        return sensors.heard(stamps, topic, setup.outages)
 
     odometry = sensors.odometry(streams['odometry'], truth, setup.wheels)
     velocities, to_map = sensors.velocities(odometry), _map(truth, odometry.poses[0])
-    odometry = disturbances.jumped(odometry, setup)
+    odometry = sensors.jumped(odometry, setup)
     kept = heard(ODOMETRY, odometry.stamps_ns)
     odometry, velocities = Trajectory(
         odometry.stamps_ns[kept], odometry.poses[kept]), velocities[kept]
@@ -173,10 +173,10 @@ def record(way: Course) -> Recording:
     rate_stamps, rates = rate_stamps[kept], rates[kept]
 
     truth_stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
-    arrivals = {topic: disturbances.arrivals(
-        streams[topic], topic, stamps[disturbances.heard(stamps, topic, setup.outages)], setup)
+    arrivals = {topic: sensors.arrivals(
+        streams[topic], topic, stamps[sensors.heard(stamps, topic, setup.outages)], setup)
         for topic, stamps in measured_at.items()}
-    arrivals[TRUTH] = disturbances.arrivals(
+    arrivals[TRUTH] = sensors.arrivals(
         np.random.default_rng(0), TRUTH, truth_stamps, setup)
     ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
                         if each.topic == topic) for topic in TOPICS}
@@ -189,7 +189,7 @@ def record(way: Course) -> Recording:
         pose_stamps_ns=pose_stamps + ahead[POSES], poses=poses, pose_is_wrong=pose_is_wrong,
         loop_stamps_ns=ends + ahead[CLOSURES], loop_poses=loop_poses, loop_group=group,
         rate_stamps_ns=rate_stamps + ahead[GYRO], rates=rates, arrivals=arrivals,
-        silenced=tuple(int(np.sum(~disturbances.heard(
+        silenced=tuple(int(np.sum(~sensors.heard(
             measured_at[each.topic], each.topic, [each]))) for each in setup.outages),
         missing_groups=missing)
 
@@ -205,7 +205,7 @@ def absolute(
         stamps, values = sensors.global_poses(streams['poses'], truth, setup.poses)
     else:
         stamps, values = np.empty(0, dtype=np.int64), np.empty((0, 2 if topic == FIXES else 3))
-    return stamps, *disturbances.moved(
+    return stamps, *sensors.moved(
         streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
         setup.jumps_of(topic))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.offline.simulation import disturbances
+from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.recording import course, record, Recording
 from pose_graph_ros.offline.simulation.settings import (
     Delay,
@@ -65,7 +65,7 @@ def test_delays_keep_stamps_and_shift_when_messages_are_recorded() -> None:
     stamps = np.arange(1000) * 50_000_000
     for delay, least, most in ((Delay('/odom', 2.0), 2.0, 2.0), (Delay('/odom', 0.5, 3.0), 0.5,
                                                                  3.5)):
-        index, recorded = disturbances.arrivals(
+        index, recorded = sensors.arrivals(
             np.random.default_rng(1), '/odom', stamps, Setup(delays=(delay,)))
         late = (recorded - stamps[index]) * 1e-9
         assert np.array_equal(np.sort(index), np.arange(1000))
