@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, read_inputs, reader_of
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, open_bags
 from pose_graph_ros.adapters.fixes import Datum
@@ -147,9 +147,7 @@ def execute(options: argparse.Namespace) -> int:
     values = shared.parameter_values(options)
     with ExitStack() as stack:
         bag = stack.enter_context(open_bags(options.bags))
-        inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options), options.hold_out,
-            shared.span_of(bag, options), truth=options.truth)
+        inputs = shared.inputs_of(bag, options, values, options.hold_out)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.of(Kind.FIX)) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
@@ -254,7 +252,8 @@ def _report(
         print(f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
               f'turns {short(math.sqrt(errors.turn), 3)} times what it claims; corrected by '
               f'{short(errors.rate, 3)} rad/s and {short(100.0 * errors.scale, 3)} % of the way')
-    print('\n'.join(f'{source}: {totals_text(each)}' for source, each in totals.items()))
+    for source, of_source in totals.items():
+        print(f'{source}: {totals_text(of_source)}')
     for each in told['findings']:
         print(f'{each["level"]:8} {each["text"]}')
     if 'new_bag' in facts:

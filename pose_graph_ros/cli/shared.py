@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 
 import yaml
 
-from pose_graph_ros.adapters.bag_inputs import OPTIONS
+from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, OPTIONS
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, one_line, Span
 from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.core.exceptions import ConfigError
 
 DELAY = 0.5  # after which a bar appears [s]
@@ -88,6 +89,14 @@ def span_of(bag: Bag, options: argparse.Namespace) -> Span:
         raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
                        f'recording is {max(length, 0.0):.3f} s long')
     return span
+
+
+def inputs_of(
+    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
+) -> Inputs:
+    """Return what is read of a bag by the options."""
+    return choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
+                         span_of(bag, options), truth=options.truth)
 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:

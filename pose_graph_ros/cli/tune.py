@@ -11,9 +11,7 @@ import sys
 import time
 from typing import Any
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs
 from pose_graph_ros.adapters.bags import BagError, open_bags
-from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
@@ -33,9 +31,7 @@ def execute(options: argparse.Namespace) -> int:
     if not os.access(where, os.W_OK):
         raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bags(options.bags) as bag:
-        inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options),
-            span=shared.span_of(bag, options), truth=options.truth)
+        inputs = shared.inputs_of(bag, options, values)
         truth = None if options.truth is None else read_truth(bag, options.truth)
         tuning = Tuning(shared.WatchedBag(bag, 'reading'), inputs, values, _show)
     try:
