@@ -52,7 +52,8 @@ OFFLINE = {
         'core.disagreement', 'core.parts'},
     'offline.simulation': {'core.geometry', 'core.graph'},
     'offline.tuning': {
-        'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
+        'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources',
+        'offline.residuals'},
 }
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.backend', 'core.disagreement', 'core.error_tuner', 'core.estimate',

@@ -192,9 +192,9 @@ def solve(parser: argparse.ArgumentParser) -> None:
                              'decision')
     parser.add_argument('--certificate', action=argparse.BooleanOptionalAction, default=True,
                         help='prove whether the minimum is the global one (default: yes)')
-    parser.add_argument('--marginals', metavar='{all,newest,ID[,ID...]}',
-                        help='covariances of these nodes as CSV: the last output, or -o FILE.csv '
-                             '(default, with such a file: all)')
+    parser.add_argument('--marginals', metavar='{all,newest,IDS}',
+                        help='covariances of these nodes, such as 3,7,20:25, as CSV: the last '
+                             'output, or -o FILE.csv (default, with such a file: all)')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
     parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
                         help='decide which loop closures to believe, and leave the others out, by '
@@ -349,9 +349,9 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
 
 
 def number(
-    least: float = -math.inf, most: float = math.inf, *, whole: bool = False,
+    least: float = -math.inf, most: float = math.inf, *, whole: bool = False, factor: float = 1,
 ) -> Callable[[str], Any]:
-    """Return what reads a finite number, and raises ArgumentTypeError if it cannot."""
+    """Return what reads a finite number, times a factor; it raises ArgumentTypeError."""
     kind = 'a whole number' if whole else 'a number'
     expected = kind if least == -math.inf else f'{kind} of at least {least:g}'
     expected += '' if most == math.inf else f' and at most {most:g}'
@@ -363,7 +363,7 @@ def number(
             value = math.nan
         if not (math.isfinite(value) and least <= value <= most):
             raise argparse.ArgumentTypeError(f'expected {expected}, got {text!r}')
-        return value
+        return value * factor
     return read
 
 

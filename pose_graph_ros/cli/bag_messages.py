@@ -24,11 +24,9 @@ _IMU = 'sensor_msgs/msg/Imu'
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
-def write_bag(
-    folder: str | Path, messages: Iterable[Message], *, overwrite: bool = False,
-) -> None:
+def write_bag(folder: str | Path, messages: Iterable[Message]) -> None:
     """Write messages as a rosbag2, in the order of their stamps."""
-    with BagWriter(folder, overwrite=overwrite) as bag:
+    with BagWriter(folder) as bag:
         for topic, type_name, stamp, message in sorted(messages, key=lambda item: item[2]):
             bag.write(topic, type_name, stamp, message)
 
@@ -43,17 +41,15 @@ def odometry_messages(
     The six variances are those of the pose and of the twist. Rates are velocities in base_link,
     shape (N, 3) [m/s, m/s, rad/s]; by default those between consecutive poses.
     """
-    pose_with_covariance, twist_with_covariance, make_twist, vector = (
-        _TYPES[f'geometry_msgs/msg/{key}']
-        for key in ('PoseWithCovariance', 'TwistWithCovariance', 'Twist', 'Vector3'))
     covariance = np.diag(variances).ravel()
     rates = velocities(path) if rates is None else rates
     for stamp, pose, (vx, _, yaw_rate) in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), rates.tolist(), strict=True):
-        twist = make_twist(vector(vx, 0.0, 0.0), vector(0.0, 0.0, yaw_rate))
+        twist = _of('Twist', _of('Vector3', vx, 0.0, 0.0), _of('Vector3', 0.0, 0.0, yaw_rate))
         yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
-            _header(stamp, frame), 'base_link', pose_with_covariance(_pose(pose), covariance),
-            twist_with_covariance(twist, covariance))
+            _header(stamp, frame), 'base_link',
+            _of('PoseWithCovariance', _pose(pose), covariance),
+            _of('TwistWithCovariance', twist, covariance))
 
 
 def fix_messages(
@@ -76,13 +72,11 @@ def rate_messages(
     topic: str, stamps_ns: StampsNs, rates: FloatArray, sigma: float,
 ) -> Iterator[Message]:
     """Return sensor_msgs/Imu messages of yaw rates in base_link [rad/s], and nothing else."""
-    vector, quaternion = (
-        _TYPES[f'geometry_msgs/msg/{key}'] for key in ('Vector3', 'Quaternion'))
     none, covariance = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
     for stamp, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
         yield topic, _IMU, stamp, _TYPES[_IMU](
-            _header(stamp, 'base_link'), quaternion(0.0, 0.0, 0.0, 1.0), none,
-            vector(0.0, 0.0, rate), covariance, vector(0.0, 0.0, 0.0), none)
+            _header(stamp, 'base_link'), _of('Quaternion', 0.0, 0.0, 0.0, 1.0), none,
+            _of('Vector3', 0.0, 0.0, rate), covariance, _of('Vector3', 0.0, 0.0, 0.0), none)
 
 
 def loop_closure_messages(
@@ -108,12 +102,11 @@ def pose_messages(
 def _poses(
     topic: str, stamps_ns: StampsNs, frames: Sequence[str], poses: Poses, covariance: Covariance,
 ) -> Iterator[Message]:
-    pose_with_covariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
     spatial = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
     spatial[PLANAR] = covariance
     for stamp, frame, pose in zip(stamps_ns.tolist(), frames, poses.tolist(), strict=True):
         yield topic, _POSE, stamp, _TYPES[_POSE](
-            _header(stamp, frame), pose_with_covariance(_pose(pose), spatial.ravel()))
+            _header(stamp, frame), _of('PoseWithCovariance', _pose(pose), spatial.ravel()))
 
 
 def _header(stamp_ns: int, frame: str) -> Any:
@@ -121,9 +114,12 @@ def _header(stamp_ns: int, frame: str) -> Any:
     return _TYPES['std_msgs/msg/Header'](time, frame)
 
 
+def _of(kind: str, *fields: Any) -> Any:
+    """Return a message of geometry_msgs."""
+    return _TYPES[f'geometry_msgs/msg/{kind}'](*fields)
+
+
 def _pose(pose: list[float]) -> Any:
     x, y, theta = pose
-    return _TYPES['geometry_msgs/msg/Pose'](
-        _TYPES['geometry_msgs/msg/Point'](x, y, 0.0),
-        _TYPES['geometry_msgs/msg/Quaternion'](
-            0.0, 0.0, float(np.sin(0.5 * theta)), float(np.cos(0.5 * theta))))
+    return _of('Pose', _of('Point', x, y, 0.0), _of(
+        'Quaternion', 0.0, 0.0, float(np.sin(0.5 * theta)), float(np.cos(0.5 * theta))))

@@ -147,10 +147,10 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
             # of the last one, the final optimisation has a part
             if before[0] < count and 0 < newest_ns < last_ns and 'chi2' in values:
                 mean = (total - before[1]) / (count - before[0])
-                recorder.log.add(Update(
+                recorder.add_update(Update(
                     newest_ns, int(values['hidden_nodes']),
-                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2']), -1))
-                recorder.log.count += count - before[0] - 1
+                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2']),
+                    -1), count - before[0])
                 before = count, total, longest
     return values
 

@@ -28,19 +28,9 @@ import numpy as np
 from pose_graph_ros.cli.graph_input import NamedRows, read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.offline.drawing import views
 from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, pattern
-from pose_graph_ros.offline.drawing.views import (
-    factor_graph,
-    five_states,
-    hidden,
-    map_places,
-    markov_random_field,
-    part,
-    Role,
-    Sort,
-    time_slices,
-    VIEWS,
-)
+from pose_graph_ros.offline.drawing.views import Role, Sort
 
 N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
 INK, GREY = '#111111', '#7a828c'
@@ -82,23 +72,23 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError('expected a graph or --example, and not both')
     graphs: Sequence[tuple[str, NamedRows]]
     if options.example:
-        graphs = [(title, NamedRows(rows, rows.node_ids)) for title, rows in five_states()]
+        graphs = [(title, NamedRows(rows, rows.node_ids)) for title, rows in views.five_states()]
     else:
         graphs = [('', read(options.graph, options.edge2))]
     notes: list[str] = []
     panels: list[Panel] = []
     for title, (rows, ids) in graphs:
-        whole = factor_graph(rows, ids)
-        shown, n_cut = part(whole, _chosen(options, ids, whole))
-        view = VIEWS[options.view](shown)
-        at, n_near = ((time_slices(view), 0) if options.view == 'dbn'
-                      else map_places(view, spring=options.spring))
+        whole = views.factor_graph(rows, ids)
+        shown, n_cut = views.part(whole, _chosen(options, ids, whole))
+        view = views.VIEWS[options.view](shown)
+        at, n_near = ((views.time_slices(view), 0) if options.view == 'dbn'
+                      else views.map_places(view, spring=options.spring))
         order = elimination_order(shown) if options.ordering == 'elimination' else None
         blocks = (pattern(shown, order) if options.pattern or options.example or order is not None
                   else None)
         panels.append(Panel(title, view, at, blocks))
         notes += view.graph['notes']
-        n_shown, n_whole = len(hidden(shown)), len(hidden(whole))
+        n_shown, n_whole = len(views.hidden(shown)), len(views.hidden(whole))
         if n_shown < n_whole:
             notes.append(f'{n_shown} of {n_whole} hidden nodes; '
                          f'{n_cut} constraints lead to others.')
@@ -106,7 +96,7 @@ def execute(options: argparse.Namespace) -> int:
             notes.append('Not to scale: hidden nodes stand apart, as by springs.')
         elif n_near > 0:
             notes.append(f'{n_near} hidden nodes lie on others; --spring moves them apart.')
-        fixed = [shown.nodes[node]['name'] for node in hidden(shown) if shown.nodes[node]['fixed']]
+        fixed = [data['name'] for _, data in shown.nodes(data=True) if data.get('fixed', False)]
         if blocks is not None and len(fixed) > 0:
             notes.append(f'H has no row for what is fixed: {", ".join(fixed[:5])}'
                          f'{", ..." if len(fixed) > 5 else ""}.')
@@ -127,12 +117,12 @@ def execute(options: argparse.Namespace) -> int:
 
 def _chosen(options: argparse.Namespace, ids: IntArray, whole: Any) -> set[int]:
     """Return the rows that are drawn; raise ConfigError if they are too many."""
-    chosen = set(hidden(whole))
+    chosen = set(views.hidden(whole))
     if options.nodes is not None:
         chosen = set(rows_of(ids, options.nodes, '--nodes').tolist())
     elif options.around is not None:
         start = int(rows_of(ids, str(options.around), '--around')[0])
-        field = nx.Graph(markov_random_field(whole))
+        field = nx.Graph(views.markov_random_field(whole))
         chosen = set(nx.ego_graph(field, start, radius=options.hops))
     if len(chosen) > N_MOST:
         raise ConfigError(

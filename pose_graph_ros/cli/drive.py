@@ -9,6 +9,7 @@ best rigid motion, which is the most favourable comparison for it. So is the tru
 its map may begin elsewhere, as where only a part of a recording is replayed.
 """
 
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -41,7 +42,7 @@ from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
 from pose_graph_ros.core.quantities import StampNs
 
-MOST_SAMPLES = 200_000  # of a path that are kept; an even number
+MOST_SAMPLES = 200_000  # of a path that are compared and drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +70,8 @@ class Drive:
     truth: Trajectory | None  # `T_map_base`; None if unknown
     loop_stamps_ns: IntArray  # of both ends of the loop closures, (L, 2)
     map_axes: tuple[str, str] = ('x', 'y')
-    fix_unused: BoolArray | None = None  # whether it is doubted or waits; None: all are believed
-    fix_refused: BoolArray | None = None  # whether it is not in the graph; None: all are
+    fix_unused: BoolArray | np.bool_ = np.False_  # whether it is doubted or waits, (M,) or of all
+    fix_refused: BoolArray | np.bool_ = np.False_  # whether it is not in the graph
     fix_sources: Sequence[str] = ()  # none if unknown
     loop_states: Sequence[State] = ()  # none if all are believed
     loop_sources: Sequence[str] = ()  # none if unknown
@@ -78,12 +79,12 @@ class Drive:
 
     @property
     def fix_kinds(self) -> dict[str, BoolArray]:
-        """Which fixes are used, doubted and held out, shape (M,) each; others are refused."""
-        nothing = np.zeros_like(self.fix_held_out)
-        refused = nothing if self.fix_refused is None else self.fix_refused
-        doubted = nothing if self.fix_unused is None else self.fix_unused
-        rest = ~self.fix_held_out & ~refused
-        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': self.fix_held_out}
+        """Which fixes are used, doubted, held out and refused, shape (M,) each."""
+        held_out, refused, doubted = np.broadcast_arrays(
+            self.fix_held_out, self.fix_refused, self.fix_unused)
+        rest = ~held_out & ~refused
+        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': held_out,
+                'refused': refused}
 
     def loops(self, state: State) -> BoolArray:
         """Return which loop closures are in a state, shape (L,)."""
@@ -124,7 +125,8 @@ class Drive:
             turns = se2.wrap(
                 self.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
             rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
-        for kind, chosen in self.fix_kinds.items():
+        for kind in ('used', 'doubted', 'held out'):
+            chosen = self.fix_kinds[kind]
             for name, path in paths.items():
                 _, errors = distances(path, stamps[chosen], positions[chosen])
                 rows += error_rows(f'{name} to fixes {kind}', errors)
@@ -223,7 +225,6 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
         'odometry': len(drive.odometry), 'poses': len(drive.corrected),
         **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
            for kind, chosen in drive.fix_kinds.items()},
-        'fixes_refused': 0 if drive.fix_refused is None else int(np.sum(drive.fix_refused)),
         'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
         'errors': [asdict(row) for row in drive.rows], **extra}
 
@@ -241,27 +242,24 @@ def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, An
     return format_table(drive.rows)
 
 
-class PathCollector:
-    """Samples of a path; of very many, only every second one is kept, or fewer."""
+class Samples:
+    """Samples of a path, as they come."""
 
     def __init__(self) -> None:
-        self._stamps, self._poses = list[int](), list[PoseVector]()
-        self._count, self._stride = 0, 1
+        self._stamps, self._poses = array('q'), array('d')
 
     def add(self, stamp_ns: StampNs, pose: PoseVector) -> None:
         """Add a sample."""
-        if self._count % self._stride == 0:
-            self._stamps.append(stamp_ns)
-            self._poses.append(pose)
-        self._count += 1
-        if len(self._stamps) == MOST_SAMPLES:
-            self._stamps, self._poses = self._stamps[::2], self._poses[::2]
-            self._stride *= 2
+        self._stamps.append(stamp_ns)
+        self._poses.extend(pose)
 
     def path(self) -> Trajectory:
-        """Return the samples by stamp; of several with the same stamp the first one."""
-        stamps, first = np.unique(np.array(self._stamps, dtype=np.int64), return_index=True)
-        return Trajectory(stamps, np.array(self._poses).reshape(-1, 3)[first])
+        """Return them by stamp, the first one of equal stamps; of very many only some."""
+        stride = 1
+        while len(self._stamps) // stride >= MOST_SAMPLES:
+            stride *= 2
+        stamps, first = np.unique(np.array(self._stamps)[::stride], return_index=True)
+        return Trajectory(stamps, np.array(self._poses).reshape(-1, 3)[::stride][first])
 
 
 class _Fix(NamedTuple):
@@ -290,7 +288,7 @@ def collect_drive(
     if origin is not None:
         reader.datum.keep(origin)
     preferred = inputs.of(*ODOMETRY_KINDS)[0]
-    odometry, fixes, loops = PathCollector(), list[_Fix](), list[Key]()
+    odometry, fixes, loops = Samples(), list[_Fix](), list[Key]()
     for source, message, held_out in read_inputs(bag, inputs):
         try:
             measurement = reader.read(source, message.decode())
@@ -354,7 +352,7 @@ def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
         what = 'no topic' if info is None else f'type {info.type} of'
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
-    poses = PathCollector()
+    poses = Samples()
     for stamp, pose in poses_on(bag, topic, span):
         poses.add(stamp, pose)
     return poses.path()

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -170,14 +170,6 @@ class LivePoses:
                          np.array(self._covariances).reshape(-1, 3, 3))
 
 
-class Copied(NamedTuple):
-    """Numbers of messages."""
-
-    original: int  # copied as they are
-    corrected: int  # poses of odometry in the map
-    left_out: int  # others on the topics that are written, or that ROS 1 has alone
-
-
 class _Corrector:
     """Makes what is published with each message of the primary odometry."""
 
@@ -236,9 +228,12 @@ class _Corrector:
 def write_corrected(
     writer: BagWriter, bag: Bag, inputs: Inputs, values: Mapping[str, Any], *,
     estimate: Estimate, covariances: Covariances,
-) -> Copied:
+) -> dict[str, int]:
     """
-    Return the numbers of messages after copying those of the span of the inputs, with the result.
+    Return how many messages were copied, with the result, and how many were not.
+
+    These are `original`, copied as they are, `corrected`, poses of odometry in the map, and
+    `left_out`, others on the topics that are written, or that ROS 1 has alone.
 
     With each message of the primary odometry comes its pose in the map by the whole recording,
     and the transform from map to odom if its frame is `odom_frame`. The path comes first, on a
@@ -252,17 +247,14 @@ def write_corrected(
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
-    original = corrected = left_out = 0
+    counts = {'original': 0, 'corrected': 0, 'left_out': 0}
     for message in bag.messages(list(bag.topics), inputs.span):
-        if _copy(writer, message, corrector):
-            original += 1
-        else:
-            left_out += 1
+        counts['original' if _copy(writer, message, corrector) else 'left_out'] += 1
         if message.topic == corrector.topic:
             for topic, data in corrector.outputs(message):
                 writer.write(topic, TYPES[topic], message.recorded_ns, data)
-                corrected += topic == ODOMETRY
-    return Copied(original, corrected, left_out)
+                counts['corrected'] += topic == ODOMETRY
+    return counts
 
 
 def _copy(writer: BagWriter, message: BagMessage, ours: _Corrector) -> bool:

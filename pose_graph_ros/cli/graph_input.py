@@ -10,6 +10,7 @@ when the later one of their ends is reached. The vertices are a second apart, or
 """
 
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 import re
 import sys
@@ -117,16 +118,11 @@ def read_measurements(
                               f'{file.ids[lone + 1]}')
     odometry = steps[first]
     closures = np.setdiff1d(np.arange(len(edges)), odometry)
-    last = np.maximum(edges.i, edges.j)[closures]
-    closures, last = closures[np.argsort(last, kind='stable')], np.sort(last)
-    samples = list(_odometry(edges.rows(odometry), stamps_ns))
-    found: list[OdometrySample | LoopClosure] = []
-    begin = 0
-    for k, sample in enumerate(samples):
-        end = int(np.searchsorted(last, k, side='right'))
-        found += [sample, *_closures(edges.rows(closures[begin:end]), stamps_ns)]
-        begin = end
-    return found
+    last = np.maximum(edges.i, edges.j)[closures].tolist()
+    events: list[tuple[int, OdometrySample | LoopClosure]] = [
+        *enumerate(_odometry(edges.rows(odometry), stamps_ns)),
+        *zip(last, _closures(edges.rows(closures), stamps_ns), strict=True)]
+    return [each for _, each in sorted(events, key=itemgetter(0))]
 
 
 def _read_stamps(path: Path, n: int) -> IntArray:

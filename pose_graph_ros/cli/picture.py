@@ -92,7 +92,8 @@ def _facts(drive: Drive) -> str:
     """Return the subtitle: duration, length and numbers of measurements."""
     path = max(drive.corrected, drive.odometry, key=len)
     steps = np.diff(path.poses[:, :2], axis=0)
-    numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()}
+    numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()
+               if kind != 'refused'}
     doubted, waiting = (
         int(np.sum(drive.loops(state))) for state in (State.DOUBTED, State.WAITING))
     parts = [f'{numbers.pop("used")} fixes used' + ''.join(
@@ -138,7 +139,7 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
             drive.fix_kinds.values(), ({**USED_FIXES, 'markersize': 4.5}, DOUBTED_FIXES,
                                        HELD_OUT_FIXES),
             (label('fixes'), label('doubted fixes').replace(
-                'doubted fixes', 'doubted fixes, not used'), 'fixes held out'), strict=True):
+                'doubted fixes', 'doubted fixes, not used'), 'fixes held out'), strict=False):
         if np.any(chosen):
             axes.plot(*thinned(drive.fix_positions[chosen]).T, **style, zorder=2, label=name)
     inside = np.all(path.covers(drive.loop_stamps_ns), axis=1)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, read_inputs, reader_of
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, open_bags
 from pose_graph_ros.adapters.fixes import Datum
@@ -48,7 +48,6 @@ from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.g2o_writing import write_g2o
 from pose_graph_ros.core.judgement.texts import (
@@ -56,7 +55,6 @@ from pose_graph_ros.core.judgement.texts import (
     is_notable,
     Key,
     ORDER,
-    sentence,
     short,
     states_by_stamps,
     totals_text,
@@ -66,7 +64,6 @@ from pose_graph_ros.core.measurements import Answer, LoopClosure, Measurement, O
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
-NAMED = 10  # constraints of a source that the text names
 
 
 class Replayed(NamedTuple):
@@ -78,31 +75,11 @@ class Replayed(NamedTuple):
     recorder: Recorder
     datum: Datum | None = None  # of the map; None for a g2o file
 
-    @property
-    def origin(self) -> MapOrigin | None:
-        """Origin of the map on the Earth; None if it is unknown."""
-        plane = None if self.datum is None else self.datum.plane
-        return None if plane is None else plane.origin
 
-    def states(self, verdicts: Sequence[Verdict]) -> dict[Key, State]:
-        """Return what is believed, by source and stamps; refused loop closures are not."""
-        refused = dict.fromkeys(self.backend.refused_closures, State.DOUBTED)
-        return states_by_stamps(verdicts) | refused
-
-    def run(
-        self, options: argparse.Namespace, drive: Drive, values: Mapping[str, Any],
-        kinds: Mapping[str, Kind], seconds: float,
-    ) -> Run:
-        """Return what run.json is made from."""
-        estimate = self.backend.estimate()
-        assert estimate is not None
-        refused = dict.fromkeys(
-            self.backend.refused_closures, 'Refused: it could not be attached to the path.')
-        return Run(
-            options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}',
-            drive, self.backend, estimate, self.backend.verdicts(), self.recorder, values, kinds,
-            self.counts, self.report, self.origin, seconds,
-            refused | self.recorder.refused)
+def states_of(backend: PoseGraphBackend) -> dict[Key, State]:
+    """Return what is believed, by source and stamps; refused loop closures are not."""
+    return states_by_stamps(backend.verdicts()) | dict.fromkeys(
+        backend.refused_closures, State.DOUBTED)
 
 
 def run(
@@ -152,7 +129,7 @@ def run_measurements(
                 measurement, backend.graph.n_nodes):
             begin = time.thread_time()  # of this process, however busy the machine is
             report = backend.update()
-            recorder.log.add(Update(
+            recorder.add_update(Update(
                 int(backend.node_stamps_ns[-1]), len(backend.node_stamps_ns),
                 1e3 * (time.thread_time() - begin), report.chi2, report.iterations))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
@@ -170,9 +147,7 @@ def execute(options: argparse.Namespace) -> int:
     values = shared.parameter_values(options)
     with ExitStack() as stack:
         bag = stack.enter_context(open_bags(options.bags))
-        inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options), options.hold_out,
-            shared.span_of(bag, options), truth=options.truth)
+        inputs = shared.inputs_of(bag, options, values, options.hold_out)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.of(Kind.FIX)) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
@@ -190,18 +165,17 @@ def execute(options: argparse.Namespace) -> int:
             why = ', '.join(f'{answer} {count}' for (source, answer), count
                             in sorted(result.counts.items()) if source in names)
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
+        plane = None if result.datum is None else result.datum.plane
         drive = with_refused(collect_drive(
             shared.WatchedBag(bag, 'comparing'), inputs, values, estimate.path, options.truth,
-            origin=result.origin, states=result.states(result.backend.verdicts())),
+            origin=None if plane is None else plane.origin, states=states_of(result.backend)),
             result.backend)
-        facts: dict[str, Any] = {'bags': [str(path) for path in options.bags]}
+        facts: dict[str, Any] = {'bags': [str(path) for path in options.bags], 'seconds': seconds}
         if writer is not None:
-            copied = write_corrected(
+            facts['new_bag'] = write_corrected(
                 writer, shared.WatchedBag(bag, 'writing the bag'), inputs, values,
                 estimate=estimate, covariances=covariances(result.backend, estimate))
-            facts['new_bag'] = copied._asdict()
-    return _report(options, result.run(options, drive, values, inputs.kinds, seconds), facts,
-                   result.datum, live)
+    return _report(options, result, drive, facts, values=values, kinds=inputs.kinds, live=live)
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
@@ -217,13 +191,10 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     backend, report = run_measurements((
         (odometry if isinstance(each, OdometrySample) else CLOSURES, each)
         for each in measurements), values, recorder)
-    result = Replayed(backend, report, backend.counts, recorder)
-    seconds = time.monotonic() - start
-    estimate = backend.estimate()
+    seconds, estimate, states = time.monotonic() - start, backend.estimate(), states_of(backend)
     assert estimate is not None, 'a graph has vertices'
-    states = result.states(backend.verdicts())
     samples = [each for each in measurements if isinstance(each, OdometrySample)]
-    loops = [(each.reference_ns or 0, each.stamp_ns) for each in measurements
+    loops = [(each.reference_ns, each.stamp_ns) for each in measurements
              if isinstance(each, LoopClosure)]
     drive = Drive(
         Trajectory(np.array([each.stamp_ns for each in samples]),
@@ -232,74 +203,68 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         None, np.array(loops, dtype=np.int64).reshape(-1, 2),
         loop_states=[states.get((CLOSURES, stamp, reference), State.BELIEVED)
                      for reference, stamp in loops])
-    kinds = {odometry: Kind.ODOMETRY, CLOSURES: Kind.LOOP_CLOSURE}
-    return _report(options, result.run(options, drive, values, kinds, seconds), {})
+    return _report(
+        options, Replayed(backend, report, backend.counts, recorder), drive, {'seconds': seconds},
+        values=values, kinds={odometry: Kind.ODOMETRY, CLOSURES: Kind.LOOP_CLOSURE})
 
 
 def _report(
-    options: argparse.Namespace, run: Run, facts: Mapping[str, Any], datum: Datum | None = None,
-    live: LivePoses | None = None,
+    options: argparse.Namespace, result: Replayed, drive: Drive, facts: Mapping[str, Any], *,
+    values: Mapping[str, Any], kinds: Mapping[str, Kind], live: LivePoses | None = None,
 ) -> int:
     """Write the results and print a summary; return the exit code."""
-    backend, estimate, report = run.backend, run.estimate, run.report
-    assert report is not None
-    counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
-    nees = {} if run.drive.truth is None or report.status is Status.FAILED else consistency(
-        run.drive, covariances(backend, estimate))
-    table = write_results(run.drive, options.out, run.title, {
-        **facts, 'seconds': run.seconds, **{f'nees_{name}': each for name, each in nees.items()},
+    backend, report, datum = result.backend, result.report, result.datum
+    estimate, title = backend.estimate(), options.bags[0].stem
+    assert estimate is not None, 'there is a path'
+    verdicts, totals = backend.verdicts(), backend.verdict_totals()
+    counts = {'.'.join(key): count for key, count in sorted(result.counts.items())}
+    nees = {} if drive.truth is None or report.status is Status.FAILED else consistency(
+        drive, covariances(backend, estimate))
+    table = write_results(drive, options.out, title, {
+        **facts, **{f'nees_{name}': each for name, each in nees.items()},
         'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
         'chi2': estimate.chi2, 'odometry_errors': estimate.odometry_errors._asdict(),
-        'status': report.status.value, 'counts': counts,
-        'judged': judgement(backend.verdict_totals(), run.verdicts)})
+        'status': report.status.value, 'counts': counts, 'judged': judgement(totals, verdicts)})
     write_g2o(backend.graph, options.out / 'graph.g2o')
-    write_document(run, options.out)
-    exported = write_exports(options.export, options.out, run.title, backend=backend,
+    refused = dict.fromkeys(
+        backend.refused_closures, 'Refused: it could not be attached to the path.')
+    told = write_document(Run(
+        title, f'replay of {", ".join(path.name for path in options.bags)}', drive, backend,
+        estimate, verdicts, result.recorder, values, kinds, result.counts, report,
+        None if datum is None or datum.plane is None else datum.plane.origin, facts['seconds'],
+        refused | result.recorder.refused), options.out)
+    exported = write_exports(options.export, options.out, title, backend=backend,
                              estimate=estimate, datum=datum)
     if live is not None:
         exported.append(options.out / 'live.csv')
         write_lines(exported[-1], live.lines())
     if options.json:
         print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
-    else:
-        print('\n'.join(_lines(run, facts)))
-        print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
-        names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
-                 *(path.name for path in exported)]
-        table = '\n'.join([table, *consistency_lines(nees)])
-        print(f'\n{table}\n\nwritten: {options.out}/path.tum, {", ".join(names)}')
-    return 0 if report.status is Status.CONVERGED else 1
-
-
-def _lines(run: Run, facts: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is told of a run."""
-    estimate, report = run.estimate, run.report
-    assert report is not None
-    yield (f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
-           f'observed nodes in {run.seconds:.2f} s; {report.status.value}, chi2 '
-           f'{report.chi2:.6g}; {estimate.alignment.value}')
+        return 0 if report.status is Status.CONVERGED else 1
+    print(f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
+          f'observed nodes in {facts["seconds"]:.2f} s; {report.status.value}, chi2 '
+          f'{report.chi2:.6g}; {estimate.alignment.value}')
     errors = estimate.odometry_errors
     if errors != AS_CLAIMED:
-        yield (f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
-               f'turns {short(math.sqrt(errors.turn), 3)} times what it claims; corrected by '
-               f'{short(errors.rate, 3)} rad/s and {short(100.0 * errors.scale, 3)} % of the way')
-    for source, fit in sorted(run.backend.reports().items()):
-        text = f'{source}: squared residual {short(fit.energy, 3)} sigma^2'
-        if fit.errors.significant:
-            text += (f'; errors of {short(fit.errors.sigma_correlated, 3)} m with a time constant '
-                     f'of {short(fit.errors.tau, 3)} s')
-        if fit.in_use is not None:
-            text += f'; treated as correlated over {short(fit.in_use.tau, 3)} s'
-        if fit.wrongly_white:
-            text += f', but are treated as white: see {source}.correlation_time'
-        yield text
-    yield from judgement_lines(run.backend.verdict_totals(), run.verdicts)
+        print(f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
+              f'turns {short(math.sqrt(errors.turn), 3)} times what it claims; corrected by '
+              f'{short(errors.rate, 3)} rad/s and {short(100.0 * errors.scale, 3)} % of the way')
+    for source, of_source in totals.items():
+        print(f'{source}: {totals_text(of_source)}')
+    for each in told['findings']:
+        print(f'{each["level"]:8} {each["text"]}')
     if 'new_bag' in facts:
-        yield ('new bag: {original} messages copied, {left_out} left out, {corrected} poses of '
-               'odometry corrected'.format(**facts['new_bag']))
+        print('new bag: {original} messages copied, {left_out} left out, {corrected} poses of '
+              'odometry corrected'.format(**facts['new_bag']))
+    print('counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()))
+    names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
+             *(path.name for path in exported)]
+    print('\n'.join(['', table, *consistency_lines(nees), '',
+                     f'written: {options.out}/path.tum, {", ".join(names)}']))
+    return 0 if report.status is Status.CONVERGED else 1
 
 
 def judgement(
@@ -313,17 +278,3 @@ def judgement(
             for source, each in totals.items()},
         'constraints': [as_json(each) for each in verdicts
                         if each.kind is Judged.LOOP_CLOSURE or is_notable(each)]}
-
-
-def judgement_lines(
-    totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
-) -> Iterator[str]:
-    """Yield a line for each source, and for the first of its constraints that are doubted."""
-    for source, each in totals.items():
-        yield f'{source}: {totals_text(each)}'
-        doubted = [verdict for verdict in verdicts
-                   if verdict.source == source and verdict.state is State.DOUBTED]
-        for verdict in doubted[:NAMED]:
-            yield f'  {verdict.id}: {sentence(verdict)}'
-        if len(doubted) > NAMED:
-            yield f'  and {len(doubted) - NAMED} more, all of which are in summary.json'

@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 
 import yaml
 
-from pose_graph_ros.adapters.bag_inputs import OPTIONS
+from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, OPTIONS
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, one_line, Span
 from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.core.exceptions import ConfigError
 
 DELAY = 0.5  # after which a bar appears [s]
@@ -90,6 +91,14 @@ def span_of(bag: Bag, options: argparse.Namespace) -> Span:
     return span
 
 
+def inputs_of(
+    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
+) -> Inputs:
+    """Return what is read of a bag by the options."""
+    return choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
+                         span_of(bag, options), truth=options.truth)
+
+
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
     """Return the same items, with a bar on standard error if that is a terminal."""
     if not sys.stderr.isatty():
@@ -108,20 +117,8 @@ class WatchedBag(Bag):
         self._bag, self._title = bag, title
 
     def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
-        messages = self._bag.messages(topics, span)
-        return self._watched(messages, span) if sys.stderr.isatty() else messages
-
-    def _watched(self, messages: Iterator[BagMessage], span: Span) -> Iterator[BagMessage]:
-        from tqdm import tqdm  # noqa: PLC0415  (not needed without a terminal)
-
-        shown_ns = self.start_ns if span.begin_ns is None else span.begin_ns
-        end_ns = self.end_ns if span.end_ns is None else min(span.end_ns, self.end_ns)
-        length_ns = max(end_ns - shown_ns, 1)
-        with tqdm(desc=self._title, total=length_ns * 1e-9, leave=False, delay=DELAY, bar_format=(
-                '{desc}: {percentage:3.0f} % |{bar}| {n:.0f} of {total:.0f} s [{remaining} left]'
-                )) as bar:
-            for message in messages:
-                if message.recorded_ns - shown_ns >= length_ns // 500:
-                    bar.update((message.recorded_ns - shown_ns) * 1e-9)
-                    shown_ns = message.recorded_ns
-                yield message
+        begin_ns, end_ns = span.begin_ns or self.start_ns, span.end_ns or self.end_ns
+        share = (min(end_ns, self.end_ns) - begin_ns) / max(self.end_ns - self.start_ns, 1)
+        return iter(watched(
+            self._bag.messages(topics, span), desc=self._title,
+            total=round(share * sum(self.topics[topic].count for topic in topics))))

@@ -14,14 +14,7 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros.adapters.bag_writer import BagWriter
-from pose_graph_ros.cli.bag_messages import (
-    fix_messages,
-    loop_closure_messages,
-    Message,
-    odometry_messages,
-    pose_messages,
-    rate_messages,
-)
+from pose_graph_ros.cli import bag_messages
 from pose_graph_ros.cli.shared import watched
 from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what_graphs_lack
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
@@ -30,22 +23,10 @@ from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o_writing import g2o_text
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.quantities import Seconds
+from pose_graph_ros.offline.simulation import settings
 from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
 from pose_graph_ros.offline.simulation.motion import PERIOD_S
 from pose_graph_ros.offline.simulation.recording import Course, course, record, Recording
-from pose_graph_ros.offline.simulation.settings import (
-    CLOSURES,
-    DURATIONS_S,
-    FIXES,
-    GYRO,
-    Gyro,
-    Jump,
-    NODE_DISTANCES,
-    ODOMETRY,
-    POSES,
-    Setup,
-    TRUTH,
-)
 from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 GRAPH_SUFFIX = '.g2o'
@@ -71,14 +52,14 @@ def execute(options: argparse.Namespace) -> int:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
     way = course(WORLDS[options.world], options.seed,
-                 options.duration or DURATIONS_S[options.world],
+                 options.duration or settings.DURATIONS_S[options.world],
                  lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.time[-1])}
     files = dict[Path, bytes]()
     simulated: SimulatedGraph | Recording
     if is_graph:
-        simulated = graph_of(way, options.node_distance or NODE_DISTANCES[options.world])
+        simulated = graph_of(way, options.node_distance or settings.NODE_DISTANCES[options.world])
         about |= _about_graph(way, simulated)
         for path, poses in ((options.out, simulated.start),
                             (beside['g2o'], simulated.truth.poses)):
@@ -132,8 +113,8 @@ def simulate_drive(
     All but the gyroscope is the same without. The heading by the wheels drifts per distance
     [rad/m].
     """
-    def change(usual: Setup) -> Setup:
-        return replace(usual, gyro=Gyro() if gyro else None,
+    def change(usual: settings.Setup) -> settings.Setup:
+        return replace(usual, gyro=settings.Gyro() if gyro else None,
                        wheels=replace(usual.wheels, heading_drift=heading_drift))
     return record(course(WORLDS['drive'], seed, duration_s, change))
 
@@ -165,37 +146,40 @@ def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> d
     return about
 
 
-def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
+def _messages(drive: Recording) -> dict[str, Iterator[bag_messages.Message]]:
     """Return the messages of all topics by stamp; of equally late ones the first is written."""
     setup = drive.setup
+    odometry, truth, gyro, fixes, poses, closures = (
+        settings.ODOMETRY, settings.TRUTH, settings.GYRO, settings.FIXES, settings.POSES,
+        settings.CLOSURES)
     topics = {
-        ODOMETRY: odometry_messages(
-            ODOMETRY, 'odom', drive.odometry, ODOMETRY_VARIANCES, drive.velocities),
-        TRUTH: odometry_messages(TRUTH, 'map', drive.truth, (0.0,) * 6)}
+        odometry: bag_messages.odometry_messages(
+            odometry, 'odom', drive.odometry, ODOMETRY_VARIANCES, drive.velocities),
+        truth: bag_messages.odometry_messages(truth, 'map', drive.truth, (0.0,) * 6)}
     if setup.gyro is not None:
-        topics[GYRO] = rate_messages(
-            GYRO, drive.rate_stamps_ns, drive.rates,
-            setup.claimed(GYRO) * setup.gyro.sigma / np.sqrt(PERIOD_S))
+        topics[gyro] = bag_messages.rate_messages(
+            gyro, drive.rate_stamps_ns, drive.rates,
+            setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S))
     if setup.fixes is not None:
-        topics[FIXES] = fix_messages(FIXES, drive.fix_stamps_ns, drive.fixes,
-                                     setup.claimed(FIXES) * setup.fixes.sigma)
+        topics[fixes] = bag_messages.fix_messages(
+            fixes, drive.fix_stamps_ns, drive.fixes, setup.claimed(fixes) * setup.fixes.sigma)
     if setup.poses is not None:
-        sigmas = setup.claimed(POSES) * np.array(setup.poses.sigmas)
-        topics[POSES] = pose_messages(
-            POSES, drive.pose_stamps_ns, drive.poses, np.diag(np.square(sigmas[[0, 0, 1]])))
+        sigmas = setup.claimed(poses) * np.array(setup.poses.sigmas)[[0, 0, 1]]
+        topics[poses] = bag_messages.pose_messages(
+            poses, drive.pose_stamps_ns, drive.poses, np.diag(np.square(sigmas)))
     if setup.closures is not None:
-        sigmas = setup.claimed(CLOSURES) * np.array(setup.closures.sigmas)
-        topics[CLOSURES] = loop_closure_messages(
-            CLOSURES, drive.loop_stamps_ns, drive.loop_poses, np.diag(np.square(sigmas)))
+        sigmas = setup.claimed(closures) * np.array(setup.closures.sigmas)
+        topics[closures] = bag_messages.loop_closure_messages(
+            closures, drive.loop_stamps_ns, drive.loop_poses, np.diag(np.square(sigmas)))
     return topics
 
 
 def _delivered(
-    messages: Iterable[Message], index: IntArray, recorded_ns: IntArray,
-) -> Iterator[Message]:
+    messages: Iterable[bag_messages.Message], index: IntArray, recorded_ns: IntArray,
+) -> Iterator[bag_messages.Message]:
     """Yield messages in the order in which they arrive; only those on their way are kept."""
     left = np.bincount(index).tolist()
-    made, kept = enumerate(messages), dict[int, Message]()
+    made, kept = enumerate(messages), dict[int, bag_messages.Message]()
     for k, recorded in zip(index.tolist(), recorded_ns.tolist(), strict=True):
         while k not in kept:
             number, message = next(made)
@@ -233,12 +217,12 @@ def _closures(
             'missing_groups': missing}
 
 
-def _disturbances(setup: Setup, start_ns: int) -> dict[str, Any]:
+def _disturbances(setup: settings.Setup, start_ns: int) -> dict[str, Any]:
     """Return what is disturbed, with times as stamps."""
     def stamp(seconds: float) -> int:
         return start_ns + round(seconds * 1e9)
 
-    def end(jump: Jump) -> int | None:
+    def end(jump: settings.Jump) -> int | None:
         return stamp(jump.at_s + jump.seconds) if np.isfinite(jump.seconds) else None
 
     return {

@@ -15,26 +15,12 @@ from typing import Any
 
 from pose_graph_ros.cli.arguments import number
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.offline.simulation import settings
 from pose_graph_ros.offline.simulation.settings import (
-    ClaimedSigma,
-    ClockOffset,
-    CLOSURES,
-    Closures,
-    Delay,
-    Duplicates,
     DURATIONS_S,
-    FalseClosures,
-    FIXES,
-    Fixes,
-    GlobalPoses,
-    GYRO,
-    Gyro,
     Jump,
     NODE_DISTANCES,
-    ODOMETRY,
     OdometryErrors,
-    Outage,
-    POSES,
     Setup,
 )
 
@@ -43,6 +29,33 @@ FALSE_SIZE = 4  # closures of a group of false ones
 # Options of what a graph does not have, by their names among the parsed ones.
 ONLY_IN_BAGS = ('odometry', 'wheel_scale', 'slip', 'heading_drift', 'gyro', 'gyro_noise', 'delay',
                 'duplicate', 'clock_offset')
+SENSORS: dict[str, Any] = {
+    'wheels': settings.Wheels, 'gyro': settings.Gyro, 'fixes': settings.Fixes,
+    'poses': settings.GlobalPoses, 'closures': settings.Closures}
+# The sensor and its numbers that an option sets.
+FIELDS = {
+    'odometry': ('wheels', 'errors'), 'wheel_scale': ('wheels', 'scale'),
+    'slip': ('wheels', 'slip_events_per_s'), 'heading_drift': ('wheels', 'heading_drift'),
+    'gyro_noise': ('gyro', 'sigma', 'bias', 'bias_walk'), 'fix_period': ('fixes', 'period_s'),
+    'fix_sigma': ('fixes', 'white'), 'fix_correlated': ('fixes', 'correlated', 'correlation_s'),
+    'global_pose': ('poses', 'period_s'), 'global_pose_sigma': ('poses', 'sigmas'),
+    'closures': ('closures', 'rate'), 'closure_sigma': ('closures', 'sigmas')}
+# Grammar, class, name in the setup and help of each disturbance, by its option.
+DISTURBANCES: dict[str, tuple[str, Callable[..., Any], str, str]] = {
+    'outage': ('TOPIC:FROM:TO', settings.Outage, 'outages', 'nothing is measured in between'),
+    'jump': ('TOPIC:AT:DX,DY[,RAD][:FOR]', Jump, 'jumps',
+             'step of odometry in the frame of the robot; or step of fixes or global poses, east '
+             'and north, for so many seconds; /odom:AT:reset: odometry begins again at its '
+             'origin'),
+    'delay': ('TOPIC:S[:JITTER]', settings.Delay, 'delays',
+              'recorded so long after the stamp, plus 0 to JITTER at random, which shuffles '
+              'messages'),
+    'duplicate': ('TOPIC:SHARE', settings.Duplicates, 'duplicates',
+                  'share of the messages that come again within a second'),
+    'clock_offset': ('TOPIC:S', settings.ClockOffset, 'offsets',
+                     'the clock of this sensor is ahead'),
+    'claimed_sigma': ('TOPIC:FACTOR', settings.ClaimedSigma, 'claims',
+                      'ratio of the sigmas in the messages to the true ones (default: 1, honest)')}
 Change = tuple[str, Any]  # a topic and what happens to it, None if nothing shall
 
 
@@ -100,19 +113,19 @@ def _by_world(values: dict[str, float]) -> str:
 def _add_sensors(parser: argparse.ArgumentParser) -> None:
     """Add the options on sensors and disturbances."""
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
-    wheels.add_argument('--odometry', choices=[each.value for each in OdometryErrors],
+    wheels.add_argument('--odometry', choices=[*OdometryErrors],
                         help='errors of two wheels, or a random walk as the node assumes it '
                              '(default: wheels; a graph always has the latter)')
-    wheels.add_argument('--wheel-scale', metavar='LEFT,RIGHT', type=_numbers(2),
+    wheels.add_argument('--wheel-scale', metavar='LEFT,RIGHT', type=_numbers(0, 1),
                         help='ratio of measured to true distance (default: 1.0068,1.0070)')
-    wheels.add_argument('--slip', metavar='PER_MINUTE', type=number(0.0),
+    wheels.add_argument('--slip', metavar='PER_MINUTE', type=number(0.0, factor=1.0 / 60.0),
                         help='events of slip of each wheel, which then measures 1 cm too much at '
                              '1 m/s (default: 1; hall: 0.5)')
     wheels.add_argument('--heading-drift', metavar='RAD_PER_M', type=number(),
                         help='drift of the heading by the wheels [rad/m] (default: 0)')
     gyro = parser.add_argument_group('gyroscope on /imu/data, 100 Hz')
     gyro.add_argument('--gyro', action='store_true', help='with a gyroscope')
-    gyro.add_argument('--gyro-noise', metavar='WHITE,BIAS,WALK', type=_numbers(3),
+    gyro.add_argument('--gyro-noise', metavar='WHITE,BIAS,WALK', type=_numbers(0, 1, 2),
                       help='white noise [rad/sqrt(s)], bias at the start [rad/s] and its walk '
                            '[rad/s/sqrt(s)]; implies --gyro (default: 5e-4,0.01,2e-5)')
     fixes = parser.add_argument_group('GNSS on /gps/fix')
@@ -121,21 +134,21 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
     fixes.add_argument('--fix-period', metavar='S', type=number(0.01), help='(default: 0.5)')
     fixes.add_argument('--fix-sigma', metavar='M', type=number(0.0),
                        help='white error of a coordinate (default: 0.4)')
-    fixes.add_argument('--fix-correlated', metavar='M,S', type=_numbers(2),
+    fixes.add_argument('--fix-correlated', metavar='M,S', type=_numbers(0, 1),
                        help='standard deviation and time constant of the correlated '
                             '(Gauss-Markov) error of a coordinate; 0,1 for none '
                             '(default: 1.2,60)')
     poses = parser.add_argument_group('global poses on /global_pose')
     poses.add_argument('--global-pose', metavar='PERIOD', type=number(0.01),
                        help='a pose in the map every so many seconds (default: there are none)')
-    poses.add_argument('--global-pose-sigma', metavar='M,RAD', type=_numbers(2),
+    poses.add_argument('--global-pose-sigma', metavar='M,RAD', type=_numbers(0, 1),
                        help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
     loops = parser.add_argument_group('loop closures on /loop_closure')
     loops.add_argument('--closures', metavar='RATE', type=number(0.0, 1.0),
                        help='share of the stretches driven before in which a closure is found, '
                             '0 to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
                             '(default: 1; grid: 0.5)')
-    loops.add_argument('--closure-sigma', metavar='M,RAD', type=_numbers(2),
+    loops.add_argument('--closure-sigma', metavar='M,RAD', type=_numbers(0, 0, 1),
                        help='(default: 0.1,0.0175; hall: 0.05,0.01; grid: 0.1,0.02)')
     loops.add_argument('--false-rate', metavar='SHARE', type=number(0.0),
                        help='share of all closures that tie two different places '
@@ -149,56 +162,50 @@ def _add_disturbances(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         'disturbances', 'each may be repeated; times are seconds since the start. The drive has '
         'an outage and a jump\nof /gps/fix, which yours replace; "/gps/fix:none" removes them')
-    for name, grammar, kind, text in (
-            ('--outage', 'TOPIC:FROM:TO', Outage, 'nothing is measured in between'),
-            ('--jump', 'TOPIC:AT:DX,DY[,RAD][:FOR]', Jump,
-             'step of odometry in the frame of the robot; or step of fixes or global poses, east '
-             'and north, for so many seconds; /odom:AT:reset: odometry begins again at its '
-             'origin'),
-            ('--delay', 'TOPIC:S[:JITTER]', Delay,
-             'recorded so long after the stamp, plus 0 to JITTER at random, which shuffles '
-             'messages'),
-            ('--duplicate', 'TOPIC:SHARE', Duplicates,
-             'share of the messages that come again within a second'),
-            ('--clock-offset', 'TOPIC:S', ClockOffset,
-             'the clock of this sensor is ahead'),
-            ('--claimed-sigma', 'TOPIC:FACTOR', ClaimedSigma,
-             'ratio of the sigmas in the messages to the true ones (default: 1, honest)')):
-        group.add_argument(name, metavar=grammar, type=_disturbance(grammar, kind),
-                           action='append', default=[], help=text)
+    for option, (grammar, kind, _, text) in DISTURBANCES.items():
+        group.add_argument(f'--{option.replace("_", "-")}', metavar=grammar, action='append',
+                           type=_disturbance(grammar, kind), default=[], help=text)
 
 
 def changed(usual: Setup, options: argparse.Namespace) -> Setup:
     """Return what is simulated, by the usual of the world and the options; raises ConfigError."""
-    wheels = _present({
-        'errors': options.odometry and OdometryErrors(options.odometry),
-        'scale': options.wheel_scale, 'heading_drift': options.heading_drift,
-        'slip_events_per_s': None if options.slip is None else options.slip / 60.0})
-    poses = _present({'period_s': options.global_pose, 'sigmas': options.global_pose_sigma})
-    setup = replace(
-        usual, wheels=replace(usual.wheels, **wheels), fixes=_fixes(usual.fixes, options),
-        gyro=Gyro(*options.gyro_noise or ()) if options.gyro or options.gyro_noise else None,
-        poses=GlobalPoses(**poses) if poses else None,
-        closures=_closures(usual.closures or Closures(), options))
-    present = [ODOMETRY, *(topic for topic, sensor in (
-        (GYRO, setup.gyro), (FIXES, setup.fixes), (POSES, setup.poses), (CLOSURES, setup.closures))
-        if sensor is not None)]
-    fields = {'outage': 'outages', 'jump': 'jumps', 'delay': 'delays', 'duplicate': 'duplicates',
-              'clock_offset': 'offsets', 'claimed_sigma': 'claims'}
-    values: dict[str, Any] = {}
-    for option, name in fields.items():
-        given: Sequence[Change] = getattr(options, option)
-        for topic, _ in given:
-            if topic not in present:
-                raise ConfigError(
-                    f'--{option.replace("_", "-")} {topic}: nothing is simulated there, expected '
-                    f'one of {", ".join(present)}')
-        replaced = {topic for topic, _ in given}
+    given: dict[str, dict[str, Any]] = {
+        sensor: {} for sensor, there in (('gyro', options.gyro), ('fixes', options.fix)) if there}
+    for option, (sensor, *names) in FIELDS.items():
+        value = getattr(options, option)
+        if option == 'odometry' and value is not None:
+            value = OdometryErrors(value)
+        if value is not None:
+            given.setdefault(sensor, {}).update(
+                zip(names, value if len(names) > 1 else (value,), strict=True))
+    given.setdefault('closures', {})
+    if options.false_rate is not None or options.false_groups is not None:
+        groups, size = options.false_groups or (0, FALSE_SIZE)
+        given['closures']['false'] = replace(
+            (usual.closures or SENSORS['closures']()).false, share=options.false_rate, singles=0,
+            groups=groups, size=size, loose=False)
+    if options.fix is False and 'fixes' in given:
+        raise ConfigError('--no-fix: expected no other option on fixes, but there is one')
+    values: dict[str, Any] = {sensor: replace(getattr(usual, sensor) or SENSORS[sensor](), **of)
+                              for sensor, of in given.items()}
+    if options.fix is False:
+        values['fixes'] = None
+    setup = replace(usual, **values)
+    present = [settings.ODOMETRY, *(topic for topic, sensor in (
+        (settings.GYRO, setup.gyro), (settings.FIXES, setup.fixes), (settings.POSES, setup.poses),
+        (settings.CLOSURES, setup.closures)) if sensor is not None)]
+    for option, (_, _, name, _) in DISTURBANCES.items():
+        found: Sequence[Change] = getattr(options, option)
+        replaced = {topic for topic, _ in found}
+        for topic in replaced - {*present}:
+            raise ConfigError(
+                f'--{option.replace("_", "-")} {topic}: nothing is simulated there, expected '
+                f'one of {", ".join(present)}')
         values[name] = (
             *(each for each in getattr(usual, name)
               if each.topic not in replaced and each.topic in present),
-            *(each for _, each in given if each is not None))
-    return replace(setup, **values)
+            *(each for _, each in found if each is not None))
+    return replace(usual, **values)
 
 
 def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
@@ -208,37 +215,14 @@ def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
             raise ConfigError(f'--{name.replace("_", "-")}: only a bag has it, but {options.out} '
                               'is a graph')
     for topic, _ in options.outage:
-        if topic == ODOMETRY:
-            raise ConfigError(f'--outage {ODOMETRY}: a graph cannot do without odometry')
+        if topic == settings.ODOMETRY:
+            raise ConfigError(f'--outage {settings.ODOMETRY}: a graph cannot do without odometry')
 
 
-def _fixes(usual: Fixes | None, options: argparse.Namespace) -> Fixes | None:
-    correlated, correlation = options.fix_correlated or (None, None)
-    given = _present({'period_s': options.fix_period, 'white': options.fix_sigma,
-                      'correlated': correlated, 'correlation_s': correlation})
-    if options.fix is False and given:
-        raise ConfigError('--no-fix: expected no other option on fixes, but there is one')
-    if options.fix is False or (usual is None and options.fix is None and not given):
-        return None
-    return replace(usual or Fixes(), **given)
+def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:
+    """Return what reads numbers with commas between them, and gives them in an order."""
+    count = max(order) + 1
 
-
-def _closures(usual: Closures, options: argparse.Namespace) -> Closures:
-    false: FalseClosures = usual.false
-    if options.false_rate is not None or options.false_groups is not None:
-        number_of_groups, size = options.false_groups or (0, FALSE_SIZE)
-        false = replace(false, share=options.false_rate, singles=0, groups=number_of_groups,
-                        size=size, loose=False)
-    sigmas = options.closure_sigma and (options.closure_sigma[0], *options.closure_sigma)
-    return replace(usual, false=false, **_present({'rate': options.closures, 'sigmas': sigmas}))
-
-
-def _present(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in values.items() if value is not None}
-
-
-def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
-    """Return what reads so many numbers with commas between them."""
     def read(text: str) -> tuple[float, ...]:
         try:
             values = tuple(float(each) for each in text.split(','))
@@ -247,7 +231,7 @@ def _numbers(count: int) -> Callable[[str], tuple[float, ...]]:
         if len(values) != count or not all(map(math.isfinite, values)):
             raise argparse.ArgumentTypeError(
                 f'expected {count} numbers with commas between them, got {text!r}')
-        return values
+        return tuple(values[k] for k in order)
     return read
 
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from pose_graph_ros.cli.arguments import METHODS
-from pose_graph_ros.cli.graph_input import read_file
+from pose_graph_ros.cli.graph_input import read_file, rows_of
 from pose_graph_ros.cli.solve_starts import CONFIG, Problem, Solution, solve, with_certificate
 from pose_graph_ros.core.batch.levenberg_marquardt import Status
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
@@ -159,15 +159,7 @@ def _chosen(problem: Problem, which: str) -> IntArray:
         return np.arange(len(problem.ids))
     if which == 'newest':
         return np.array([problem.engine.newest_pose])
-    try:
-        names = [int(word) for word in which.split(',')]
-    except ValueError:
-        raise PoseGraphError(f'--marginals: expected all, newest or ids separated by commas, '
-                             f'got {which!r}') from None
-    for name in names:
-        if name not in problem.ids:
-            raise PoseGraphError(f'--marginals: the file has no vertex {name}')
-    return np.searchsorted(problem.ids, names)
+    return rows_of(problem.ids, which, '--marginals')
 
 
 class _Marginals(NamedTuple):

@@ -207,19 +207,16 @@ class Report:
 
     def values(self) -> dict[str, Any]:
         """Return the keys of `certificate` in the JSON output, as in docs/tools.md."""
-        made = self.certificate
-        verdict = Verdict.NOT_ATTEMPTED if made is None else made.verdict
+        made, bound = self.certificate, self.bound
         return {
-            'verdict': verdict.value, 'reason': self.reason, 'seconds': self.seconds,
-            'chi2': None if made is None else made.chi2,
-            'gap': None if made is None else made.gap,
-            'relative_gap': None if made is None else made.relative_gap,
-            'lambda_min': None if made is None else made.smallest,
-            'rank': None if made is None else made.rank,
+            'verdict': (Verdict.NOT_ATTEMPTED if made is None else made.verdict).value,
+            'reason': self.reason, 'seconds': self.seconds,
+            **{key: None if made is None else getattr(made, name) for key, name in (
+                ('chi2', 'chi2'), ('gap', 'gap'), ('relative_gap', 'relative_gap'),
+                ('lambda_min', 'smallest'), ('rank', 'rank'))},
             'lower_minimum': made is not None and made.is_lower,
-            'chi2_from_it': self.chi2_from_it,
-            'chi2_bound': self.bound,
-            'chi2_gap': None if self.bound is None else max(self.chi2 - self.bound, 0.0)}
+            'chi2_from_it': self.chi2_from_it, 'chi2_bound': bound,
+            'chi2_gap': None if bound is None else max(self.chi2 - bound, 0.0)}
 
     def lines(self) -> list[str]:
         """Return what is printed."""
@@ -242,9 +239,8 @@ class Report:
             lines.append('  this bounds no chi2, whose information depends on the direction; it '
                          'only speaks for the headings')
         else:
-            above = max(self.chi2 - self.bound, 0.0)
             lines.append(f'  so no poses have a chi2 below {self.bound:.9g}; that found is '
-                         f'{above:.2g} above this')
+                         f'{max(self.chi2 - self.bound, 0.0):.2g} above this')
         return lines
 
 

@@ -11,14 +11,11 @@ import sys
 import time
 from typing import Any
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs
 from pose_graph_ros.adapters.bags import BagError, open_bags
-from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
 from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
-from pose_graph_ros.cli.tuning_drive import TuningDrive
 from pose_graph_ros.offline.tuning.fit import CONTRADICTION
 
 
@@ -34,27 +31,23 @@ def execute(options: argparse.Namespace) -> int:
     if not os.access(where, os.W_OK):
         raise BagError(f'{options.out}: cannot be written: no permission')
     with open_bags(options.bags) as bag:
-        inputs = choose_inputs(
-            bag, source_list(values), shared.wanted_topics(options),
-            span=shared.span_of(bag, options), truth=options.truth)
+        inputs = shared.inputs_of(bag, options, values)
         truth = None if options.truth is None else read_truth(bag, options.truth)
-        drive = TuningDrive(shared.WatchedBag(bag, 'reading'), inputs, values)
-        path = str(bag.path)
+        tuning = Tuning(shared.WatchedBag(bag, 'reading'), inputs, values, _show)
     try:
-        tuning = Tuning(drive, inputs, values, path, _show)
         outcome = tuning.tune(options.folds, start + options.budget, truth)
     finally:
         _show('')
     names = ' '.join(each.name for each in options.bags)
-    headline = [f'Noise by `pose-graph tune {names}`', *_notes(outcome, drive)]
+    headline = [f'Noise by `pose-graph tune {names}`', *_notes(outcome, tuning)]
     is_better = outcome.verdict is Verdict.BETTER
     if is_better:
         options.out.write_text(yaml_text(outcome.tuned, headline), encoding='utf-8')
     if options.json:
-        print(json.dumps(_facts(options, outcome, drive, time.monotonic() - start), indent=2))
+        print(json.dumps(_facts(options, outcome, tuning, time.monotonic() - start), indent=2))
     else:
         print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
-        print('\n'.join(_lines(outcome, drive)))
+        print('\n'.join(_lines(outcome, tuning)))
         print(f'\nwritten: {options.out}' if is_better else '\nnothing is written')
     return 0 if is_better else 1
 
@@ -65,11 +58,11 @@ def _show(text: str) -> None:
         print(f'\r\x1b[K{text}', end='', file=sys.stderr, flush=True)
 
 
-def _notes(outcome: Outcome, drive: TuningDrive) -> list[str]:
+def _notes(outcome: Outcome, tuning: Tuning) -> list[str]:
     """Return what is to be known of the estimate."""
     notes = [f'{outcome.measured}; {outcome.folds_done} of {outcome.folds} parts of the drive '
              f'held out in turn, in stretches of {outcome.stretch:.3g} s']
-    if drive.is_cut:
+    if tuning.is_cut:
         notes.append('the bag is long: only its first part was read')
     if outcome.n_doubted > 0:
         notes.append(f'{outcome.n_doubted} measurements contradict the others and were left out')
@@ -79,7 +72,7 @@ def _notes(outcome: Outcome, drive: TuningDrive) -> list[str]:
     return [*notes, outcome.verdict.value]
 
 
-def _lines(outcome: Outcome, drive: TuningDrive) -> list[str]:
+def _lines(outcome: Outcome, tuning: Tuning) -> list[str]:
     """Return the tables as text."""
     rows = [('', 'before', 'after', '95 %', ''), *(
         (each.name, _value(each.before), _value(each.after) if each.changes else '',
@@ -97,7 +90,7 @@ def _lines(outcome: Outcome, drive: TuningDrive) -> list[str]:
     for name, error in zip(('before, to truth', 'after, to truth'), outcome.to_truth,
                            strict=False):
         lines.append(f'{name:<22}{error:>7.3f} m')
-    return [*lines, '', *_notes(outcome, drive)]
+    return [*lines, '', *_notes(outcome, tuning)]
 
 
 def _value(value: Any) -> str:
@@ -108,7 +101,7 @@ def _value(value: Any) -> str:
 
 
 def _facts(
-    options: argparse.Namespace, outcome: Outcome, drive: TuningDrive, seconds: float,
+    options: argparse.Namespace, outcome: Outcome, tuning: Tuning, seconds: float,
 ) -> dict[str, Any]:
     """Return the results as plain values for JSON."""
     return {
@@ -122,7 +115,7 @@ def _facts(
             ('before', 'after'), outcome.to_truth, strict=False))) or None,
         'folds': outcome.folds, 'folds_done': outcome.folds_done, 'stretch_s': outcome.stretch,
         'doubted': outcome.n_doubted, 'contradiction': outcome.contradiction,
-        'is_cut': drive.is_cut, 'seconds': seconds}
+        'is_cut': tuning.is_cut, 'seconds': seconds}
 
 
 def _plain(facts: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import math
 from typing import Any
 
-from pose_graph_ros.cli.tuning_drive import SourceOfPoses
 from pose_graph_ros.offline.tuning import likelihood as lk
+from pose_graph_ros.offline.tuning.drive_rows import SourceOfPoses
 from pose_graph_ros.offline.tuning.fit import Fit, Found
 from pose_graph_ros.offline.tuning.likelihood import Role
 

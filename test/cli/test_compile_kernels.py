@@ -3,12 +3,8 @@
 """The tool that compiles before the first start; what it calls has its tests in core."""
 
 import os
-from pathlib import Path
 import subprocess
 import sys
-
-import numba
-import pytest
 
 from pose_graph_ros.cli import compile_kernels as module
 from pose_graph_ros.cli.main import main
@@ -40,14 +36,3 @@ def test_without_a_compiler_it_does_not_claim_to_have_compiled() -> None:
         timeout=240)
     assert done.returncode == 2
     assert done.stderr == 'error: NUMBA_DISABLE_JIT is set, so nothing is compiled\n'
-
-
-@pytest.mark.parametrize(('folders', 'said'), [
-    ({'/ws/core/a/__pycache__', '/ws/core/b/__pycache__'}, 'in /ws/core, in each __pycache__'),
-    ({'/home/u/.cache/pose_graph_ros/a', '/home/u/.cache/pose_graph_ros/b'},
-     'in /home/u/.cache/pose_graph_ros, where only this user finds it; set NUMBA_CACHE_DIR for '
-     'others')])
-def test_it_says_who_finds_the_code(folders, said, monkeypatch) -> None:
-    monkeypatch.setattr(numba.config, 'CACHE_DIR', '')
-    monkeypatch.setattr(jit, 'cache_folders', lambda: set(map(Path, folders)))
-    assert module._place() == said

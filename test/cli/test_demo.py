@@ -2,19 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The environment of the processes of the demo, which itself runs in test_replay_is_node."""
 
-from contextlib import ExitStack
 
 import pytest
 
 from pose_graph_ros.cli.demo import isolated_environment
-
-
-def test_two_at_the_same_time_have_different_domains(tmp_path) -> None:
-    with ExitStack() as stack:
-        domains = [stack.enter_context(isolated_environment(tmp_path))['ROS_DOMAIN_ID']
-                   for _ in range(40)]
-    assert len(set(domains)) == 40
-    assert all(0 < int(domain) <= 100 for domain in domains)
 
 
 def test_domains_are_free_again_after_an_error(tmp_path) -> None:

@@ -159,14 +159,6 @@ def test_wrong_input_is_refused_in_one_line(words, message, small, tmp_path, cap
     assert error.count('\n') == 1
 
 
-def test_the_suffix_is_checked_first(capsys) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(['draw', 'no_such_file.g2o', '-o', 'graph.jpg'])
-    assert ended.value.code == 2
-    assert "expected a name that ends with .svg, .png, .dot, got 'graph.jpg'" in (
-        capsys.readouterr().err)
-
-
 @pytest.mark.parametrize('suffix', ['.g2o', '.json'])
 def test_a_saved_graph_has_its_biases(suffix, tmp_path) -> None:
     out = tmp_path / 'map.svg'

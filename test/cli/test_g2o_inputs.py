@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A g2o file as measurements over time."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tum_files import read_tum
 
 from pose_graph_ros.cli.graph_input import read_measurements
-from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
@@ -80,13 +77,3 @@ def test_a_graph_without_odometry_is_refused_by_the_vertices(tmp_path) -> None:
     path.write_text(f'EDGE_SE2 0 1 {STEP}\nEDGE_SE2 0 7 {LOOP}\n')
     with pytest.raises(FileFormatError, match='there is none from 1 to 7'):
         read_measurements(path)
-
-
-def test_a_replay_writes_path_picture_and_summary(square, tmp_path) -> None:
-    assert main(['replay', str(square), '-o', str(tmp_path / 'out')]) == 0
-    path = read_tum(tmp_path / 'out' / 'path.tum')
-    assert len(path) == 9
-    found = json.loads((tmp_path / 'out' / 'summary.json').read_text())
-    assert found['counts'] == {'loop_closure.accepted': 3, 'odom.accepted': 9}
-    assert (found['loop_closures'], found['status']) == (3, 'converged')
-    assert (tmp_path / 'out' / 'drive.png').stat().st_size > 10_000

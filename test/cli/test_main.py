@@ -3,18 +3,14 @@
 """The command `pose-graph`: its tools, and those of them that need no module of their own."""
 
 from pathlib import Path
-import signal
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from pose_graph_ros import __version__
-from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
-from pose_graph_ros.cli.main import guarded, main, SUMMARIES
-from pose_graph_ros.cli.simulate import simulate_drive
+from pose_graph_ros.cli.main import main, SUMMARIES
 
 TOOLS = tuple(SUMMARIES)
 RING = Path(__file__).parents[1] / 'data' / 'ring.g2o'
@@ -28,14 +24,6 @@ def test_help_lists_all_tools(capsys) -> None:
     assert ended.value.code == 0
     printed = capsys.readouterr().out
     assert all(f'\n    {tool} ' in printed for tool in TOOLS)
-
-
-@pytest.mark.parametrize('tool', TOOLS)
-def test_each_tool_has_a_help(tool, capsys) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([tool, '--help'])
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith(f'usage: pose-graph {tool} ')
 
 
 def test_the_version_is_that_of_the_package(capsys) -> None:
@@ -99,20 +87,6 @@ def test_parameters_are_printed_as_tables_and_as_a_file(capsys) -> None:
     assert capsys.readouterr().out == as_yaml()
 
 
-def test_a_drive_is_simulated_once(tmp_path, capsys) -> None:
-    folder = tmp_path / 'drive'
-    assert main(['simulate', str(folder), '--seed', '5', '--duration', '12']) == 0
-    assert capsys.readouterr().out.endswith(f'written: {folder}, {folder}_truth.json\n')
-    drive = simulate_drive(5, 12.0)
-    with open_bag(folder) as bag:
-        assert sorted(bag.topics) == ['/gps/fix', '/ground_truth', '/odom']
-        stamps = [message.recorded_ns for message in bag.messages(['/odom'])]
-    np.testing.assert_array_equal(np.array(stamps) - 4_000_000, drive.odometry.stamps_ns)
-    # what is there is not overwritten
-    assert main(['simulate', str(folder)]) == 2
-    assert capsys.readouterr().err == f'error: {folder}: exists already, not overwritten\n'
-
-
 INTERRUPTED_IN_THE_COMPILER = """
 import ctypes, os, signal, sys, time
 from pose_graph_ros.cli.main import guarded
@@ -136,14 +110,3 @@ def test_ctrl_c_while_the_compiler_calls_back_ends_a_tool_without_a_word() -> No
     done = subprocess.run([sys.executable, '-c', INTERRUPTED_IN_THE_COMPILER], check=False,
                           capture_output=True, text=True, timeout=15)
     assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
-
-
-def test_ctrl_c_is_as_before_after_a_tool() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        for handler in (signal.default_int_handler, signal.SIG_IGN):
-            signal.signal(signal.SIGINT, handler)
-            assert guarded(lambda: 3) == 3
-            assert signal.getsignal(signal.SIGINT) is handler
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -56,7 +56,7 @@ def test_covariances_are_those_of_the_dense_inverse(name, tmp_path, capsys) -> N
 
     newest = max(expected)
     for which, names in (('newest', [newest]), (f'{newest},{min(expected)}', [
-            newest, min(expected)])):
+            min(expected), newest])):
         capsys.readouterr()
         assert main(['solve', str(DATA / name), '--marginals', which]) == 0
         lines = capsys.readouterr().out.splitlines()
@@ -82,8 +82,8 @@ def test_a_point_has_no_heading(tmp_path, capsys) -> None:
 
 
 @pytest.mark.parametrize(('text', 'which', 'said'), [
-    ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', '7', 'no vertex 7'),
-    ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'some', "separated by commas, got 'some'"),
+    ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', '7', 'no hidden node 7'),
+    ('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'some', "expected ids such as 3,7,20:25, got 'some'"),
     ('EDGE_PRIOR_SE2_XY 5 1 1 1 0 1', 'all', 'hidden node 5 is not determined')])
 def test_what_cannot_be_told_is_one_line_of_error(text, which, said, tmp_path, capsys) -> None:
     path = tmp_path / 'graph.g2o'

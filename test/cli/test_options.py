@@ -36,22 +36,6 @@ def parsed(*words: str) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
-def test_topics_are_those_of_the_options() -> None:
-    nothing = {'odom': None, 'fix': None, 'global_pose': None, 'loop_closure': None, 'imu': None,
-               'gyro': None}
-    assert shared.wanted_topics(parsed()) == nothing
-    given = parsed('--odom', '/a', '--global-pose', '/b', '--loop-closure', '/c', '--imu', '/d')
-    assert shared.wanted_topics(given) == {
-        'odom': '/a', 'fix': None, 'global_pose': '/b', 'loop_closure': '/c', 'imu': '/d',
-        'gyro': None}
-    assert (parsed().truth, parsed().hold_out) == (None, 0)
-
-
-def test_without_options_all_parameters_have_their_defaults() -> None:
-    assert shared.parameter_values(parsed()) == checked({})
-    assert shared.ros_arguments(parsed()) == ['--ros-args']
-
-
 def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path) -> None:
     path = tmp_path / 'params.yaml'
     path.write_text(FILE, encoding='utf-8')
@@ -67,13 +51,6 @@ def test_parameters_come_from_the_file_and_from_the_command_line(tmp_path) -> No
     assert shared.ros_arguments(given) == [
         '--ros-args', '--params-file', str(path), '-p', 'frequency:=20', '-p',
         'rear.lever_arm:=[1, 2]', '-p', 'publish_tf:=false']
-
-
-def test_a_file_without_a_section_for_the_node_sets_nothing(tmp_path) -> None:
-    path = tmp_path / 'params.yaml'
-    for text in ('', '- a list', 'other: {ros__parameters: {frequency: 1.0}}'):
-        path.write_text(text, encoding='utf-8')
-        assert shared.parameter_values(parsed('--params-file', str(path))) == checked({})
 
 
 def test_a_file_of_ros2_param_dump_is_taken(tmp_path) -> None:
@@ -106,8 +83,3 @@ def test_a_wrong_file_is_refused(text, said, tmp_path) -> None:
 def test_a_parameter_without_a_value_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"expected NAME:=VALUE, got 'frequency=1\.0'"):
         shared.parameter_values(parsed('-p', 'frequency=1.0'))
-
-
-def test_a_value_that_cannot_be_read_is_refused_with_the_name_of_its_parameter() -> None:
-    with pytest.raises(ConfigError, match=r"--param frequency: '\[1' is not YAML"):
-        shared.parameter_values(parsed('-p', 'frequency:=[1'))

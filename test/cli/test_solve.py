@@ -10,7 +10,6 @@ import re
 from false_loops import laps
 import numpy as np
 import pytest
-from random_graphs import corridor_graph
 
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.graph.graph import Graph
@@ -70,13 +69,6 @@ def test_a_graph_is_solved_to_its_optimum(name, start, tmp_path, capsys) -> None
     assert len(after.graph.observed) == len(before.graph.observed)
 
 
-def test_nothing_is_written_without_out(tmp_path) -> None:
-    path = write(tmp_path / 'graph.g2o', CONFLICT)
-    assert main(['solve', str(path)]) == 0
-    assert path.read_text(encoding='utf-8') == CONFLICT
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_the_start_is_that_of_the_file_only_if_asked_for(tmp_path, capsys) -> None:
     text = (DATA / 'ring.g2o').read_text(encoding='ascii')
     rng = np.random.default_rng(2)
@@ -100,33 +92,6 @@ def test_the_start_is_that_of_the_file_only_if_asked_for(tmp_path, capsys) -> No
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith('chi2')]
     assert re.search(r'converged after [12] iterations', lines[-1])
     assert printed_chi2(lines[-1:]) == pytest.approx(best, rel=SAME_CHI2)
-
-
-def test_edge2_is_read_as_said(tmp_path, capsys) -> None:
-    root = np.array([[3.0, 1.0, -0.5], [0.0, 2.0, 0.25], [0.0, 0.0, 4.0]])
-    full = root.T @ root
-    numbers = {
-        'g2o': full[np.triu_indices(3)], 'isam': root[np.triu_indices(3)],
-        'toro': np.array([full[0, 0], full[0, 1], full[1, 1], full[2, 2], full[0, 2],
-                          full[1, 2]])}
-    means = ('0 1 1 0 0.5', '1 2 1 0 0.5', '0 2 1.5 1 1.5')
-    chi2 = {}
-    for order, six in numbers.items():
-        tag = 'EDGE_SE2' if order == 'g2o' else 'EDGE2'
-        path = write(tmp_path / f'{order}.g2o', ''.join(
-            f'{tag} {mean} {" ".join(map(repr, six.tolist()))}\n' for mean in means))
-        option = [] if order == 'g2o' else ['--edge2', order]
-        assert main(['solve', str(path), *option]) == 0
-        chi2[order] = printed_chi2(capsys.readouterr().out.splitlines())
-    assert chi2['g2o'] > 0.01
-    assert chi2['toro'] == pytest.approx(chi2['g2o'], rel=SAME_CHI2)
-    assert chi2['isam'] == pytest.approx(chi2['g2o'], rel=SAME_CHI2)
-    # without the option it is found out, with a warning
-    assert main(['solve', str(tmp_path / 'toro.g2o')]) == 0
-    captured = capsys.readouterr()
-    assert printed_chi2(captured.out.splitlines()) == pytest.approx(chi2['toro'], rel=SAME_CHI2)
-    assert 'EDGE2 is read in the order of toro, as' in captured.err
-    assert len(captured.err.splitlines()) == 1
 
 
 # Graphs that nothing, or not enough, holds, with what is said.
@@ -170,49 +135,6 @@ def test_there_is_an_answer_wherever_there_is_a_graph(name, start, tmp_path, cap
         assert after.energies().chi2 == pytest.approx(0.0, abs=1e-6)
 
 
-def test_lines_of_other_tools_are_one_warning_for_each_tag(tmp_path, capsys) -> None:
-    path = write(tmp_path / 'other.graph', CONFLICT + """
-        PARAMS_SE2OFFSET 0 0 0 0
-        VERTEX_TRACKXYZ 100 3 4 0
-        VERTEX_TRACKXYZ 101 5 6 0
-        FIX 100
-        EDGE_SE2_TRACKXYZ 20 100 1 2 1 0 1
-        EQUIV 20 22
-        EQUIV 21 23
-        EQUIV 20 23
-    """)
-    plain = write(tmp_path / 'plain.g2o', CONFLICT)
-    printed = []
-    for each in (path, plain):
-        assert main(['solve', str(each)]) == 0
-        captured = capsys.readouterr()
-        printed.append(printed_chi2(captured.out.splitlines()))
-        warnings = captured.err.splitlines()
-        if each is path:
-            assert [re.findall(r": (\d+) lines '(\S+)' are skipped", line)
-                    for line in warnings] == [
-                [('3', 'EQUIV')], [('2', 'VERTEX_TRACKXYZ')], [('1', 'PARAMS_SE2OFFSET')],
-                [('1', 'EDGE_SE2_TRACKXYZ')]]
-            assert all(line.startswith(f'warning: {path}: ') for line in warnings)
-        else:
-            assert warnings == []
-    assert printed[0] == printed[1]
-
-
-def test_strong_noise_of_the_headings_is_solved_from_another_start(tmp_path, capsys) -> None:
-    path = tmp_path / 'corridor.g2o'
-    write_g2o(corridor_graph(1, sigma=0.3), path)
-    assert main(['solve', str(path), '--start', 'file']) == 0
-    from_truth = capsys.readouterr().out.splitlines()
-    assert 'from the present poses' in from_truth[1]
-    path.write_text(re.sub(r'(?m)^VERTEX_SE2 .*\n', '', path.read_text(encoding='ascii')),
-                    encoding='ascii')
-    assert main(['solve', str(path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert 'from the start with unit headings' in lines[2]
-    assert printed_chi2(lines) <= 1.01 * printed_chi2(from_truth)
-
-
 def test_the_constraints_with_the_largest_energies_are_named(tmp_path, capsys) -> None:
     path, out = write(tmp_path / 'conflict.g2o', CONFLICT), tmp_path / 'out.g2o'
     assert main(['solve', str(path), '-o', str(out)]) == 0
@@ -230,13 +152,6 @@ def test_the_constraints_with_the_largest_energies_are_named(tmp_path, capsys) -
     assert [name for name, _ in named] == ['23', '20']
     assert [float(energy) for _, energy in named] == pytest.approx(
         sorted(energies.observed.tolist(), reverse=True), rel=1e-3)
-
-
-def test_at_most_five_of_each_are_named(capsys) -> None:
-    assert main(['solve', str(DATA / 'chain.g2o')]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert sum(line.startswith('  edge ') for line in lines) == 5
-    assert sum(line.startswith('  observed node ') for line in lines) == 5
 
 
 # --- Wrong loop closures ---------------------------------------------------------------------
@@ -316,16 +231,6 @@ def test_the_least_sigma_of_a_closure_can_be_chosen(tmp_path, capsys) -> None:
         printed = capsys.readouterr().out
         doubted.append(int(re.search(r'(\d+) doubted', printed)[1]))
     assert doubted == [5, 5, 0]
-
-
-@pytest.mark.parametrize('sigma', ['-1', 'nan', 'inf', 'wide'])
-def test_a_sigma_that_is_none_is_refused(sigma, tmp_path, capsys) -> None:
-    with pytest.raises(SystemExit) as error:
-        main(['solve', str(tmp_path / 'graph.g2o'), '--robust', '--closure-sigma', sigma, '0.1'])
-    assert error.value.code == 2
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert 'argument --closure-sigma: ' in said
-    assert sigma in said
 
 
 @pytest.mark.parametrize('name', LOOSE)

@@ -4,8 +4,8 @@
 // states, and the one place that knows which time and which measurement the reader looks at.
 
 const DATA = JSON.parse(document.getElementById('data').textContent);
-const STATES = DATA.states ||
-  ['believed', 'believed weakly', 'waiting', 'doubted', 'refused', 'held out'];
+const STATES = DATA.states;
+const isPaper = () => document.documentElement.classList.contains('paper');
 const CALM = matchMedia('(prefers-reduced-motion: reduce)');
 
 // --- elements -----------------------------------------------------------------------------------
@@ -32,7 +32,7 @@ function fill(node, properties, children) {
 
 /** Make a section of the page with a heading, and put it on the page. */
 function section(id, title, lead) {
-  const node = make('section', {id, 'aria-labelledby': `${id}-title`, tabindex: '-1'},
+  const node = make('section', {id, 'aria-labelledby': `${id}-title`},
     make('h2', {id: `${id}-title`}, title), lead ? make('p', {class: 'lead'}, lead) : null);
   document.getElementById('main').append(node);
   return node;
@@ -41,19 +41,8 @@ function section(id, title, lead) {
 /** A line that says why there is nothing to see. */
 const nothing = (why) => make('p', {class: 'nothing'}, why);
 
-/** A link to a place of the page, from which the keyboard goes on. */
-function linkTo(id, text) {
-  return make('a', {href: `#${encodeURIComponent(id)}`, onclick: (event) => {
-    event.preventDefault();
-    const node = document.getElementById(id);
-    if (node) bringIntoView(node, 'start');
-    if (node) node.focus({preventScroll: true});
-  }}, text);
-}
-
-function bringIntoView(node, block) {
-  node.scrollIntoView({behavior: CALM.matches ? 'auto' : 'smooth', block});
-}
+/** A link to a place of the page. */
+const linkTo = (id, text) => make('a', {href: `#${encodeURIComponent(id)}`}, text);
 
 /** A table; the first cell of each row is its heading. */
 function table(look, heads, rows) {
@@ -72,7 +61,8 @@ let palette = {};
 /** The value of a colour of report.css in the scheme that is shown. */
 function colour(name) {
   if (!(name in palette)) {
-    palette[name] = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+    const both = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
+    palette[name] = both.match(/#\w+/g)[Number(document.documentElement.dataset.scheme === 'dark')];
   }
   return palette[name];
 }
@@ -99,15 +89,7 @@ function number(value, digits = 3) {
   return String(Number(value.toPrecision(digits)));
 }
 
-/** A length in the unit in which it is easily read. */
-function length(metres, digits = 3) {
-  const size = Math.abs(metres);
-  if (size >= 1000) return `${number(metres / 1000, digits)} km`;
-  if (size < 0.01 && size > 0) return `${number(metres * 1000, digits)} mm`;
-  if (size < 1 && size > 0) return `${number(metres * 100, digits)} cm`;
-  return `${number(metres, digits)} m`;
-}
-
+const length = (metres) => `${number(metres)} m`;
 const degrees = (radians) => (known(radians) ? (radians * 180) / Math.PI : null);
 
 /** Seconds since the start, as `12.3 s` or `2:03.4` or `1:02:03`. */
@@ -137,14 +119,8 @@ const counted = (count, one, many = `${one}s`) => `${number(count, 6)} ${count =
 
 /** The smallest and the largest of all known values. */
 function extent(...columns) {
-  let [low, high] = [Infinity, -Infinity];
-  for (const column of columns) {
-    for (const value of column || []) {
-      if (known(value) && value < low) low = value;
-      if (known(value) && value > high) high = value;
-    }
-  }
-  return low <= high ? [low, high] : null;
+  const all = columns.flatMap((column) => (column || []).filter(known));
+  return all.length === 0 ? null : [Math.min, Math.max].map((most) => all.reduce((one, other) => most(one, other)));
 }
 
 // --- looks --------------------------------------------------------------------------------------
@@ -178,7 +154,7 @@ function swatch({colour: name, shape, dash, width, area, open}) {
 // --- what the reader looks at -------------------------------------------------------------------
 
 const focus = {time: null, item: null};
-const followers = {time: [], item: []};
+const followers = {time: [], item: [], print: []};
 
 /** Let all charts and the map mark a time [s]. */
 function lookAtTime(time) {

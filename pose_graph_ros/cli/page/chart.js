@@ -50,13 +50,10 @@ function makeChart(host, {title, x, y, series, band, rules = [], note, height = 
 
 /** What a chart shows in words: the title, the axes, and between what its columns are. */
 function described(title, x, y, series, rules) {
-  const spans = series.filter(({name}) => name).map((each) => {
-    const [low, high] = extent(each.y) || [null, null];
-    return `${each.name} from ${number(low)} to ${number(high)}`;
-  });
-  return `${title}: ${y.label} over ${x.label}; ${
-    [...spans, ...rules.map(({name}) => name).filter((name) => name)].join('; ')}. `
-    + 'Arrow keys move the read-out.';
+  const spans = series.filter(({name}) => name).map((each) => (
+    `${each.name} from ${(extent(each.y) || []).map((value) => number(value)).join(' to ')}`));
+  return [`${title}: ${y.label} over ${x.label}`, ...spans, ...rules.map(({name}) => name || ''),
+    'arrow keys move the read-out'].filter((text) => text).join('; ');
 }
 
 /** A scale with all values and rules in it; a linear one of y has zero, a logarithmic one none. */
@@ -75,29 +72,16 @@ function scaleOf(name, {log, range, floor}, columns, rules) {
 
 const TIME_STEPS = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 18000, 36000, 86400];
 
-function axisOf({label, log, time, format}, size, space) {
+function axisOf({label, time, format}, size, space) {
   const text = format || (time ? (value) => clock(value, 0) : (value) => number(value));
   return {
     label, size, space, labelSize: 18, labelGap: 0, font: '12px system-ui, sans-serif',
     labelFont: '12px system-ui, sans-serif', stroke: () => colour('muted'),
     grid: {stroke: () => colour('grid'), width: 1}, ticks: {show: false},
     border: {show: true, stroke: () => colour('axis'), width: 1},
-    values: (_, splits) => splits.map(text),
+    values: (_, splits) => splits.map((value) => (value === null ? '' : text(value))),
     ...(time && (DATA.duration || 0) >= 120 ? {incrs: TIME_STEPS} : {}),
-    ...(log ? {splits: (u, axis, low, high) => logTicks(low, high), filter: (_, all) => all} : {}),
   };
-}
-
-/** Powers of ten, and 2 and 5 of each if they are few. */
-function logTicks(low, high) {
-  const decades = Math.log10(high / low);
-  const factors = decades < 2.5 ? [1, 2, 5] : [1];
-  const every = Math.ceil(decades / 7);
-  const found = [];
-  for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power += every) {
-    for (const factor of factors) found.push(Number((factor * 10 ** power).toPrecision(3)));
-  }
-  return found.filter((value) => value >= low && value <= high);
 }
 
 function seriesOf({name, colour: paint, kind = 'line', dash, width = 1.6, format}, y) {

@@ -7,11 +7,7 @@
 /** Put the map on the page; returns how to choose an item. */
 function showMap() {
   const host = section('map', 'Map');
-  const path = (DATA.lines || {}).corrected;
-  if (!path || path.x.length === 0) {
-    host.append(nothing('No path: the run made no hidden nodes.'));
-    return () => {};
-  }
+  const path = DATA.lines.corrected;
   const stage = make('div', {class: 'stage', id: 'stage', role: 'application',
     'aria-roledescription': 'map',
     'aria-label': 'Map of the drive. Arrow keys pan, plus and minus zoom, 0 shows all, Enter '
@@ -37,12 +33,11 @@ function showMap() {
   const below = new Painted({padding: 0.25, paint: (...of) => {
     paintLayers(layers, ...of);
     // of two canvases the upper one hides the other on paper
-    if (document.documentElement.classList.contains('paper')) paintFocus(path, ...of);
+    if (isPaper()) paintFocus(path, ...of);
   }}).addTo(map);
   const above = new Painted({padding: 0, paint: (...of) => paintFocus(path, ...of)}).addTo(map);
   L.control.scale({imperial: false, position: 'bottomright'}).addTo(map);
-  const axes = DATA.axes || ['x', 'y'];
-  stage.append(make('p', {class: 'axes'}, `↑ ${axes[1]} [m] → ${axes[0]} [m]`));
+  stage.append(make('p', {class: 'axes'}, `↑ ${DATA.axes[1]} [m] → ${DATA.axes[0]} [m]`));
   stage.querySelector('.leaflet-control-zoom').append(make('a', {href: '#', role: 'button',
     title: 'Show all', 'aria-label': 'Show all', onclick: (event) => {
       event.preventDefault();
@@ -51,36 +46,34 @@ function showMap() {
   const tell = () => {
     const {lng, lat} = map.getCenter();
     stage.dataset.view = `${lng} ${lat} ${2 ** map.getZoom()}`;
-    above.repaint();
+    above._update();
   };
   map.on('move zoom', tell);
   tell();
   repaints.push(() => {
     map.invalidateSize({animate: false});
-    below.repaint();
-    above.repaint();
+    below._update();
+    above._update();
   });
   // what was shown as a whole stays so; as long as a page is changed for paper, see `printWhole`
   map.on('resize', ({newSize}) => {
-    const printed = document.documentElement.classList.contains('paper');
-    if (map.getZoom() === fitted && newSize.x > 100 && !printed) fit();
+    if (map.getZoom() === fitted && newSize.x > 100 && !isPaper()) fit();
   });
 
-  const tick = showLayers(side, layers, () => below.repaint());
+  const tick = showLayers(side, layers, () => below._update());
   const choose = (item) => {
     const layer = layers.find((each) => (each.items || []).includes(item));
     layer.shown = true;
-    if (layer.states) layer.states.add(item.shown);
+    if (layer.states) layer.states.add(item.state);
     tick();
-    below.repaint();
+    below._update();
     lookAtItem(item);
     lookAtTime(item.times[item.times.length - 1]);
     const [x, y] = middleOf(item.ends);
     const apart = Math.max(...item.ends.map((end) => Math.hypot(end[0] - x, end[1] - y)));
     const half = Math.max(1.4 * apart, Math.min(0.06 * (box.getEast() - box.getWest()), 60), 2);
-    const zoom = Math.log2(Math.min(stage.clientWidth, stage.clientHeight) / 2 / half);
-    map.setView([y, x], zoom, {animate: !CALM.matches});
-    bringIntoView(stage, 'nearest');
+    map.fitBounds([[y - half, x - half], [y + half, x + half]], {animate: !CALM.matches});
+    stage.scrollIntoView({block: 'nearest'});
   };
   const shown = () => layers.filter((layer) => layer.shown);
   const pick = ({lng, lat}, pixels) => {
@@ -89,7 +82,7 @@ function showMap() {
     if (!item) return;
     lookAtTime(item.times[item.times.length - 1]);
     const panel = document.getElementById('panel');
-    if (panel.getBoundingClientRect().top > window.innerHeight - 120) bringIntoView(panel, 'nearest');
+    if (panel.getBoundingClientRect().top > window.innerHeight - 120) panel.scrollIntoView({block: 'nearest'});
   };
   map.on('click', ({latlng, originalEvent: {pointerType}}) => pick(
     latlng, pointerType === 'touch' || pointerType === 'pen' ? 18 : 9));
@@ -105,14 +98,14 @@ function showMap() {
     stage.classList.toggle('on-item', item !== null);
     if (!item) label.remove();
     else label.setLatLng(latlng).setContent(make('span', {}, make('b', {}, item.id || item.source),
-      make('br'), item.spring ? 'spring' : STATES[item.shown])).addTo(map);
+      make('br'), item.spring ? 'spring' : STATES[item.state])).addTo(map);
     lookAtTime(timeAt(path, latlng, 14 / scale));
   });
   map.on('mouseout', () => label.remove());
   scrollBeforeZoom(map, stage);
   printWhole(map);
-  followers.time.push(() => above.repaint());
-  followers.item.push(() => above.repaint());
+  followers.time.push(() => above._update());
+  followers.item.push(() => above._update());
   showTime(main, path);
   makePanel(side, choose);
   const tables = [...(DATA.fixes || []), ...(DATA.closures || [])];
@@ -128,62 +121,44 @@ function showMap() {
 /** The box that shows the path and the truth as a whole. */
 function boxOf(layers) {
   const lines = layers.filter(({id}) => id === 'corrected' || id === 'truth').map(({line}) => line);
-  const [[left, right], [bottom, top]] = ['x', 'y'].map((name) => extent(...lines.map(
-    (line) => line[name])));
-  const room = Math.max(0.03 * Math.max(right - left, top - bottom), 0.5);
-  return L.latLngBounds([bottom - room, left - room], [top + room, right + room]);
+  return L.latLngBounds(lines.flatMap(({x, y}) => x.map((each, k) => [y[k], each]))).pad(0.03);
 }
 
 /** The wheel zooms, unless it has begun to scroll the page before the map came under it. */
-function scrollBeforeZoom(map, stage) {
-  let waiting = null;
-  window.addEventListener('wheel', ({target}) => {
-    if (stage.contains(target) && waiting === null) return;
-    map.scrollWheelZoom.disable();
-    clearTimeout(waiting);
-    waiting = setTimeout(() => {
-      waiting = null;
-      map.scrollWheelZoom.enable();
-    }, 200);
+function scrollBeforeZoom({scrollWheelZoom}, stage) {
+  let last = -Infinity;
+  window.addEventListener('wheel', ({target, timeStamp}) => {
+    const scrolls = !scrollWheelZoom.enabled() && timeStamp - last < 200;
+    scrollWheelZoom[!stage.contains(target) || scrolls ? 'disable' : 'enable']();
+    last = timeStamp;
   }, {passive: true, capture: true});
 }
 
 /** On paper there is the same part of the map, whatever the size of the paper. */
 function printWhole(map) {
   let seen = null;
-  window.addEventListener('beforeprint', () => {
-    seen = [map.getCenter(), map.getZoom()];
+  followers.print.push((begins) => {
     const bounds = map.getBounds();
-    document.documentElement.classList.add('paper');
+    if (begins) seen = [map.getCenter(), map.getZoom()];
     map.invalidateSize({animate: false});
-    map.fitBounds(bounds, {animate: false});
-  });
-  window.addEventListener('afterprint', () => {
-    document.documentElement.classList.remove('paper');
-    map.invalidateSize({animate: false});
-    map.setView(...seen, {animate: false});
+    if (begins) map.fitBounds(bounds, {animate: false});
+    else map.setView(...seen, {animate: false});
   });
 }
 
 // --- items and layers ---------------------------------------------------------------------------
 
-/** A fix or a closure; `shown` is the state as which it is painted. */
+/** A fix or a closure. */
 function itemOf(kind, source, k) {
   const column = (name) => (source[name] ? source[name][k] : null);
-  const why = column('why');
-  const heldOut = Boolean(column('held_out'));
-  const item = {
-    kind, source: source.source, state: column('state'), id: column('id'), distance: column('d'),
-    reason: why === null || why < 0 ? null : DATA.texts[why], heldOut,
-    shown: heldOut ? HELD_OUT : column('state')};
-  if (kind === 'closure') {
-    return {...item, times: [column('t0'), column('t1')],
-      ends: [[column('x0'), column('y0')], [column('x1'), column('y1')]]};
-  }
-  const at = column('at');
+  const [why, at] = [column('why'), column('at')];
   const {x, y} = DATA.lines.corrected;
-  return {...item, times: [column('t')], ends: [[column('x'), column('y')]],
-    tie: known(at) && at >= 0 ? [x[at], y[at]] : null};
+  return {
+    kind, source: source.source, state: column('state'), id: column('id'), distance: column('d'),
+    reason: why < 0 ? null : DATA.texts[why], ...(kind === 'closure' ? {
+      times: [column('t0'), column('t1')],
+      ends: [[column('x0'), column('y0')], [column('x1'), column('y1')]]} : {
+      times: [column('t')], ends: [[column('x'), column('y')]], tie: at >= 0 ? [x[at], y[at]] : null})};
 }
 
 function springItem(spring) {
@@ -204,7 +179,7 @@ function makeLayers() {
   const ellipses = DATA.ellipses || {x: []};
   const measurements = (kind, sources) => (sources || []).map((source) => {
     const items = source.state.map((_, k) => itemOf(kind, source, k));
-    const counts = STATES.map((_, state) => items.filter((item) => item.shown === state).length);
+    const counts = STATES.map((_, state) => items.filter((item) => item.state === state).length);
     return {id: `${kind}/${source.source}`, kind, items, counts, count: items.length,
       name: `${kind === 'fix' ? 'fixes' : 'closures'}${sources.length > 1 ? ` ${source.source}` : ''}`,
       states: new Set(STATES.keys()), swatch: {...LOOKS[BELIEVED], dash: kind === 'fix' ? null : []}};
@@ -229,9 +204,9 @@ function nearestItem(layers, x, y, scale, pixels) {
   let [best, found] = [pixels / scale, null];
   for (const {items, states} of layers) {
     for (const item of items || []) {
-      if (states && !states.has(item.shown)) continue;
+      if (states && !states.has(item.state)) continue;
       // what is not believed is wanted more often, and there is less of it
-      const bonus = item.shown === BELIEVED || item.shown === HELD_OUT ? 0 : 3;
+      const bonus = item.state === BELIEVED || item.state === HELD_OUT ? 0 : 3;
       const apart = toSegment(x, y, item.ends[0], item.ends[item.ends.length - 1]) - bonus / scale;
       if (apart < best) [best, found] = [apart, item];
     }
@@ -248,13 +223,10 @@ function toSegment(x, y, [p, q], [r, s]) {
 }
 
 /** When the robot was near a place, if it was. */
-function timeAt(path, {lng, lat}, within) {
-  let [best, found] = [within, null];
-  for (let k = 0; k < path.x.length; k += 1) {
-    const apart = Math.hypot(path.x[k] - lng, path.y[k] - lat);
-    if (apart < best) [best, found] = [apart, path.t[k]];
-  }
-  return found;
+function timeAt({t, x, y}, {lng, lat}, within) {
+  const apart = x.map((each, k) => Math.hypot(each - lng, y[k] - lat));
+  const [nearest] = extent(apart);
+  return nearest < within ? t[apart.indexOf(nearest)] : null;
 }
 
 // --- controls -----------------------------------------------------------------------------------
@@ -332,15 +304,14 @@ const MOST_ENTRIES = 100;
 function makePanel(host, centreOn) {
   const panel = make('div', {class: 'panel card', id: 'panel', 'aria-live': 'polite'});
   host.append(panel);
-  const tag = (state) => make('span', {class: 'state'}, swatch({...lookOf(state), dash: null}),
-    STATES[state] || 'unknown');
   const show = (item) => panel.replaceChildren(...(!item ? [make('p', {class: 'hint'},
     'Click or tap a fix, a closure or a spring on the map to see what is known of it.')] : [
     make('div', {class: 'panel-head'},
       make('h3', {}, KINDS[item.kind], ' ', make('span', {class: 'id'}, item.id || item.source)),
       make('button', {type: 'button', class: 'plain', 'aria-label': 'Close',
         onclick: () => lookAtItem(null)}, '×')),
-    make('p', {}, ...[...new Set([item.state, item.shown])].filter(known).map(tag)),
+    make('p', {}, known(item.state) ? make('span', {class: 'state'},
+      swatch({...lookOf(item.state), dash: null}), STATES[item.state]) : null),
     make('p', {class: 'reason'}, item.reason || ''),
     make('dl', {}, factsOf(item).flatMap(
       ([name, value]) => [make('dt', {}, name), make('dd', {}, value)])),

@@ -7,9 +7,6 @@ const Painted = L.Renderer.extend({
   _initContainer() {
     this._container = make('canvas', {'aria-hidden': 'true'});
   },
-  _destroyContainer() {
-    this._container.remove();
-  },
   /** Leaflet calls this when the map has come to rest. */
   _update() {
     if (this._map._animatingZoom && this._bounds) return;
@@ -31,9 +28,6 @@ const Painted = L.Renderer.extend({
       scale, min, max, visible, place: (x, y) => [x * scale - origin.x, -y * scale - origin.y],
       back: ({x, y}) => [(x + origin.x) / scale, -(y + origin.y) / scale]});
   },
-  repaint() {
-    this._update();
-  },
 });
 
 /** On which sides a place is out of a frame, as bits. */
@@ -47,7 +41,7 @@ function paintLayers(layers, context, frame) {
   const measured = (order) => shown.filter(({counts}) => counts).forEach((layer) => order
     .filter((state) => layer.states.has(state) && layer.counts[state] > 0)
     .forEach((state) => (layer.kind === 'fix' ? paintFixes : paintClosures)(
-      layer.items.filter((item) => item.shown === state), state, context, frame)));
+      layer.items.filter((item) => item.state === state), state, context, frame)));
   for (const layer of shown) {
     if (layer.ellipses) paintEllipses(layer, context, frame);
     if (layer.line && layer.id !== 'corrected') paintPath(layer, context, frame);
@@ -68,22 +62,20 @@ function paintGrid(context, frame, asTexts) {
   const least = 110 / scale;
   const power = 10 ** Math.floor(Math.log10(least));
   const step = [1, 2, 5, 10].map((each) => each * power).find((each) => each >= least);
-  context.strokeStyle = colour('grid');
-  context.lineWidth = 1;
-  context.beginPath();
+  const lines = new Path2D();
   for (let k = Math.ceil(left / step); k <= right / step; k += 1) {
     const u = Math.round(place(k * step, 0)[0]) + 0.5;
-    context.moveTo(u, min.y);
-    context.lineTo(u, max.y);
+    lines.moveTo(u, min.y);
+    lines.lineTo(u, max.y);
     if (asTexts && u > min.x + 130) halo(context, number(k * step, 6), u + 3, max.y - 5);
   }
   for (let k = Math.ceil(bottom / step); k <= top / step; k += 1) {
     const v = Math.round(place(0, k * step)[1]) + 0.5;
-    context.moveTo(min.x, v);
-    context.lineTo(max.x, v);
+    lines.moveTo(min.x, v);
+    lines.lineTo(max.x, v);
     if (asTexts && v < max.y - 30) halo(context, number(k * step, 6), min.x + 6, v - 3);
   }
-  if (!asTexts) context.stroke();
+  if (!asTexts) paint(context, lines, ['grid', 1]);
 }
 
 /** A text that can be read on whatever is below it. */
@@ -96,30 +88,41 @@ function halo(context, text, u, v) {
   context.fillText(text, u, v);
 }
 
-function stroke(context, name, width, places) {
-  context.strokeStyle = colour(name);
-  context.lineWidth = width;
-  context.beginPath();
-  for (const [k, [u, v]] of places.entries()) context[k === 0 ? 'moveTo' : 'lineTo'](u, v);
-  context.stroke();
+/** Paint a shape in some colours, one above the other: lines of a width, or filled if it is 0. */
+function paint(context, shape, ...coats) {
+  context.lineJoin = 'round';
+  for (const [name, width] of coats) {
+    context.strokeStyle = context.fillStyle = colour(name);
+    context.lineWidth = width;
+    context[width > 0 ? 'stroke' : 'fill'](shape);
+  }
+}
+
+function through(places) {
+  const shape = new Path2D();
+  for (const [k, [u, v]] of places.entries()) shape[k === 0 ? 'moveTo' : 'lineTo'](u, v);
+  return shape;
+}
+
+function circle(u, v, radius) {
+  const shape = new Path2D();
+  shape.arc(u, v, radius, 0, 7);
+  return shape;
 }
 
 /** Paint a path, without the points that do not show and the parts that are out of sight. */
 function paintPath({line: {x, y}, look}, context, frame) {
-  context.strokeStyle = colour(look.colour);
-  context.lineWidth = look.width;
-  context.lineJoin = 'round';
-  context.setLineDash(look.dash);
-  context.beginPath();
+  const shape = new Path2D();
   let [p, q, before] = [Infinity, Infinity, 0];
   for (let k = 0; k < x.length; k += 1) {
     const [u, v] = frame.place(x[k], y[k]);
     if (Math.abs(u - p) + Math.abs(v - q) < 1.5 && k < x.length - 1) continue;
     const side = sideOf(frame, u, v);
-    context[k === 0 || (side & before) !== 0 ? 'moveTo' : 'lineTo'](u, v);
+    shape[k === 0 || (side & before) !== 0 ? 'moveTo' : 'lineTo'](u, v);
     [p, q, before] = [u, v, side];
   }
-  context.stroke();
+  context.setLineDash(look.dash);
+  paint(context, shape, [look.colour, look.width]);
   context.setLineDash([]);
 }
 
@@ -151,16 +154,10 @@ function paintEllipses({ellipses: e, factor}, context, frame) {
 /** Paint the mark of a state with a border, which lets it show on lines of any colour. */
 function stamp(state, context, [u, v], size) {
   const {colour: name, shape, open} = lookOf(state);
-  const path = new Path2D(shape);
   context.save();
   context.translate(u, v);
   context.scale(size, size);
-  context.strokeStyle = colour('surface');
-  context.lineWidth = 3.6;
-  context.stroke(path);
-  context.strokeStyle = context.fillStyle = colour(name);
-  context.lineWidth = 1.7;
-  context[open ? 'stroke' : 'fill'](path);
+  paint(context, new Path2D(shape), ['surface', 3.6], [name, open ? 1.7 : 0]);
   context.restore();
 }
 
@@ -185,7 +182,7 @@ function paintClosures(items, state, context, frame) {
     ([one, other]) => (sideOf(frame, ...one) & sideOf(frame, ...other)) === 0);
   context.setLineDash(dash);
   context.globalAlpha = believed ? 0.75 : 1;
-  for (const line of lines) stroke(context, name, believed ? 1.3 : 1.6, line);
+  for (const line of lines) paint(context, through(line), [name, believed ? 1.3 : 1.6]);
   context.setLineDash([]);
   context.globalAlpha = 1;
   if (lines.length > (believed || state === REFUSED ? 150 : 600)) return;
@@ -198,11 +195,8 @@ function paintSprings({items}, context, frame) {
   for (const {ends, spring} of [...items].reverse()) {
     const places = ends.map((end) => frame.place(...end));
     const [u, v] = middleOf(places);
-    stroke(context, 'spring', 4, places);
-    context.fillStyle = colour('spring');
-    context.beginPath();
-    context.arc(u, v, 8.5, 0, 7);
-    context.fill();
+    paint(context, through(places), ['spring', 4]);
+    paint(context, circle(u, v, 8.5), ['spring', 0]);
     context.fillStyle = colour('surface');
     context.fillText(String(spring.rank), u, v + 0.5);
   }
@@ -216,30 +210,15 @@ function paintFocus(path, context, frame) {
   const {x, y, theta} = poseAt(path, focus.time);
   context.translate(...frame.place(x, y));
   context.rotate(-(theta || 0));
-  const shape = new Path2D('M13,0L-8,7.5L-4.5,0L-8,-7.5Z');
-  context.lineJoin = 'round';
-  context.strokeStyle = colour('surface');
-  context.lineWidth = 5;
-  context.stroke(shape);
-  context.fillStyle = colour('ink');
-  context.fill(shape);
+  paint(context, new Path2D('M13,0L-8,7.5L-4.5,0L-8,-7.5Z'), ['surface', 5], ['ink', 0]);
 }
 
 /** A frame around what is chosen, and a line from a fix to where the robot was. */
 function paintChosen(item, context, frame) {
   const places = item.ends.map((end) => frame.place(...end));
-  const name = item.spring ? 'spring' : lookOf(item.shown).colour;
-  if (item.tie) stroke(context, name, 1.5, [places[0], frame.place(...item.tie)]);
-  stroke(context, 'surface', 9, places);
-  stroke(context, name, 4.5, places);
-  for (const [u, v] of places) {
-    for (const [ring, width] of [['surface', 6], ['ink', 2.4]]) {
-      context.strokeStyle = colour(ring);
-      context.lineWidth = width;
-      context.beginPath();
-      context.arc(u, v, 10, 0, 7);
-      context.stroke();
-    }
-  }
-  if (!item.spring) stamp(item.shown, context, middleOf(places), 1.3);
+  const name = item.spring ? 'spring' : lookOf(item.state).colour;
+  if (item.tie) paint(context, through([places[0], frame.place(...item.tie)]), [name, 1.5]);
+  paint(context, through(places), ['surface', 9], [name, 4.5]);
+  for (const [u, v] of places) paint(context, circle(u, v, 10), ['surface', 6], ['ink', 2.4]);
+  if (!item.spring) stamp(item.state, context, middleOf(places), 1.3);
 }

@@ -54,8 +54,7 @@ function showFindings() {
       make('span', {}, make('b', {class: 'unseen'}, `${LEVELS[name][0]}: `), text),
       anchor ? linkTo(anchor, 'Show') : null);
   }));
-  const count = good.length === 1 ? '1 thing is as it should be'
-    : `${good.length} things are as they should be`;
+  const count = `${counted(good.length, 'thing is as it', 'things are as they')} should be`;
   document.getElementById('main').append(
     make('div', {id: 'findings', role: 'region', 'aria-label': 'Findings'},
       others.length > 0 ? list(others) : null,
@@ -67,20 +66,18 @@ function showFindings() {
 /** Position and heading errors over time with what was claimed of them, and the table of errors. */
 function showErrors() {
   const {errors} = DATA;
-  const host = section('errors', 'Errors over time', errors && errors.t.length > 0
+  const host = section('errors', 'Errors over time', errors
     ? `Distance to ${errors.against === 'truth' ? 'the truth' : errors.against}. The band is what `
       + 'the covariances claim: 95 % of errors should be in it.' : null);
-  if (errors && errors.t.length > 0) showErrorCharts(charts(host, 'wide'), errors);
+  if (errors) showErrorCharts(charts(host, 'wide'), errors);
   else host.append(nothing('No errors over time: the run had no truth, and no fixes were held out '
     + '(--truth, --hold-out).'));
   const rows = DATA.error_table || [];
-  const heads = Object.entries({median: 'median', rms: 'rms', p95: '95 %', maximum: 'largest',
-    count: 'of'}).filter(([name]) => rows.some((row) => known(row[name])));
-  const cell = (row, name) => (name === 'count' || !known(row[name]) ? number(row[name], 6)
-    : row[name].toFixed(2) + (row.unit === 'deg' ? '°' : ''));
   if (rows.length > 0) {
-    host.append(table('errors card', ['distance [m]', ...heads.map(([, head]) => head)],
-      rows.map((row) => [row.name, ...heads.map(([name]) => cell(row, name))])));
+    host.append(table('errors card', ['distance [m]', 'median', 'rms', '95 %', 'largest', 'of'],
+      rows.map(({name, unit, median, rms, p95, maximum, count}) => [
+        name, ...[median, rms, p95, maximum].map((size) => (
+          known(size) ? size.toFixed(2) + (unit === 'deg' ? '°' : '') : '–')), number(count, 6)])));
   }
 }
 
@@ -89,10 +86,8 @@ function showErrorCharts(host, {t, position, odometry, sigma, heading}) {
   const log = top(odometry) > 5 * top(position);
   const floor = log ? Math.max(0.002, top(position) / 300) : 0;
   const claimed = (sigma || []).map((each) => (known(each) ? 2 * each : null));
-  const series = [{name: 'corrected path', y: position, colour: 'path', width: 2}];
-  if (odometry) {
-    series.push({name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]});
-  }
+  const series = [{name: 'corrected path', y: position, colour: 'path', width: 2},
+    {name: 'odometry, aligned', y: odometry, colour: 'odometry', dash: [6, 4]}];
   if (sigma) {
     series.push({name: 'claimed, 2 sigma', y: claimed, colour: 'path', width: 0.5},
       {y: claimed.map((each) => (each === null ? null : floor / 2)), colour: 'path', width: 0});
@@ -113,7 +108,6 @@ function showSources() {
     + 'optimisation takes up. A ratio of 2 says that sigmas are half of what they should be; an '
     + 'interval with 1 in it, that nothing is wrong with them.');
   const sources = DATA.sources || [];
-  if (sources.length === 0) host.append(nothing('No residuals: nothing was measured.'));
   sources.forEach((source) => showSource(host, source));
 }
 
@@ -130,7 +124,7 @@ function showSource(host, source) {
     energy && known(energy.quantile95_share)
       && `${number(100 * energy.quantile95_share)} % within their 95 % bound`];
   const card = make('article', {
-    class: 'card source', id: `source-${name}`, tabindex: '-1', 'aria-label': `Source ${name}`},
+    class: 'card source', id: `source-${name}`, 'aria-label': `Source ${name}`},
   make('h3', {}, name, ' ', make('span', {class: 'kind'}, String(kind || '').replace(/_/g, ' '))),
   make('p', {class: 'verdict'}, verdict || ''),
   make('p', {class: 'numbers'}, numbers.filter((text) => text).join(' · ')));
@@ -138,7 +132,7 @@ function showSource(host, source) {
   if (rows.length === 0) card.append(nothing('None of them is in the graph, so there are no residuals.'));
   else card.append(table('ratios', ['component', 'expected', 'found', 'ratio', '95 % interval'],
     rows.map((row) => [[row.name, make('small', {}, ` ${counted(row.count, 'residual')}`)],
-      number(row.expected), number(row.found), [make('b', {}, number(row.ratio)), ratioPicture(row)],
+      number(row.expected), number(row.found), make('b', {class: signOf(row)}, number(row.ratio)),
       known(row.low) ? `${number(row.low, 2)} – ${number(row.high, 2)}` : '–'])));
   if (!series || series.t.length === 0) return;
   const row = charts(card, '');
@@ -151,17 +145,9 @@ function showSource(host, source) {
   showAutocorrelation(row, source);
 }
 
-/** The ratio on a logarithmic axis from 1/5 to 5: a dot, its interval, and 1. */
-function ratioPicture({ratio, low, high}) {
-  const at = (value) => 4 + 112 * Math.min(1, Math.max(0, 0.5 + Math.log(value) / Math.log(25)));
-  const sign = !known(low) || (low <= 1 && high >= 1) ? 'believed' : (low > 1 ? 'doubted' : 'waiting');
-  return draw('svg', {class: 'ratio-picture', viewBox: '0 0 120 18', 'aria-hidden': 'true'},
-    draw('path', {d: 'M4,9H116M60,2V16', stroke: 'var(--muted)'}),
-    known(low) && low > 0 ? draw('rect', {x: at(low), width: Math.max(at(high) - at(low), 2), y: 4,
-      height: 10, rx: 2, fill: 'var(--believed)', 'fill-opacity': 0.4}) : null,
-    known(ratio) && ratio > 0
-      ? draw('circle', {cx: at(ratio), cy: 9, r: 5, fill: `var(--${sign})`}) : null);
-}
+/** Whether the interval of a ratio has 1 in it, or says that sigmas are too small or too large. */
+const signOf = ({low, high}) => (!known(low) || (low <= 1 && high >= 1) ? ''
+  : (low > 1 ? 'too-small' : 'too-large'));
 
 function noChart(host, title, why) {
   host.append(make('figure', {class: 'chart'}, make('figcaption', {}, title), nothing(why)));
@@ -169,10 +155,9 @@ function noChart(host, title, why) {
 
 function showHistogram(host, {histogram}) {
   const title = 'How large they are';
-  if (!histogram || histogram.count.length === 0) {
-    noChart(host, title, 'The optimum follows this source wherever it leads, so that its residuals '
-      + 'say nothing.');
-    return;
+  if (!histogram) {
+    return noChart(host, title, 'The optimum follows this source wherever it leads, so that its '
+      + 'residuals say nothing.');
   }
   const {edges, count} = histogram;
   const wide = edges[1] - edges[0];
@@ -180,7 +165,7 @@ function showHistogram(host, {histogram}) {
   const values = count.map((_, k) => edges[k] + wide / 2);
   const normal = values.map((value) => (
     total * wide * Math.exp(-0.5 * value * value)) / Math.sqrt(2 * Math.PI));
-  makeChart(host, {title, note: 'Larger ones are counted in the outermost bars.',
+  return makeChart(host, {title, note: 'Larger ones are counted in the outermost bars.',
     x: {label: 'residual / expected', values, range: [edges[0], edges[edges.length - 1]]},
     y: {label: 'count'}, series: [{kind: 'bars', name: 'found', y: count, colour: 'path'},
       {name: 'normal, as claimed', y: normal, colour: 'odometry'}]});
@@ -188,9 +173,8 @@ function showHistogram(host, {histogram}) {
 
 function showAutocorrelation(host, {autocorrelation}) {
   const title = 'How long they keep their direction';
-  if (!autocorrelation || autocorrelation.lag.length === 0) {
-    noChart(host, title, 'There are too few residuals, or they say nothing.');
-    return;
+  if (!autocorrelation) {
+    return noChart(host, title, 'There are too few residuals, or they say nothing.');
   }
   const {lag, value, band, fitted, time, in_use: inUse} = autocorrelation;
   const last = lag[lag.length - 1];
@@ -206,7 +190,7 @@ function showAutocorrelation(host, {autocorrelation}) {
   const rules = [{at: time, name: `suggests ${number(time)} s`, colour: 'doubted'},
     {at: inUse, name: `in use ${number(inUse)} s`, dash: [2, 3], colour: 'held-out'}]
     .filter(({at}) => known(at) && at > 0).map((rule) => ({of: 'x', ...rule}));
-  makeChart(host, {title, series, rules, y: {label: 'autocorrelation'},
+  return makeChart(host, {title, series, rules, y: {label: 'autocorrelation'},
     band: known(band) ? [series.length - 1, series.length] : null,
     x: {label: log ? 'lag [s], logarithmic' : 'lag [s]', values: lag, log,
       range: log ? null : [0, farthest]},
@@ -220,11 +204,10 @@ function showSprings(choose) {
     'Constraints as springs between poses: the energy is what each adds to chi2, and the mark in '
     + 'its bar is what it adds on average if its covariance is right.');
   if (springItems.length === 0) {
-    host.append(nothing('None: the graph has no constraints with a residual.'));
-    return;
+    return host.append(nothing('None: the graph has no constraints with a residual.'));
   }
   const [, most] = extent(...springItems.map(({spring}) => [spring.energy, spring.expected, 1e-9]));
-  host.append(make('ol', {class: 'springs card'}, springItems.map((item) => {
+  return host.append(make('ol', {class: 'springs card'}, springItems.map((item) => {
     const {rank, name, kind, energy, expected, text} = item.spring;
     const bar = (height, x, width, fillName) => draw('rect', {
       x: `${(100 * x) / most}%`, width, height, y: (10 - height) / 2, fill: `var(--${fillName})`});
@@ -247,10 +230,7 @@ function showUpdates() {
     ? `${counted(updates.count || updates.t.length, 'update')}: half took less than ${
       number(share(0.5))} ms, 95 % less than ${number(share(0.95))} ms, the longest ${
       number(share(1))} ms.` : null);
-  if (!updates || updates.t.length === 0) {
-    host.append(nothing('No updates were recorded in this run.'));
-    return;
-  }
+  if (!updates) return host.append(nothing('No updates were recorded in this run.'));
   const axis = (label, column) => {
     const found = extent((column || []).filter((value) => value > 0));
     const log = found !== null && found[1] > 20 * found[0];
@@ -261,7 +241,7 @@ function showUpdates() {
     series: [{kind: 'dots', y: updates.ms, colour: 'path', name: 'update [ms]'}],
     rules: known(updates.period) && updates.period < 20 * share(1) ? [{of: 'y', at: updates.period,
       colour: 'doubted', dash: [6, 4], name: `period of the node, ${number(updates.period)} ms`}] : []});
-  makeChart(row, {title: 'chi2 of the graph', x: timeAxis(updates.t),
+  return makeChart(row, {title: 'chi2 of the graph', x: timeAxis(updates.t),
     y: axis('chi2, nodes', updates.chi2), series: [
       {y: updates.chi2, colour: 'odometry', name: 'chi2'},
       {y: updates.nodes, colour: 'path', dash: [6, 4], name: 'hidden nodes',
@@ -273,7 +253,6 @@ function showSparsity() {
   const host = section('sparsity', 'Sparsity of H and of its factor',
     'Each node is a row and a column. What the order of elimination leaves empty costs no time.');
   const matrices = DATA.sparsity || [];
-  if (matrices.length === 0) host.append(nothing('No matrices: the graph of this run is not there any more.'));
   const row = charts(host, 'wide');
   for (const {title, size, nonzeros, fill: filled, bins, cells} of matrices) {
     const caption = [`${number(size, 6)} × ${number(size, 6)} blocks`,
@@ -293,20 +272,19 @@ function showSparsity() {
 }
 
 // on paper the page is light and has all findings, whatever it is on the screen
-let onScreen = null;
-let folded = [];
-window.addEventListener('beforeprint', () => {
-  onScreen = document.documentElement.dataset.scheme;
-  folded = [...document.querySelectorAll('details.good:not([open])')];
-  for (const each of folded) each.open = true;
-  document.documentElement.classList.add('paper');
-  setScheme('light');
-});
-window.addEventListener('afterprint', () => {
-  document.documentElement.classList.remove('paper');
-  for (const each of folded) each.open = false;
-  setScheme(onScreen);
-});
+let [onScreen, folded] = [null, []];
+const print = (begins) => {
+  document.documentElement.classList.toggle('paper', begins);
+  if (begins) {
+    onScreen = document.documentElement.dataset.scheme;
+    folded = [...document.querySelectorAll('details.good:not([open])')];
+  }
+  for (const each of folded) each.open = begins;
+  for (const follow of followers.print) follow(begins);
+  setScheme(begins ? 'light' : onScreen);
+};
+window.addEventListener('beforeprint', () => print(true));
+window.addEventListener('afterprint', () => print(false));
 
 showHead();
 const choose = showMap();

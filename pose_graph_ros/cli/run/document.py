@@ -13,7 +13,7 @@ import numpy as np
 from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.places import number, rounded
-from pose_graph_ros.cli.run.recorder import Run
+from pose_graph_ros.cli.run.recorder import Run, thinned
 from pose_graph_ros.cli.run.sources import analyse, source_entry, springs
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.graph.graph import Graph
@@ -79,13 +79,15 @@ def document(run: Run) -> dict[str, Any]:
         'sources': [source_entry(each, frame) for each in analyses.values()],
         'springs': springs(run.backend, path, analysis.residuals, run.verdicts, frame),
         'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
-        'texts': frame.texts}
+        'texts': list(frame.texts)}
 
 
-def write_document(run: Run, folder: Path) -> None:
-    """Write run.json into a folder."""
-    text = json.dumps(document(run), allow_nan=False, separators=(',', ':'), ensure_ascii=False)
+def write_document(run: Run, folder: Path) -> dict[str, Any]:
+    """Return the JSON object of a run, after writing it into a folder as run.json."""
+    data = document(run)
+    text = json.dumps(data, allow_nan=False, separators=(',', ':'), ensure_ascii=False)
     (folder / FILE).write_text(text + '\n', encoding='utf-8')
+    return data
 
 
 def _utc(stamp_ns: int) -> str | None:
@@ -106,8 +108,7 @@ def _facts(run: Run) -> list[dict[str, str]]:
     path = drive.corrected
     duration = float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9
     travelled = float(np.sum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T)))
-    updates = run.recorder.log
-    longest = max((each.milliseconds for each in updates.updates), default=None)
+    longest = max((each.milliseconds for each in run.recorder.updates), default=None)
     freedom = _freedom(run.backend.graph)
     facts = [
         ('duration', _clock(duration), ''), ('distance', _metres(travelled), 'of the path'),
@@ -129,7 +130,7 @@ def _facts(run: Run) -> list[dict[str, str]]:
         facts.append(('time to run', f'{run.seconds:.1f} s',
                       f'{duration / run.seconds:.0f} times as fast as driven'))
     if longest is not None:
-        facts.append(('longest update', f'{longest:.1f} ms', f'of {updates.count}'))
+        facts.append(('longest update', f'{longest:.1f} ms', f'of {run.recorder.n_updates}'))
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
 
 
@@ -156,14 +157,14 @@ def _metres(metres: float) -> str:
 
 def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
     """Return the updates as columns; None if none was recorded."""
-    updates = run.recorder.log.updates
-    if len(updates) == 0:
+    if len(run.recorder.updates) == 0:
         return None
-    stamps, nodes, milliseconds, chi2, iterations = zip(*updates, strict=True)
+    stamps, nodes, milliseconds, chi2, iterations = zip(
+        *thinned(run.recorder.updates), strict=True)
     return {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
             'ms': rounded(milliseconds, 2), 'chi2': [number(each, 6) for each in chi2],
             'iterations': None if min(iterations) < 0 else list(iterations),
-            'count': run.recorder.log.count,
+            'count': run.recorder.n_updates,
             'period': number(1e3 / float(run.values['frequency']))}
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.run.recorder import Recorder, Run
+from pose_graph_ros.cli.run.recorder import Recorder, Run, silent
 from pose_graph_ros.cli.run.sources import claim, SourceAnalysis, WRONG
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
@@ -159,7 +159,7 @@ def _disagreements(run: Run) -> Iterator[Finding]:
 
 def _updates(run: Run) -> Iterator[Finding]:
     """Yield what concerns the times of updates."""
-    updates = run.recorder.log.updates
+    updates = run.recorder.updates
     period = 1e3 / float(run.values['frequency'])
     slow = [each for each in updates if each.milliseconds > period]
     worst = max(slow, key=lambda each: each.milliseconds, default=None)
@@ -167,7 +167,7 @@ def _updates(run: Run) -> Iterator[Finding]:
     if worst is not None and (len(slow) > 2 or worst.milliseconds > 5.0 * period):
         at = (worst.stamp_ns - run.start_ns) * 1e-9
         yield Finding(
-            'notice', f'{len(slow)} of {run.recorder.log.count} updates took longer than their '
+            'notice', f'{len(slow)} of {run.recorder.n_updates} updates took longer than their '
             f'period of {period:.0f} ms, the longest {worst.milliseconds:.0f} ms at {at:.0f} s '
             f'with {worst.nodes} nodes; a window bounds them (window.seconds)', 'updates')
 
@@ -323,19 +323,19 @@ def silences(
     recorder: Recorder, kinds: Mapping[str, Kind], start_ns: StampNs,
 ) -> Iterator[Finding]:
     """Yield silences of odometry, and of fixes and global poses."""
-    for source, arrivals in recorder.arrivals.items():
+    for source, stamps_ns in recorder.stamps_ns.items():
         kind = kinds.get(source)
         moves = kind in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO)
         if not moves and kind not in (Kind.FIX, Kind.GLOBAL_POSE):
             continue
-        gaps = arrivals.gaps(0.5 if moves else 4.0, periods=8.0) - start_ns * 1e-9
+        gaps = silent(stamps_ns, 0.5 if moves else 4.0) - start_ns * 1e-9
         if len(gaps) == 0:
             continue
         lengths = gaps[:, 1] - gaps[:, 0]
         told = gaps[np.sort(np.argsort(-lengths, kind='stable')[:MOST_TOLD])]
         where = ', '.join(f'{begin:.1f} to {end:.1f} s' for begin, end in told.tolist())
         more = f' and {len(gaps) - len(told)} more' if len(gaps) > len(told) else ''
-        others = any(each.is_odometry and name != source and name in recorder.arrivals
+        others = any(each.is_odometry and name != source and name in recorder.stamps_ns
                      for name, each in kinds.items())
         what = ('the path follows odometry there, and its covariance grows' if not moves else
                 'the heading there is that of other sources' if kind is Kind.GYRO else

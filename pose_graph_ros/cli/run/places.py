@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map of a run: paths, ellipses, fixes, closures and what is believed of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 import math
 from typing import Any
@@ -29,8 +29,6 @@ MOST_OF_SOURCE = 20_000  # fixes or loop closures; half are kept for those not b
 def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
     """Return values as a list for JSON, None for those that are not finite."""
     array = np.round(np.asarray(values, dtype=np.float64), digits) + 0.0
-    if np.all(np.isfinite(array)):
-        return list(array.tolist())
     as_objects = array.astype(object)
     as_objects[~np.isfinite(array)] = None
     return list(as_objects.tolist())
@@ -88,8 +86,7 @@ class Frame:
 
     start_ns: StampNs
     offset: FloatArray  # (2,) [m]
-    texts: list[str] = field(default_factory=list)
-    _known: dict[str, int] = field(default_factory=dict)
+    texts: dict[str, int] = field(default_factory=dict)  # with their numbers, which are in order
 
     def seconds(self, stamps_ns: IntArray) -> list[float]:
         """Return stamps as seconds since the start."""
@@ -102,12 +99,7 @@ class Frame:
 
     def text(self, text: str) -> int:
         """Return the number of a text; -1 for an empty one."""
-        if text == '':
-            return -1
-        if text not in self._known:
-            self._known[text] = len(self.texts)
-            self.texts.append(text)
-        return self._known[text]
+        return -1 if text == '' else self.texts.setdefault(text, len(self.texts))
 
 
 def lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
@@ -143,35 +135,49 @@ def ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[s
                for name, row, column in (('xx', 0, 0), ('xy', 0, 1), ('yy', 1, 1))}}
 
 
+def _by_source(sources: Sequence[str], stamps: IntArray) -> Iterator[tuple[str, IntArray]]:
+    """Yield sources with the rows of their measurements, by stamp."""
+    for source in dict.fromkeys(sources):
+        rows = np.flatnonzero(np.asarray(sources) == source)
+        yield source, rows[np.argsort(stamps[rows], kind='stable')]
+
+
+def _judged(
+    verdicts: Sequence[Verdict | None], states: Sequence[int], whys: Sequence[str], frame: Frame,
+) -> dict[str, Any]:
+    """Return the columns of what is believed, and why not."""
+    return {'state': list(states), 'why': [frame.text(why) for why in whys],
+            'id': ['' if each is None else each.id for each in verdicts],
+            # when they were judged [sigma]
+            'd': rounded([np.nan if each is None else each.distance for each in verdicts], 2)}
+
+
 def fixes(
     drive: Drive, verdicts: Sequence[Verdict], at_ns: IntArray, frame: Frame,
 ) -> list[dict[str, Any]]:
     """Return the fixes and global poses of each source; `at_ns` are stamps of the path."""
     known = {(each.source, each.stamp_ns): each for each in verdicts if each.reference_ns is None}
-    sources = np.array(drive.fix_sources or ['fix'] * len(drive.fix_stamps_ns), dtype=str)
-    refused = (np.zeros_like(drive.fix_held_out) if drive.fix_refused is None
-               else drive.fix_refused)
+    refused = drive.fix_kinds['refused']
     found = []
-    for source in dict.fromkeys(sources.tolist()):
-        every = np.flatnonzero(sources == source)
-        every = every[np.argsort(drive.fix_stamps_ns[every], kind='stable')]
-        judged = [known.get((source, stamp)) for stamp in drive.fix_stamps_ns[every].tolist()]
-        states = [HELD_OUT if out else REFUSED if no else _state(verdict)
-                  for out, no, verdict in zip(drive.fix_held_out[every].tolist(),
-                                              refused[every].tolist(), judged, strict=True)]
-        shown = _shown(states)
-        rows, judged = every[shown], [judged[k] for k in shown.tolist()]
-        states = [states[k] for k in shown.tolist()]
+    sources = drive.fix_sources or ['fix'] * len(drive.fix_stamps_ns)
+    for source, every in _by_source(sources, drive.fix_stamps_ns):
+        states = np.select([drive.fix_held_out[every], refused[every]], [HELD_OUT, REFUSED], [
+            _state(known.get((source, stamp))) for stamp in drive.fix_stamps_ns[every].tolist()])
+        some = _shown(states)
+        rows, states = every[some], states[some]
+        stamps = drive.fix_stamps_ns[rows]
+        judged = [known.get((source, stamp)) for stamp in stamps.tolist()]
         x, y = frame.places(drive.fix_positions[rows])
+        columns = _judged(judged, states.tolist(), [
+            '' if verdict is None or state in (BELIEVED, HELD_OUT)
+            else sentence(verdict, frame.start_ns)
+            for verdict, state in zip(judged, states.tolist(), strict=True)], frame)
         found.append({
-            'source': source, 'left_out': len(every) - len(rows),
-            't': frame.seconds(drive.fix_stamps_ns[rows]), 'x': x, 'y': y, 'state': states,
-            'why': [-1 if verdict is None or state in (BELIEVED, HELD_OUT)
-                    else frame.text(sentence(verdict, frame.start_ns))
-                    for verdict, state in zip(judged, states, strict=True)],
+            'source': source, 'left_out': len(every) - len(rows), 't': frame.seconds(stamps),
+            'x': x, 'y': y,
+            **columns, 'id': columns['id'] if any(judged) else None,
             'held_out': drive.fix_held_out[rows].astype(int).tolist(),
-            'id': _ids(judged) if any(judged) else None, 'd': _sigmas(judged),
-            'at': _nearest(drive.fix_stamps_ns[rows], at_ns)})
+            'at': _nearest(stamps, at_ns)})
     return found
 
 
@@ -180,45 +186,29 @@ def closures(
 ) -> list[dict[str, Any]]:
     """Return the loop closures of each source, in the order of their later ends."""
     known = {(each.source, each.stamp_ns, each.reference_ns): each for each in verdicts}
-    sources = np.array(
-        drive.loop_sources or ['loop_closure'] * len(drive.loop_stamps_ns), dtype=str)
     found = []
-    for source in dict.fromkeys(sources.tolist()):
-        rows = np.flatnonzero(sources == source)
-        stamps = drive.loop_stamps_ns[rows[np.argsort(
-            drive.loop_stamps_ns[rows, 1], kind='stable')]]
-        keys = [(source, later, earlier) for earlier, later in stamps.tolist()]
-        states = [REFUSED if key in refused and key not in known else _state(known.get(key))
-                  for key in keys]
-        shown = _shown(states)
-        keys, ends = [keys[k] for k in shown.tolist()], np.sort(stamps[shown], axis=1)
+    sources = drive.loop_sources or ['loop_closure'] * len(drive.loop_stamps_ns)
+    for source, rows in _by_source(sources, drive.loop_stamps_ns[:, 1]):
+        keys = [(source, later, earlier) for earlier, later in drive.loop_stamps_ns[rows].tolist()]
+        states = np.array([REFUSED if key in refused and key not in known
+                           else _state(known.get(key)) for key in keys], dtype=np.int64)
+        some = _shown(states)
+        keys, ends = [keys[k] for k in some], np.sort(drive.loop_stamps_ns[rows[some]], axis=1)
         judged = [known.get(key) for key in keys]
-        places = drive.corrected.at(
-            np.clip(ends, *drive.corrected.stamps_ns[[0, -1]]))[:, :, :2]
+        path = drive.corrected
+        places = path.at(np.clip(ends, *path.stamps_ns[[0, -1]]))[:, :, :2]
         (x0, y0), (x1, y1) = frame.places(places[:, 0]), frame.places(places[:, 1])
         found.append({
             'source': source, 'left_out': len(rows) - len(keys),
             't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
-            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1,
-            'state': [states[k] for k in shown.tolist()],
-            'why': [frame.text(refused.get(key, '') if verdict is None
-                               else sentence(verdict, frame.start_ns))
-                    for key, verdict in zip(keys, judged, strict=True)],
-            'id': _ids(judged), 'd': _sigmas(judged)})
+            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, **_judged(judged, states[some].tolist(), [
+                refused.get(key, '') if verdict is None else sentence(verdict, frame.start_ns)
+                for key, verdict in zip(keys, judged, strict=True)], frame)})
     return found
 
 
 def _state(verdict: Verdict | None) -> int:
     return BELIEVED if verdict is None else STATES.index(verdict.state.value)
-
-
-def _ids(verdicts: Sequence[Verdict | None]) -> list[str]:
-    return ['' if each is None else each.id for each in verdicts]
-
-
-def _sigmas(verdicts: Sequence[Verdict | None]) -> list[float | None]:
-    """Return the distances when they were judged [sigma]."""
-    return rounded([np.nan if each is None else each.distance for each in verdicts], 2)
 
 
 def errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, Any] | None:
@@ -229,16 +219,16 @@ def errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, An
     """
     path, truth, odometry = drive.corrected, drive.truth, drive.placed_odometry
     if truth is not None:
-        stamps = truth.stamps_ns[path.covers(truth.stamps_ns)]
-        against, places = 'truth', truth.at(stamps) if len(stamps) > 0 else np.empty((0, 3))
+        against, stamps, places = 'truth', truth.stamps_ns, truth.poses
     else:
-        out = drive.fix_held_out & path.covers(drive.fix_stamps_ns)
-        order = np.argsort(drive.fix_stamps_ns[out], kind='stable')
-        stamps = drive.fix_stamps_ns[out][order]
-        against, places = 'held-out fixes', drive.fix_positions[out][order]
-    if len(stamps) == 0:
+        order = np.argsort(drive.fix_stamps_ns, kind='stable')
+        order = order[drive.fix_held_out[order]]
+        against, stamps, places = (
+            'held-out fixes', drive.fix_stamps_ns[order], drive.fix_positions[order])
+    inside = np.flatnonzero(path.covers(stamps))
+    if len(inside) == 0:
         return None
-    some = spread(len(stamps), 2000)
+    some = inside[spread(len(inside), 2000)]
     stamps, places = stamps[some], places[some]
     _, far = distances(path, stamps, places[:, :2])
     by_odometry = np.full(len(stamps), np.nan)
@@ -252,7 +242,7 @@ def errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, An
             'odometry': rounded(by_odometry)}
 
 
-def _shown(states: Sequence[int]) -> IntArray:
+def _shown(states: IntArray) -> IntArray:
     """Return which measurements of a source are in run.json: of very many, only some."""
     believed = np.isin(states, (BELIEVED, HELD_OUT))
     others, rest = np.flatnonzero(~believed), np.flatnonzero(believed)
@@ -262,8 +252,6 @@ def _shown(states: Sequence[int]) -> IntArray:
 
 def _nearest(stamps: IntArray, at_ns: IntArray) -> list[int]:
     """Return the index of the nearest of sorted stamps for each stamp, -1 for those outside."""
-    if len(at_ns) == 0:
-        return [-1] * len(stamps)
     after = np.clip(np.searchsorted(at_ns, stamps), 0, len(at_ns) - 1)
     before = np.maximum(after - 1, 0)
     nearer = np.abs(at_ns[before] - stamps) < np.abs(at_ns[after] - stamps)

@@ -1,10 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What run.json is made from: a run at its end, and what was recorded on the way, bounded."""
+"""What run.json is made from: a run at its end, and what was recorded on the way."""
 
+from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-import heapq
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,8 +20,8 @@ from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, Measurement
 from pose_graph_ros.core.quantities import Seconds, StampNs
 
-MOST_UPDATES = 2000  # that are kept: of more, two neighbours become one with the longer time
-MOST_SILENCES = 20  # of a source that are kept, the longest
+MOST_UPDATES = 2000  # in run.json
+MOST_SILENCES = 20  # of a source that are told
 MOST_REFUSED = 5000  # loop closures whose reasons are kept
 
 
@@ -35,87 +35,53 @@ class Update(NamedTuple):
     iterations: int  # -1 if unknown
 
 
-class UpdateLog:
-    """Updates in the order of time, at most `MOST_UPDATES` of them, of `count`."""
-
-    def __init__(self) -> None:
-        self._kept: list[Update] = []
-        self._open: list[Update] = []  # those that become the next one that is kept
-        self._stride = 1
-        self.count = 0
-
-    def add(self, update: Update) -> None:
-        """Add an update, which is later than the others; the first one only loads the solver."""
-        self.count += 1
-        if self.count == 1:
-            return
-        self._open.append(update)
-        if len(self._open) < self._stride:
-            return
-        self._kept.append(_worst(*self._open))
-        self._open = []
-        if len(self._kept) >= MOST_UPDATES:
-            self._kept = [_worst(*pair) for pair in zip(
-                self._kept[::2], self._kept[1::2], strict=True)]
-            self._stride *= 2
-
-    @property
-    def updates(self) -> list[Update]:
-        """The updates that are kept."""
-        return [*self._kept, *([_worst(*self._open)] if self._open else [])]
+def thinned(updates: Sequence[Update]) -> list[Update]:
+    """Return at most `MOST_UPDATES`: neighbours become the last one with their longest time."""
+    stride = 1
+    while len(updates) // stride >= MOST_UPDATES:
+        stride *= 2
+    groups = [updates[k:k + stride] for k in range(0, len(updates), stride)]
+    return [group[-1]._replace(milliseconds=max(each.milliseconds for each in group),
+                               iterations=max(each.iterations for each in group))
+            for group in groups]
 
 
-def _worst(*updates: Update) -> Update:
-    """Return the last of some updates with the largest time and number of iterations."""
-    return updates[-1]._replace(milliseconds=max(each.milliseconds for each in updates),
-                                iterations=max(each.iterations for each in updates))
+def silent(stamps_ns: Sequence[StampNs], least_s: Seconds) -> FloatArray:
+    """
+    Return the longest silences of a source: begin and end [s], shape (K, 2).
 
-
-@dataclass(slots=True)
-class Arrivals:
-    """When the measurements of a source were made, and the longest silences between them."""
-
-    count: int = 0
-    first_ns: StampNs = 0
-    last_ns: StampNs = 0
-    silences: list[tuple[int, StampNs]] = field(default_factory=list)  # length, begin: a heap
-
-    def add(self, stamp_ns: StampNs) -> None:
-        """Add a measurement; the silence before a late one is not seen."""
-        if self.count == 0:
-            self.first_ns = self.last_ns = stamp_ns
-        elif stamp_ns > self.last_ns:
-            heapq.heappush(self.silences, (stamp_ns - self.last_ns, self.last_ns))
-            if len(self.silences) > MOST_SILENCES:
-                heapq.heappop(self.silences)
-            self.last_ns = stamp_ns
-        self.count += 1
-
-    def gaps(self, least_s: Seconds, periods: float) -> FloatArray:
-        """Return the longest silences, in the order of time: begin and end [s], shape (K, 2)."""
-        if self.count < 3:
-            return np.empty((0, 2))
-        lengths = [length for length, _ in self.silences]
-        others = self.count - 1 - len(lengths)
-        usual = (self.last_ns - self.first_ns - sum(lengths)) / others if others > 0 else (
-            float(np.median(lengths)))
-        found = sorted((begin, begin + length) for length, begin in self.silences
-                       if length > max(least_s * 1e9, periods * usual))
-        return np.array(found, dtype=np.float64).reshape(-1, 2) * 1e-9
+    Stamps are in the order of arrival; the silence before a late one is not seen.
+    """
+    if len(stamps_ns) < 3:
+        return np.empty((0, 2))
+    newest = np.maximum.accumulate(np.array(stamps_ns, dtype=np.int64))
+    lengths = np.diff(newest)
+    longest = np.argsort(lengths, kind='stable')[-MOST_SILENCES:]
+    others = np.delete(lengths, longest)
+    usual = float(np.mean(others) if len(others) > 0 else np.median(lengths))
+    found = np.sort(longest[lengths[longest] > max(least_s * 1e9, 8.0 * usual)])
+    return np.column_stack((newest[found], newest[found + 1])) * 1e-9
 
 
 @dataclass(slots=True)
 class Recorder:
     """What is recorded of a run as it goes on."""
 
-    log: UpdateLog = field(default_factory=UpdateLog)
-    arrivals: dict[str, Arrivals] = field(default_factory=dict)
+    updates: list[Update] = field(default_factory=list)
+    n_updates: int = 0  # with those that were not recorded one by one
+    stamps_ns: 'dict[str, array[int]]' = field(default_factory=dict)  # by source, as they came
     refused: dict[Key, str] = field(default_factory=dict)  # why, of the first loop closures
+
+    def add_update(self, update: Update, count: int = 1) -> None:
+        """Add the last of some updates, later than all others; the first loads the solver."""
+        if self.n_updates > 0:
+            self.updates.append(update)
+        self.n_updates += count
 
     def add_measurement(self, source: str, stamp_ns: StampNs) -> None:
         """Add a measurement in the order of arrival; one without a stamp does not count."""
         if stamp_ns > 0:
-            self.arrivals.setdefault(source, Arrivals()).add(stamp_ns)
+            self.stamps_ns.setdefault(source, array('q')).append(stamp_ns)
 
     def add_answer(self, source: str, measurement: Measurement, answer: Answer) -> None:
         """Add what was answered to a measurement at once."""

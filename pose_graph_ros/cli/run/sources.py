@@ -38,11 +38,6 @@ class SourceAnalysis(NamedTuple):
     suspects: tuple[str, ...]  # others of which this is so: their errors may show in its residuals
 
     @property
-    def row_names(self) -> tuple[str, str, str]:
-        """Names of the three coordinates."""
-        return _NAMES['map' if self.residuals.kind == 'map' else 'edge']
-
-    @property
     def is_wrong(self) -> bool:
         """Whether the claimed covariances are surely much too small or too large."""
         return bool(self.fit.low > WRONG or (self.fit.high < 1.0 / WRONG and not self.correlated
@@ -75,13 +70,14 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
     rows = [row.coordinate for row in present.rows]
+    names = _NAMES['map' if residuals.kind == 'map' else 'edge']
     some = spread(len(used.ids), 2000)
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
     values = normalised[np.isfinite(normalised)]
     return {
         'name': residuals.source, 'kind': analysis.kind.value,
         'count': len(residuals.ids), 'used': len(used.ids),
-        'rows': [_row(*pair, analysis.row_names) for pair in zip(
+        'rows': [_row(*pair, names) for pair in zip(
             present.rows, found.rows, strict=True)],
         'energy': {'expected': number(present.energy_expected),
                    'found': number(present.energy_found),

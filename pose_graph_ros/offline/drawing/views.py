@@ -32,7 +32,6 @@ import networkx as nx
 import numpy as np
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import (
     EdgeKind,
@@ -346,28 +345,21 @@ def _free(x: float, taken: list[float], level: float) -> FloatArray:
 
 def five_states() -> list[tuple[str, GraphRows]]:
     """Return a pose graph after each of five updates, as in Figure 3.10 of the thesis."""
-    motion = np.array((2.0, 0.0, 0.0))
-    poses = [np.zeros(3)]
-    for _ in range(4):
-        poses.append(se2.compose(poses[-1], motion))
-
-    def update(new: list[FloatArray], observed: list[int], edges: list[int]) -> GraphUpdate:
-        """Return an update with hidden nodes, observed ones on nodes, and edges from nodes."""
-        return GraphUpdate(
-            hidden=np.array(new).reshape(-1, 3),
-            edges=Edges(edges, [each + 1 for each in edges], np.tile(motion, (len(edges), 1)),
-                        np.tile(np.eye(3), (len(edges), 1, 1)), [EdgeKind.ODOMETRY] * len(edges)),
+    states = []
+    for title, n, observed in (
+            ('a) a hidden node x0 and an observed node z0', 1, [0]),
+            ('b) another observed node on x0: same pattern, other values', 1, [0, 0]),
+            ('c) a node x1 and an edge: two by two blocks', 2, [0, 0]),
+            ('d) an observed node on x1: same pattern', 2, [0, 0, 1]),
+            ('e) a chain: block-tridiagonal', 5, [0, 0, 1, 3])):
+        poses, graph = np.zeros((n, 3)), Graph()
+        poses[:, 0] = 2.0 * np.arange(n)
+        i, eyes = np.arange(n - 1), np.tile(np.eye(3), (5, 1, 1))
+        graph.apply(GraphUpdate(
+            hidden=poses, edges=Edges(i, i + 1, np.diff(poses, axis=0), eyes[:n - 1],
+                                      [EdgeKind.ODOMETRY] * (n - 1)),
             observed=ObservedNodes(
-                observed, mean=np.zeros((len(observed), 3)),
-                information=np.tile(np.eye(3), (len(observed), 1, 1)),
-                kind=[ObservedKind.GLOBAL_POSE] * len(observed)))
-    graph, states = Graph(), []
-    for title, change in (
-            ('a) a hidden node x0 and an observed node z0', update(poses[:1], [0], [])),
-            ('b) another observed node on x0: same pattern, other values', update([], [0], [])),
-            ('c) a node x1 and an edge: two by two blocks', update(poses[1:2], [], [0])),
-            ('d) an observed node on x1: same pattern', update([], [1], [])),
-            ('e) a chain: block-tridiagonal', update(poses[2:], [3], [1, 2, 3]))):
-        graph.apply(change)
+                observed, mean=np.zeros((len(observed), 3)), information=eyes[:len(observed)],
+                kind=[ObservedKind.GLOBAL_POSE] * len(observed))))
         states.append((title, graph.rows()))
     return states

@@ -97,17 +97,13 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
     if n == 0 or len(known) == 0:
         return ScaleFit(n, (), 0.0, 0.0, 1.0, 0.0, 0.0, math.nan, math.nan, math.nan)
     freedom = np.sum(used.measured, axis=1)
-    energies, expected = used.energies, np.maximum(used.rows(known).redundancies, 0.0)
-    mean_freedom = float(np.mean(freedom))
-    redundancy = float(np.mean(expected)) / mean_freedom
-    scale = float(np.median(used.scale))
-    rows = _rows(used, used.rows(known), errors)
+    energies, expected = used.energies, float(np.mean(
+        np.maximum(used.rows(known).redundancies, 0.0)))
+    redundancy, scale = expected / float(np.mean(freedom)), float(np.median(used.scale))
     independent = sum(_independent(used, row, errors) for row in range(_COORDINATES))
-    ratio, low, high = _ratio(
-        float(np.mean(bounded(energies, redundancy * freedom, freedom))),
-        float(np.mean(expected)), independent, redundancy)
+    ratio, low, high = _ratio(energies, freedom, redundancy, independent)
     return ScaleFit(
-        n, rows, float(np.mean(expected)), float(np.mean(energies)),
+        n, _rows(used, used.rows(known), errors), expected, float(np.mean(energies)),
         float(np.mean(energies <= _quantiles(freedom, INTERVAL))), redundancy, independent,
         scale * ratio, scale * low, scale * high)
 
@@ -125,10 +121,8 @@ def _rows(
         sigma = sigmas[measured, row]
         squares = (used.errors[measured, row] / sigma)**2
         share = float(np.mean(left[known.measured[:, row], row]))
-        one = np.ones(len(squares))
         ratio, low, high = _ratio(
-            float(np.mean(bounded(squares, share * one, one))), share,
-            _independent(used, row, errors), share)
+            squares, np.ones(len(squares)), share, _independent(used, row, errors))
         rows.append(RowFit(
             row, len(squares), float(np.sqrt(np.mean(sigma**2))), math.sqrt(share),
             float(np.sqrt(np.mean(squares))), ratio, low, high))
@@ -144,13 +138,14 @@ def _left(residuals: SourceResiduals) -> FloatArray:
 
 
 def _ratio(
-    found: float, expected: float, independent: float, redundancy: float,
+    squares: FloatArray, freedom: FloatArray, redundancy: float, independent: float,
 ) -> tuple[float, float, float]:
-    """Return the ratio of sigmas with its interval."""
+    """Return the ratio of sigmas with its interval, by squares of which a share is left."""
     # where the fit takes nearly all, nothing is said either
-    if (independent < LEAST_INDEPENDENT or redundancy < 0.005 or expected <= 0.0):
+    if independent < LEAST_INDEPENDENT or redundancy < 0.005:
         return math.nan, math.nan, math.nan
-    ratio = math.sqrt(found / expected)
+    expected = redundancy * freedom
+    ratio = math.sqrt(np.mean(bounded(squares, expected, freedom)) / np.mean(expected))
     low, high = (ratio * math.sqrt(independent / float(
         chdtri(independent, 0.5 + side * 0.5 * INTERVAL))) for side in (-1.0, 1.0))
     return ratio, low, high

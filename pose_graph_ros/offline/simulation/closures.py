@@ -126,3 +126,22 @@ def false_poses(
     moved = se2.compose(se2.inverse(se2.between(old[lead], old)), looks[lead])
     return se2.compose(se2.compose(moved, se2.between(new[lead], new)),
                        generator.normal(0.0, closures.sigmas, (len(pairs), 3)))
+
+
+def with_false(
+    generator: np.random.Generator, path: Path, closures: Closures, ends: IntArray,
+    poses: FloatArray,
+) -> tuple[IntArray, FloatArray, IntArray, int]:
+    """
+    Return true closures and false ones by their later ends, and how many groups are missing.
+
+    Of each its stamps, shape (L, 2), the measured pose, (L, 3), and the number of its group, (L,),
+    -1 if it is true.
+    """
+    sizes = closures.false.sizes(len(ends))
+    pairs, groups = false_pairs(generator, path, sizes, closures)
+    false = false_poses(generator, path, pairs, groups, closures)
+    every = np.concatenate((ends, path.stamps_ns[pairs]))
+    order = np.argsort(every[:, 1], kind='stable')
+    return (every[order], np.concatenate((poses, false))[order],
+            np.append(np.full(len(ends), -1), groups)[order], len(sizes) - len(np.unique(groups)))

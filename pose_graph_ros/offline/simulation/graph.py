@@ -19,16 +19,22 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres
-from pose_graph_ros.offline.simulation import disturbances, sensors
+from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.closures import (
-    false_pairs,
-    false_poses,
     measured,
     Path,
     revisits,
+    with_false,
 )
-from pose_graph_ros.offline.simulation.recording import Course
-from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, Jump, ODOMETRY, POSES
+from pose_graph_ros.offline.simulation.recording import absolute, Course
+from pose_graph_ros.offline.simulation.settings import (
+    CLOSURES,
+    FIXES,
+    Jump,
+    ODOMETRY,
+    POSES,
+    START_NS,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +84,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     if setup.fixes is None and setup.poses is None:
         poses = se2.between(poses[0], poses)
     truth = Trajectory(way.truth.stamps_ns[at], poses)
-    start_ns = int(way.truth.stamps_ns[0])
-
-    odometry = _odometry(streams['odometry'], truth, [
-        jump for jump in setup.jumps if jump.topic == ODOMETRY], start_ns)
+    odometry = _odometry(streams['odometry'], truth, setup.jumps_of(ODOMETRY))
     loops, group, missing = _closures(
         way, Path(truth.stamps_ns, poses, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
@@ -93,7 +96,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
 
 
 def _odometry(
-    generator: np.random.Generator, truth: Trajectory, jumps: list[Jump], start_ns: int,
+    generator: np.random.Generator, truth: Trajectory, jumps: list[Jump],
 ) -> Edges:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
@@ -103,7 +106,7 @@ def _odometry(
         if jump.step is None:
             raise ConfigError(f'jump of {ODOMETRY}: in a graph it cannot begin again, expected '
                               'DX,DY')
-        k = int(np.searchsorted(truth.stamps_ns, start_ns + round(jump.at_s * 1e9))) - 1
+        k = int(np.searchsorted(truth.stamps_ns, START_NS + round(jump.at_s * 1e9))) - 1
         if 0 <= k < n:
             mean[k] = se2.compose(mean[k], np.array(jump.step))
     information = np.zeros((n, 3, 3))
@@ -133,42 +136,33 @@ def _closures(way: Course, path: Path, node_distance: float) -> tuple[Edges, Int
     found = streams['rate'].random(len(old)) < settings.rate
     old, new = old[found], new[found]
     poses = measured(streams['closures'], path.poses[old], path.poses[new], settings)
-    sizes = settings.false.sizes(len(old))
-    pairs, groups = false_pairs(streams['false'], path, sizes, settings)
-    false = false_poses(streams['false'], path, pairs, groups, settings)
-    ends = np.concatenate((np.column_stack((old, new)), pairs))
-    order = np.argsort(ends[:, 1], kind='stable')
-    order = order[disturbances.heard(
-        path.stamps_ns[ends[order, 1]],
-        [each for each in way.setup.outages if each.topic == CLOSURES], int(path.stamps_ns[0]))]
+    stamps, poses, group, missing = with_false(
+        streams['false'], path, settings, path.stamps_ns[np.column_stack((old, new))], poses)
+    kept = sensors.heard(stamps[:, 1], CLOSURES, way.setup.outages)
+    ends, group = np.searchsorted(path.stamps_ns, stamps[kept]), group[kept]
     sigmas = way.setup.claimed(CLOSURES) * np.array(settings.sigmas)
-    edges = Edges(ends[order, 0], ends[order, 1], np.concatenate((poses, false))[order],
-                  np.tile(np.diag(sigmas**-2), (len(order), 1, 1)),
-                  np.full(len(order), EdgeKind.LOOP_CLOSURE))
-    group = np.append(np.full(len(old), -1), groups)[order]
-    return edges, group, len(sizes) - len(np.unique(groups))
+    edges = Edges(ends[:, 0], ends[:, 1], poses[kept],
+                  np.tile(np.diag(sigmas**-2), (len(ends), 1, 1)),
+                  np.full(len(ends), EdgeKind.LOOP_CLOSURE))
+    return edges, group, missing
 
 
 def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[ObservedNodes, IntArray]:
     """Return fixes or global poses, each with its error moved to the nearest node; the wrong."""
-    setup, start_ns = way.setup, int(way.truth.stamps_ns[0])
-    if topic == FIXES and setup.fixes is not None:
-        stamps, values = sensors.positions(way.streams['fixes'], way.truth, setup.fixes)
-        sigmas, kind = np.array([setup.fixes.sigma] * 2), ObservedKind.POSITION
-        stream = way.streams['jumps']
-    elif topic == POSES and setup.poses is not None:
-        stamps, values = sensors.global_poses(way.streams['poses'], way.truth, setup.poses)
-        sigmas, kind = np.array(setup.poses.sigmas)[[0, 0, 1]], ObservedKind.GLOBAL_POSE
-        stream = way.streams['pose jumps']
-    else:
+    setup = way.setup
+    stamps, values, wrong = absolute(way, topic, way.truth)
+    kept = sensors.heard(stamps, topic, setup.outages)
+    stamps, values, wrong = stamps[kept], values[kept], wrong[kept]
+    if len(stamps) == 0:
         return ObservedNodes(), np.empty(0, dtype=np.int64)
-    moved, wrong = disturbances.moved(
-        stream, stamps, values, [each for each in setup.jumps if each.topic == topic], start_ns)
-    kept = disturbances.heard(
-        stamps, [each for each in setup.outages if each.topic == topic], start_ns)
-    stamps, wrong = stamps[kept], wrong[kept]
+    if topic == FIXES:
+        assert setup.fixes is not None
+        sigmas, kind = np.array([setup.fixes.sigma] * 2), ObservedKind.POSITION
+    else:
+        assert setup.poses is not None
+        sigmas, kind = np.array(setup.poses.sigmas)[[0, 0, 1]], ObservedKind.GLOBAL_POSE
     width = len(sigmas)
-    errors = (moved[kept] - way.truth.at(stamps)[:, :width])
+    errors = values - way.truth.at(stamps)[:, :width]
     # the nearest node in time, and the first of those that are nearest to it
     after = np.clip(np.searchsorted(truth.stamps_ns, stamps), 1, len(truth) - 1)
     nearer = stamps - truth.stamps_ns[after - 1] < truth.stamps_ns[after] - stamps

@@ -19,13 +19,12 @@ from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Seconds
-from pose_graph_ros.offline.simulation import disturbances, sensors
+from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.closures import (
-    false_pairs,
-    false_poses,
     measured,
     Path,
     revisits,
+    with_false,
 )
 from pose_graph_ros.offline.simulation.motion import Motion, PERIOD_S
 from pose_graph_ros.offline.simulation.settings import (
@@ -36,12 +35,12 @@ from pose_graph_ros.offline.simulation.settings import (
     ODOMETRY,
     POSES,
     Setup,
+    START_NS,
     TOPICS,
     TRUTH,
 )
 from pose_graph_ros.offline.simulation.worlds import World
 
-START_NS = 1_746_518_400_250_000_000  # stamp of the start [ns]
 CITY = TangentPlane(50.7271, 7.0866, 61.0)  # worlds are on the plane that touches the Earth here
 STREAMS = ('world', 'gyro', 'odometry', 'fixes', 'poses', 'closures', 'rate', 'jumps',
            'pose jumps', 'false', 'truth', *TOPICS)
@@ -130,10 +129,9 @@ def _states(
 
     sensors.odometry(state('odometry'), truth, usual.wheels)
     stamps, values = sensors.positions(state('fixes'), truth, fixes)
-    _true_closures(state('closures'), truth, path, closures)
-    disturbances.moved(state('jumps'), stamps, values,
-                       [each for each in usual.jumps if each.topic == FIXES], START_NS)
-    _false_closures(state('false'), path, closures, 0)
+    ends, poses = _true_closures(state('closures'), truth, path, closures)
+    sensors.moved(state('jumps'), stamps, values, usual.jumps_of(FIXES))
+    with_false(state('false'), path, closures, ends[:0], poses[:0])
     state('truth')
     return states
 
@@ -141,35 +139,44 @@ def _states(
 def record(way: Course) -> Recording:
     """Return what all sensors say on a course."""
     setup, truth, streams = way.setup, way.truth, way.streams
-    path = Path(truth.stamps_ns, truth.poses, way.motion.distance)
-    start_ns = int(truth.stamps_ns[0])
-    keep = _Outages(setup, start_ns)
+    measured_at = dict.fromkeys(TOPICS, np.empty(0, dtype=np.int64))  # with what outages leave out
+
+    def heard(topic: str, stamps: IntArray) -> BoolArray:
+        measured_at[topic] = stamps
+        return sensors.heard(stamps, topic, setup.outages)
 
     odometry = sensors.odometry(streams['odometry'], truth, setup.wheels)
-    origin = odometry.poses[0]    # still at rest
-    velocities = sensors.velocities(odometry)
-    odometry = disturbances.jumped(
-        odometry, [each for each in setup.jumps if each.topic == ODOMETRY], start_ns)
-    kept_odometry = keep(ODOMETRY, odometry.stamps_ns)
-    odometry = Trajectory(odometry.stamps_ns[kept_odometry], odometry.poses[kept_odometry])
+    velocities, to_map = sensors.velocities(odometry), _map(truth, odometry.poses[0])
+    odometry = sensors.jumped(odometry, setup)
+    kept = heard(ODOMETRY, odometry.stamps_ns)
+    odometry, velocities = Trajectory(
+        odometry.stamps_ns[kept], odometry.poses[kept]), velocities[kept]
 
-    fix_stamps, fixes, fix_is_wrong = _fixes(way, keep)
-    to_map = _map(truth, fixes, origin)
-    pose_stamps, poses, pose_is_wrong = _global_poses(way, to_map, keep)
-    ends, loop_poses, group, missing = _closures(way, path, keep)
+    fix_stamps, places, fix_is_wrong = absolute(way, FIXES, truth)
+    kept = heard(FIXES, fix_stamps)
+    fix_stamps, fix_is_wrong = fix_stamps[kept], fix_is_wrong[kept]
+    fixes = CITY.to_geodetic(places[kept])
+    if len(fixes) > 0:
+        to_map = _fixed_map(fixes[0])
+    pose_stamps, poses, pose_is_wrong = absolute(
+        way, POSES, Trajectory(truth.stamps_ns, to_map(truth.poses)))
+    kept = heard(POSES, pose_stamps)
+    pose_stamps, poses, pose_is_wrong = (
+        pose_stamps[kept], se2.wrapped(poses[kept]), pose_is_wrong[kept])
+    ends, loop_poses, group, missing = _closures(way)
+    kept = heard(CLOSURES, ends[:, 1])
+    ends, loop_poses, group = ends[kept], loop_poses[kept], group[kept]
 
     rates = (np.empty(0) if setup.gyro is None else
              sensors.yaw_rates(streams['gyro'], truth.poses[:, 2], setup.gyro))
-    rate_stamps = truth.stamps_ns[:len(rates)]
-    kept = keep(GYRO, rate_stamps)
+    kept = heard(GYRO, rate_stamps := truth.stamps_ns[:len(rates)])
     rate_stamps, rates = rate_stamps[kept], rates[kept]
 
     truth_stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
-    measured_at = {ODOMETRY: odometry.stamps_ns, GYRO: rate_stamps, FIXES: fix_stamps,
-                   POSES: pose_stamps, CLOSURES: ends[:, 1]}
-    arrivals = {topic: disturbances.arrivals(streams[topic], topic, stamps, setup)
-                for topic, stamps in measured_at.items()}
-    arrivals[TRUTH] = disturbances.arrivals(
+    arrivals = {topic: sensors.arrivals(
+        streams[topic], topic, stamps[sensors.heard(stamps, topic, setup.outages)], setup)
+        for topic, stamps in measured_at.items()}
+    arrivals[TRUTH] = sensors.arrivals(
         np.random.default_rng(0), TRUTH, truth_stamps, setup)
     ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
                         if each.topic == topic) for topic in TOPICS}
@@ -177,52 +184,41 @@ def record(way: Course) -> Recording:
         setup=setup, distance=float(way.motion.distance[-1]),
         truth=Trajectory(truth_stamps, to_map(truth.at(truth_stamps))),
         odometry=Trajectory(odometry.stamps_ns + ahead[ODOMETRY], odometry.poses),
-        velocities=velocities[kept_odometry],
+        velocities=velocities,
         fix_stamps_ns=fix_stamps + ahead[FIXES], fixes=fixes, fix_is_wrong=fix_is_wrong,
         pose_stamps_ns=pose_stamps + ahead[POSES], poses=poses, pose_is_wrong=pose_is_wrong,
         loop_stamps_ns=ends + ahead[CLOSURES], loop_poses=loop_poses, loop_group=group,
         rate_stamps_ns=rate_stamps + ahead[GYRO], rates=rates, arrivals=arrivals,
-        silenced=tuple(keep.silenced), missing_groups=missing)
+        silenced=tuple(int(np.sum(~sensors.heard(
+            measured_at[each.topic], each.topic, [each]))) for each in setup.outages),
+        missing_groups=missing)
 
 
-class _Outages:
-    """Which measurements are in no outage; counts the others."""
-
-    def __init__(self, setup: Setup, start_ns: int) -> None:
-        self._outages, self._start_ns = setup.outages, start_ns
-        self.silenced = [0] * len(setup.outages)
-
-    def __call__(self, topic: str, stamps_ns: IntArray) -> BoolArray:
-        kept = np.ones(len(stamps_ns), dtype=bool)
-        for k, outage in enumerate(self._outages):
-            if outage.topic == topic:
-                inside = ~disturbances.heard(stamps_ns, (outage,), self._start_ns)
-                self.silenced[k] = int(np.sum(inside))
-                kept &= ~inside
-        return kept
-
-
-def _fixes(way: Course, keep: _Outages) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return stamps of the fixes, what they say [deg, deg, m], and which are wrong."""
-    settings = way.setup.fixes
-    if settings is None:
-        return np.empty(0, dtype=np.int64), np.empty((0, 3)), np.zeros(0, dtype=bool)
-    stamps, positions = sensors.positions(way.streams['fixes'], way.truth, settings)
-    positions, wrong = disturbances.moved(
-        way.streams['jumps'], stamps, positions,
-        [each for each in way.setup.jumps if each.topic == FIXES], int(way.truth.stamps_ns[0]))
-    kept = keep(FIXES, stamps)
-    return stamps[kept], CITY.to_geodetic(positions[kept]), wrong[kept]
+def absolute(
+    way: Course, topic: str, truth: Trajectory,
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Return stamps of fixes or global poses, what they say in the map, and which are wrong."""
+    setup, streams = way.setup, way.streams
+    if topic == FIXES and setup.fixes is not None:
+        stamps, values = sensors.positions(streams['fixes'], truth, setup.fixes)
+    elif topic == POSES and setup.poses is not None:
+        stamps, values = sensors.global_poses(streams['poses'], truth, setup.poses)
+    else:
+        stamps, values = np.empty(0, dtype=np.int64), np.empty((0, 2 if topic == FIXES else 3))
+    return stamps, *sensors.moved(
+        streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
+        setup.jumps_of(topic))
 
 
-def _map(
-    truth: Trajectory, fixes: FloatArray, origin: FloatArray,
-) -> Callable[[FloatArray], FloatArray]:
-    """Return what moves poses of the world to the map; `origin` is where odometry begins."""
-    if len(fixes) == 0:
-        moved = se2.compose(origin, se2.inverse(truth.poses[0]))
-        return lambda poses: se2.compose(moved, poses)
-    plane = TangentPlane(*fixes[0].tolist())
+def _map(truth: Trajectory, origin: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what moves poses of the world to the frame in which odometry begins."""
+    moved = se2.compose(origin, se2.inverse(truth.poses[0]))
+    return lambda poses: se2.compose(moved, poses)
+
+
+def _fixed_map(fix: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what moves poses of the world to the plane that touches the Earth at a fix."""
+    plane = TangentPlane(*fix.tolist())
 
     def to_map(poses: FloatArray) -> FloatArray:
         poses = poses.copy()
@@ -231,39 +227,15 @@ def _map(
     return to_map
 
 
-def _global_poses(
-    way: Course, to_map: Callable[[FloatArray], FloatArray], keep: _Outages,
-) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return stamps of the global poses, the poses in the map, and which are wrong."""
-    settings, truth = way.setup.poses, way.truth
-    if settings is None:
-        return np.empty(0, dtype=np.int64), np.empty((0, 3)), np.zeros(0, dtype=bool)
-    stamps, poses = sensors.global_poses(
-        way.streams['poses'], Trajectory(truth.stamps_ns, to_map(truth.poses)), settings)
-    poses, wrong = disturbances.moved(
-        way.streams['pose jumps'], stamps, poses,
-        [each for each in way.setup.jumps if each.topic == POSES], int(truth.stamps_ns[0]))
-    kept = keep(POSES, stamps)
-    return stamps[kept], se2.wrapped(poses[kept]), wrong[kept]
-
-
-def _closures(
-    way: Course, path: Path, keep: _Outages,
-) -> tuple[IntArray, FloatArray, IntArray, int]:
+def _closures(way: Course) -> tuple[IntArray, FloatArray, IntArray, int]:
     """Return stamps, measured poses and groups of closures, and how many groups are missing."""
     settings = way.setup.closures
     if settings is None:
         return np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64), 0
+    path = Path(way.truth.stamps_ns, way.truth.poses, way.motion.distance)
     ends, poses = _true_closures(way.streams['closures'], way.truth, path, settings)
     found = way.streams['rate'].random(len(ends)) < settings.rate
-    ends, poses = ends[found], poses[found]
-    false_ends, false, groups, missing = _false_closures(
-        way.streams['false'], path, settings, len(ends))
-    order = np.argsort(np.append(ends[:, 1], false_ends[:, 1]), kind='stable')
-    ends = np.concatenate((ends, false_ends))[order]
-    kept = keep(CLOSURES, ends[:, 1])
-    group = np.append(np.full(len(poses), -1), groups)[order]
-    return ends[kept], np.concatenate((poses, false))[order][kept], group[kept], missing
+    return with_false(way.streams['false'], path, settings, ends[found], poses[found])
 
 
 def _true_closures(
@@ -281,13 +253,3 @@ def _true_closures(
     ends = np.minimum(ends, path.stamps_ns[-1])
     poses = truth.at(ends)
     return ends, measured(generator, poses[:, 0], poses[:, 1], settings)
-
-
-def _false_closures(
-    generator: np.random.Generator, path: Path, settings: Closures, true: int,
-) -> tuple[IntArray, FloatArray, IntArray, int]:
-    """Return stamps (F, 2), measured poses (F, 3), groups (F,), and how many are missing."""
-    sizes = settings.false.sizes(true)
-    pairs, groups = false_pairs(generator, path, sizes, settings)
-    poses = false_poses(generator, path, pairs, groups, settings)
-    return path.stamps_ns[pairs], poses, groups, len(sizes) - len(np.unique(groups))

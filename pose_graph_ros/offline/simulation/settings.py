@@ -8,7 +8,7 @@ out of range. Times are seconds since the start of the simulation.
 """
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 import math
 
 from pose_graph_ros.core.config import require, require_member
@@ -20,6 +20,7 @@ DURATIONS_S = {'drive': 440.0, 'hall': 900.0, 'grid': 1800.0}
 NODE_DISTANCES = {'drive': 2.0, 'hall': 1.0, 'grid': 1.0}
 """Usual lengths of simulations, and distances of the nodes of a graph [m], by world."""
 TRUTH = '/ground_truth'
+START_NS = 1_746_518_400_250_000_000  # stamp of the start [ns]
 LATENCY_S = {ODOMETRY: 0.004, GYRO: 0.002, FIXES: 0.13, POSES: 0.05, CLOSURES: 0.8, TRUTH: 0.004}
 """Usual time from the stamp of a measurement to its recording, by topic."""
 TOPICS = (ODOMETRY, GYRO, FIXES, POSES, CLOSURES)
@@ -40,7 +41,7 @@ def _finite(name: str, values: tuple[float, ...], above: float = -math.inf) -> N
             raise ConfigError(f'{name}: expected finite numbers{least}, got {value:g}')
 
 
-class OdometryErrors(Enum):
+class OdometryErrors(StrEnum):
     """Where the errors of odometry come from."""
 
     WHEELS = 'wheels'
@@ -332,3 +333,7 @@ class Setup:
     def claimed(self, topic: str) -> float:
         """Return the factor on the sigmas that a topic claims."""
         return math.prod(each.factor for each in self.claims if each.topic == topic)
+
+    def jumps_of(self, topic: str) -> list[Jump]:
+        """Return the jumps of a topic."""
+        return [each for each in self.jumps if each.topic == topic]

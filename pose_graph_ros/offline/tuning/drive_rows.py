@@ -2,12 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Odometry and what was measured in the map, by stamp, as the rows of `likelihood`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import BackendConfig, NodePolicy, NoiseFrom, OdometrySource
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    MeasurementSource,
+    NodePolicy,
+    NoiseFrom,
+    OdometrySource,
+)
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.measurements import (
     GlobalPose,
@@ -17,12 +23,17 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.stream import OdometryStream
 from pose_graph_ros.core.odometry.timeline import OdometryTimeline
+from pose_graph_ros.core.quantities import Metres, Radians, StampNs
+from pose_graph_ros.core.sources.validation import validate, Validated
 from pose_graph_ros.offline.tuning import likelihood as lk
 
 # Longest time between two rows [ns]: the noise of a motion is that of a nearly straight one.
 STEP_NS = 1_000_000_000
 
 Absolute = Position | GlobalPose | HeadingOnly
+Key = tuple[str, StampNs]
+"""Source and stamp of a measurement."""
+LEAST = 20  # measurements of a source whose noise is estimated
 
 
 class Measured(NamedTuple):
@@ -63,9 +74,21 @@ class DriveRows(NamedTuple):
         """Stamps since the first one, shape (N,) [s]."""
         return np.asarray((self.stamps_ns - self.stamps_ns[:1]) * 1e-9, dtype=np.float64)
 
-    def without(self, held_out: BoolArray) -> 'DriveRows':
-        """Return the rows with some measurements left out, but not their motions."""
-        return self._replace(source=np.where(held_out, -1, self.source))
+
+class SourceOfPoses(NamedTuple):
+    """What a source has measured in the map, by the settings of its covariances."""
+
+    name: str
+    measured: Measured
+    is_constant: bool  # whether it always claims the same covariance
+    is_scalable: bool  # whether what it claims is valid and not at a bound, so that a factor helps
+    sigma: Metres  # median of a coordinate; 0 without positions
+    sigma_heading: Radians  # median; 0 without headings
+
+    def is_among(self, keys: Collection[Key]) -> BoolArray:
+        """Return which of its measurements are among some."""
+        return np.array([(self.name, stamp) in keys
+                         for stamp in self.measured.stamps_ns.tolist()], dtype=bool)
 
 
 def measured(measurements: Sequence[Absolute]) -> Measured:
@@ -160,3 +183,41 @@ def odometry_noise(source: OdometrySource) -> FloatArray:
     found[lk.GIVEN] = 1.0
     scale = source.sigma_scale or 1.0
     return np.asarray(found * scale * np.sqrt(source.covariance_scale))
+
+
+def source_of_poses(
+    name: str, kept: Sequence[Absolute], settings: MeasurementSource,
+) -> SourceOfPoses | None:
+    """Return the valid ones of some measurements; None if they are too few."""
+    policy = settings.covariance
+    valid, repaired, newest_ns = [], False, -10**18
+    for each in sorted(kept, key=lambda one: one.stamp_ns):
+        one = validate(each, policy)
+        if not isinstance(one, Validated) or (
+                each.stamp_ns - newest_ns < settings.minimum_period * 1e9):
+            continue
+        newest_ns = each.stamp_ns
+        repaired = repaired or len(one.repairs) > 0
+        assert isinstance(one.measurement, Absolute)
+        valid.append(one.measurement)
+    if len(valid) < LEAST:
+        return None
+    columns = measured(valid)
+    variances, headings = (each[each > 0.0] for each in (
+        0.5 * (columns.values[:, lk.XX - lk.X] + columns.values[:, lk.YY - lk.X]),
+        columns.values[:, lk.HEADING_VAR - lk.X]))
+    bounds = policy.position_floor**2, policy.position_ceiling**2
+    inside = len(variances) == 0 or bool(
+        np.min(variances) > 1.01 * bounds[0] and np.max(variances) < 0.99 * bounds[1])
+    return SourceOfPoses(
+        name, columns, is_constant=_is_same(variances) and _is_same(headings),
+        is_scalable=inside and not repaired and len(policy.override) == 0,
+        sigma=_median_sigma(variances), sigma_heading=_median_sigma(headings))
+
+
+def _is_same(variances: FloatArray) -> bool:
+    return len(variances) == 0 or bool(np.max(variances) < 1.05 * np.min(variances))
+
+
+def _median_sigma(variances: FloatArray) -> float:
+    return float(np.sqrt(np.median(variances))) if len(variances) > 0 else 0.0

@@ -41,6 +41,8 @@ CHANGE_RISE = 6.63
 CORRELATED_RISE = 7.4
 # What keeps its setting by itself; correlated errors are there or not as a whole.
 DECIDABLE = Role.ODOMETRY, Role.WHITE, Role.HEADING, Role.CLOSURE
+# White variance beside a correlated one, as its setting.
+WHITE_SHARE = 0.05
 # Number of parameters whose settings are tried before all the others are taken to be lost.
 TRIALS = 2
 # Steps of the logarithms for second derivatives.
@@ -85,12 +87,6 @@ class Fit(NamedTuple):
     """Result of a fit."""
 
     found: tuple[Found, ...]
-    cost: float
-    """Twice the negative logarithm of the posterior density."""
-    n_measurements: int
-    n_beyond: int
-    """Number of positions that are unlikely to be right."""
-    n_evaluations: int
     contradiction: float
     """Ratio by which stretches contradict each other more than the model says, at least 1."""
 
@@ -102,9 +98,6 @@ class Fit(NamedTuple):
 
 class AnyProblem(Protocol):
     """A cost as a function of the logarithms of parameters; see `Problem`."""
-
-    n_evaluations: int
-    n_beyond: int
 
     def value(self, parameters: Sequence[Parameter], x: FloatArray) -> float:
         """Return the cost."""
@@ -118,19 +111,19 @@ class Minimum(NamedTuple):
     cost: float
 
 
-def fit(problem: Problem, parameters: Sequence[Parameter], white_share: float = 0.05) -> Fit:
+def fit(problem: Problem, parameters: Sequence[Parameter]) -> Fit:
     """Return the most likely parameters, with their intervals."""
     problem.find_heading()
-    best = _unrestricted(problem, parameters, white_share)
+    best = _unrestricted(problem, parameters)
     ratio = _contradiction(problem, *best[:2])
     if ratio > CONTRADICTION:
         problem.thin(STRIDES)
-        best = _unrestricted(problem, parameters, white_share)
+        best = _unrestricted(problem, parameters)
         ratio = max(ratio, _contradiction(problem, *best[:2]))
-    return decided(problem, best, ratio, int(np.sum(problem.rows.source >= 0)))
+    return decided(problem, best, ratio)
 
 
-def decided(problem: AnyProblem, best: Minimum, ratio: float, n_measurements: int) -> Fit:
+def decided(problem: AnyProblem, best: Minimum, ratio: float) -> Fit:
     """Return the fit after settings that are likely enough are kept."""
     parameters, x, cost = best
     kept: list[Parameter] = []
@@ -159,18 +152,15 @@ def decided(problem: AnyProblem, best: Minimum, ratio: float, n_measurements: in
                         high=max(each.high, each.parameter.setting))
           for each in _intervals(problem, best.parameters, best.x, [], ratio)
           if each.parameter in kept)]
-    problem.value([*parameters, *kept], _with_settings(x, kept))
-    return Fit(tuple(found), cost, n_measurements, problem.n_beyond, problem.n_evaluations, ratio)
+    return Fit(tuple(found), ratio)
 
 
-def _unrestricted(
-    problem: Problem, parameters: Sequence[Parameter], white_share: float,
-) -> Minimum:
+def _unrestricted(problem: Problem, parameters: Sequence[Parameter]) -> Minimum:
     """Return the minimum over all parameters, with correlated errors where there are any."""
     best = Minimum(parameters, *minimum(problem, parameters, _begin(problem, parameters)))
     for each in parameters:
         if each.role is Role.WHITE:
-            more = _correlated(problem, best, each, white_share)
+            more = _correlated(problem, best, each)
             if best.cost - more.cost > CORRELATED_RISE:
                 best = more
     return best
@@ -212,15 +202,13 @@ def minimum(
     return np.clip(np.atleast_1d(result.x), low, high), float(result.fun)
 
 
-def _correlated(
-    problem: Problem, best: Minimum, white: Parameter, white_share: float,
-) -> Minimum:
+def _correlated(problem: Problem, best: Minimum, white: Parameter) -> Minimum:
     """Return the minimum with correlated errors of a source."""
     parameters, x = best.parameters, best.x
     at = list(parameters).index(white)
     others, rest, variance = [*parameters[:at], *parameters[at + 1:]], np.delete(x, at), x[at]
     more = [*others, Parameter(Role.CORRELATED, white.index, 1.0),
-            Parameter(Role.SHARE, white.index, white_share),
+            Parameter(Role.SHARE, white.index, WHITE_SHARE),
             Parameter(Role.TAU, white.index, 1.0)]
     low, high = bounds(problem, more[-1])
     odometry = np.array([each.role is Role.ODOMETRY for each in others], dtype=bool)

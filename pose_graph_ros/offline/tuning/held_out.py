@@ -19,7 +19,7 @@ odometry keeps as much more.
 
 from collections.abc import Mapping, Sequence
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -65,9 +65,10 @@ class Errors(NamedTuple):
         """Shape (K,) [m]."""
         return np.asarray(np.hypot(self.errors[:, 0], self.errors[:, 1]))
 
-    def rows(self, which: BoolArray) -> 'Errors':
+    def rows(self, which: BoolArray | IntArray) -> 'Errors':
         """Return some of them."""
-        return Errors(self.stamps_ns[which], self.errors[which], self.covariances[which])
+        columns: Any = (column[which] for column in self)
+        return Errors(*columns)
 
 
 NO_ERRORS = Errors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
@@ -91,12 +92,9 @@ class Summary(NamedTuple):
 
 def joined(parts: Sequence[Errors]) -> Errors:
     """Return the errors of several folds, by stamp."""
-    together = Errors(np.concatenate([each.stamps_ns for each in parts]),
-                      np.concatenate([each.errors for each in parts]),
-                      np.concatenate([each.covariances for each in parts]))
-    order = np.argsort(together.stamps_ns, kind='stable')
-    return Errors(
-        together.stamps_ns[order], together.errors[order], together.covariances[order])
+    columns: Any = map(np.concatenate, zip(*parts, strict=True))
+    together = Errors(*columns)
+    return together.rows(np.argsort(together.stamps_ns, kind='stable'))
 
 
 def stretch_length(duration: float, period: float, tau: float, folds: int) -> float:

@@ -149,7 +149,7 @@ def _fade(state, p, at, phi):  # type: ignore[no-untyped-def]
 
 @kernel
 def _position(state, p, gain, row, at, correlated, white):  # type: ignore[no-untyped-def]
-    """Return the cost of a position, after correcting by it, and its weight in that."""
+    """Return the cost of a position, after correcting by it."""
     n = len(state)
     c, s = math.cos(state[2]), math.sin(state[2])
     ox = c * row[ARM_X] - s * row[ARM_Y]
@@ -177,7 +177,7 @@ def _position(state, p, gain, row, at, correlated, white):  # type: ignore[no-un
             p[j, i] = p[i, j]
     if weight < 1.0:
         distance = GATE * (1.0 - math.log(weight))
-    return distance + math.log(det), weight
+    return distance + math.log(det)
 
 
 @kernel
@@ -206,7 +206,7 @@ def costs(  # type: ignore[no-untyped-def]
     seconds, source, rows, noise, errors, heading, first, out,
 ):
     """
-    Return how many positions are beyond the gate, after writing the cost of each row of a drive.
+    Write the cost of each row of a drive.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def costs(  # type: ignore[no-untyped-def]
     n = 3 + 2 * len(errors)
     state, p, gain = np.zeros(n), np.zeros((n, n)), np.zeros((n, 2))
     state[2] = heading
-    left_out, lost, started = 0, False, False
+    lost, started = False, False
     last = seconds[0]
     out[:first] = 0.0
     for k in range(first, len(seconds)):
@@ -241,15 +241,13 @@ def costs(  # type: ignore[no-untyped-def]
             starts = lost or not started
             if starts:
                 _start(state, p, row, RESTART_VARIANCE if started else START_VARIANCE)
-            cost, weight = _position(
+            cost = _position(
                 state, p, gain, row, 3 + 2 * of, errors[of, CORRELATED], errors[of, WHITE])
             if not starts:  # at a start, nothing was predicted
                 out[k] += cost
-                left_out += weight < 1.0
             lost, started = False, True
         if row[HEADING_VAR] > 0.0 and started:
             out[k] += _heading(state, p, gain, row, errors[of, WHITE_HEADING])
-    return left_out
 
 
 class Role(Enum):
@@ -294,9 +292,6 @@ class Problem:
     tick: Callable[[], None] = lambda: None
     """Called at each evaluation, for progress and for giving up."""
     heading: float = 0.0
-    n_evaluations: int = 0
-    n_beyond: int = 0
-    """Number of positions beyond the gate at the last evaluation."""
     _seconds: FloatArray = field(init=False)
     _first: int = field(init=False)
     _costs: FloatArray = field(init=False)
@@ -331,14 +326,11 @@ class Problem:
         for parameter in parameters:
             if parameter.role is Role.SHARE:
                 errors[parameter.index, WHITE] *= errors[parameter.index, CORRELATED]
-        self.n_evaluations += 1
         self.tick()
         total = np.zeros(len(self._costs))
         for source, weight in self._levels:
-            n_left_out = costs(self._seconds, source, self.rows.rows, noise, errors,
-                                  self.heading, self._first, self._costs)
-            if source is self._levels[0][0]:
-                self.n_beyond = n_left_out
+            costs(self._seconds, source, self.rows.rows, noise, errors, self.heading,
+                  self._first, self._costs)
             total += weight * self._costs
         return total
 

@@ -8,20 +8,18 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.batch.optimizer import optimize
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.offline.certificate.certify import certify, examined, rounded, Verdict
+from pose_graph_ros.offline.certificate.certify import certify, examined, Verdict
 from pose_graph_ros.offline.certificate.objective import (
     formulate,
     Formulation,
     NotCoveredError,
     QuadraticForm,
 )
-from pose_graph_ros.offline.certificate.riemannian import minimized, unit_rows
+from pose_graph_ros.offline.certificate.riemannian import minimized
 
 
 def ring(n: int, winding: int) -> Graph:
@@ -136,7 +134,7 @@ def test_the_gradient_is_that_of_differences(seed: int) -> None:
     np.testing.assert_allclose(quadratic.product(z), dense(form) @ z, rtol=1e-8, atol=1e-8)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(seeds, st.sampled_from((0.05, 0.5, 3.0)))
 def test_the_smallest_eigenvalue_is_that_of_the_dense_matrix(seed: int, noise: float) -> None:
     form = formulate(random_graph(seed, noise))
@@ -182,19 +180,7 @@ def test_a_ring_wound_too_often_is_not_certified_and_the_right_one_is_found(n: i
     assert (again.verdict, again.rank, again.is_lower) == (Verdict.CERTIFIED, 1, False)
 
 
-@settings(max_examples=20, deadline=None)
-@given(seeds)
-def test_noisy_graphs_are_certified_at_the_minimum_of_chi2(seed: int) -> None:
-    graph = random_graph(seed, 0.05)
-    optimize(graph, SolverConfig())
-    found = certify(formulate(graph), graph.poses)
-    assert found.verdict is Verdict.CERTIFIED
-    assert found.rank == 1
-    assert found.relative_gap <= 1e-5
-    assert found.chi2 == pytest.approx(slow_cost(graph, found.poses))
-
-
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 @given(seeds)
 def test_no_start_leads_below_the_bound(seed: int) -> None:
     # so much noise that often the relaxation is not tight
@@ -232,22 +218,6 @@ def test_the_objective_is_nowhere_above_chi2_if_it_says_so(seed: int) -> None:
         assert quadratic.cost(form.headings(poses)[:, None]) <= isotropic.energies(poses).chi2
 
 
-def test_a_graph_without_unknowns_has_its_cost() -> None:
-    graph = Graph()
-    graph.apply(GraphUpdate(
-        np.zeros((2, 3)), Edges([0], [1], [[1.0, 0.0, 0.0]], [np.eye(3)], [0]), fix=[0, 1]))
-    found = certify(formulate(graph), graph.poses)
-    assert (found.verdict, found.chi2, found.gap) == (Verdict.CERTIFIED, 1.0, 0.0)
-
-
-def test_parts_that_are_each_held_are_certified_together() -> None:
-    graph = ring(8, 0)
-    graph.apply(GraphUpdate(
-        graph.poses.copy(), Edges(graph.edges.i + 8, graph.edges.j + 8, graph.edges.mean,
-                                  graph.edges.information, graph.edges.kind), fix=[8]))
-    assert certify(formulate(graph), graph.poses).verdict is Verdict.CERTIFIED
-
-
 @pytest.mark.parametrize(('what', 'size', 'reason'), [
     ('landmarks', 2, 'landmarks'), ('biases', 3, 'biases'), ('hidden', 3, 'join 1 node')])
 def test_what_the_objective_does_not_cover_is_said(what: str, size: int, reason: str) -> None:
@@ -255,11 +225,3 @@ def test_what_the_objective_does_not_cover_is_said(what: str, size: int, reason:
     graph.apply(GraphUpdate(**{what: np.zeros((1, size))}))
     with pytest.raises(NotCoveredError, match=reason):
         formulate(graph)
-
-
-def test_rows_of_zeros_and_of_several_numbers_become_headings() -> None:
-    np.testing.assert_array_equal(unit_rows(np.zeros((1, 2), complex)), [[1.0, 0.0]])
-    z = np.exp(1j * np.arange(5.0))[:, None]
-    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    found = rounded(np.column_stack((z, np.zeros((5, 2)))) @ turn)
-    np.testing.assert_allclose(found * (z[0] / found[0]), z, atol=1e-12)

@@ -44,16 +44,6 @@ def test_with_a_cell_for_each_block_the_pattern_of_h_is_exact() -> None:
         assert np.array_equal(counts_of(found), expected)
 
 
-def test_cells_count_the_blocks_in_them() -> None:
-    graph = graph_of(0.0)
-    expected, found = blocks_of(graph), hessian(graph, most_bins=7)
-    assert found.bins == 7
-    at = np.arange(len(expected)) * 7 // len(expected)
-    sums = np.zeros((7, 7), dtype=int)
-    np.add.at(sums, tuple(at[np.argwhere(expected)].T), 1)
-    assert np.array_equal(counts_of(found), sums)
-
-
 def test_the_factor_has_the_fill_of_its_order() -> None:
     for correlation_time in (0.0, 20.0):
         graph = graph_of(correlation_time)

@@ -5,12 +5,9 @@
 from typing import Any
 
 from hypothesis import given, settings, strategies as st
-import networkx as nx
 import numpy as np
-import pytest
 from random_graphs import random_graph
 
-from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import Prior
@@ -20,11 +17,9 @@ from pose_graph_ros.offline.drawing.views import (
     bayesian_network,
     factor_graph,
     factors,
-    five_states,
     hidden,
     map_places,
     markov_random_field,
-    part,
     pose_graph,
     Role,
     Sort,
@@ -147,13 +142,6 @@ def test_the_pattern_is_that_of_the_matrix_and_the_random_field_that_off_its_dia
     np.testing.assert_array_equal(pairs[1:, 1:], np.triu(expected, 1))
 
 
-def test_the_pattern_of_a_small_graph_is_that_of_the_matrix() -> None:
-    found = pattern(SMALL)
-    np.testing.assert_array_equal(found.blocks, numeric_pattern(small_graph()))
-    assert found.names == ('x1', 'x2', 'x3', 'b4', 'l5')
-    assert found.sizes == (3, 3, 3, 1, 2)
-
-
 @given(seeds)
 def test_the_fill_is_that_of_a_numeric_factor(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -175,54 +163,6 @@ def test_the_elimination_takes_each_node_once(seed: int) -> None:
     assert found.names == tuple(whole.nodes[row]['name'] for row in order if row != 3)
     assert not np.any(found.fill & found.blocks)
     assert not np.any(np.tril(found.fill))
-
-
-def test_a_tree_is_eliminated_without_fill() -> None:
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((7, 3)), edges=Edges(
-        [0, 0, 0, 3, 3, 5], [1, 2, 3, 4, 5, 6], np.zeros((6, 3)), np.tile(np.eye(3), (6, 1, 1)),
-        [EdgeKind.LOOP_CLOSURE] * 6)))
-    whole = factor_graph(graph.rows())
-    assert np.any(pattern(whole, list(range(7))).fill)
-    assert not np.any(pattern(whole, elimination_order(whole)).fill)
-
-
-@given(seeds)
-def test_a_dynamic_bayesian_network_has_no_circle(seed: int) -> None:
-    graph = random_graph(seed, n_biases=2)
-    graph = with_random_kinds(graph, seed)
-    assert nx.is_directed_acyclic_graph(bayesian_network(factor_graph(graph.rows())))
-
-
-def with_random_kinds(graph: Graph, seed: int) -> Graph:
-    """Return a graph some of whose loop closures are odometry, in either direction."""
-    rows, rng = graph.rows(), np.random.default_rng(seed)
-    kinds = rows.edges.kind
-    swap = (kinds == EdgeKind.LOOP_CLOSURE) & (rng.random(len(kinds)) < 0.5)
-    kinds[swap] = EdgeKind.ODOMETRY
-    other = Graph()
-    other.fill(rows)
-    return other
-
-
-def test_the_five_states_have_the_patterns_of_the_thesis() -> None:
-    shown = [factor_graph(rows) for _, rows in five_states()]
-    band = np.abs(np.subtract.outer(np.arange(5), np.arange(5))) <= 1
-    expected = [np.ones((1, 1)), np.ones((1, 1)), np.ones((2, 2)), np.ones((2, 2)), band]
-    for each, blocks in zip(shown, expected, strict=True):
-        np.testing.assert_array_equal(pattern(each).blocks, blocks)
-    assert [len(roles(pose_graph(each), Role.OBSERVED)) for each in shown] == [
-        1, 2, 2, 3, 4]
-
-
-def test_a_part_has_the_terms_among_its_nodes() -> None:
-    chain = factor_graph(five_states()[-1][1])
-    shown, n_cut = part(chain, {0, 1, 2})
-    assert [shown.nodes[node]['name'] for node in hidden(shown)] == ['x0', 'x1', 'x2']
-    assert n_cut == 1
-    assert named(markov_random_field(shown)) == [('x0', 'x1'), ('x1', 'x2')]
-    with pytest.raises(GraphUpdateError, match='none of the hidden nodes'):
-        part(chain, set())
 
 
 @settings(max_examples=10, deadline=None)
@@ -247,15 +187,3 @@ def test_every_vertex_has_a_place_and_poses_are_to_scale(seed: int, name: str) -
 def least_distance(at: np.ndarray) -> float:
     apart = at[:, None] - at[None]
     return float(np.min(np.hypot(apart[..., 0], apart[..., 1]) + 1e9 * np.eye(len(at))))
-
-
-def test_nodes_on_each_other_are_counted_and_springs_move_them_apart() -> None:
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((3, 3)), edges=Edges(
-        [0, 1], [1, 2], np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)),
-        [EdgeKind.ODOMETRY] * 2)))
-    view = markov_random_field(factor_graph(graph.rows()))
-    assert map_places(view)[1] == 3
-    at, n_near = map_places(view, spring=True)
-    assert n_near == 0
-    assert least_distance(np.array(list(at.values()))) > 0.5

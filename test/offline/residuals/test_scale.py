@@ -10,7 +10,6 @@ import pytest
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.replay import run_measurements
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.offline.residuals.scale import fit, whiteness
 from pose_graph_ros.offline.residuals.source_residuals import SourceResiduals
 from pose_graph_ros.offline.residuals.variance_components import analyse, Analysis
@@ -109,19 +108,3 @@ def test_all_sources_together_tell_which_one_is_wrong(wrong: str, ratio: float) 
                        for fits in (found.together, found.at_estimate))
     assert together < apart
     assert not found.correlated
-
-
-def test_correlated_errors_that_are_taken_for_white_are_named() -> None:
-    found = analysed({'global_pose.correlation_time': 0.0}, tau=20.0, seconds=200.0)
-    assert found.correlated == {'global_pose'}
-    assert found.together == found.at_estimate
-
-
-def test_a_few_time_constants_of_slow_errors_tell_little_even_if_they_are_small() -> None:
-    source = made(0.3 * np.random.default_rng(1).normal(size=(200, 2)), 1.0)
-    white, slow = fit(source), fit(source, CorrelatedErrors(50.0, 0.9, 0.1))
-    assert not white.says_nothing
-    duration = float(np.ptp(source.stamps_ns)) * 1e-9
-    assert slow.independent < 2.5 * max(duration / 50.0, 1.0)
-    nearly_white = fit(source, CorrelatedErrors(1e-3, 1e-6, 1.0))
-    assert nearly_white.independent == pytest.approx(white.independent, rel=0.05)

@@ -112,16 +112,3 @@ def test_the_energies_of_honest_measurements_are_as_expected() -> None:
     for source, pairs in sums.items():
         found, expected = np.sum(pairs, axis=0)
         assert abs(found - expected) < 4.0 * np.sqrt(2.0 * expected), source
-
-
-def test_unused_constraints_have_their_distance_from_the_estimate_without_them() -> None:
-    drive = HonestDrive(3, seconds=200.0, closures=10, false_closures=3)
-    backend, _ = run_measurements(drive.measurements(), checked({}))
-    found = analyse(backend.parts()).residuals['loop_closure']
-    assert np.sum(~found.used) == 3
-    unused = found.rows(~found.used)
-    expected = [backend._smoother.edge_innovations(
-        backend.graph.edges_at([number])).squared_distances(
-            backend.graph.edges_at([number]).information) for number in unused.ids]
-    np.testing.assert_allclose(unused.distances**2, np.ravel(expected), rtol=1e-9)
-    assert np.all(unused.distances > 10.0)

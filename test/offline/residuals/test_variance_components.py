@@ -5,7 +5,6 @@
 from pathlib import Path
 
 import numpy as np
-from public_data import needs, PUBLIC
 import pytest
 
 from pose_graph_ros.cli.main import main
@@ -15,8 +14,6 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.offline.residuals import variance_components as vc
 from pose_graph_ros.offline.residuals.source_residuals import inverse
-
-M3500 = 'graphs/input_M3500_g2o.g2o'
 
 
 def laps(seed: int, times: tuple[float, float]) -> vc.Constraints:
@@ -74,13 +71,3 @@ def test_closures_that_are_honest_are_not_found_wrong_and_those_that_claim_a_thi
         texts = [each['text'] for each in data['findings'] if f'{CLOSURES}.covariance_scale' in (
             each['text'])]
         assert len(texts) == (0 if claim == 1.0 else 1)
-
-
-@needs(M3500)
-def test_odometry_and_closures_of_equal_noise_are_found_to_be_equal(tmp_path: Path) -> None:
-    assert main(['replay', str(PUBLIC / M3500), '-o', str(tmp_path)]) == 0
-    ratios = {each['name']: each['ratio']
-              for each in read_document(tmp_path / 'run.json')['sources']}
-    # 0.0226 m and rad by the truth, 0.1495 as the file says
-    assert ratios['odom'] == pytest.approx(0.151, rel=0.05)
-    assert ratios[CLOSURES] == pytest.approx(0.151, rel=0.08)

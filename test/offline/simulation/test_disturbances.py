@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.offline.simulation import disturbances
+from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.recording import course, record, Recording
 from pose_graph_ros.offline.simulation.settings import (
-    CLOSURES,
     Delay,
-    Duplicates,
     Fixes,
     GlobalPoses,
     Gyro,
@@ -64,27 +61,11 @@ def test_odometry_goes_on_from_where_it_jumped_to() -> None:
     np.testing.assert_allclose(jumped.poses[second + 1], 0.0, atol=1e-12)
 
 
-def test_the_twist_of_odometry_does_not_jump() -> None:
-    jumped = drive(jumps=(Jump('/odom', 200.0, (30.0, 0.0, 1.0)),))
-    np.testing.assert_array_equal(jumped.velocities, drive().velocities)
-
-
-def test_global_poses_jump_in_the_map_for_some_time() -> None:
-    usual = drive()
-    other = drive(jumps=(Jump('/global_pose', 100.0, (2.0, 3.0, 0.5), 50.0),))
-    moved = other.poses - usual.poses
-    moved[:, 2] = se2.wrap(moved[:, 2])
-    time = (usual.pose_stamps_ns - usual.start_ns) * 1e-9
-    inside = (time >= 100.0) & (time < 150.0)
-    np.testing.assert_allclose(moved, inside[:, None] * np.array((2.0, 3.0, 0.5)), atol=1e-12)
-    np.testing.assert_array_equal(other.pose_is_wrong, inside)
-
-
 def test_delays_keep_stamps_and_shift_when_messages_are_recorded() -> None:
     stamps = np.arange(1000) * 50_000_000
     for delay, least, most in ((Delay('/odom', 2.0), 2.0, 2.0), (Delay('/odom', 0.5, 3.0), 0.5,
                                                                  3.5)):
-        index, recorded = disturbances.arrivals(
+        index, recorded = sensors.arrivals(
             np.random.default_rng(1), '/odom', stamps, Setup(delays=(delay,)))
         late = (recorded - stamps[index]) * 1e-9
         assert np.array_equal(np.sort(index), np.arange(1000))
@@ -96,26 +77,3 @@ def test_delays_keep_stamps_and_shift_when_messages_are_recorded() -> None:
     usual, late = drive(), drive(delays=tuple(Delay(topic, 1.0, 2.0) for topic in TOPICS))
     for topic, found in stamps_of(late).items():
         np.testing.assert_array_equal(found, stamps_of(usual)[topic])
-
-
-def test_duplicates_come_again_within_a_second() -> None:
-    stamps = np.arange(5000) * 50_000_000
-    index, recorded = disturbances.arrivals(
-        np.random.default_rng(1), CLOSURES, stamps, Setup(duplicates=(
-            Duplicates(CLOSURES, 0.2),)))
-    count = np.bincount(index)
-    assert set(count.tolist()) == {1, 2}
-    assert np.mean(count == 2) == pytest.approx(0.2, abs=0.02)
-    late = recorded - stamps[index]
-    assert late.min() == 800_000_000
-    assert late.max() <= 1_800_000_000
-
-
-@pytest.mark.parametrize('wrong', [
-    lambda: Outage('/odom', 5.0, 5.0), lambda: Outage('/ground_truth', 1.0, 2.0),
-    lambda: Jump('/gps/fix', 1.0, None), lambda: Jump('/odom', 1.0, (1.0, 0.0, 0.0), 2.0),
-    lambda: Jump('/gps/fix', float('nan'), (1.0, 0.0, 0.0)), lambda: Delay('/odom', -1.0),
-    lambda: Duplicates('/odom', 1.5)])
-def test_what_makes_no_sense_is_refused(wrong: object) -> None:
-    with pytest.raises(ConfigError, match='expected'):
-        wrong()  # type: ignore[operator]

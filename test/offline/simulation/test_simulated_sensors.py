@@ -131,14 +131,6 @@ def test_the_gyroscope_has_white_noise_and_a_bias_that_walks() -> None:
         gyro.bias_walk * np.sqrt((n - 500) * PERIOD_S), rel=0.25)
 
 
-def test_global_poses_have_the_sigmas_that_they_claim() -> None:
-    truth, settings = straight(3000.0), GlobalPoses(0.5, (0.3, 0.05))
-    stamps, poses = sensors.global_poses(np.random.default_rng(1), truth, settings)
-    errors = poses - truth.at(stamps)
-    np.testing.assert_allclose(np.std(errors, axis=0), (0.3, 0.3, 0.05), rtol=0.05)
-    assert np.mean(errors[1:] * errors[:-1]) == pytest.approx(0.0, abs=0.005)
-
-
 def test_odometry_by_the_model_has_the_noise_that_the_node_assumes() -> None:
     time = np.arange(0.0, 60.0, PERIOD_S)
     heading = 0.5 * np.sin(0.2 * time)

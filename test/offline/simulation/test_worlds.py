@@ -19,13 +19,10 @@ from pose_graph_ros.offline.simulation.settings import (
     Outage,
     Setup,
 )
-from pose_graph_ros.offline.simulation.streets import rounded
 from pose_graph_ros.offline.simulation.worlds import (
     AISLE_DEPTH,
     AISLE_SPACING,
     AISLES,
-    BLOCK,
-    BLOCKS,
     CART,
     FORKLIFT,
     WORLDS,
@@ -63,30 +60,6 @@ def test_the_robot_stays_in_the_aisles_of_the_hall_for_hours() -> None:
         np.sin(motion.poses[::100][middle, 2]) > 0.0)
     assert np.bincount(visits, minlength=2 * AISLES).min() > 10
     assert np.mean(np.diff(motion.distance) < 1e-6) > 0.1    # it stops to pick up
-
-
-def test_the_walk_covers_the_grid_and_stays_in_its_streets() -> None:
-    motion = course(WORLDS['grid'], 2, 7200.0).motion
-    away = se2.rotation(-0.35) @ motion.poses[::100, :2].T
-    off = np.abs(away / BLOCK - np.round(away / BLOCK)) * BLOCK
-    assert np.all(np.min(off, axis=0) < 1.5)
-    crossings = {tuple(each) for each in np.round(away / BLOCK).astype(int).T.tolist()}
-    assert len(crossings) > 0.8 * (BLOCKS + 1)**2
-    assert np.all((away > -1.0) & (away < BLOCK * BLOCKS + 1.0))
-
-
-def test_rounded_corners_keep_to_the_lines_and_to_the_length_of_a_turn() -> None:
-    corners = np.array([(0, 0), (10, 0), (20, 0), (20, 10), (10, 10), (10, 30)], dtype=np.float64)
-    points, middles = rounded(corners, 3.0, 0.01)
-    steps = np.diff(points, axis=0)
-    np.testing.assert_allclose(np.hypot(*steps.T), 0.01, rtol=2e-3)
-    heading = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
-    turning = np.abs(np.diff(heading)) > 1e-6
-    assert np.sum(turning) * 0.01 == pytest.approx(3 * 3.0, rel=0.1)
-    assert heading[-1] - heading[0] == pytest.approx(0.5 * np.pi, abs=1e-3)
-    np.testing.assert_allclose(
-        points[np.round(middles[:-1] / 0.01).astype(int)], [(10, 0), (20, 5), (15, 10)], atol=0.02)
-    np.testing.assert_allclose(points[[0, -1]], [(10, 0), (10, 20)], atol=0.02)
 
 
 def simulated(world: str, seed: int = 1, **changes: object) -> SimulatedGraph:

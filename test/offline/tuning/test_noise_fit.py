@@ -29,12 +29,6 @@ def test_white_errors_are_found_whatever_is_claimed(claimed: float) -> None:
     assert variance.high < 1.6 * variance.low
 
 
-def test_true_settings_are_kept() -> None:
-    fit = found(*made(1, 300))
-    assert all(each.kept for each in fit.found)
-    assert all(each.low <= each.value <= each.high for each in fit.found)
-
-
 def test_noise_of_odometry_is_found() -> None:
     sigmas = 0.3, 0.2, 0.05, 0.05
     fit = found(*made(2, 400, sigmas, white=0.3, claimed=0.3))
