@@ -10,10 +10,11 @@ one in the mean over drives; over a few drives it is what their noise happens to
 
 import numpy as np
 
-from benchmark.window_drive import Course, odometry_variances, SECOND, START_NS
+from benchmark.course import Course, SECOND, START_NS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import LoopClosure, Position
+from pose_graph_ros.offline.simulation.sensors import model_variances
 
 UNKNOWN = 1e4
 """Variance of a pose that nothing is known of [m^2, rad^2]."""
@@ -36,7 +37,7 @@ def exact_nees(course: Course, looks: IntArray) -> FloatArray:
     truth, others = course.truth(time), [each for piece in pieces for _, each in piece[2]]
     moves = se2.between(truth[:-1], truth[1:])
     noise = se2.between(moves, se2.between(measured[:-1], measured[1:]))
-    variances = odometry_variances(moves)
+    variances = model_variances(moves)
     # a closure of these drives names its reference by stamp
     stamps = looks.tolist() + [each.reference_ns for each in others
                                if isinstance(each, LoopClosure)]

@@ -48,38 +48,32 @@ class Excess:
 
 def of_run(world: World, run: Run) -> Excess:
     """Judge the samples of a run of either tool."""
-    judge = _by_gtsam if run.tool.startswith('GTSAM') else _by_ours
     steps = sorted(run.samples)
-    rows = [judge(world, step, run.samples[step]) for step in steps]
+    rows = []
+    for step in steps:
+        before, after, best = optimum(world, step, run.samples[step], run.tool)
+        off = (run.samples[step] - best)[1:, :2]     # node 0 is fixed
+        weighted = np.linalg.solve(
+            ours.position_covariances(world, step, best)[1:], off[..., None])[..., 0]
+        rows.append((before, after, np.max(np.hypot(*off.T)),
+                     np.sqrt(np.max(np.sum(off * weighted, axis=1)))))
     table = np.array(rows)
     return Excess(
         np.array(steps, dtype=float), np.maximum(0.5 * (table[:, 0] - table[:, 1]), 0.0),
         table[:, 2], table[:, 3], float(table[-1, 0]), float(table[-1, 1]))
 
 
-def _by_ours(world: World, step: int, poses: FloatArray) -> tuple[float, ...]:
-    """Return chi2 of the estimate and of the optimum, and the largest distances between them."""
+def optimum(
+    world: World, step: int, poses: FloatArray, tool: str,
+) -> tuple[float, float, FloatArray]:
+    """Return chi2 of poses and of the minimum below them, and its poses, as the tool has them."""
+    if tool.startswith('GTSAM'):
+        # only here: the rest of the benchmark can be imported without GTSAM
+        from benchmark import gtsam_peer  # noqa: PLC0415
+
+        factors, start = gtsam_peer.whole_graph(world, step), gtsam_peer.values_of(poses)
+        best = gtsam_peer.optimum(factors, start)
+        return (2.0 * factors.error(start), 2.0 * factors.error(best), gtsam_peer.poses_of(best))
     graph = world.graph(poses, step)
     before = graph.energies().chi2
-    result = optimizer.optimize(graph, EXACT)
-    return before, result.chi2, *_worst(world, step, poses, graph.poses)
-
-
-def _by_gtsam(world: World, step: int, poses: FloatArray) -> tuple[float, ...]:
-    # only here: the rest of the benchmark can be imported without GTSAM
-    from benchmark import gtsam_peer  # noqa: PLC0415
-
-    graph, start = gtsam_peer.whole_graph(world, step), gtsam_peer.values_of(poses)
-    best = gtsam_peer.optimum(graph, start)
-    return (2.0 * graph.error(start), 2.0 * graph.error(best),
-            *_worst(world, step, poses, gtsam_peer.poses_of(best)))
-
-
-def _worst(
-    world: World, step: int, poses: FloatArray, optimum: FloatArray,
-) -> tuple[float, float]:
-    off = (poses - optimum)[1:, :2]     # node 0 is fixed
-    weighted = np.linalg.solve(
-        ours.position_covariances(world, step, optimum)[1:], off[..., None])[..., 0]
-    return (float(np.max(np.hypot(*off.T))),
-            float(np.sqrt(np.max(np.sum(off * weighted, axis=1)))))
+    return before, optimizer.optimize(graph, EXACT).chi2, graph.poses

@@ -20,7 +20,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse import linalg
 
-from benchmark.runs import Plan, quiet, Run
+from benchmark import runs
+from benchmark.runs import Plan, Run, Tool
 from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import linear_starts, optimizer
 from pose_graph_ros.core.config import SolverConfig
@@ -32,14 +33,20 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 NAME, REFINED = 'ours', 'ours, refined'
+FIRST_SIGMA = 1e-5
+"""Of the pose of node 0, as GTSAM has it, where nodes go [m, rad]."""
+NEVER = 10**9
+"""A lag with which none goes."""
 BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)
 SINGLE = SolverConfig(max_iterations=1)
 AfterStep = Callable[[IncrementalSmoother, int], None]
 
 
-def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
+def run(
+    world: World, plan: Plan, after_step: AfterStep | None = None, engine: 'Ours | None' = None,
+) -> Run:
     """
-    Run the smoother over a world.
+    Run the smoother over a world; RuntimeError if a step fails.
 
     Parameters
     ----------
@@ -47,47 +54,17 @@ def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
     plan : Plan
     after_step : callable, optional
         Called with the smoother and the step, outside of what is timed.
-
-    Raises
-    ------
-    RuntimeError
-        If a step fails, saying which and why.
+    engine : Ours, optional, if it is not that of the whole graph
 
     """
-    smoother = IncrementalSmoother()
-    steps = Steps(world)
-    seconds = np.zeros(world.n_nodes)
-    done = Run(NAME, seconds)
-    total = 0.0
-    with quiet():
-        for k in range(world.n_nodes):
-            step = steps.extending if steps.plain[k] else steps.updating
-            begin = time.perf_counter()
-            result = step(smoother, k)
-            seconds[k] = time.perf_counter() - begin
-            total += seconds[k]
-            if result.status is optimizer.Status.FAILED:
-                raise RuntimeError(f'{world.name}, step {k}: {result.reason}')
-            if after_step is not None:
-                after_step(smoother, k)
-            if k in plan.samples or total > plan.limit:
-                done.samples[k] = smoother.poses.copy()
-            if total > plan.limit:
-                done.seconds, done.note = seconds[:k + 1], f'first {k + 1} steps'
-                break
-    return done
+    engine = engine or Ours(world)
+    smoother = engine.smoother
+    return runs.run(engine.name, engine, world, plan, None if after_step is None else (
+        lambda k: after_step(smoother, k)))
 
 
 def run_refined(world: World, plan: Plan) -> Run:
-    """
-    Run the smoother over a world, and refine each sample, as the node does between two updates.
-
-    Parameters
-    ----------
-    world : World
-    plan : Plan
-
-    """
+    """Run the smoother over a world, and refine each sample, as the node does between updates."""
     seconds: list[float] = []
 
     def refine(smoother: IncrementalSmoother, k: int) -> None:
@@ -101,6 +78,13 @@ def run_refined(world: World, plan: Plan) -> Run:
     done.tool, done.refinement = REFINED, seconds
     done.samples = {k: poses for k, poses in done.samples.items() if k in plan.samples}
     return done
+
+
+def kept(lag: int, every: int = 20) -> tuple[str, Tool]:
+    """Return name and tool of a smoother from which nodes go, so many at a time."""
+    name = (f'{NAME}, unlimited' if lag == NEVER else
+            f'{NAME}, one at a time' if every == 1 else NAME)
+    return name, lambda world, plan: run(world, plan, None, Ours(world, name, lag, every))
 
 
 def position_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
@@ -121,54 +105,39 @@ def position_covariances(world: World, step: int, poses: FloatArray) -> FloatArr
 
 
 def warm_up() -> None:
-    """Run the smoother on small worlds, so that nothing is compiled while times are taken."""
-    for world in _small_worlds():
+    """Run everything on small worlds, so that nothing is compiled while times are taken."""
+    for world in (chain(100), chain(100, 'late'), laps(120, 60)):
         run_refined(world, Plan(frozenset({world.n_nodes - 1})))
-
-
-def warm_up_batch() -> None:
-    """Do the same with the batch optimiser."""
-    for world in _small_worlds():
+        for every in (1, 20):
+            kept(70, every)[1](world, Plan())
+        smoother = smoothed(world)
+        smoother.newest_covariance()
+        smoother.covariances()
+        smoother.joint_covariance(1, 2)
         graph = world.graph(world.dead_reckoning())
         solve_from_nothing(graph)
         solve(graph)
 
 
-def warm_up_covariances() -> None:
-    """Do the same with covariances."""
-    for world in _small_worlds():
-        smoother = smoothed(world)
-        smoother.newest_covariance()
-        smoother.covariances()
-        smoother.joint_covariance(1, 2)
-        iterate(world.graph(smoother.poses.copy()))
-
-
-def _small_worlds() -> tuple[World, ...]:
-    return chain(100), chain(100, 'late'), laps(120, 60)
-
-
 def smoothed(world: World) -> IncrementalSmoother:
     """Return the smoother after all of a world."""
-    seen: dict[str, IncrementalSmoother] = {}
-    run(world, Plan(), lambda smoother, _: seen.update(last=smoother))
-    return seen['last']
+    engine = Ours(world)
+    run(world, Plan(), None, engine)
+    return engine.smoother
 
 
-class Steps:
+class Ours:
     """
-    What arrives in each step, as a caller has it: lists of arrays, nothing prepared.
+    Our smoother, and what arrives in each step, as a caller has it: lists of arrays.
 
-    Parameters
-    ----------
-    world : World
-    first_sigma : float, of a global pose of node 0 [m, rad]; 0: it is fixed
-
+    With a lag [nodes] older nodes go, `every` so many at a time, and node 0 is not fixed, as it
+    could not go.
     """
 
-    def __init__(self, world: World, first_sigma: float = 0.0) -> None:
+    def __init__(self, world: World, name: str = NAME, lag: int = 0, every: int = 20) -> None:
         edges = world.edges
-        self.world, self.first_sigma = world, first_sigma
+        self.world, self.name, self.lag, self.every = world, name, lag, every
+        self.smoother, self.kept = IncrementalSmoother(), 0
         self.edge_stops = [0, *world.edge_stops.tolist()]
         self.observed_stops = [0, *world.observed_stops.tolist()]
         self.i, self.j = edges.i.tolist(), edges.j.tolist()
@@ -181,12 +150,36 @@ class Steps:
             self.ahead.append(ahead)
             self.plain.append(ahead and edge_stop == edge + 1 and seen_stop == seen)
 
+    def next(self, k: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return what is called in a step."""
+        step = self.extending if self.plain[k] else self.updating
+        return (self.lagging, (step, k)) if self.lag else (step, (self.smoother, k))
+
+    def check(self, k: int, result: Any) -> FloatArray | None:
+        """Raise if a step has failed, saying which and why; return the newest pose with a lag."""
+        result, newest = result if self.lag else (result, None)
+        if result.status is optimizer.Status.FAILED:
+            raise RuntimeError(f'{self.world.name}, step {k}: {result.reason}')
+        return newest
+
+    def poses(self) -> FloatArray:
+        """Return the estimate."""
+        return self.smoother.poses.copy()
+
+    def lagging(self, step: Any, k: int) -> tuple[UpdateResult, FloatArray]:
+        """Do a step, let old nodes go, and read the newest pose."""
+        result = step(self.smoother, k)
+        if k - self.lag - self.kept >= self.every:
+            self.smoother.forget(range(self.kept, self.kept + self.every))
+            self.kept += self.every
+        return result, self.smoother.poses[-1].copy()
+
     def _first(self) -> GraphUpdate:
         first = self.world.first[None]
-        if self.first_sigma == 0.0:
+        if self.lag == 0:
             return GraphUpdate(hidden=first, fix=(0,))
         return GraphUpdate(hidden=first, observed=ObservedNodes(
-            [0], None, first, np.eye(3)[None] / self.first_sigma**2, [ObservedKind.GLOBAL_POSE]))
+            [0], None, first, np.eye(3)[None] / FIRST_SIGMA**2, [ObservedKind.GLOBAL_POSE]))
 
     def extending(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do a step that only adds a node to the end."""

@@ -4,8 +4,7 @@
 How long updates and the work between them take while closures are judged.
 
 Two back ends, one that judges and one that believes everything, get the same samples in turn.
-Times are those of the processor, which other processes change least; `benchmark.robust_node`
-measures the real node by the clock.
+Times are those of the processor, which other processes change least.
 """
 
 from collections.abc import Sequence
@@ -15,17 +14,10 @@ import time
 
 import numpy as np
 
-from benchmark import streets
-from benchmark.metrics import Metric
-from benchmark.robust_closures import add, closing, Recording
-from benchmark.robust_worlds import (
-    LOOSE,
-    of_world,
-    OUTDOORS,
-    place_recognition,
-    with_false,
-)
-from benchmark.section import say, Section, Table
+from benchmark import worlds
+from benchmark.recordings import add, closures, Recording
+from benchmark.section import Options, Section
+from benchmark.wrong_closures import of_world, simulated, with_false
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Robust
 from pose_graph_ros.core.measurements import OdometrySample
@@ -108,13 +100,12 @@ def flood(run: Timed, recording: Recording, count: int) -> tuple[float, list[flo
 
     """
     before, rng, updates = memory(), np.random.default_rng(1), len(run.updates)
-    n = len(recording.stamps_ns) - 10
+    n, information = len(recording.stamps_ns) - 10, recording.loops().information[0]
+    none = recording.only(np.zeros(len(recording.ends), dtype=bool))
     for _ in range(count // BATCH):
         i, j = np.sort(rng.choice(n, (2, BATCH)), axis=0)
-        wrong = closing(
-            recording.only(np.zeros(len(recording.ends), dtype=bool)), i, j + 1,
-            rng.uniform(-1.0, 1.0, (BATCH, 3)) * (100.0, 100.0, 3.0),
-            np.tile(recording.covariances[0], (BATCH, 1, 1)))
+        wrong = none.closing(closures(
+            i, j + 1, rng.uniform(-1.0, 1.0, (BATCH, 3)) * (100.0, 100.0, 3.0), information))
         for k in range(BATCH):
             add(run.backend, wrong, k)
         run.update(IDLE)
@@ -128,33 +119,26 @@ def memory() -> float:
     return int(line.split()[1]) / 1024.0
 
 
-def city(n: int) -> Recording:
-    """Return a drive through a city, with as many right closures."""
-    world = streets.city(n)
-    return of_world(replace(world, name='city', observed=world.observed.rows(slice(0)),
-                            observed_stops=np.zeros(world.n_nodes, dtype=np.int64)))
-
-
 def drives(n: int) -> list[Recording]:
     """Return drives of n nodes whose closures are right, from tight odometry to loose one."""
-    front_end = replace(LOOSE, right=n // 10, single=0, groups=0)
-    return [city(n), of_world(streets.corridor(n)),
-            place_recognition(replace(OUTDOORS, step=1.0, n=n), front_end, 2.5, 0)]
+    world = worlds.city(n)
+    city = replace(world, name='city', observed=world.observed.rows(slice(0)),
+                   observed_stops=np.zeros(world.n_nodes, dtype=np.int64))
+    return [of_world(city), of_world(worlds.corridor(n)), simulated('hall', 1.4 * n, 0)]
 
 
-def timing(*, quick: bool) -> Section:
+def timing(options: Options) -> Section:
     """Measure drives without wrong closures, with random ones and with groups of them."""
-    n = LARGE // 5 if quick else LARGE
+    n = LARGE // 5 if options.quick else LARGE
     section = Section(
         'Time of judging', f'Drives of {n} nodes, at an update for each node and {1e3 * IDLE:.0f} '
         'ms for the work after it. Times of the processor in ms. A step is an update with that '
         f'work. Asked for: no update above {1e3 * LONGEST:.0f} ms; without wrong closures steps '
         f'that take at most {SLOWER} times those of a back end that believes everything, over '
         'the same samples in turn.')
-    table = Table('', (
-        'drive', 'wrong', 'robust', 'update mean', 'p99', 'max', 'slice p99', 'max', 'step mean',
-        'p99', 'believed', 'end of stream [s]'))
-    section.tables.append(table)
+    table = section.table(
+        '', 'drive', 'wrong', 'robust', 'update mean', 'p99', 'max', 'slice p99', 'max',
+        'step mean', 'p99', 'believed', 'end of stream [s]')
     warm_up()
     for clean in drives(n):
         for share, group in ((0.0, 1), (0.1, 1), (0.3, 10), (0.5, 1)):
@@ -162,7 +146,7 @@ def timing(*, quick: bool) -> Section:
             kinds = (Robust.JUDGED, Robust.NONE) if share == 0.0 else (Robust.JUDGED,)
             runs = drive(recording, kinds)
             name = f'{100 * share:.0f} %' + (f', groups of {group}' if group > 1 else '')
-            section.metrics += _asked(f'{clean.name}, {name} wrong', runs, large=n >= LARGE)
+            _ask(section, f'{clean.name}, {name} wrong', runs, large=n >= LARGE)
             for kind, run in zip(kinds, runs, strict=True):
                 believed, start = _believed(run.backend), time.thread_time()
                 run.backend.optimize()
@@ -170,8 +154,7 @@ def timing(*, quick: bool) -> Section:
                     np.mean(run.updates), *_quantiles(run.updates), *_quantiles(run.slices),
                     np.mean(run.steps), np.quantile(run.steps, 0.99))), believed,
                     f'{time.thread_time() - start:.1f}')
-                say(f'  {" | ".join(table.rows[-1])}')
-    count = FLOOD // 10 if quick else FLOOD
+    count = FLOOD // 10 if options.quick else FLOOD
     grown, updates = flood(runs[0], recording, count)
     section.notes.append(
         f'{count} further wrong closures, {BATCH} with each update: the process grows by '
@@ -180,18 +163,15 @@ def timing(*, quick: bool) -> Section:
     return section
 
 
-def _asked(name: str, runs: Sequence[Timed], *, large: bool) -> list[Metric]:
-    """Return the figures that something is asked of, in a large graph."""
+def _ask(section: Section, name: str, runs: Sequence[Timed], *, large: bool) -> None:
+    """Add the figures that something is asked of, in a large graph."""
     first, slower = runs[0], SLOWER if large else None
-    metrics = [Metric(f'{name}: longest update', max(first.updates), ' s', target=LONGEST),
-               Metric(f'{name}: longest slice', max(first.slices), ' s', target=LONGEST)]
+    section.ask(f'{name}: longest update', max(first.updates), ' s', most=LONGEST)
+    section.ask(f'{name}: longest slice', max(first.slices), ' s', most=LONGEST)
     for other in runs[1:]:
-        metrics += [
-            Metric(f'{name}: steps slower by', float(
-                np.mean(first.steps) / np.mean(other.steps)), target=slower),
-            Metric(f'{name}: steps slower by, p99', float(
-                np.quantile(first.steps, 0.99) / np.quantile(other.steps, 0.99)), target=slower)]
-    return metrics
+        for what, figure in (('', np.mean), (', p99', lambda v: np.quantile(v, 0.99))):
+            section.ask(f'{name}: steps slower by{what}', figure(first.steps) / figure(
+                other.steps), most=slower)
 
 
 def _quantiles(times: Sequence[float]) -> tuple[float, float]:

@@ -3,6 +3,8 @@
 """
 Drives of any length round and round a course, made piece by piece from a seed.
 
+A day at 50 Hz is too long for `pose_graph_ros.offline.simulation`, which makes a drive at once.
+
 The noise is what the engine is told: odometry has that of its default model, fixes and closures
 have white errors with the covariances that come with them. But the engine sums up the turns that
 odometry shows, whose noise lengthens the sum the more the shorter the steps are: at 1 m/s on a
@@ -13,11 +15,12 @@ side of the last.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 
-from benchmark.worlds import integrate
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import ThinningConfig, WindowConfig, WindowPrior
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import (
@@ -26,12 +29,17 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
+from pose_graph_ros.offline.simulation.graph import composed
+from pose_graph_ros.offline.simulation.motion import path_length
+from pose_graph_ros.offline.simulation.sensors import model_variances
 
 SECOND = 1_000_000_000
 START_NS = 1_000 * SECOND
 PIECE = 600.0
 """Length of what is made at once [s]."""
 FIXES, CLOSURES = 'fix', 'loop_closure'
+UNITS = {'s': 'seconds', 'm': 'metres', 'nodes': 'nodes'}
+UNLIMITED = 'unlimited'
 FINE = 20_000
 """Points of the course between which is interpolated."""
 
@@ -53,8 +61,6 @@ class Course:
     """[s]; 0: there are none."""
     fix_sigma: float = 1.0
     """Of a coordinate [m]."""
-    fix_tau: float = 0.0
-    """Time constant of the errors of fixes, but for a white fifth of their sigma [s]; 0: white."""
     closure_period: float = 10.0
     """[s]; 0: there are none."""
     closure_sigma: tuple[float, float, float] = (0.1, 0.1, 0.02)
@@ -111,26 +117,10 @@ class Course:
             times = step * np.arange(begin, min(begin + count, n))
             truth = self.truth(times)
             moves = se2.between(np.concatenate((before, truth[:-1])), truth)
-            poses = integrate(last, self._noisy(moves, rng))[1:]
+            noise = np.sqrt(model_variances(moves)) * rng.standard_normal(moves.shape)
+            poses = composed(last, se2.compose(moves, noise))[1:]
             before, last = truth[-1:], poses[-1]
             yield times, poses, self._others(float(times[0]), float(times[-1]), rng)
-
-    def _noisy(self, moves: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return motions with the noise of the model."""
-        sigmas = np.sqrt(odometry_variances(moves))
-        return np.asarray(se2.compose(moves, sigmas * rng.standard_normal(moves.shape)))
-
-    def _fix_errors(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Return the errors of the fixes of a piece, shape (n, 2) [m]."""
-        white = self.fix_sigma * rng.standard_normal((n, 2))
-        if self.fix_tau == 0.0:
-            return white
-        phi = np.exp(-self.fix_period / self.fix_tau)
-        errors = np.sqrt(1.0 - phi**2) * rng.standard_normal((n, 2))
-        errors[:1] /= np.sqrt(1.0 - phi**2)
-        for k in range(1, n):
-            errors[k] += phi * errors[k - 1]
-        return np.asarray(self.fix_sigma * np.sqrt(0.96) * errors + 0.2 * white)
 
     def _others(
         self, begin: float, end: float, rng: np.random.Generator,
@@ -139,7 +129,8 @@ class Course:
         found: list[tuple[str, Measurement]] = []
         if self.fix_period > 0.0:
             times = _every(self.fix_period, begin, end)
-            places = self.truth(times)[:, :2] + self._fix_errors(len(times), rng)
+            places = self.truth(times)[:, :2] + self.fix_sigma * rng.standard_normal(
+                (len(times), 2))
             known, arm = self.fix_sigma**2 * np.eye(2), np.zeros(2)
             found += [(FIXES, Position(stamp, place, known, arm)) for stamp, place in zip(
                 self.stamps(times).tolist(), places, strict=True)]
@@ -163,35 +154,37 @@ class Course:
         return sorted(found, key=lambda item: item[1].stamp_ns)
 
 
-def odometry_variances(moves: FloatArray) -> FloatArray:
-    """Return the variances of (x, y, theta) of short motions by odometry, shape (N, 3)."""
-    noise = OdometryNoise()
-    distance, turn = np.hypot(moves[:, 0], moves[:, 1]), np.abs(moves[:, 2])
-    return np.column_stack((
-        noise.sigma_distance**2 * distance, noise.sigma_lateral**2 * distance,
-        noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * turn))
-
-
 def _every(period: float, begin: float, end: float) -> FloatArray:
     """Return the multiples of a period between two times."""
     first = max(int(np.ceil(begin / period)), 1)
     return period * np.arange(first, int(np.floor(end / period)) + 1)
 
 
+@cache
 def _course(length: float) -> tuple[FloatArray, FloatArray]:
     """Return path length along a closed course, shape (M,), and its poses, shape (M, 3)."""
-    if length not in _COURSES:
-        angle = np.linspace(0.0, 2.0 * np.pi, FINE + 1)
-        radius = 1.0 + 0.25 * np.cos(3.0 * angle) + 0.1 * np.sin(2.0 * angle)
-        points = radius[:, None] * np.column_stack((1.4 * np.cos(angle), np.sin(angle)))
-        moves = np.diff(points, axis=0)
-        along = np.concatenate(([0.0], np.cumsum(np.hypot(*moves.T))))
-        points, along = points * (length / along[-1]), along * (length / along[-1])
-        slope = np.gradient(points, along, axis=0)
-        slope[0] = slope[-1] = 0.5 * (slope[0] + slope[-1])
-        heading = np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))
-        _COURSES[length] = along, np.column_stack((points, heading))
-    return _COURSES[length]
+    angle = np.linspace(0.0, 2.0 * np.pi, FINE + 1)
+    radius = 1.0 + 0.25 * np.cos(3.0 * angle) + 0.1 * np.sin(2.0 * angle)
+    points = radius[:, None] * np.column_stack((1.4 * np.cos(angle), np.sin(angle)))
+    along = path_length(points)
+    points, along = points * (length / along[-1]), along * (length / along[-1])
+    slope = np.gradient(points, along, axis=0)
+    slope[0] = slope[-1] = 0.5 * (slope[0] + slope[-1])
+    return along, np.column_stack((points, np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))))
 
 
-_COURSES: dict[float, tuple[FloatArray, FloatArray]] = {}
+def settings_of(window: str) -> dict[str, Any]:
+    """
+    Return the arguments of `BackendConfig` for a window.
+
+    Names are `unlimited`, `90 s`, `90 s sparse`, `500 nodes`, and `thinning 2 m` for cells of that
+    size.
+    """
+    if window == UNLIMITED:
+        return {}
+    size, unit, *rest = window.removeprefix('thinning ').split()
+    if window.startswith('thinning'):
+        return {'thinning': ThinningConfig(cell=float(size))}
+    return {'window': WindowConfig(
+        **{UNITS[unit]: int(size)}, prior=(
+            WindowPrior.SPARSE if rest == ['sparse'] else WindowPrior.DENSE))}

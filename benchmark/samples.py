@@ -15,9 +15,8 @@ import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from benchmark.metrics import ACCURACY, Metric
-from benchmark.section import say, Section, Table
-from benchmark.window_drive import Course, FIXES
+from benchmark.course import Course, FIXES
+from benchmark.section import Options, say, Section
 from pose_graph_ros.adapters.bag_writer import BAG_VERSION
 from pose_graph_ros.cli.bag_messages import fix_messages, loop_closure_messages, odometry_messages
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -144,40 +143,27 @@ def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, float, FloatAr
     return time.monotonic() - begin, int(largest.read_text()) * 1.024e-3, np.array(curve)
 
 
-def section(samples: list[int], bags: Path | None = None) -> Section:
-    """
-    Replay bags of several lengths.
-
-    Parameters
-    ----------
-    samples : list of int, numbers of messages of odometry
-    bags : Path, optional, folder where the bags are kept, and used again; else they are removed
-
-    """
+def section(options: Options) -> Section:
+    """Replay bags of several lengths."""
     found = Section(
         'A replay of very many samples',
         f'`pose-graph replay` of a bag with odometry at {RATE:.0f} Hz, fixes at '
         f'{1.0 / FIX_PERIOD:g} Hz and a loop closure every {CLOSURE_PERIOD:.0f} s, with a window '
         f'of {WINDOW} s. Largest resident memory of the process. Asked for: below '
         f'{LIMIT:.0f} MB with 10 million samples.')
-    table = Table('', ('samples', 'hours', 'bag MB', 'time s', 'us a sample', 'hidden nodes',
-                       'largest memory MB'))
-    for n in samples:
+    table = found.table('', 'samples', 'hours', 'bag MB', 'time s', 'us a sample', 'hidden nodes',
+                        'largest memory MB')
+    for n in options.sizes or ((100_000,) if options.quick else (1_000_000, 10_000_000)):
         with tempfile.TemporaryDirectory() as scratch:
-            bag, out = Path(bags or scratch, f'{n}_samples'), Path(scratch, 'out')
-            if not bag.exists():
-                say(f'  writing {n} samples')
-                write_bag(bag, n)
+            bag, out = Path(scratch, 'bag'), Path(scratch, 'out')
+            write_bag(bag, n)
             size = sum(file.stat().st_size for file in bag.iterdir()) * 1e-6
             say('  replaying')
             seconds, memory, curve = replay(bag, out, '-p', f'window.seconds:={float(WINDOW)}')
             summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
         table.add(str(n), f'{n / RATE / 3600.0:.1f}', f'{size:.0f}', f'{seconds:.0f}',
                   f'{1e6 * seconds / n:.0f}', str(summary['hidden_nodes']), f'{memory:.0f}')
-        say('  ' + ' | '.join(table.rows[-1]))
-        found.metrics.append(Metric(
-            f'replay of {n} samples: memory', memory, ' MB', ACCURACY, LIMIT))
+        found.ask(f'replay of {n} samples: memory', memory, ' MB', most=LIMIT)
         found.notes.append(f'{n} samples, memory [MB] after each tenth of the time: ' + ', '.join(
             f'{value:.0f}' for value in curve[::max(len(curve) // 10, 1), 1]))
-    found.tables.append(table)
     return found
