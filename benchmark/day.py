@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A long drive through the back end: resident memory and times, hour by hour, and their picture.
+A long drive through the back end: resident memory and times, hour by hour.
 
 Each drive is made in a process of its own, which prints a line of JSON for each part of the drive.
 """
@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 import gc
 import json
-from pathlib import Path
 import subprocess
 import sys
 import time
@@ -22,8 +21,7 @@ import numpy as np
 from benchmark.course import Course, SECOND, settings_of, START_NS
 from benchmark.owners import holdings
 from benchmark.parts import resident_bytes
-from benchmark.report import COLOURS, panels
-from benchmark.section import Options, say, Section
+from benchmark.section import Options, say, Section, Table
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph import tables as tb
@@ -35,7 +33,6 @@ RATE = 50.0
 HOURS = 24.0
 GROWN, SLOWER = 1.05, 1.25
 """Ratios of the last hour to the first up to which memory and time count as flat."""
-FILE, PICTURE = 'hours.json', 'hours.png'
 UPDATE_EVERY = 0.5
 """Between two updates, as in the node [s]."""
 REFINEMENTS = 4
@@ -193,7 +190,7 @@ CASES = {'window of 10 minutes': Case('600 s'), 'hall, with thinning': Case('thi
 
 
 def section(options: Options) -> Section:
-    """Drive for hours; the figures of cases that are not wanted are kept."""
+    """Drive for hours."""
     hours = options.hours or (0.4 if options.quick else HOURS)
     found = Section(
         'A day', f'Odometry at {RATE:.0f} Hz, fixes at 5 Hz, a loop closure every 10 s (in the '
@@ -202,23 +199,14 @@ def section(options: Options) -> Section:
         'garbage collection, with Python, NumPy and compiled code; '
         f'mean times of calls. Flat means: the last hour at most {GROWN:g} times the memory and '
         f'{SLOWER:g} times the time of an update of the first.')
-    folder = options.out
-    file = folder / FILE
-    kept: dict[str, list[dict[str, object]]] = (
-        json.loads(file.read_text(encoding='utf-8')) if file.exists() else {})
+    times = found.table(
+        'By hour', 'drive', 'hour', 'resident MB', 'nodes', 'edges', 'observed', 'cliques MB',
+        *(f'{call} us' for call in CALLS), 'update p99 ms', 'max', 'rms m')
+    owners = found.table('What has grown since the first hour', 'drive', 'owner',
+                         'first hour kB', 'last hour kB')
     for name, case in CASES.items():
-        if not options.wants(name):
-            continue
-        # written hour by hour, so that a drive may be cut short
-        rows = kept[name] = []
-        for hour in _drive(name, case, hours):
-            rows.append(asdict(hour))
-            file.write_text(json.dumps(kept, indent=1) + '\n', encoding='utf-8')
-    made = {name: [Hour(**values) for values in rows]   # type: ignore[arg-type]
-            for name, rows in kept.items() if name in CASES}
-    _fill(found, made)
-    _draw(made, folder / PICTURE)
-    found.notes.append(f'![Memory and time by hour]({PICTURE})')
+        if options.wants(name):
+            _fill(found, name, times, owners, list(_drive(name, case, hours)))
     return found
 
 
@@ -230,47 +218,27 @@ def _drive(name: str, case: Case, hours: float) -> Iterator[Hour]:
         yield hour
 
 
-def _fill(found: Section, made: dict[str, list[Hour]]) -> None:
-    """Add tables and figures."""
-    times = found.table(
-        'By hour', 'drive', 'hour', 'resident MB', 'nodes', 'edges', 'observed', 'cliques MB',
-        *(f'{call} us' for call in CALLS), 'update p99 ms', 'max', 'rms m')
-    owners = found.table('What has grown since the first hour', 'drive', 'owner',
-                         'first hour kB', 'last hour kB')
-    for name, hours in made.items():
-        chosen = {0, 1, 2, len(hours) // 2, len(hours) - 1}
-        for k in sorted(k for k in chosen if k < len(hours)):
-            hour = hours[k]
-            times.add(name, f'{hour.hours:g}', f'{hour.resident:.1f}', str(hour.nodes),
-                      str(hour.edges), str(hour.observed), f'{hour.pool:.2f}',
-                      *(f'{hour.mean[call]:.0f}' for call in CALLS), f'{hour.p99:.1f}',
-                      f'{hour.longest:.0f}', f'{hour.rms:.3f}')
-        first, last = hours[0], hours[-1]
-        grown = {owner: size - first.owners.get(owner, 0) for owner, size in last.owners.items()}
-        for owner in sorted(grown, key=lambda owner: -grown[owner])[:5]:
-            owners.add(name, owner, f'{1e-3 * first.owners.get(owner, 0):.0f}',
-                       f'{1e-3 * last.owners[owner]:.0f}')
-        refused = {answer: n for answer, n in last.answers.items() if 'accepted' not in answer}
-        found.notes.append(f'{name}, answers: {last.answers}' if refused else
-                           f'{name}: all measurements were accepted.')
-        for what, ratio, most in (
-                ('memory', last.resident / first.resident, GROWN),
-                ('mean update', last.mean['update'] / first.mean['update'], SLOWER)):
-            found.ask(f'{name}: {what}, hour {last.hours:g} over hour {first.hours:g}', ratio,
-                      most=most)
-        found.ask(f'{name}: memory at the end', last.resident, ' MB')
-
-
-def _draw(made: dict[str, list[Hour]], file: Path) -> None:
-    values = {'resident memory [MB]': lambda hour: hour.resident,
-              'mean time of an update [ms]': lambda hour: 1e-3 * hour.mean['update'],
-              'nodes in the graph': lambda hour: hour.nodes}
-    figure, grid = panels(*values, size=(3.7, 3.4))
-    for axes, value in zip(grid, values.values(), strict=True):
-        for (name, hours), colour in zip(made.items(), COLOURS.values(), strict=False):
-            axes.plot([hour.hours for hour in hours], [value(hour) for hour in hours],
-                      color=colour, linewidth=1.6, marker='.', markersize=4, label=name)
-        axes.set_xlabel('hour', fontsize=9)
-        axes.set_ylim(bottom=0.0, top=1.15 * float(np.max(axes.get_ylim())))
-    grid[0].legend(frameon=False, fontsize=8, loc='lower right')
-    figure.savefig(file)
+def _fill(
+    found: Section, name: str, times: Table, owners: Table, hours: list[Hour],
+) -> None:
+    """Add rows and figures of a drive."""
+    for k in sorted({0, 1, 2, len(hours) // 2, len(hours) - 1} & set(range(len(hours)))):
+        hour = hours[k]
+        times.add(name, f'{hour.hours:g}', f'{hour.resident:.1f}', str(hour.nodes),
+                  str(hour.edges), str(hour.observed), f'{hour.pool:.2f}',
+                  *(f'{hour.mean[call]:.0f}' for call in CALLS), f'{hour.p99:.1f}',
+                  f'{hour.longest:.0f}', f'{hour.rms:.3f}')
+    first, last = hours[0], hours[-1]
+    grown = {owner: size - first.owners.get(owner, 0) for owner, size in last.owners.items()}
+    for owner in sorted(grown, key=lambda owner: -grown[owner])[:5]:
+        owners.add(name, owner, f'{1e-3 * first.owners.get(owner, 0):.0f}',
+                   f'{1e-3 * last.owners[owner]:.0f}')
+    refused = {answer: n for answer, n in last.answers.items() if 'accepted' not in answer}
+    found.notes.append(f'{name}, answers: {last.answers}' if refused else
+                       f'{name}: all measurements were accepted.')
+    for what, ratio, most in (
+            ('memory', last.resident / first.resident, GROWN),
+            ('mean update', last.mean['update'] / first.mean['update'], SLOWER)):
+        found.ask(f'{name}: {what}, hour {last.hours:g} over hour {first.hours:g}', ratio,
+                  most=most)
+    found.ask(f'{name}: memory at the end', last.resident, ' MB')

@@ -3,8 +3,8 @@
 """
 Sends odometry and fixes at an exact pace, and notes when what follows from them comes back.
 
-One thread, no executor: messages are patched into serialised templates, and between two of them
-the thread sleeps in the wait set of its subscriptions. What it adds itself is its pacing error.
+One thread, no executor: between two messages it sleeps in the wait set of its subscriptions. What
+it adds itself is its pacing error.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -18,23 +18,22 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import NavSatFix
 
+from pose_graph_ros.adapters.output_cdr import odometry_cdr
+from pose_graph_ros.core.estimate import Prediction
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 # As a driver has it; the node listens with best effort, so nothing is sent again.
-SENT_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
-HEARD_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
-PATH_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
-                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
 SECOND = 1_000_000_000
 PATIENCE = 60.0
 """How long the node is waited for [s]."""
@@ -71,68 +70,10 @@ def drifting(way: float) -> tuple[float, float, float]:
     return radius * math.sin(theta), radius * (1.0 - math.cos(theta)), theta
 
 
-class Template:
-    """
-    A serialised message of which some numbers are replaced.
-
-    Parameters
-    ----------
-    message : message
-        With a header.
-    marks : dict
-        Numbers that stand in the message once each, as a name tells them.
-
-    """
-
-    def __init__(self, message: Any, marks: Mapping[str, float]) -> None:
-        self._data = bytearray(serialize_message(message))
-        self._at = {}
-        for name, mark in marks.items():
-            pattern = struct.pack('<d', mark)
-            if self._data.count(pattern) != 1:
-                raise ValueError(f'{name}: expected {mark} once in the message')
-            self._at[name] = self._data.index(pattern)
-
-    def fill(self, stamp_ns: int, **numbers: float) -> bytes:
-        """Return the message with a stamp [ns] and these numbers."""
-        put_stamp(self._data, stamp_ns)
-        for name, number in numbers.items():
-            struct.pack_into('<d', self._data, self._at[name], number)
-        return bytes(self._data)
-
-
-def put_stamp(data: bytearray, stamp_ns: int) -> None:
-    """Set the stamp of a serialised message whose first field is a header."""
-    struct.pack_into('<iI', data, 4, *divmod(stamp_ns, SECOND))
-
-
 def stamp_of(data: bytes) -> int:
     """Return the stamp [ns] of a serialised message whose first field is a header."""
     seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
     return int(seconds * SECOND + nanoseconds)
-
-
-def _odometry_template() -> Template:
-    message = Odometry()
-    message.header.frame_id, message.child_frame_id = 'odom', 'base_link'
-    marks = {'x': 1.25e100, 'y': 2.25e100, 'qz': 3.25e100, 'qw': 4.25e100, 'speed': 5.25e100}
-    message.pose.pose.position.x, message.pose.pose.position.y = marks['x'], marks['y']
-    message.pose.pose.orientation.z = marks['qz']
-    message.pose.pose.orientation.w = marks['qw']
-    message.twist.twist.linear.x = marks['speed']
-    return Template(message, marks)
-
-
-def _fix_template() -> Template:
-    message = NavSatFix()
-    message.header.frame_id = 'gps'
-    message.status.status = 0
-    marks = {'latitude': 1.25e100, 'longitude': 2.25e100}
-    message.latitude, message.longitude = marks['latitude'], marks['longitude']
-    message.position_covariance_type = 2
-    message.position_covariance = [
-        SIGMA_FIX**2, 0.0, 0.0, 0.0, SIGMA_FIX**2, 0.0, 0.0, 0.0, 4.0 * SIGMA_FIX**2]
-    return Template(message, marks)
 
 
 @dataclass(slots=True)
@@ -147,7 +88,6 @@ class Phase:
     """How long after its time that was."""
     came_ns: dict[int, int] = field(default_factory=dict)
     """By the stamp of the output."""
-    paths: int = 0
     lost: int = 0
     """Messages of odometry that the node did not take."""
     cpu: float = 0.0
@@ -175,25 +115,22 @@ class Feeder:
     ----------
     environment : mapping
         Of the node; the domain is taken from it.
-    listens_to_path : bool
-        Whether to subscribe to the path.
 
     """
 
-    def __init__(self, environment: Mapping[str, str], *, listens_to_path: bool = False) -> None:
+    def __init__(self, environment: Mapping[str, str]) -> None:
         for name in ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOG_DIR', 'AMENT_PREFIX_PATH'):
             os.environ[name] = environment[name]
         self._context = Context()
         rclpy.init(context=self._context, domain_id=int(environment['ROS_DOMAIN_ID']))
         self._node = rclpy.create_node('feeder', context=self._context)
-        self._odometry = self._node.create_publisher(Odometry, 'odom', SENT_QOS)
-        self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', SENT_QOS)
+        self._odometry = self._node.create_publisher(Odometry, 'odom', QOS)
+        self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', QOS)
         self._takers: dict[Any, Callable[[bytes, int], None]] = {}
-        self._hear(DiagnosticArray, '/diagnostics', HEARD_QOS, self._on_diagnostics)
-        self._hear(Odometry, 'odometry/filtered', HEARD_QOS, self._on_output)
-        if listens_to_path:
-            self._hear(Path, 'path', PATH_QOS, self._on_path)
-        self._odometry_template, self._fix_template = _odometry_template(), _fix_template()
+        for kind, topic, take in ((DiagnosticArray, '/diagnostics', self._on_diagnostics),
+                                  (Odometry, 'odometry/filtered', self._on_output)):
+            self._takers[self._node.create_subscription(
+                kind, topic, lambda _: None, QOS, raw=True)] = take
         self._plane = TangentPlane(*DATUM)
         self._rng = np.random.default_rng(0)
         self.values: dict[str, str] = {}
@@ -203,12 +140,6 @@ class Feeder:
         self._stamp_ns, self._way = 1_700_000_000 * SECOND, 0.0
         self._newest_output = b''
         self._phase = Phase(0.0)
-
-    def _hear(
-        self, kind: type, topic: str, qos: QoSProfile, take: Callable[[bytes, int], None],
-    ) -> None:
-        self._takers[
-            self._node.create_subscription(kind, topic, lambda _: None, qos, raw=True)] = take
 
     def __enter__(self) -> 'Feeder':
         return self
@@ -225,9 +156,6 @@ class Feeder:
     def _on_output(self, data: bytes, now_ns: int) -> None:
         self._phase.came_ns.setdefault(stamp_of(data), now_ns)
         self._newest_output = data
-
-    def _on_path(self, _data: bytes, _: int) -> None:
-        self._phase.paths += 1
 
     @contextmanager
     def _listening(self) -> Iterator[Callable[[float], None]]:
@@ -308,10 +236,10 @@ class Feeder:
 
     def _send_odometry(self, speed: float) -> int:
         """Send odometry as of now; return when that began [ns]."""
-        x, y, theta = drifting(self._way)
-        data = self._odometry_template.fill(
-            self._stamp_ns, x=x, y=y, qz=math.sin(0.5 * theta), qw=math.cos(0.5 * theta),
-            speed=speed)
+        moving = Odometry()
+        moving.twist.twist.linear.x = speed
+        pose = Prediction(np.array(drifting(self._way)), np.zeros((3, 3)))
+        data = odometry_cdr(self._stamp_ns, pose, moving, 'odom', 'base_link')
         self._n_sent += 1
         begin_ns = time.monotonic_ns()
         self._odometry.publish(data)
@@ -319,10 +247,14 @@ class Feeder:
 
     def _send_fix(self) -> None:
         position = np.array(truth(self._way)) + self._rng.normal(0.0, SIGMA_FIX, 2)
-        latitude, longitude, _ = self._plane.to_geodetic(position)
+        message = NavSatFix(position_covariance_type=2, position_covariance=(
+            SIGMA_FIX**2 * np.diag((1.0, 1.0, 4.0))).ravel())
+        message.header.frame_id = 'gps'
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._stamp_ns, SECOND)
+        message.status.status = 0
+        message.latitude, message.longitude, _ = self._plane.to_geodetic(position).tolist()
         self._n_sent += 1
-        self._fix.publish(self._fix_template.fill(
-            self._stamp_ns, latitude=latitude, longitude=longitude))
+        self._fix.publish(message)
 
     def fill(self, nodes: int) -> float:
         """Make the node drive until it has so many hidden nodes; return how long that took [s]."""

@@ -18,7 +18,9 @@ from rosbags.typesys import get_typestore, Stores
 from benchmark.course import Course, FIXES
 from benchmark.section import Options, say, Section
 from pose_graph_ros.adapters.bag_writer import BAG_VERSION
+from pose_graph_ros.adapters.output_cdr import odometry_cdr
 from pose_graph_ros.cli.bag_messages import fix_messages, loop_closure_messages, odometry_messages
+from pose_graph_ros.core.estimate import Prediction
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -32,20 +34,9 @@ LIMIT = 400.0
 """Resident memory that is asked for [MB]."""
 WINDOW = 600
 """[s]"""
-COMMAND = '''
-import sys
-from pose_graph_ros.cli.main import main
-code = main(sys.argv[2:])
-with open('/proc/self/status') as status, open(sys.argv[1], 'w') as largest:
-    largest.write(next(line.split()[1] for line in status if line.startswith('VmHWM:')))
-sys.exit(code)
-'''
-"""Runs a tool, and writes its largest resident memory [KiB] into a file."""
-POSE, LINEAR, ANGULAR = 44, 388, 412
-"""Where in a message with the frames odom and base_link the pose begins, and the twist."""
 ODOMETRY, FIX = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/NavSatFix'
 POSE_TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-LOOK_EVERY = 1.0
+LOOK_EVERY = 0.2
 """At the memory of the process [s]."""
 
 
@@ -71,7 +62,7 @@ def write_bag(folder: Path, samples: int, seed: int = 0) -> None:
         for times, poses, others in course.pieces():
             stamps = course.stamps(times)
             messages = [(stamp, '/odom', data) for stamp, data in zip(
-                stamps.tolist(), _odometry(stamps, poses, course.speed), strict=True)]
+                stamps.tolist(), _odometry(stamps, poses), strict=True)]
             fixes = [each for source, each in others if source == FIXES]
             found = [*_fixes([each for each in fixes if isinstance(each, Position)], course),
                      *_closures([each for _, each in others if isinstance(each, LoopClosure)])]
@@ -83,22 +74,12 @@ def write_bag(folder: Path, samples: int, seed: int = 0) -> None:
                 writer.write(topics[topic], stamp, data)
 
 
-def _odometry(stamps: np.ndarray, poses: FloatArray, speed: float) -> Iterator[bytes]:
-    """Yield serialised messages: one is made, the others differ from it in a few numbers."""
-    path = Trajectory(stamps[:2], poses[:2])
-    first = next(iter(odometry_messages('/odom', 'odom', path, (0.01,) * 6)))
-    data = np.frombuffer(get_typestore(Stores.ROS2_JAZZY).serialize_cdr(first[3], ODOMETRY),
-                         dtype=np.uint8)
-    table = np.tile(data, (len(stamps), 1))
-    seconds = np.stack((stamps // 10**9, stamps % 10**9), axis=1).astype(np.uint32)
-    table[:, 4:12] = seconds.view(np.uint8)
-    half = 0.5 * poses[:, 2]
-    zero = np.zeros(len(poses))
-    values = np.column_stack((poses[:, :2], zero, zero, zero, np.sin(half), np.cos(half)))
-    table[:, POSE:POSE + 56] = np.ascontiguousarray(values).view(np.uint8)
-    table[:, LINEAR:LINEAR + 8] = np.frombuffer(np.float64(speed).tobytes(), dtype=np.uint8)
-    for row in table:
-        yield row.tobytes()
+def _odometry(stamps: np.ndarray, poses: FloatArray) -> Iterator[bytes]:
+    """Yield serialised messages, all with the twist of the first."""
+    first = next(iter(odometry_messages(
+        '/odom', 'odom', Trajectory(stamps[:2], poses[:2]), (0.01,) * 6)))[3]
+    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
+        yield odometry_cdr(stamp, Prediction(pose, 0.01 * np.eye(3)), first, 'odom', 'base_link')
 
 
 def _fixes(positions: list[Position], course: Course) -> Iterator[tuple]:
@@ -116,31 +97,19 @@ def _closures(closures: list[LoopClosure]) -> Iterator[tuple]:
             closures[0].covariance)
 
 
-def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, float, FloatArray]:
-    """
-    Return the time of a replay [s], its largest memory [MB], and the memory on the way.
-
-    The last has the shape (K, 2): time [s] and resident memory [MB].
-
-    Parameters
-    ----------
-    bag, out : Path
-    arguments : str, further ones of `pose-graph replay`
-
-    """
-    # `ru_maxrss` of a child counts the memory of this process as well, of before its exec
-    begin, largest = time.monotonic(), out.with_name('largest')
+def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, FloatArray]:
+    """Return the time of a replay [s], and the resident memory of the process on the way [MB]."""
+    begin, curve = time.monotonic(), list[float]()
     child = subprocess.Popen(
-        [sys.executable, '-c', COMMAND, str(largest), 'replay', str(bag), '-o', str(out),
+        [str(Path(sys.executable).with_name('pose-graph')), 'replay', str(bag), '-o', str(out),
          *arguments], stdout=subprocess.DEVNULL)
-    curve: list[tuple[float, float]] = []
     while child.poll() is None:
         pages = int(Path(f'/proc/{child.pid}/statm').read_text(encoding='ascii').split()[1])
-        curve.append((time.monotonic() - begin, pages * os.sysconf('SC_PAGE_SIZE') * 1e-6))
+        curve.append(pages * os.sysconf('SC_PAGE_SIZE') * 1e-6)
         time.sleep(LOOK_EVERY)
     if child.returncode not in (0, 1):
         raise RuntimeError(f'replay ended with {child.returncode}')
-    return time.monotonic() - begin, int(largest.read_text()) * 1.024e-3, np.array(curve)
+    return time.monotonic() - begin, np.array(curve)
 
 
 def section(options: Options) -> Section:
@@ -159,11 +128,11 @@ def section(options: Options) -> Section:
             write_bag(bag, n)
             size = sum(file.stat().st_size for file in bag.iterdir()) * 1e-6
             say('  replaying')
-            seconds, memory, curve = replay(bag, out, '-p', f'window.seconds:={float(WINDOW)}')
+            seconds, curve = replay(bag, out, '-p', f'window.seconds:={float(WINDOW)}')
             summary = json.loads((out / 'summary.json').read_text(encoding='utf-8'))
         table.add(str(n), f'{n / RATE / 3600.0:.1f}', f'{size:.0f}', f'{seconds:.0f}',
-                  f'{1e6 * seconds / n:.0f}', str(summary['hidden_nodes']), f'{memory:.0f}')
-        found.ask(f'replay of {n} samples: memory', memory, ' MB', most=LIMIT)
+                  f'{1e6 * seconds / n:.0f}', str(summary['hidden_nodes']), f'{max(curve):.0f}')
+        found.ask(f'replay of {n} samples: memory', max(curve), ' MB', most=LIMIT)
         found.notes.append(f'{n} samples, memory [MB] after each tenth of the time: ' + ', '.join(
-            f'{value:.0f}' for value in curve[::max(len(curve) // 10, 1), 1]))
+            f'{value:.0f}' for value in curve[::max(len(curve) // 10, 1)]))
     return found
