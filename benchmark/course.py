@@ -38,8 +38,6 @@ START_NS = 1_000 * SECOND
 PIECE = 600.0
 """Length of what is made at once [s]."""
 FIXES, CLOSURES = 'fix', 'loop_closure'
-UNITS = {'s': 'seconds', 'm': 'metres', 'nodes': 'nodes'}
-UNLIMITED = 'unlimited'
 FINE = 20_000
 """Points of the course between which is interpolated."""
 
@@ -173,18 +171,10 @@ def _course(length: float) -> tuple[FloatArray, FloatArray]:
     return along, np.column_stack((points, np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))))
 
 
-def settings_of(window: str) -> dict[str, Any]:
-    """
-    Return the arguments of `BackendConfig` for a window.
-
-    Names are `unlimited`, `90 s`, `90 s sparse`, `500 nodes`, and `thinning 2 m` for cells of that
-    size.
-    """
-    if window == UNLIMITED:
-        return {}
-    size, unit, *rest = window.removeprefix('thinning ').split()
-    if window.startswith('thinning'):
-        return {'thinning': ThinningConfig(cell=float(size))}
-    return {'window': WindowConfig(
-        **{UNITS[unit]: int(size)}, prior=(
-            WindowPrior.SPARSE if rest == ['sparse'] else WindowPrior.DENSE))}
+WINDOWS: dict[str, dict[str, Any]] = {
+    'unlimited': {},
+    '90 s': {'window': WindowConfig(seconds=90)},
+    '90 s sparse': {'window': WindowConfig(seconds=90, prior=WindowPrior.SPARSE)},
+    '600 s': {'window': WindowConfig(seconds=600)},
+    'thinning 2 m': {'thinning': ThinningConfig(cell=2.0)}}
+"""Arguments of `BackendConfig` for a window, by name."""

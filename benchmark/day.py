@@ -8,7 +8,7 @@ Each drive is made in a process of its own, which prints a line of JSON for each
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 import gc
 import json
 import subprocess
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.course import Course, SECOND, settings_of, START_NS
+from benchmark.course import Course, SECOND, START_NS, WINDOWS
 from benchmark.owners import holdings
 from benchmark.parts import resident_bytes
 from benchmark.section import Options, say, Section, Table
@@ -144,49 +144,33 @@ def _hour(
         dict(holdings(backend).most_common(OWNERS)))
 
 
-def in_process(course: Course, window: str, part: float) -> Iterator[Hour]:
-    """
-    Drive a course in a new process, and yield what became of each part of it.
-
-    Parameters
-    ----------
-    course : Course
-    window : str, as in `settings_of`
-    part : float, length of a part [h]
-
-    """
-    given = asdict(course)
-    program = ('from benchmark.day import main\n'
-               f'main({given!r}, {window!r}, {part!r})')
+def in_process(course: Course, window: str, part: float) -> list[Hour]:
+    """Drive a course in a new process; return what became of each part of it [h]."""
+    program = f'from benchmark.day import main\nmain({asdict(course)!r}, {window!r}, {part!r})'
+    made = []
     with subprocess.Popen([sys.executable, '-c', program], stdout=subprocess.PIPE,
                           text=True) as child:
         assert child.stdout is not None
         for line in child.stdout:
-            yield Hour(**json.loads(line))
+            made.append(Hour(**json.loads(line)))
+            say(f'  {made[-1]}')
     if child.returncode != 0:
         raise RuntimeError(f'the drive ended with {child.returncode}')
+    return made
 
 
 def main(course: dict[str, Any], window: str, part: float) -> None:
     """Drive a course and print what became of each part, as JSON; for a process of its own."""
     warm_up()
-    for hour in drive(Course(**course), BackendConfig(**settings_of(window)), part):
+    for hour in drive(Course(**course), BackendConfig(**WINDOWS[window]), part):
         print(json.dumps(asdict(hour)), flush=True)
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """A drive of hours."""
-
-    window: str
-    """As in `window_settings`."""
-    course: dict[str, object] = field(default_factory=dict)
-    """What differs from the default course."""
 
 
 HALL = {'length': 200.0, 'laps_back': (1, 2, 5, 20, 100), 'closure_period': 5.0, 'aside': 0.1}
 """A closed hall, whose places are recognised however long ago they were seen."""
-CASES = {'window of 10 minutes': Case('600 s'), 'hall, with thinning': Case('thinning 2 m', HALL)}
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    'window of 10 minutes': ('600 s', {}), 'hall, with thinning': ('thinning 2 m', HALL)}
+"""Window, and what differs from the default course."""
 
 
 def section(options: Options) -> Section:
@@ -204,18 +188,11 @@ def section(options: Options) -> Section:
         *(f'{call} us' for call in CALLS), 'update p99 ms', 'max', 'rms m')
     owners = found.table('What has grown since the first hour', 'drive', 'owner',
                          'first hour kB', 'last hour kB')
-    for name, case in CASES.items():
+    for name, (window, changed) in CASES.items():
         if options.wants(name):
-            _fill(found, name, times, owners, list(_drive(name, case, hours)))
+            course = Course(3600.0 * hours, odometry_rate=RATE, **changed)
+            _fill(found, name, times, owners, in_process(course, window, min(1.0, hours / 4.0)))
     return found
-
-
-def _drive(name: str, case: Case, hours: float) -> Iterator[Hour]:
-    course = Course(3600.0 * hours, odometry_rate=RATE, **case.course)  # type: ignore[arg-type]
-    for hour in in_process(course, case.window, min(1.0, hours / 4.0)):
-        say(f'  {name}: {hour.hours:.2f} h, {hour.resident:.1f} MB, {hour.nodes} nodes, update '
-            f'{1e-3 * hour.mean["update"]:.2f} ms, rms {hour.rms:.2f} m')
-        yield hour
 
 
 def _fill(

@@ -6,7 +6,7 @@ Drives with fixes, recorded or simulated, whose measurements can be changed, and
 The noise of a simulated drive is what the engine is told.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -164,7 +164,7 @@ def plaza(data: Path, seed: int) -> Drive:
 
 
 def feed(
-    backend: PoseGraphBackend, events: Sequence[Event], update_every: float,
+    backend: PoseGraphBackend, events: Iterable[Event], update_every: float,
 ) -> Iterator[int]:
     """Feed events in the order given; update so often in stamps of the odometry [s], and yield."""
     due = 0

@@ -17,7 +17,6 @@ import numpy as np
 
 from benchmark import excess, ours, parts, worlds
 from benchmark.metrics import ACCURACY, Metric, OPTIMUM, RATIO
-from benchmark.report import EXCESS_FLOOR
 from benchmark.runs import (
     interleaved,
     MICROSECOND,
@@ -54,6 +53,8 @@ SAMPLES = 15
 """In a quick run, at the most."""
 LARGE = 8000
 """Sets with as many nodes are sampled ten times more rarely."""
+EXCESS_FLOOR = 1e-6
+"""Excess below this is none: rounding, where a graph is still a tree."""
 QUICK_SIZE = 1300
 """Sets with more nodes and loop closures are left out of quick runs."""
 TIME_HEADER = ('world', 'nodes', 'closures', 'tool', 'mean', 'p50', 'p99', 'max', 'total s',
@@ -202,8 +203,6 @@ def _add(
         section.metrics.append(Metric(
             f'{key}/worst position when refined, {name}',
             1e3 * float(figure(item.judged[ours.REFINED].worst)), ' mm', ACCURACY, target))
-    section.curves += [Curve('excess', item.world.name, tool, judged.steps, judged.half_chi2)
-                       for tool, judged in item.judged.items()]
 
 
 def _tables(section: Section, comparisons: list[Comparison]) -> None:
@@ -253,7 +252,6 @@ def variants(options: Options) -> Section:
                     most=VARIANT_FACTOR)
         _add_worst(section, 'variants', item)
         _add(section, 'variants', item)
-    section.curves = []
     return section
 
 
@@ -273,7 +271,7 @@ def _time_curves(item: Comparison) -> list[Curve]:
         seconds: FloatArray = np.median([run.seconds for run in runs], axis=0)
         edges = np.unique(np.geomspace(10, len(seconds), BINS).astype(int))
         means = [float(np.mean(seconds[a:b])) / MICROSECOND for a, b in pairwise(edges)]
-        curves.append(Curve('step time', 'chain', tool, edges[1:].astype(float), np.array(means)))
+        curves.append(Curve(tool, edges[1:].astype(float), np.array(means)))
     return curves
 
 

@@ -54,7 +54,7 @@ def of_run(world: World, run: Run) -> Excess:
         before, after, best = optimum(world, step, run.samples[step], run.tool)
         off = (run.samples[step] - best)[1:, :2]     # node 0 is fixed
         weighted = np.linalg.solve(
-            ours.position_covariances(world, step, best)[1:], off[..., None])[..., 0]
+            ours.fresh_covariances(world, step, best)[1:, :2, :2], off[..., None])[..., 0]
         rows.append((before, after, np.max(np.hypot(*off.T)),
                      np.sqrt(np.max(np.sum(off * weighted, axis=1)))))
     table = np.array(rows)

@@ -15,7 +15,6 @@ from benchmark.section import Options, Section
 from benchmark.wrong_closures import simulated
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Robust, ThinningConfig
-from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.offline.simulation.settings import FalseClosures
 
 HOURS, SHARED, QUICK_HOURS, QUICK_SHARED = 8.0, 1.0, 0.5, 0.2
@@ -49,16 +48,13 @@ def _drive(hours: float, seed: int) -> Recording:
 def _run(recording: Recording, thinning: ThinningConfig) -> list[Tenth]:
     """Drive with true closures, all believed."""
     backend = PoseGraphBackend(replace(recording.config(Robust.NONE), thinning=thinning))
-    found, closure, odometry = list[Tenth](), 0, recording.odometry
+    found, steps = list[Tenth](), recording.steps()
     for part in np.array_split(np.arange(len(recording.stamps_ns)), TENTHS):
         squared, claims, spent = list[float](), list[float](), 0.0
         for k in part.tolist():
+            step = next(steps)
             begin = time.perf_counter()
-            stamp = int(recording.stamps_ns[k])
-            backend.add_odometry(OdometrySample(stamp, odometry[k]))
-            while closure < len(recording.ends) and recording.arrival_ns[closure] <= stamp:
-                add(backend, recording, closure)
-                closure += 1
+            add(backend, *step)
             if k % UPDATE_EVERY == UPDATE_EVERY - 1:
                 backend.update()
                 drain(backend)
@@ -68,9 +64,9 @@ def _run(recording: Recording, thinning: ThinningConfig) -> list[Tenth]:
                 squared.append(off[0]**2 + off[1]**2)
                 claims.append(nees(off, covariance))
         found.append(Tenth(
-            float(stamp - recording.stamps_ns[0]) / 3.6e12, backend.graph.n_nodes,
-            backend.graph.n_edges, float(np.mean(squared)), float(np.mean(claims)),
-            1e3 * spent / len(part), resident()))
+            float(step[0].stamp_ns - recording.stamps_ns[0]) / 3.6e12,
+            backend.graph.n_nodes, backend.graph.n_edges, float(np.mean(squared)),
+            float(np.mean(claims)), 1e3 * spent / len(part), resident()))
     return found
 
 

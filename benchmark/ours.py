@@ -10,15 +10,11 @@ goes through `update`, as in the back end.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
-import itertools
 import math
 import time
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import linalg
 
 from benchmark import runs
 from benchmark.runs import Plan, Run, Tool
@@ -26,8 +22,7 @@ from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import linear_starts, optimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
@@ -87,21 +82,12 @@ def kept(lag: int, every: int = 20) -> tuple[str, Tool]:
     return name, lambda world, plan: run(world, plan, None, Ours(world, name, lag, every))
 
 
-def position_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
-    """
-    Return the covariances of the positions of all nodes after a step, shape (step + 1, 2, 2).
-
-    Parameters
-    ----------
-    world : World
-    step : int
-    poses : ndarray, shape (step + 1, 3), the optimum
-
-    """
+def fresh_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
+    """Return the covariances of all nodes after a step, all linearized at poses, (N, 3, 3)."""
     edges, observed = world.part(step)
     smoother = IncrementalSmoother()
     smoother.update(GraphUpdate(hidden=poses, edges=edges, observed=observed, fix=(0,)))
-    return smoother.covariances()[:, :2, :2]
+    return smoother.covariances()
 
 
 def warm_up() -> None:
@@ -244,58 +230,3 @@ def polished(world: World, poses: FloatArray) -> float:
 def start_of_batch(world: World) -> FloatArray:
     """Return the start that both tools are given in the batch comparison, shape (N, 3)."""
     return linear_starts.chordal(world.graph(world.dead_reckoning()))
-
-
-def _jacobians(
-    poses: FloatArray, ends: tuple[IntArray, ...],
-    errors: Callable[[FloatArray, list[IntArray]], FloatArray],
-) -> list[FloatArray]:
-    """Return the derivatives of errors by the poses of each end, (M, 3, 3), by differences."""
-    size, step = len(ends[0]), 1e-6
-    # each constraint gets ends of its own, so that all of them can be moved at once
-    own = np.concatenate([poses[end] for end in ends])
-    at = [np.arange(k * size, (k + 1) * size) for k in range(len(ends))]
-    found = []
-    for rows in at:
-        columns = []
-        for k in range(3):
-            moved = [own.copy(), own.copy()]
-            moved[0][rows, k] -= step
-            moved[1][rows, k] += step
-            difference = errors(moved[1], at) - errors(moved[0], at)
-            difference[:, 2] = se2.wrap(difference[:, 2])
-            columns.append(difference / (2.0 * step))
-        found.append(np.stack(columns, axis=2))
-    return found
-
-
-def oracle_covariances(graph: Graph, nodes: list[int]) -> FloatArray:
-    """Return covariances, shape (len(nodes), 3, 3), from the plain sparse system: slow, sure."""
-    edges, observed, size = graph.edges, graph.observed, 3 * graph.n_nodes
-    blocks = []
-    A, B = _jacobians(graph.poses, (edges.i, edges.j), lambda poses, at: (
-        error_functions.edge_errors(poses, replace(edges, i=at[0], j=at[1]))))
-    for (i, left), (j, right) in itertools.product(((edges.i, A), (edges.j, B)), repeat=2):
-        blocks.append((i, j, np.swapaxes(left, 1, 2) @ edges.weighted_information @ right))
-    A, = _jacobians(graph.poses, (observed.node,), lambda poses, at: (
-        error_functions.observed_errors(poses, replace(observed, node=at[0]))))
-    blocks.append((observed.node, observed.node,
-                   np.swapaxes(A, 1, 2) @ observed.weighted_information @ A))
-    three = np.arange(3)
-    rows = [np.broadcast_to(3 * i[:, None, None] + three[:, None], block.shape)
-            for i, _, block in blocks]
-    columns = [np.broadcast_to(3 * j[:, None, None] + three, block.shape)
-               for _, j, block in blocks]
-    H = sparse.csc_array(
-        (np.concatenate([block.ravel() for *_, block in blocks]),
-         (np.concatenate([row.ravel() for row in rows]),
-          np.concatenate([column.ravel() for column in columns]))), (size, size))
-    free = np.flatnonzero(~np.repeat(graph.fixed, 3))
-    factor = linalg.splu(H[free][:, free].tocsc())
-    found = []
-    for node in nodes:
-        at = np.searchsorted(free, 3 * node) + three
-        unit = np.zeros((len(free), 3))
-        unit[at, three] = 1.0
-        found.append(factor.solve(unit)[at])
-    return np.array(found)

@@ -2,21 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What holds the memory of an object and of all that it refers to, by owner."""
 
-from array import array
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from enum import Enum
+import gc
 from mmap import mmap
 import sys
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 
 DEPTH = 3
 """Names of attributes in the name of an owner."""
-LEAVES = (str, bytes, bytearray, int, float, complex, bool, array, np.generic, Enum, mmap)
-OTHERS = (type, ModuleType, FunctionType, BuiltinFunctionType)
+OTHERS = (type, ModuleType, FunctionType, BuiltinFunctionType, Enum)
 """What belongs to nobody."""
 
 
@@ -28,57 +27,36 @@ def holdings(root: Any) -> Counter[str]:
     while level:
         further = []
         for owner, item in level:
-            found[owner] += _size(item)
+            found[owner] += len(item) if isinstance(item, mmap) else (
+                # a view owns nothing
+                0 if getattr(item, 'base', None) is not None else sys.getsizeof(item))
             for name, part in _parts(item):
                 if id(part) not in seen and part is not None and not isinstance(part, OTHERS):
                     seen.add(id(part))
-                    further.append((_joined(owner, name), part))
+                    named = name != '' and owner.count('.') + 1 < DEPTH
+                    further.append((f'{owner}.{name}'.strip('.') if named else owner, part))
         level = further
     return found
 
 
-def _joined(owner: str, name: str) -> str:
-    if name == '' or (owner != '' and owner.count('.') + 1 >= DEPTH):
-        return owner
-    return f'{owner}.{name}' if owner else name
-
-
-def _size(item: Any) -> int:
-    if isinstance(item, np.ndarray):
-        # a view owns nothing
-        return sys.getsizeof(item) if item.base is None else 0
-    return len(item) if isinstance(item, mmap) else sys.getsizeof(item)
-
-
 def _parts(item: Any) -> Iterator[tuple[str, Any]]:
     """Yield the names and values of what an object refers to; without a name what it contains."""
-    if isinstance(item, LEAVES):
-        return
-    if isinstance(item, memoryview):
-        yield '', item.obj
     if isinstance(item, np.ndarray):
-        if item.base is not None:
-            yield '', item.base
+        yield '', item.base
+    elif isinstance(item, memoryview):
+        yield '', item.obj
     elif isinstance(item, Mapping):
         for key, value in list(item.items()):
-            yield '', key
             # names of streams and sources; other keys are too many to name
             yield (key if isinstance(key, str) else ''), value
-    elif isinstance(item, list | tuple | set | frozenset | deque):
-        for value in list(item):
-            yield '', value
-    elif isinstance(item, MethodType):
-        yield '', item.__self__
     else:
-        for name in _attributes(item):
-            value = getattr(item, name, None)
-            # tables that are mappings of arrays have names as well
-            yield name.strip('_'), value
-
-
-def _attributes(item: Any) -> list[str]:
-    names = list(getattr(item, '__dict__', ()))
-    for kind in type(item).__mro__:
-        slots = kind.__dict__.get('__slots__', ())
-        names += [slots] if isinstance(slots, str) else list(slots)
-    return [name for name in names if not name.startswith('__')]
+        names = list(getattr(item, '__dict__', ()))
+        for kind in type(item).__mro__:
+            slots = kind.__dict__.get('__slots__', ())
+            names += [slots] if isinstance(slots, str) else list(slots)
+        for name in names:
+            if not name.startswith('__'):
+                yield name.strip('_'), getattr(item, name, None)
+        if len(names) == 0:
+            for part in gc.get_referents(item):
+                yield '', part

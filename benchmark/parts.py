@@ -210,7 +210,7 @@ COLD, WARM = 20.0, 0.5
 BYTES = 700.0
 """Of a node of a chain."""
 CHECKED = 7
-"""Nodes whose covariances are compared with those from the plain sparse system."""
+"""Nodes whose covariances are compared with those of a fresh smoother."""
 
 _START = '''
 import time
@@ -241,7 +241,8 @@ def covariances(options: Options) -> Section:
         f'Asked for: the newest one below {NEWEST:.0f} us a step; those of all nodes in at most '
         f'{ALL_OVER_FACTORIZATION:.0f} times a factorisation. An iteration is linearizing, '
         'factorising and solving once (batch.optimize with one iteration). The deviation is the '
-        'largest of an element, over the roots of the diagonal, from the plain sparse system.')
+        'largest of an element, over the roots of the diagonal, from those of a fresh smoother, '
+        'linearized at the estimate.')
     table = section.table('', 'world', 'nodes', 'newest p50 us', 'newest p99 us', 'all ms',
                           'iteration ms', 'all / iteration', 'pair us', 'deviation all',
                           'deviation newest')
@@ -269,8 +270,7 @@ def covariances(options: Options) -> Section:
                 pair.append(_seconds(lambda s=smoother, w=world:
                                      s.joint_covariance(w.n_nodes // 3, w.n_nodes - 1)))
         nodes = np.linspace(1, world.n_nodes - 1, CHECKED).astype(int).tolist()
-        graph.set_poses(smoother.poses)
-        oracle = ours.oracle_covariances(graph, nodes)
+        oracle = ours.fresh_covariances(world, world.n_nodes - 1, smoother.poses.copy())[nodes]
         deviation = _deviation(smoother.covariances()[nodes], oracle)
         deviation_newest = _deviation(smoother.newest_covariance()[None], oracle[-1:])
         p50, p99 = (float(value) / MICROSECOND for value in np.percentile(newest, (50, 99)))

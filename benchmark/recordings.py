@@ -9,6 +9,7 @@ best rigid motion, as nothing ties them to the truth. The truth decides nothing 
 """
 
 from collections import defaultdict, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import time
@@ -94,6 +95,20 @@ class Recording:
         return BackendConfig(odometry={'odom': source},
                              measurements={CLOSURES: replace(LOOP_CLOSURES, robust=robust)})
 
+    def steps(self) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
+        """Yield the samples of odometry, each with the closures that arrive after it."""
+        closures = [LoopClosure(stamp, pose, cov, reference_ns=reference)
+                    for (reference, stamp), pose, cov in zip(
+                        self.ends.tolist(), self.poses, self.covariances, strict=True)]
+        stops = np.searchsorted(self.arrival_ns, self.stamps_ns, side='right')
+        stops[-1] = len(closures)
+        begin = 0
+        for stamp, pose, end in zip(
+                self.stamps_ns.tolist(), self.odometry, stops.tolist(), strict=True):
+            yield (OdometrySample(stamp, pose, twist_variance=self.twist_variance),
+                   closures[begin:end])
+            begin = end
+
     def loops(self) -> Edges:
         """Return the closures as edges, their information in the axes of the later pose."""
         i, j = np.searchsorted(self.stamps_ns, self.ends).T
@@ -145,13 +160,10 @@ def feed(recording: Recording, config: BackendConfig) -> Run:
     backend = PoseGraphBackend(config)
     live: dict[int, tuple[float, float]] = {}
     updates: list[float] = []
-    idle, due, closure = 0.0, UPDATE_EVERY, 0
+    idle, due = 0.0, UPDATE_EVERY
     begin = time.perf_counter()
-    for stamp, pose in zip(recording.stamps_ns.tolist(), recording.odometry, strict=True):
-        backend.add_odometry(OdometrySample(stamp, pose, twist_variance=recording.twist_variance))
-        while closure < len(recording.ends) and recording.arrival_ns[closure] <= stamp:
-            add(backend, recording, closure)
-            closure += 1
+    for step in recording.steps():
+        add(backend, *step)
         if backend.graph.n_nodes >= due:
             due = backend.graph.n_nodes + UPDATE_EVERY
             start = time.perf_counter()
@@ -164,8 +176,6 @@ def feed(recording: Recording, config: BackendConfig) -> Run:
             fit = fits(estimate.path, recording.truth)
             live[estimate.stamp_ns] = float(fit.last[-1]), float(fit.rms[-1])
             begin += time.perf_counter() - looked
-    for late in range(closure, len(recording.ends)):
-        add(backend, recording, late)
     backend.optimize()
     seconds = time.perf_counter() - begin
     estimate = backend.estimate()
@@ -174,11 +184,13 @@ def feed(recording: Recording, config: BackendConfig) -> Run:
                np.array(updates), seconds, idle)
 
 
-def add(backend: PoseGraphBackend, recording: Recording, k: int) -> None:
-    """Add closure k of a recording."""
-    reference, stamp = recording.ends[k].tolist()
-    backend.add_measurement(LoopClosure(
-        stamp, recording.poses[k], recording.covariances[k], reference_ns=reference), CLOSURES)
+def add(
+    backend: PoseGraphBackend, sample: OdometrySample, closures: list[LoopClosure],
+) -> None:
+    """Add a sample of odometry, and closures."""
+    backend.add_odometry(sample)
+    for closure in closures:
+        backend.add_measurement(closure, CLOSURES)
 
 
 def drain(backend: PoseGraphBackend) -> float:

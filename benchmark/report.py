@@ -16,19 +16,14 @@ import platform
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-import numpy as np
 
 from benchmark.section import Curve, Section, Table
 
-COLOURS = {'ours': '#0072B2', 'ours, refined': '#009E73', 'GTSAM skip 10': '#E69F00',
-           'GTSAM skip 1': '#D55E00'}
+COLOURS = {'ours': '#0072B2', 'GTSAM skip 10': '#E69F00', 'GTSAM skip 1': '#D55E00'}
 INK, GREY, GRID = '#222222', '#666666', '#E2E2E2'
 PANEL, DPI = (5.3, 3.1), 100
 """Size of a panel [inch] and dots per inch."""
-COLUMNS = 3
 VERSIONS = ('gtsam', 'numpy', 'scipy', 'numba')
-EXCESS_FLOOR = 1e-6
-"""Excess below this is none: rounding, where a graph is still a tree."""
 
 
 def write(
@@ -51,15 +46,11 @@ def write(
     remarks = about.strip().split('\n\n')[-1].replace('\n', ' ')
     parts = [f'# {title}', '', *_environment(command), '', remarks, '',
              '## Requirements', '', *_verdicts(sections)]
-    for name, heading, draw in (
-            ('step_time', 'Time of a step against the size of the graph', _draw_step_time),
-            ('excess', 'Excess along the run', _draw_excess)):
-        chosen = [curve for curve in curves if curve.picture == name.replace('_', ' ')]
-        file = folder / f'{name}.png'
-        if len(chosen) > 0:
-            draw(chosen, file)
-        if file.exists():
-            parts += [f'## {heading}', '', f'![{heading}]({name}.png)', '']
+    picture = folder / 'step_time.png'
+    if len(curves) > 0:
+        _draw_step_time(curves, picture)
+    if picture.exists():
+        parts += [f'![Time of a step against the size of the graph]({picture.name})', '']
     for section in sections:
         parts += [f'## {section.title}', '', section.about, '']
         for table in section.tables:
@@ -130,30 +121,14 @@ def _draw_step_time(curves: list[Curve], file: Path) -> None:
     figure.savefig(file)
 
 
-def _draw_excess(curves: list[Curve], file: Path) -> None:
-    names = list(dict.fromkeys(curve.panel for curve in curves))
-    figure, grid = panels(*names)
-    for curve in curves:
-        grid[names.index(curve.panel)].plot(
-            curve.x, np.maximum(curve.y, EXCESS_FLOOR), color=COLOURS[curve.tool],
-            linewidth=1.4, marker='.', markersize=4, label=curve.tool)
-    for axes in grid:
-        axes.set(yscale='log', xlabel='step', ylabel='excess')
-        axes.set_ylim(bottom=0.5 * EXCESS_FLOOR)
-    grid[0].legend(frameon=False, fontsize=9)
-    figure.savefig(file)
-
-
 def panels(*titles: str, size: tuple[float, float] = PANEL) -> tuple[Figure, list[Axes]]:
     """Return a figure with a panel of some size [inch] for each title, and the panels."""
-    columns = min(len(titles), COLUMNS)
-    rows = -(-len(titles) // columns)
-    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, facecolor='white',
+    figure = Figure(figsize=(size[0] * len(titles), size[1]), dpi=DPI, facecolor='white',
                     layout='constrained')
     FigureCanvasAgg(figure)
     grid = []
     for k, title in enumerate(titles):
-        axes = figure.add_subplot(rows, columns, k + 1)
+        axes = figure.add_subplot(1, len(titles), k + 1)
         axes.spines[['top', 'right']].set_visible(False)
         axes.spines[['left', 'bottom']].set_color(GREY)
         axes.tick_params(which='both', colors=GREY, labelsize=9)

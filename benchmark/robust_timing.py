@@ -9,18 +9,18 @@ Times are those of the processor, which other processes change least.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from itertools import chain
 import time
 
 import numpy as np
 
 from benchmark import worlds
-from benchmark.recordings import add, closures, Recording
+from benchmark.parts import resident_bytes
+from benchmark.recordings import add, CLOSURES, closures, Recording
 from benchmark.section import Options, Section
 from benchmark.wrong_closures import of_world, simulated, with_false
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Robust
-from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.warm_up import warm_up
 
 LONGEST, SLOWER = 0.05, 1.3
@@ -58,33 +58,13 @@ class Timed:
         self.steps.append(time.thread_time() - begin)
 
 
-def drive(recording: Recording, kinds: Sequence[Robust], idle: float = IDLE) -> list[Timed]:
-    """
-    Feed a recording to back ends of some kinds, one sample to each in turn.
-
-    Parameters
-    ----------
-    recording : Recording
-    kinds : sequence of Robust
-    idle : float, time for the work after each update [s]
-
-    Returns
-    -------
-    list of Timed
-
-    """
+def drive(recording: Recording, kinds: Sequence[Robust]) -> list[Timed]:
+    """Feed a recording to back ends of some kinds, one sample to each in turn."""
     runs = [Timed(PoseGraphBackend(recording.config(kind))) for kind in kinds]
-    closure = 0
-    for stamp, pose in zip(recording.stamps_ns.tolist(), recording.odometry, strict=True):
-        begin = closure
-        while closure < len(recording.ends) and recording.arrival_ns[closure] <= stamp:
-            closure += 1
+    for step in recording.steps():
         for run in runs:
-            run.backend.add_odometry(
-                OdometrySample(stamp, pose, twist_variance=recording.twist_variance))
-            for k in range(begin, closure):
-                add(run.backend, recording, k)
-            run.update(idle)
+            add(run.backend, *step)
+            run.update(IDLE)
     return runs
 
 
@@ -99,24 +79,18 @@ def flood(run: Timed, recording: Recording, count: int) -> tuple[float, list[flo
     count : int
 
     """
-    before, rng, updates = memory(), np.random.default_rng(1), len(run.updates)
+    before, rng, updates = resident_bytes(), np.random.default_rng(1), len(run.updates)
     n, information = len(recording.stamps_ns) - 10, recording.loops().information[0]
     none = recording.only(np.zeros(len(recording.ends), dtype=bool))
     for _ in range(count // BATCH):
         i, j = np.sort(rng.choice(n, (2, BATCH)), axis=0)
         wrong = none.closing(closures(
             i, j + 1, rng.uniform(-1.0, 1.0, (BATCH, 3)) * (100.0, 100.0, 3.0), information))
-        for k in range(BATCH):
-            add(run.backend, wrong, k)
+        _, arriving = zip(*wrong.steps(), strict=True)
+        for closure in chain.from_iterable(arriving):
+            run.backend.add_measurement(closure, CLOSURES)
         run.update(IDLE)
-    return memory() - before, run.updates[updates:]
-
-
-def memory() -> float:
-    """Return the resident size of the process [MB]."""
-    status = Path('/proc/self/status').read_text(encoding='ascii')
-    line, = (line for line in status.splitlines() if line.startswith('VmRSS'))
-    return int(line.split()[1]) / 1024.0
+    return 1e-6 * (resident_bytes() - before), run.updates[updates:]
 
 
 def drives(n: int) -> list[Recording]:

@@ -75,11 +75,8 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A line of a picture."""
+    """Time of a step of a tool [us] against the size of the graph."""
 
-    picture: str
-    """`step time` or `excess`."""
-    panel: str
     tool: str
     x: FloatArray
     y: FloatArray

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmark import day, excess, hall, ours, samples
-from benchmark.course import CLOSURES, Course, FIXES, SECOND, settings_of, START_NS
-from benchmark.drives import nees, rms
+from benchmark.course import CLOSURES, Course, FIXES, SECOND, START_NS, WINDOWS
+from benchmark.drives import feed, nees, rms
 from benchmark.exact_estimate import exact_nees
 from benchmark.metrics import ACCURACY, Metric, RATIO
 from benchmark.runs import interleaved, Plan, Run, sample_steps, timing, Tool
@@ -53,15 +53,6 @@ TIMES = ('world', 'tool', 'mean', 'p50', 'p99', 'max', 'ratio mean', 'p50', 'p99
 ERRORS = ('world', 'tool', 'newest to truth m, mrad', 'window to truth m',
           'newest to optimum mm: rms', 'max', 'window to optimum mm: rms', 'max', 'samples')
 
-THRESHOLDS = (
-    'Distances to the optimum are small beside the sigma of the newest position (of both '
-    'coordinates together): 0.49 m in the chain of 1200, where 0.7 mm are 0.0014 sigma, and 0.35 m'
-    ' in the laps, where 38 mm are 0.11. In the chain `budget` of `SmootherConfig` decides: a '
-    'hundredth of it and of `budget_share` gives 0.12 mm in 1.2 times the time of a step, with a '
-    'tenth of `alpha`, too, 0.06 mm in 1.4 times, with which it would be less than ten times as '
-    'fast. In the laps no threshold brings it below 28 mm: that is the shape at which nodes were '
-    'linearized when they left. (Means over the steps of the least time of 7 runs.)')
-
 SEEDS, QUICK_SEEDS = 20, 3
 UPDATE_EVERY = 1.0
 """[s]"""
@@ -73,7 +64,7 @@ LOOK_EVERY = 10
 """Updates from one pose whose error counts to the next."""
 NEAR = 1.03
 NEES = 0.9, 1.2
-WINDOWS = '90 s', '90 s sparse'
+SHORT = '90 s', '90 s sparse'
 LEFT = 105.0
 """Age from which on a node has left these windows, their groups and updates included [s]."""
 COURSE = Course(
@@ -137,7 +128,7 @@ def peers(options: Options) -> Section:
         'before on every fifth node. Errors are of all steps (newest pose to truth) or of '
         'samples; the optimum is that of the unlimited graph at that step, each tool under its '
         f'own error model. Asked for: at least {RATIO_ASKED:.0f} times as fast as the incremental '
-        'one in the mean, at no larger error.', notes=[THRESHOLDS])
+        'one in the mean, at no larger error.')
     found.table('Time of a step [us]', *TIMES)
     found.table('Errors', *ERRORS)
     tools: dict[str, Tool] = dict((ours.kept(LAG, TOGETHER), ours.kept(LAG, 1),
@@ -217,28 +208,17 @@ def _run(course: Course, config: BackendConfig, oldest: float = np.inf) -> Outco
 
     """
     backend = PoseGraphBackend(config)
-    due, n_updates = 0, 0
     squared, found, looks = list[float](), list[float](), list[int]()
     # without fixes the map is the frame in which odometry begins
     start = _start(course) if course.fix_period == 0.0 else None
-    for source, measurement in course.events():
-        if not isinstance(measurement, OdometrySample):
-            if _age(measurement) > oldest:
-                continue
-            backend.add_measurement(measurement, source)
-            continue
-        backend.add_odometry(measurement, source)
-        if measurement.stamp_ns < due:
-            continue
-        due = measurement.stamp_ns + round(UPDATE_EVERY * SECOND)
-        backend.update()
+    events = (event for event in course.events() if _age(event[1]) <= oldest)
+    for n_updates, stamp_ns in enumerate(feed(backend, events, UPDATE_EVERY), 1):
         for _ in range(REFINEMENTS):
             if backend.refine().finished:
                 break
-        n_updates += 1
         estimate = backend.estimate(with_path=False)
         if (estimate is None or n_updates % LOOK_EVERY > 0
-                or measurement.stamp_ns < START_NS + SETTLED * SECOND
+                or stamp_ns < START_NS + SETTLED * SECOND
                 or (start is None and estimate.alignment is not AlignmentState.ALIGNED)):
             continue
         true = course.truth(np.array([(estimate.stamp_ns - START_NS) / SECOND]))[0]
@@ -253,7 +233,7 @@ def _run(course: Course, config: BackendConfig, oldest: float = np.inf) -> Outco
                   backend.graph.n_nodes)
 
 
-def _age(measurement: Measurement) -> float:
+def _age(measurement: OdometrySample | Measurement) -> float:
     """Return how old the pose is that a closure leads to; 0 for other measurements [s]."""
     reference_ns = getattr(measurement, 'reference_ns', None)
     return 0.0 if reference_ns is None else (measurement.stamp_ns - reference_ns) / SECOND
@@ -303,9 +283,9 @@ def _compare(
     """Add rows and figures of one kind of drive with one kind of settings."""
     before = fair = 0.0
     some_refused = max(courses[0].laps_back) * courses[0].lap > LEFT
-    for window in ('unlimited', *[WITHOUT] * some_refused, *WINDOWS):
+    for window in ('unlimited', *[WITHOUT] * some_refused, *SHORT):
         is_fair = window == WITHOUT
-        config = BackendConfig(**settings_of('unlimited' if is_fair else window), **sources)
+        config = BackendConfig(**WINDOWS['unlimited' if is_fair else window], **sources)
         errors = [_run(course, config, LEFT if is_fair else np.inf) for course in courses]
         error = float(np.sqrt(np.mean([each.squared for each in errors])))
         before, fair = before or error, error if is_fair else fair
