@@ -15,8 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from benchmark import excess, ours, parts, worlds
-from benchmark.metrics import ACCURACY, Metric, OPTIMUM, RATIO
+from benchmark import ours, parts, worlds
+from benchmark.metrics import ACCURACY, OPTIMUM, RATIO
 from benchmark.runs import (
     interleaved,
     MICROSECOND,
@@ -72,7 +72,7 @@ class Comparison:
 
     world: World
     runs: dict[str, list[Run]]
-    judged: dict[str, excess.Excess]
+    judged: dict[str, ours.Excess]
     """Of ours also `ours.REFINED`, in a run of its own."""
     refinement: list[float]
     """Times of the iterations of that [s]."""
@@ -118,12 +118,12 @@ def _compare(
         tools |= {setting.name: setting for setting in ((FAST, CAREFUL) if careful else (FAST,))}
     steps = sample_steps(world.n_nodes, every) if judge else frozenset()
     runs = interleaved(world, tools, Plan(steps, options.limit), options.repeats)
-    judged: dict[str, excess.Excess] = {}
+    judged: dict[str, ours.Excess] = {}
     refinement: list[float] = []
     if judge:
         refined = ours.run_refined(world, Plan(steps, options.limit))
         refinement = refined.refinement
-        judged = {run.tool: excess.of_run(world, run)
+        judged = {run.tool: ours.excess(world, run)
                   for run in (runs[ours.NAME][0], refined, *(
                       of_tool[0] for name, of_tool in runs.items() if name != ours.NAME))}
     return Comparison(world, runs, judged, refinement)
@@ -185,9 +185,8 @@ def _add(
     key = f'{row}/{item.world.name}'
     for peer in item.peers:
         means, _, p99s = item.ratio(peer).tolist()
-        section.metrics += [
-            Metric(f'{key}/ratio to {peer}, mean', means, 'x', RATIO, mean, higher_is_better=True),
-            Metric(f'{key}/ratio to {peer}, p99', p99s, 'x', RATIO, p99, higher_is_better=True)]
+        section.ask(f'{key}/ratio to {peer}, mean', means, 'x', RATIO, least=mean)
+        section.ask(f'{key}/ratio to {peer}, p99', p99s, 'x', RATIO, least=p99)
     if ours.NAME not in item.judged:
         return
     theirs = item.judged[item.peers[0]] if asked and len(item.peers) > 0 else None
@@ -195,14 +194,12 @@ def _add(
     targets = (None, None) if theirs is None else (
         max(theirs.figures()[0], EXCESS_FLOOR),
         max(theirs.figures()[2], EXCESS_FLOOR, least_maximum))
-    section.metrics += [
-        Metric(f'{key}/excess, median', median, '', ACCURACY, targets[0]),
-        Metric(f'{key}/excess, max', highest, '', ACCURACY, targets[1])]
+    section.ask(f'{key}/excess, median', median, '', ACCURACY, most=targets[0])
+    section.ask(f'{key}/excess, max', highest, '', ACCURACY, most=targets[1])
     for name, figure in (('median', np.median), ('max', np.max)):
         target = None if theirs is None else max(1e3 * float(figure(theirs.worst)), POSITION_FLOOR)
-        section.metrics.append(Metric(
-            f'{key}/worst position when refined, {name}',
-            1e3 * float(figure(item.judged[ours.REFINED].worst)), ' mm', ACCURACY, target))
+        section.ask(f'{key}/worst position when refined, {name}',
+                    1e3 * figure(item.judged[ours.REFINED].worst), ' mm', ACCURACY, most=target)
 
 
 def _tables(section: Section, comparisons: list[Comparison]) -> None:
@@ -259,9 +256,8 @@ def _add_worst(
     section: Section, row: str, item: Comparison, target: float | None = None,
 ) -> None:
     if ours.NAME in item.judged:
-        worst = 1e3 * float(np.max(item.judged[ours.NAME].worst))
-        section.metrics.append(Metric(
-            f'{row}/{item.world.name}/worst position', worst, ' mm', ACCURACY, target))
+        worst = 1e3 * np.max(item.judged[ours.NAME].worst)
+        section.ask(f'{row}/{item.world.name}/worst position', worst, ' mm', ACCURACY, most=target)
 
 
 def _time_curves(item: Comparison) -> list[Curve]:
@@ -333,9 +329,8 @@ def _add_final(section: Section, key: str, item: Comparison) -> None:
         section.ask(f'{key}/steps left undone', left, most=0.0)
     else:
         best = min(best, judged.optimum_chi2)
-        section.metrics.append(Metric(
-            f'{key}/final chi2 above it', max(judged.final_chi2 - best, 0.0), '', ACCURACY))
-    section.metrics.append(Metric(f'{key}/optimum', best, '', OPTIMUM))
+        section.ask(f'{key}/final chi2 above it', max(judged.final_chi2 - best, 0.0), '', ACCURACY)
+    section.ask(f'{key}/optimum', best, '', OPTIMUM)
 
 
 SECTIONS = {

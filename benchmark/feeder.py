@@ -7,9 +7,10 @@ One thread, no executor: between two messages it sleeps in the wait set of its s
 it adds itself is its pacing error.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 import gc
 import math
 import os
@@ -70,6 +71,14 @@ def drifting(way: float) -> tuple[float, float, float]:
     return radius * math.sin(theta), radius * (1.0 - math.cos(theta)), theta
 
 
+@cache
+def _moving(speed: float) -> Odometry:
+    """Return odometry with a speed [m/s]."""
+    message = Odometry()
+    message.twist.twist.linear.x = speed
+    return message
+
+
 def stamp_of(data: bytes) -> int:
     """Return the stamp [ns] of a serialised message whose first field is a header."""
     seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
@@ -126,11 +135,18 @@ class Feeder:
         self._node = rclpy.create_node('feeder', context=self._context)
         self._odometry = self._node.create_publisher(Odometry, 'odom', QOS)
         self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', QOS)
-        self._takers: dict[Any, Callable[[bytes, int], None]] = {}
+        self._takers: dict[int, tuple[Any, Callable[[bytes, int], None]]] = {}
         for kind, topic, take in ((DiagnosticArray, '/diagnostics', self._on_diagnostics),
                                   (Odometry, 'odometry/filtered', self._on_output)):
-            self._takers[self._node.create_subscription(
-                kind, topic, lambda _: None, QOS, raw=True)] = take
+            subscription = self._node.create_subscription(
+                kind, topic, lambda _: None, QOS, raw=True)
+            self._takers[subscription.handle.pointer] = subscription, take
+        # used for as long as the context and the subscriptions are
+        self._used = ExitStack()
+        for handle in (self._context.handle, *(each.handle for each, _ in self._takers.values())):
+            self._used.enter_context(handle)
+        self._wait_set = rclpy_implementation.WaitSet(
+            len(self._takers), 0, 0, 0, 0, 0, self._context.handle)
         self._plane = TangentPlane(*DATUM)
         self._rng = np.random.default_rng(0)
         self.values: dict[str, str] = {}
@@ -145,6 +161,7 @@ class Feeder:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._used.close()
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
 
@@ -157,44 +174,29 @@ class Feeder:
         self._phase.came_ns.setdefault(stamp_of(data), now_ns)
         self._newest_output = data
 
-    @contextmanager
-    def _listening(self) -> Iterator[Callable[[float], None]]:
-        """Give a function that takes what comes up to an instant of the steady clock [s]."""
-        with ExitStack() as stack:
-            stack.enter_context(self._context.handle)
-            handles = [subscription.handle for subscription in self._takers]
-            for handle in handles:
-                stack.enter_context(handle)
-            wait_set = rclpy_implementation.WaitSet(
-                len(handles), 0, 0, 0, 0, 0, self._context.handle)
-            by_pointer = {subscription.handle.pointer: (subscription, take)
-                          for subscription, take in self._takers.items()}
-
-            def listen(until: float) -> None:
-                waits = True
-                while waits:
-                    wait_set.clear_entities()
-                    for handle in handles:
-                        wait_set.add_subscription(handle)
-                    left = until - time.monotonic()
-                    waits = left > 0.0
-                    wait_set.wait(int(left * 1e9) if waits else 0)
-                    for pointer in wait_set.get_ready_entities('subscription'):
-                        subscription, take = by_pointer[pointer]
-                        taken = subscription.handle.take_message(subscription.msg_type, True)
-                        if taken is not None:
-                            take(taken[0], time.monotonic_ns())
-
-            yield listen
+    def listen(self, until: float) -> None:
+        """Take what comes up to an instant of the steady clock [s]."""
+        waits = True
+        while waits:
+            self._wait_set.clear_entities()
+            for subscription, _ in self._takers.values():
+                self._wait_set.add_subscription(subscription.handle)
+            left = until - time.monotonic()
+            waits = left > 0.0
+            self._wait_set.wait(int(left * 1e9) if waits else 0)
+            for pointer in self._wait_set.get_ready_entities('subscription'):
+                subscription, take = self._takers[pointer]
+                taken = subscription.handle.take_message(subscription.msg_type, True)
+                if taken is not None:
+                    take(taken[0], time.monotonic_ns())
 
     def wait_until(self, done: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
         """Listen until something is so; raises TimeoutError if it does not become so."""
         end = time.monotonic() + patience
-        with self._listening() as listen:
-            while not done():
-                if time.monotonic() > end:
-                    raise TimeoutError(f'waited {patience} s until {what}: {self.values}')
-                listen(time.monotonic() + 0.002)
+        while not done():
+            if time.monotonic() > end:
+                raise TimeoutError(f'waited {patience} s until {what}: {self.values}')
+            self.listen(time.monotonic() + 0.002)
 
     def wait_for_listener(self) -> None:
         """Wait until somebody listens to odometry and sends outputs."""
@@ -206,11 +208,6 @@ class Feeder:
         self.wait_until(lambda: self._odometry.get_subscription_count() > 0
                         and self._fix.get_subscription_count() > 0
                         and self.values.get('prepared') == '1', 'the node is ready', 300.0)
-
-    def rest(self, seconds: float) -> None:
-        """Only listen for a while."""
-        with self._listening() as listen:
-            listen(time.monotonic() + seconds)
 
     def settle(self) -> None:
         """Wait until the node has processed all that was sent and not lost, and has said so."""
@@ -236,10 +233,8 @@ class Feeder:
 
     def _send_odometry(self, speed: float) -> int:
         """Send odometry as of now; return when that began [ns]."""
-        moving = Odometry()
-        moving.twist.twist.linear.x = speed
         pose = Prediction(np.array(drifting(self._way)), np.zeros((3, 3)))
-        data = odometry_cdr(self._stamp_ns, pose, moving, 'odom', 'base_link')
+        data = odometry_cdr(self._stamp_ns, pose, _moving(speed), 'odom', 'base_link')
         self._n_sent += 1
         begin_ns = time.monotonic_ns()
         self._odometry.publish(data)
@@ -259,22 +254,21 @@ class Feeder:
     def fill(self, nodes: int) -> float:
         """Make the node drive until it has so many hidden nodes; return how long that took [s]."""
         begin = time.monotonic()
-        with self._listening() as listen:
-            for k in range(nodes + 1):
-                self._advance(FILL_STEP, FILL_SPEED)
-                self._send_odometry(FILL_SPEED)
-                if k % FILL_FIXES == 0:
-                    self._send_fix()
-                if not self._newest_output:
-                    # before its first estimate the node answers nothing
-                    listen(time.monotonic() + 0.02)
-                patience = time.monotonic() + PATIENCE
-                while self._newest_output and self._busy():
-                    listen(time.monotonic() + 0.001)
-                    if time.monotonic() > patience:
-                        raise TimeoutError(f'the node does not go on: {self.values}')
-                if k % 50 == 0:
-                    listen(0.0)
+        for k in range(nodes + 1):
+            self._advance(FILL_STEP, FILL_SPEED)
+            self._send_odometry(FILL_SPEED)
+            if k % FILL_FIXES == 0:
+                self._send_fix()
+            if not self._newest_output:
+                # before its first estimate the node answers nothing
+                self.listen(time.monotonic() + 0.02)
+            patience = time.monotonic() + PATIENCE
+            while self._newest_output and self._busy():
+                self.listen(time.monotonic() + 0.001)
+                if time.monotonic() > patience:
+                    raise TimeoutError(f'the node does not go on: {self.values}')
+            if k % 50 == 0:
+                self.listen(0.0)
         self.settle()
         return time.monotonic() - begin
 
@@ -301,20 +295,19 @@ class Feeder:
         every, count = max(round(rate / FIX_RATE), 1), round(rate * seconds)
         gc.collect()
         gc.disable()
-        with self._listening() as listen:
-            cpu, begin = cpu_seconds(), time.monotonic()
-            for k in range(count):
-                due = begin + k / rate
-                listen(due)
-                self._advance(1.0 / rate, SPEED)
-                sent_ns = self._send_odometry(SPEED)
-                phase.sent_ns[self._stamp_ns] = sent_ns
-                phase.late_ns.append(sent_ns - int(due * 1e9))
-                if k % every == 0:
-                    self._send_fix()
-            listen(begin + count / rate)
-            phase.cpu = (cpu_seconds() - cpu) / (time.monotonic() - begin)
-            listen(time.monotonic() + STRAGGLERS)
+        cpu, begin = cpu_seconds(), time.monotonic()
+        for k in range(count):
+            due = begin + k / rate
+            self.listen(due)
+            self._advance(1.0 / rate, SPEED)
+            sent_ns = self._send_odometry(SPEED)
+            phase.sent_ns[self._stamp_ns] = sent_ns
+            phase.late_ns.append(sent_ns - int(due * 1e9))
+            if k % every == 0:
+                self._send_fix()
+        self.listen(begin + count / rate)
+        phase.cpu = (cpu_seconds() - cpu) / (time.monotonic() - begin)
+        self.listen(time.monotonic() + STRAGGLERS)
         gc.enable()
         if self._newest_output and stamp_of(self._newest_output) == self._stamp_ns:
             position = deserialize_message(self._newest_output, Odometry).pose.pose.position

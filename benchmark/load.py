@@ -150,7 +150,7 @@ def echo(options: Options) -> Section:
         table = section.table(title, *HEADER)
         with started('benchmark.echo', parameters) as (process, feeder):
             feeder.wait_for_listener()
-            feeder.rest(1.0)
+            feeder.listen(time.monotonic() + 1.0)
             for rate in (*options.rates, *higher):
                 phase = feeder.run(rate, _seconds(options), process.cpu_seconds)
                 FLOOR.setdefault(rate, phase)
@@ -174,7 +174,7 @@ def graphs(options: Options) -> Section:
     for count in _sizes(options):
         with started(NODE, PARAMETERS) as (process, feeder):
             feeder.wait_until_ready()
-            feeder.rest(0.5)
+            feeder.listen(time.monotonic() + 0.5)
             filled = feeder.fill(count)
             memory = process.memory()
             table = section.table(f'{feeder.values["hidden_nodes"]} hidden nodes', *HEADER)

@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 from benchmark import ours, worlds
-from benchmark.metrics import ACCURACY, Metric, OPTIMUM, RATIO
+from benchmark.metrics import ACCURACY, OPTIMUM, RATIO
 from benchmark.runs import MICROSECOND, Plan, quiet
 from benchmark.section import Options, Section, Table
 from benchmark.worlds import chain, World
@@ -169,10 +169,9 @@ def _measure_world(section: Section, table: Table, world: World, options: Option
         if theirs in times:
             ratio = times[theirs] / times[mine]
             ratios[mine] = f'{ratio:.1f}'
-            section.metrics.append(Metric(
-                f'{key}/ratio, {"no guess" if mine == "nothing" else "same start"}', ratio, 'x',
-                RATIO, FASTER, higher_is_better=True))
-    section.metrics.append(Metric(f'{key}/chi2, no guess', chi2['nothing'], '', OPTIMUM))
+            section.ask(f'{key}/ratio, {"no guess" if mine == "nothing" else "same start"}', ratio,
+                        'x', RATIO, least=FASTER)
+    section.ask(f'{key}/chi2, no guess', chi2['nothing'], '', OPTIMUM)
     section.ask(f'{key}/above the best known', (chi2['nothing'] - best) / max(best, 1.0),
                 most=SAME)
     ms = {name: f'{1e3 * value:.2f}' for name, value in times.items()}
@@ -282,9 +281,8 @@ def covariances(options: Options) -> Section:
         key = f'covariances/{world.name}'
         section.ask(f'{key}/newest', p50, ' us', most=NEWEST)
         section.ask(f'{key}/all over an iteration', ratio, 'x', most=ALL_OVER_FACTORIZATION)
-        section.metrics += [
-            Metric(f'{key}/deviation of all', deviation, '', ACCURACY),
-            Metric(f'{key}/deviation of the newest', deviation_newest, '', ACCURACY)]
+        section.ask(f'{key}/deviation of all', deviation, '', ACCURACY)
+        section.ask(f'{key}/deviation of the newest', deviation_newest, '', ACCURACY)
     return section
 
 
@@ -334,9 +332,7 @@ def memory(options: Options) -> Section:
     table = section.table('', 'nodes', 'bytes a node', 'peak, bytes a node', 'step us')
     table.add(str(n), f'{figures["grown"] / n:.0f}', f'{figures["peak"] / n:.0f}',
               f'{figures["seconds"] / n / MICROSECOND:.2f}')
-    section.metrics = [
-        Metric(f'memory/chain {n}/bytes a node', figures['grown'] / n, '',
-               ACCURACY, BYTES)]
+    section.ask(f'memory/chain {n}/bytes a node', figures['grown'] / n, '', ACCURACY, most=BYTES)
     return section
 
 

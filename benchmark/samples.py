@@ -15,7 +15,8 @@ import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 
-from benchmark.course import Course, FIXES
+from benchmark.course import Course
+from benchmark.drives import Event
 from benchmark.section import Options, say, Section
 from pose_graph_ros.adapters.bag_writer import BAG_VERSION
 from pose_graph_ros.adapters.output_cdr import odometry_cdr
@@ -63,11 +64,8 @@ def write_bag(folder: Path, samples: int, seed: int = 0) -> None:
             stamps = course.stamps(times)
             messages = [(stamp, '/odom', data) for stamp, data in zip(
                 stamps.tolist(), _odometry(stamps, poses), strict=True)]
-            fixes = [each for source, each in others if source == FIXES]
-            found = [*_fixes([each for each in fixes if isinstance(each, Position)], course),
-                     *_closures([each for _, each in others if isinstance(each, LoopClosure)])]
             messages += [(stamp, topic, bytes(types.serialize_cdr(message, kind)))
-                         for topic, kind, stamp, message in found]
+                         for topic, kind, stamp, message in _others(others, course)]
             # a closure or a fix after the odometry with its stamp
             messages.sort(key=lambda message: message[:2] != '/odom' and message[0])
             for stamp, topic, data in messages:
@@ -82,19 +80,18 @@ def _odometry(stamps: np.ndarray, poses: FloatArray) -> Iterator[bytes]:
         yield odometry_cdr(stamp, Prediction(pose, 0.01 * np.eye(3)), first, 'odom', 'base_link')
 
 
-def _fixes(positions: list[Position], course: Course) -> Iterator[tuple]:
-    if len(positions) > 0:
-        where = PLANE.to_geodetic(np.array([each.position for each in positions]))
-        yield from fix_messages('/gps/fix', np.array([each.stamp_ns for each in positions]),
-                                where, course.fix_sigma)
-
-
-def _closures(closures: list[LoopClosure]) -> Iterator[tuple]:
+def _others(others: list[Event], course: Course) -> Iterator[tuple]:
+    """Yield the messages of fixes and of closures."""
+    fixes = [each for _, each in others if isinstance(each, Position)]
+    closures = [each for _, each in others if isinstance(each, LoopClosure)]
+    if len(fixes) > 0:
+        yield from fix_messages(
+            '/gps/fix', np.array([each.stamp_ns for each in fixes]),
+            PLANE.to_geodetic(np.array([each.position for each in fixes])), course.fix_sigma)
     if len(closures) > 0:
-        ends = np.array([(each.reference_ns, each.stamp_ns) for each in closures])
         yield from loop_closure_messages(
-            '/loop_closure', ends, np.array([each.pose for each in closures]),
-            closures[0].covariance)
+            '/loop_closure', np.array([(each.reference_ns, each.stamp_ns) for each in closures]),
+            np.array([each.pose for each in closures]), closures[0].covariance)
 
 
 def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, FloatArray]:

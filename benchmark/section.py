@@ -10,7 +10,7 @@ import sys
 from typing import Any
 
 from benchmark.files import DATA, load_folder
-from benchmark.metrics import Metric
+from benchmark.metrics import Metric, RATIO, Slack
 from benchmark.worlds import World
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
@@ -101,15 +101,13 @@ class Section:
         return self.tables[-1]
 
     def ask(
-        self, key: str, value: float, unit: str = '', *, most: float | None = None,
-        least: float | None = None,
+        self, key: str, value: float, unit: str = '', slack: Slack | None = None, *,
+        most: float | None = None, least: float | None = None,
     ) -> None:
-        """Add a figure that is not gated, and what is asked of it."""
-        if most is not None or least is None:
-            self.metrics.append(Metric(key, float(value), unit, target=most))
-        if least is not None:
-            self.metrics.append(Metric(
-                key, float(value), unit, target=least, higher_is_better=True))
+        """Add a figure, what is asked of it, and by how much it may get worse, if it is gated."""
+        self.metrics.append(Metric(
+            key, float(value), unit, slack, most if least is None else least,
+            higher_is_better=least is not None or slack is RATIO))
 
 
 def kept_with(

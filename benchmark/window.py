@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmark import day, excess, hall, ours, samples
-from benchmark.course import CLOSURES, Course, FIXES, SECOND, START_NS, WINDOWS
+from benchmark import day, hall, ours, samples
+from benchmark.course import CLOSURES, Course, exact_nees, FIXES, SECOND, START_NS, WINDOWS
 from benchmark.drives import feed, nees, rms
-from benchmark.exact_estimate import exact_nees
-from benchmark.metrics import ACCURACY, Metric, RATIO
+from benchmark.metrics import RATIO
 from benchmark.runs import interleaved, Plan, Run, sample_steps, timing, Tool
 from benchmark.section import Options, Section
 from benchmark.worlds import chain, laps, World
@@ -105,7 +104,7 @@ def _errors(world: World, run: Run) -> Errors:
     off = run.newest - world.truth[:len(run.newest)]
     to_truth, window = [], []
     for k, poses in run.samples.items():
-        best = excess.optimum(world, k, world.truth[:k + 1], run.tool)[2]
+        best = ours.optimum(world, k, world.truth[:k + 1], run.tool)[2]
         kept = slice(k + 1 - len(poses), k + 1)
         to_truth.append((poses - world.truth[kept])[:, :2])
         window.append(np.hypot(*(poses - best[kept])[:, :2].T))
@@ -156,9 +155,8 @@ def _add(found: Section, world: World, runs: dict[str, list[Run]]) -> None:
         if name.startswith('GTSAM'):
             both = figures[:3] / timing(runs[first], steps, LAG + 1)[:3]
             ratios = tuple(f'{ratio:.1f}' for ratio in both)
-            found.metrics.append(Metric(
-                f'{world.name}/times as fast as {name}', float(both[0]), 'x', RATIO, RATIO_ASKED,
-                higher_is_better=True))
+            found.ask(f'{world.name}/times as fast as {name}', both[0], 'x', RATIO,
+                      least=RATIO_ASKED)
         mean, p50, p99, longest, _ = figures
         found.tables[0].add(label, name, f'{mean:.1f}', f'{p50:.1f}', f'{p99:.0f}',
                             f'{longest:.0f}', *ratios, str(len(of_tool)), of_tool[0].note)
@@ -173,13 +171,11 @@ def _add(found: Section, world: World, runs: dict[str, list[Run]]) -> None:
         return
     best = min(gtsam, key=lambda name: judged[name].newest)
     for what in ('newest', 'window'):
-        found.metrics.append(Metric(
-            f'{world.name}/error of the {what} to the truth over that of {best}',
-            getattr(judged[first], what) / getattr(judged[best], what), '', ACCURACY, NO_LARGER))
+        found.ask(f'{world.name}/error of the {what} to the truth over that of {best}',
+                  getattr(judged[first], what) / getattr(judged[best], what), most=NO_LARGER)
         mine, theirs = (rms(getattr(judged[name], f'off_{what}')) for name in (first, best))
-        found.metrics.append(Metric(
-            f'{world.name}/distance of the {what} to the optimum over that of {best}',
-            mine / theirs, '', ACCURACY, NO_LARGER))
+        found.ask(f'{world.name}/distance of the {what} to the optimum over that of {best}',
+                  mine / theirs, most=NO_LARGER)
 
 
 @dataclass(frozen=True, slots=True)
