@@ -83,6 +83,7 @@ def optimizer_of(
     else:
         params.setMaxIterations(LOSS_ITERATIONS)
         loss = getattr(gtsam.noiseModel.mEstimator, method).Create(LOSS_SIGMAS)
+        graph = graph.clone()
         for k in closures:
             factor = graph.at(k)
             model = gtsam.noiseModel.Robust.Create(loss, factor.noiseModel())
