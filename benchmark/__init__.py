@@ -1,11 +1,12 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Measure the engine against GTSAM; not installed and not needed by anything else.
+Measure the engine, beside GTSAM or alone; not installed and not needed by anything else.
 
-`worlds`, `streets` and `files` make the graphs, `ours` and `gtsam_peer` run them, `excess` judges
-the estimates, the `row_...` modules are the requirements, `metrics` holds the figures and gates
-them, `report` writes them down.
+`engine`, `solve`, `inputs`, `robust`, `window` and `load` are the pages, each with its sections;
+`worlds`, `files`, `drives`, `recordings`, `wrong_closures` and `course` are what is measured on;
+`runs` drives `ours` and `gtsam_peer` step by step, `peer` is a program around GTSAM; `section` and
+`metrics` hold what was found, `report` writes it down, `__main__` reads the command line.
 """
 
 import os

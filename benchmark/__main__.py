@@ -1,15 +1,17 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Command line of the benchmark: choose the rows, measure, report, and compare with the baseline.
+Command line of the benchmark: choose a page or sections of it, measure, report, gate.
 
     make bench BENCH_ARGS='--quick --gate'
-    .venv/bin/python -m benchmark --only loops/ring --only batch
+    .venv/bin/python -m benchmark engine.loops engine.batch --case ring
+    .venv/bin/python -m benchmark robust.timing --quick
 """
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
+from datetime import date
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 import shlex
@@ -17,85 +19,81 @@ import sys
 import time
 import traceback
 
-from benchmark import (
-    metrics,
-    ours,
-    report,
-    row_back_end,
-    row_batch,
-    row_chain,
-    row_loops,
-    row_resources,
-)
-from benchmark.files import DEFAULT_FOLDER
-from benchmark.section import Options, say, Section
+from benchmark import metrics, ours, report
+from benchmark.files import DATA
+from benchmark.section import kept_with, Options, say, Section
 
-ROWS: dict[str, Callable[[Options], Section]] = {
-    'chain': row_chain.measure,
-    'variants': row_chain.measure_variants,
-    'back_end': row_back_end.measure,
-    'loops': row_loops.measure,
-    'floppy': row_loops.measure_floppy,
-    'batch': row_batch.measure,
-    'covariances': row_resources.measure_covariances,
-    'start': row_resources.measure_start,
-    'memory': row_resources.measure_memory,
-}
-REPEATS = 3
+PAGES = 'engine', 'solve', 'inputs', 'robust', 'window', 'load'
+"""Modules with a page each: its title, its sections by name, and what it is about."""
+FIRST = PAGES[0]
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog='python -m benchmark', formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Measure the engine against GTSAM, requirement by requirement.',
-        epilog='rows: ' + ', '.join(ROWS) + '\n\n'
-        'examples:\n'
-        '  --quick --gate            before a commit: fails and names what got worse\n'
-        '  --only loops/ring         one row, only worlds whose name holds "ring"\n'
-        '  --data FOLDER             with the graph files of that folder (.g2o, TORO .graph)\n'
-        '  --write-baseline          after a change for the better, on purpose\n')
-    parser.add_argument('--quick', action='store_true',
-                        help='small worlds: under 2 minutes on 2 cores')
-    parser.add_argument('--only', metavar='ROW[/WORLD]', action='append', default=[],
-                        help='measure this row alone, and of it only the worlds whose names hold '
-                        'WORLD; may be given several times')
-    parser.add_argument('--repeats', type=int, metavar='N', default=REPEATS,
-                        help='runs of each tool over each world (default %(default)s); what '
-                        'takes over a minute is run once')
-    parser.add_argument('--limit', type=float, default=200.0, metavar='SECONDS',
-                        help='cut a run of one tool over one world after this time (default '
-                        '%(default)s); ratios are then over the steps that were done')
-    parser.add_argument('--data', type=Path, metavar='FOLDER',
-                        help='folder with graph files (default: that of the shared data, where '
-                        'it exists)')
+        description='Measure the engine, requirement by requirement, beside GTSAM or alone.',
+        epilog='examples:\n'
+        '  --quick --gate                    before a commit: fails and names what got worse\n'
+        '  engine.loops --case ring           one section, only worlds whose name holds "ring"\n'
+        '  robust --quick                    another page\n'
+        '  load --size 1000 --seconds 8      the node with 1000 hidden nodes\n'
+        '  --write-baseline                  after a change for the better, on purpose\n')
+    parser.add_argument('names', nargs='*', default=[FIRST], metavar='NAME',
+                        help=f'a page ({", ".join(PAGES)}; default {FIRST}) or sections of one, '
+                        'as engine.loops; those that are not made again stay on the page')
+    parser.add_argument('--quick', action='store_true', help='small worlds, few drives: minutes')
+    parser.add_argument('--case', action='append', default=[], metavar='TEXT',
+                        help='only worlds, drives and graphs with TEXT in their names; may be '
+                        'given several times; other rows of the page stay')
+    parser.add_argument('--repeats', type=int, metavar='N', default=3,
+                        help='runs of each tool that is timed (default %(default)s)')
+    parser.add_argument('--runs', type=int, metavar='N', help='seeded drives of each kind')
+    parser.add_argument('--limit', type=float, default=60.0, metavar='SECONDS',
+                        help='cut a run of one tool after this time (default %(default)s); '
+                        'ratios are then over the steps that were done')
+    parser.add_argument('--size', type=int, nargs='+', default=[], metavar='N',
+                        help='load: hidden nodes; window.samples: samples of odometry')
+    parser.add_argument('--hours', type=float, metavar='H', help='window.day: length of drives')
+    parser.add_argument('--rates', type=float, nargs='+', default=Options().rates, metavar='HZ',
+                        help='load: of odometry (default %(default)s)')
+    parser.add_argument('--seconds', type=float, default=Options().seconds, metavar='S',
+                        help='load: at each rate (default %(default)s)')
+    parser.add_argument('--data', type=Path, default=DATA, metavar='DIR',
+                        help='folder with public data; what is not there is skipped')
     parser.add_argument('--without-gtsam', action='store_true',
                         help='measure ours alone: no ratios')
-    parser.add_argument('--out', type=Path, default=Path('build/benchmark'), metavar='DIR',
-                        help='folder for README.md, metrics.json and pictures (default '
-                        '%(default)s; docs/benchmarks is the committed one)')
+    parser.add_argument('--out', type=Path, metavar='DIR',
+                        help='folder of the page (default build/benchmark/PAGE)')
     parser.add_argument('--gate', action='store_true',
                         help='compare with benchmark/baseline.json and exit with 1 if anything '
                         'got worse')
     parser.add_argument('--write-baseline', action='store_true',
                         help='write what was measured into benchmark/baseline.json')
     options = parser.parse_args(arguments)
-    for name in options.only:
-        if name.partition('/')[0] not in ROWS:
-            parser.error(f'--only {name}: there is no such row; rows are {", ".join(ROWS)}')
-    if options.repeats < 1:
-        parser.error(f'--repeats: expected at least 1, got {options.repeats}')
-    if options.data is not None and not options.data.is_dir():
-        parser.error(f'--data: {options.data} is no folder')
+    pages = {name.partition('.')[0] for name in options.names}
+    if len(pages) > 1 or not pages <= set(PAGES):
+        parser.error(f'expected sections of one page of {", ".join(PAGES)}, got '
+                     f'{" ".join(options.names)}')
+    options.page, = pages
+    options.module = import_module(f'benchmark.{options.page}')
+    sections = tuple(options.module.SECTIONS)
+    options.sections = [name.partition('.')[2] for name in options.names
+                        if name != options.page] or sections
+    for name in options.sections:
+        if name not in sections:
+            parser.error(f'{options.page} has no section {name}, but {", ".join(sections)}')
+    if options.repeats < 1 or (options.runs is not None and options.runs < 1):
+        parser.error('--repeats, --runs: expected at least 1')
     return options
 
 
-def _measure(name: str, options: Options) -> Section:
-    """Measure one row; an exception is its result, not the end of the benchmark."""
+def _measure(name: str, function: Callable[[Options], Section], options: Options) -> Section:
+    """Measure one section; an exception is its result, not the end of the benchmark."""
     begin = time.perf_counter()
     say(f'{name} ...')
     try:
-        section = ROWS[name](options)
-    except Exception as error:  # one row must not cost the others
+        section = function(options)
+    except Exception as error:  # one section must not cost the others
         traceback.print_exc()
         section = Section(name, 'Not measured.', failed=True,
                           notes=[f'{type(error).__name__}: {error}'])
@@ -107,28 +105,41 @@ def _measure(name: str, options: Options) -> Section:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the benchmark; return 1 if a row failed or something got worse, 2 without GTSAM."""
+    """Run the benchmark; return 1 if a section failed or something got worse, 2 without GTSAM."""
     chosen = _parse(arguments)
-    folder = chosen.data or (DEFAULT_FOLDER if DEFAULT_FOLDER.is_dir() else None)
-    if not chosen.without_gtsam and find_spec('gtsam') is None:
+    gtsam = find_spec('gtsam') is not None
+    if chosen.page == FIRST and not chosen.without_gtsam and not gtsam:
         say('gtsam is not installed: `make bench` does that, or give --without-gtsam')
         return 2
-    options = Options(chosen.quick, chosen.repeats, folder, limit=chosen.limit,
-                      gtsam=not chosen.without_gtsam)
-    wanted: dict[str, tuple[str, ...]] = {}
-    for name in chosen.only or ROWS:
-        row, _, world = name.partition('/')
-        wanted[row] = (*wanted.get(row, ()), *([world] if world else []))
+    out = chosen.out or Path('build/benchmark', chosen.page)
+    out.mkdir(parents=True, exist_ok=True)
+    options = Options(
+        chosen.quick, chosen.repeats, chosen.runs, chosen.data, tuple(chosen.case), chosen.limit,
+        gtsam and not chosen.without_gtsam, tuple(chosen.size), chosen.hours,
+        tuple(chosen.rates), chosen.seconds, out)
+    # folders are others elsewhere
+    shown = [word if before not in ('--data', '--out') else before[2:].upper()
+             for before, word in zip(['', *arguments], arguments, strict=False)]
+    command = shlex.join(['python', '-m', 'benchmark', *shown])
 
     say('compiling, or loading what has been compiled')
     ours.warm_up()
-    sections = [_measure(row, replace(options, worlds=worlds)) for row, worlds in wanted.items()]
-    figures = [metric for section in sections for metric in section.metrics]
-    command = shlex.join(['python', '-m', 'benchmark', *arguments])
-    path = report.write(sections, chosen.out, command)
-    say(f'{report.summary(figures)}; see {path}')
+    made = []
+    for name in chosen.sections:
+        section = _measure(name, chosen.module.SECTIONS[name], options)
+        made.append(section)
+        section.notes.append(f'Made on {date.today().isoformat()} by `{command}`.')
+        kept = kept_with(out, name, section, tuple(chosen.module.SECTIONS),
+                         rows=len(options.cases) > 0)
+        path = report.write(
+            kept, out, f'python -m benchmark {chosen.page}', title=chosen.module.TITLE,
+            about=chosen.module.__doc__ or '',
+            curves=[curve for each in made for curve in each.curves])
+    figures = [metric for section in made for metric in section.metrics]
+    asked = [metric for metric in figures if metric.target is not None]
+    say(f'{sum(metric.reached for metric in asked)} of {len(asked)} figures reach what is asked; '
+        f'see {path}')
 
-    failed = [section.title for section in sections if section.failed]
     mode = 'quick' if chosen.quick else 'full'
     worse = metrics.gate(figures, mode) if chosen.gate else []
     if chosen.write_baseline:
@@ -137,6 +148,7 @@ def main(arguments: list[str]) -> int:
         say(f'worse: {line}')
     if chosen.gate and len(worse) == 0:
         say('gate: nothing got worse')
+    failed = [section.title for section in made if section.failed]
     if failed:
         say(f'failed: {", ".join(failed)}')
     return 1 if worse or failed else 0

@@ -1,143 +1,204 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated drives whose noise is exactly what the engine is told, and how they are fed to it."""
+"""
+Drives with fixes, recorded or simulated, whose measurements can be changed, and their way in.
 
-from collections.abc import Iterator
+The noise of a simulated drive is what the engine is told.
+"""
+
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
-from scipy.signal import lfilter
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, GyroSource, MeasurementSource, OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position, YawRate
+from pose_graph_ros.offline.simulation import sensors
+from pose_graph_ros.offline.simulation.recording import course
+from pose_graph_ros.offline.simulation.settings import Fixes, Gyro, OdometryErrors, Wheels
+from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 SECOND = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """What is simulated."""
-
-    name: str
-    speed: float = 1.0
-    """[m/s]"""
-    duration: float = 120.0
-    """[s]"""
-    odometry_rate: float = 10.0
-    """[Hz]"""
-    period: float = 1.0
-    """Of the fixes [s]."""
-    sigma: float = 1.0
-    """Of a coordinate of a fix [m]."""
-    tau: float = 0.0
-    """Time constant of the errors of the fixes [s]; 0: white."""
-    white_share: float = 0.0
-    """Of the variance of the fixes, if they are correlated."""
-    outliers: float = 0.0
-    """Share of the fixes that are tens of metres off."""
-    rest: float = 0.0
-    """At the beginning [s]."""
-    drift: float = 0.0
-    """Of the heading by odometry, which is not told [rad/m]."""
+SIGMA = 1.0
+"""Of the fixes [m]."""
+WHITE = Fixes(1.0, SIGMA, 0.0)
+"""At 1 Hz."""
+PLAZA = 'robot/plaza1'
+Event = tuple[str, OdometrySample | Measurement]
+"""A source, and what it says."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A simulated drive."""
+    """Odometry, truth and fixes of one drive, perhaps with a fault."""
 
+    odometry: Trajectory
+    truth: Trajectory
     stamps_ns: IntArray
-    truth: FloatArray
-    """`T_map_base`, shape (N, 3)."""
-    odometry: FloatArray
-    """`T_odom_base`, shape (N, 3)."""
-    fix_stamps_ns: IntArray
+    """Of the fixes, shape (M,)."""
     fixes: FloatArray
     """Shape (M, 2) [m]."""
-    sigma: float
-    rates: FloatArray | None = None
-    """Of a gyroscope in the middle between two stamps, shape (N - 1,) [rad/s]."""
+    wrong: frozenset[tuple[str, int]] = frozenset()
+    """Source and stamp of each wrong measurement."""
+    fault_ns: tuple[int, int] = (0, 0)
+    """When the wrong ones come; they are to be doubted in this time."""
+    good_ns: int = 0
+    """When what is right comes again; 0: there is no such time."""
+    others: tuple[Event, ...] = ()
+    """Of other sources."""
+    sigma: float = SIGMA
+    """What the fixes claim [m]."""
 
-    def events(self) -> list[OdometrySample | Measurement]:
-        """Return all that the sensors say, by stamp."""
-        samples: list[OdometrySample | Measurement] = [
-            OdometrySample(int(stamp), pose)
-            for stamp, pose in zip(self.stamps_ns, self.odometry, strict=True)]
-        samples += [
-            Position(int(stamp), position, self.sigma**2 * np.eye(2), np.zeros(2))
-            for stamp, position in zip(self.fix_stamps_ns, self.fixes, strict=True)]
-        if self.rates is not None:
-            middles = self.stamps_ns[:-1] + np.diff(self.stamps_ns) // 2
-            samples += [YawRate(int(stamp), float(rate))
-                        for stamp, rate in zip(middles, self.rates, strict=True)]
-        return sorted(samples, key=lambda sample: sample.stamp_ns)
+    @property
+    def middle_ns(self) -> int:
+        """When most faults begin."""
+        stamps = self.odometry.stamps_ns
+        return int(stamps[0] + stamps[-1]) // 2
+
+    def events(self) -> list[Event]:
+        """Return what comes, by stamp."""
+        events: list[Event] = [('odom', OdometrySample(stamp, pose)) for stamp, pose in zip(
+            self.odometry.stamps_ns.tolist(), self.odometry.poses, strict=True)]
+        events += positions('fix', self.stamps_ns, self.fixes, self.sigma)
+        return sorted([*events, *self.others], key=lambda event: event[1].stamp_ns)
+
+    def only_right(self) -> 'Drive':
+        """Return the drive without what is wrong."""
+        kept = np.array([('fix', stamp) not in self.wrong for stamp in self.stamps_ns.tolist()],
+                        dtype=bool)
+        others = tuple((source, one) for source, one in self.others
+                       if (source, one.stamp_ns) not in self.wrong)
+        return replace(self, stamps_ns=self.stamps_ns[kept], fixes=self.fixes[kept],
+                       others=others, wrong=frozenset())
+
+    def moved(self, chosen: BoolArray, by: FloatArray) -> 'Drive':
+        """
+        Move some of the fixes, which are wrong then.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool, shape (M,)
+        by : ndarray, shape (2,) or (M, 2) [m]
+
+        """
+        wrong = frozenset(('fix', stamp) for stamp in self.stamps_ns[chosen].tolist())
+        first, last = self.stamps_ns[chosen][[0, -1]].tolist() if chosen.any() else (0, -1)
+        return replace(self, fixes=self.fixes + np.where(chosen[:, None], by, 0.0),
+                       wrong=self.wrong | wrong, fault_ns=(first, last + 1))
+
+    def offset(self, begin_s: float, end_s: float, by: FloatArray) -> 'Drive':
+        """Move the fixes of a time since the middle [s] by so much, shape (2,) [m]."""
+        end_ns = self.middle_ns + round(end_s * SECOND)
+        moved = self.moved(self.within(begin_s, end_s), by)
+        return replace(moved, fault_ns=(moved.fault_ns[0], end_ns), good_ns=end_ns)
+
+    def silent(self, begin_s: float, end_s: float) -> 'Drive':
+        """Leave out the fixes of a time since the middle [s]."""
+        kept = ~self.within(begin_s, end_s)
+        return replace(self, stamps_ns=self.stamps_ns[kept], fixes=self.fixes[kept],
+                       good_ns=self.middle_ns + round(end_s * SECOND))
+
+    def within(self, begin_s: float, end_s: float) -> BoolArray:
+        """Return which fixes are of a time since the middle [s], shape (M,)."""
+        since = (self.stamps_ns - self.middle_ns) / SECOND
+        return np.asarray((since >= begin_s) & (since < end_s))
 
 
-def simulate(kind: Kind, seed: int, noise: OdometryNoise) -> Drive:
-    """Simulate a winding drive from an unknown heading, with odometry noise as in `core`."""
-    rng = np.random.default_rng(seed)
-    step = 1.0 / kind.odometry_rate
-    time = np.arange(0.0, kind.duration, step)
-    rate = 0.1 * np.sin(2.0 * np.pi * time / 37.0) + 0.05 * np.sin(2.0 * np.pi * time / 11.0)
-    moving = np.clip(time - kind.rest, 0.0, 1.0) if kind.rest > 0.0 else np.ones(len(time))
-    distance, turns = kind.speed * step * moving, rate * step * moving
-    heading_variance = (noise.sigma_heading_distance**2 * distance
-                        + noise.sigma_heading_turn**2 * np.abs(turns))
-    errors = rng.standard_normal((len(time), 3)) * np.column_stack((
-        noise.sigma_distance * np.sqrt(distance), noise.sigma_lateral * np.sqrt(distance),
-        np.sqrt(heading_variance)))
-    errors[:, 2] += kind.drift * distance
-    truth = np.zeros((len(time), 3))
-    odometry = np.zeros((len(time), 3))
-    odometry[0] = (5.0, -3.0, rng.uniform(-np.pi, np.pi))
-    for k in range(1, len(time)):
-        increment = np.array((distance[k], 0.0, turns[k]))
-        truth[k] = se2.compose(truth[k - 1], increment)
-        odometry[k] = se2.compose(odometry[k - 1], se2.compose(increment, errors[k]))
-    seen = np.arange(3, len(time), max(round(kind.period / step), 1))
-    shape = (len(seen), 2)
-    off = rng.standard_normal(shape)
-    if kind.tau > 0.0:
-        phi = np.exp(-kind.period / kind.tau)
-        drive = np.sqrt(1.0 - phi**2) * rng.standard_normal(shape)
-        drive[0] = rng.standard_normal(2)
-        slow = lfilter([1.0], [1.0, -phi], drive, axis=0)
-        off = np.sqrt(1.0 - kind.white_share) * slow + np.sqrt(kind.white_share) * off
-    wrong = rng.random(len(seen)) < kind.outliers
-    off = kind.sigma * off + np.where(wrong[:, None], rng.uniform(-50.0, 50.0, shape), 0.0)
-    stamps = SECOND + np.round(time * SECOND).astype(np.int64)
-    return Drive(stamps, truth, odometry, stamps[seen], truth[seen, :2] + off, kind.sigma)
+def positions(
+    source: str, stamps_ns: IntArray, places: FloatArray, sigma: float = SIGMA,
+) -> list[Event]:
+    """Return fixes as they come."""
+    return [(source, Position(stamp, place, sigma**2 * np.eye(2), np.zeros(2)))
+            for stamp, place in zip(stamps_ns.tolist(), places, strict=True)]
+
+
+def simulated(
+    seed: int, duration_s: float, world: str = 'grid', fixes: Fixes = WHITE, *, every: int = 2,
+    drift: float = 0.0, gyro: Gyro | None = None,
+) -> Drive:
+    """
+    Simulate a drive from an unknown heading.
+
+    Parameters
+    ----------
+    seed : int
+    duration_s : float
+    world : str, of `WORLDS`
+    fixes : Fixes
+    every : int, which samples of odometry are taken, of 20 Hz
+    drift : float, of the heading by odometry, which is not told [rad/m]
+    gyro : Gyro, optional, a further source; every fifth of its rates, of 20 Hz, is a mean
+
+    """
+    way = course(WORLDS[world], seed, duration_s)
+    rng = np.random.default_rng((seed, 1))
+    wheels = Wheels(OdometryErrors.MODEL, heading_drift=drift,
+                    start=(5.0, -3.0, rng.uniform(-np.pi, np.pi)))
+    odometry = sensors.odometry(rng, way.truth, wheels)
+    stamps, places = sensors.positions(rng, way.truth, fixes)
+    others: tuple[Event, ...] = ()
+    if gyro is not None:
+        rates = sensors.yaw_rates(rng, way.truth.poses[:, 2], gyro)
+        others = tuple(('gyro', YawRate(stamp, rate)) for stamp, rate in zip(
+            way.truth.stamps_ns.tolist(), rates.tolist(), strict=True))
+    return Drive(Trajectory(odometry.stamps_ns[::every], odometry.poses[::every]), way.truth,
+                 stamps, places, sigma=fixes.sigma, others=others)
+
+
+def plaza(data: Path, seed: int) -> Drive:
+    """Read the drive of a lawn mower, odometry and truth, and make fixes of its truth at 1 Hz."""
+    tables = (np.genfromtxt(data / PLAZA / name, delimiter=',', skip_header=1)
+              for name in ('odom.csv', 'gt.csv'))
+    odometry, truth = (
+        Trajectory(stamps[new], rows[new, 1:4]) for rows in tables
+        for stamps in [np.round(rows[:, 0] * 1e9).astype(np.int64)]
+        for new in [np.append(True, np.diff(stamps) > 0)])
+    begin = max(odometry.stamps_ns[0], truth.stamps_ns[0])
+    stamps = np.arange(begin + SECOND, min(odometry.stamps_ns[-1], truth.stamps_ns[-1]), SECOND)
+    noise = np.random.default_rng(seed).normal(0.0, SIGMA, (len(stamps), 2))
+    return Drive(odometry, truth, stamps, truth.at(stamps)[:, :2] + noise)
 
 
 def feed(
-    backend: PoseGraphBackend, events: list[OdometrySample | Measurement], update_every: float,
+    backend: PoseGraphBackend, events: Iterable[Event], update_every: float,
 ) -> Iterator[int]:
     """Feed events in the order given; update so often in stamps of the odometry [s], and yield."""
     due = 0
-    for event in events:
-        if isinstance(event, OdometrySample):
-            backend.add_odometry(event)
-            if event.stamp_ns >= due:
-                backend.update()
-                due = event.stamp_ns + round(update_every * SECOND)
-                yield event.stamp_ns
-        else:
-            backend.add_measurement(event, 'gyro' if isinstance(event, YawRate) else 'fix')
+    for source, event in events:
+        if not isinstance(event, OdometrySample):
+            backend.add_measurement(event, source)
+            continue
+        backend.add_odometry(event)
+        if event.stamp_ns >= due:
+            due = event.stamp_ns + round(update_every * SECOND)
+            backend.update()
+            yield event.stamp_ns
 
 
-def with_gyro(drive: Drive, noise: GyroSource, seed: int) -> Drive:
-    """Return a drive with a gyroscope as well, whose errors are those of its settings."""
-    rng = np.random.default_rng((seed, 1))
-    steps = np.diff(drive.stamps_ns) * 1e-9
-    turns = se2.wrap(np.diff(drive.truth[:, 2]))
-    walk = rng.normal(0.0, noise.sigma_bias) + np.cumsum(
-        noise.sigma_bias_walk * np.sqrt(steps) * rng.standard_normal(len(steps)))
-    white = np.sqrt(noise.sigma_rate**2 * steps + noise.sigma_turn**2 * np.abs(turns))
-    return replace(drive, rates=walk + (turns + white * rng.standard_normal(len(steps))) / steps)
+def off_truth(backend: PoseGraphBackend, truth: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Return the error of the newest pose, shape (3,), and its covariance."""
+    estimate = backend.estimate(with_path=False)
+    assert estimate is not None
+    off = estimate.T_map_base - truth.at(estimate.stamp_ns)
+    off[2] = se2.wrap(off[2])
+    return off, estimate.covariance
 
 
-def new_backend(source: MeasurementSource) -> PoseGraphBackend:
-    """Return an engine that takes the fixes as a source with these settings."""
-    return PoseGraphBackend(BackendConfig(measurements={'fix': source}))
+def nees(off: FloatArray, covariance: FloatArray) -> float:
+    """Return e^T C^-1 e / 3."""
+    return float(off @ np.linalg.solve(covariance, off)) / 3.0
+
+
+def rms(off: FloatArray) -> float:
+    """Return the root mean square of numbers, or of the lengths of vectors, shape (N, 2)."""
+    return float(np.sqrt(np.mean(np.square(off if off.ndim == 1 else np.hypot(*off.T)))))
+
+
+def path_rms(path: Trajectory, truth: Trajectory) -> float:
+    """Return the error of a path to the truth [m]."""
+    inside = truth.covers(path.stamps_ns)
+    return rms((path.poses[inside] - truth.at(path.stamps_ns[inside]))[:, :2])

@@ -3,13 +3,14 @@
 """
 Sends odometry and fixes at an exact pace, and notes when what follows from them comes back.
 
-One thread, no executor: messages are patched into serialised templates, and between two of them
-the thread sleeps in the wait set of its subscriptions. What it adds itself is its pacing error.
+One thread, no executor: between two messages it sleeps in the wait set of its subscriptions. What
+it adds itself is its pacing error.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 import gc
 import math
 import os
@@ -18,23 +19,22 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import NavSatFix
 
+from pose_graph_ros.adapters.output_cdr import odometry_cdr
+from pose_graph_ros.core.estimate import Prediction
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 # As a driver has it; the node listens with best effort, so nothing is sent again.
-SENT_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
-HEARD_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
-PATH_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE,
-                      durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.RELIABLE)
 SECOND = 1_000_000_000
 PATIENCE = 60.0
 """How long the node is waited for [s]."""
@@ -71,68 +71,18 @@ def drifting(way: float) -> tuple[float, float, float]:
     return radius * math.sin(theta), radius * (1.0 - math.cos(theta)), theta
 
 
-class Template:
-    """
-    A serialised message of which some numbers are replaced.
-
-    Parameters
-    ----------
-    message : message
-        With a header.
-    marks : dict
-        Numbers that stand in the message once each, as a name tells them.
-
-    """
-
-    def __init__(self, message: Any, marks: Mapping[str, float]) -> None:
-        self._data = bytearray(serialize_message(message))
-        self._at = {}
-        for name, mark in marks.items():
-            pattern = struct.pack('<d', mark)
-            if self._data.count(pattern) != 1:
-                raise ValueError(f'{name}: expected {mark} once in the message')
-            self._at[name] = self._data.index(pattern)
-
-    def fill(self, stamp_ns: int, **numbers: float) -> bytes:
-        """Return the message with a stamp [ns] and these numbers."""
-        put_stamp(self._data, stamp_ns)
-        for name, number in numbers.items():
-            struct.pack_into('<d', self._data, self._at[name], number)
-        return bytes(self._data)
-
-
-def put_stamp(data: bytearray, stamp_ns: int) -> None:
-    """Set the stamp of a serialised message whose first field is a header."""
-    struct.pack_into('<iI', data, 4, *divmod(stamp_ns, SECOND))
+@cache
+def _moving(speed: float) -> Odometry:
+    """Return odometry with a speed [m/s]."""
+    message = Odometry()
+    message.twist.twist.linear.x = speed
+    return message
 
 
 def stamp_of(data: bytes) -> int:
     """Return the stamp [ns] of a serialised message whose first field is a header."""
     seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
     return int(seconds * SECOND + nanoseconds)
-
-
-def _odometry_template() -> Template:
-    message = Odometry()
-    message.header.frame_id, message.child_frame_id = 'odom', 'base_link'
-    marks = {'x': 1.25e100, 'y': 2.25e100, 'qz': 3.25e100, 'qw': 4.25e100, 'speed': 5.25e100}
-    message.pose.pose.position.x, message.pose.pose.position.y = marks['x'], marks['y']
-    message.pose.pose.orientation.z = marks['qz']
-    message.pose.pose.orientation.w = marks['qw']
-    message.twist.twist.linear.x = marks['speed']
-    return Template(message, marks)
-
-
-def _fix_template() -> Template:
-    message = NavSatFix()
-    message.header.frame_id = 'gps'
-    message.status.status = 0
-    marks = {'latitude': 1.25e100, 'longitude': 2.25e100}
-    message.latitude, message.longitude = marks['latitude'], marks['longitude']
-    message.position_covariance_type = 2
-    message.position_covariance = [
-        SIGMA_FIX**2, 0.0, 0.0, 0.0, SIGMA_FIX**2, 0.0, 0.0, 0.0, 4.0 * SIGMA_FIX**2]
-    return Template(message, marks)
 
 
 @dataclass(slots=True)
@@ -147,7 +97,6 @@ class Phase:
     """How long after its time that was."""
     came_ns: dict[int, int] = field(default_factory=dict)
     """By the stamp of the output."""
-    paths: int = 0
     lost: int = 0
     """Messages of odometry that the node did not take."""
     cpu: float = 0.0
@@ -175,25 +124,29 @@ class Feeder:
     ----------
     environment : mapping
         Of the node; the domain is taken from it.
-    listens_to_path : bool
-        Whether to subscribe to the path.
 
     """
 
-    def __init__(self, environment: Mapping[str, str], *, listens_to_path: bool = False) -> None:
+    def __init__(self, environment: Mapping[str, str]) -> None:
         for name in ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOG_DIR', 'AMENT_PREFIX_PATH'):
             os.environ[name] = environment[name]
         self._context = Context()
         rclpy.init(context=self._context, domain_id=int(environment['ROS_DOMAIN_ID']))
         self._node = rclpy.create_node('feeder', context=self._context)
-        self._odometry = self._node.create_publisher(Odometry, 'odom', SENT_QOS)
-        self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', SENT_QOS)
-        self._takers: dict[Any, Callable[[bytes, int], None]] = {}
-        self._hear(DiagnosticArray, '/diagnostics', HEARD_QOS, self._on_diagnostics)
-        self._hear(Odometry, 'odometry/filtered', HEARD_QOS, self._on_output)
-        if listens_to_path:
-            self._hear(Path, 'path', PATH_QOS, self._on_path)
-        self._odometry_template, self._fix_template = _odometry_template(), _fix_template()
+        self._odometry = self._node.create_publisher(Odometry, 'odom', QOS)
+        self._fix = self._node.create_publisher(NavSatFix, 'gps/fix', QOS)
+        self._takers: dict[int, tuple[Any, Callable[[bytes, int], None]]] = {}
+        for kind, topic, take in ((DiagnosticArray, '/diagnostics', self._on_diagnostics),
+                                  (Odometry, 'odometry/filtered', self._on_output)):
+            subscription = self._node.create_subscription(
+                kind, topic, lambda _: None, QOS, raw=True)
+            self._takers[subscription.handle.pointer] = subscription, take
+        # used for as long as the context and the subscriptions are
+        self._used = ExitStack()
+        for handle in (self._context.handle, *(each.handle for each, _ in self._takers.values())):
+            self._used.enter_context(handle)
+        self._wait_set = rclpy_implementation.WaitSet(
+            len(self._takers), 0, 0, 0, 0, 0, self._context.handle)
         self._plane = TangentPlane(*DATUM)
         self._rng = np.random.default_rng(0)
         self.values: dict[str, str] = {}
@@ -204,16 +157,11 @@ class Feeder:
         self._newest_output = b''
         self._phase = Phase(0.0)
 
-    def _hear(
-        self, kind: type, topic: str, qos: QoSProfile, take: Callable[[bytes, int], None],
-    ) -> None:
-        self._takers[
-            self._node.create_subscription(kind, topic, lambda _: None, qos, raw=True)] = take
-
     def __enter__(self) -> 'Feeder':
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._used.close()
         self._node.destroy_node()
         rclpy.shutdown(context=self._context)
 
@@ -226,47 +174,29 @@ class Feeder:
         self._phase.came_ns.setdefault(stamp_of(data), now_ns)
         self._newest_output = data
 
-    def _on_path(self, _data: bytes, _: int) -> None:
-        self._phase.paths += 1
-
-    @contextmanager
-    def _listening(self) -> Iterator[Callable[[float], None]]:
-        """Give a function that takes what comes up to an instant of the steady clock [s]."""
-        with ExitStack() as stack:
-            stack.enter_context(self._context.handle)
-            handles = [subscription.handle for subscription in self._takers]
-            for handle in handles:
-                stack.enter_context(handle)
-            wait_set = rclpy_implementation.WaitSet(
-                len(handles), 0, 0, 0, 0, 0, self._context.handle)
-            by_pointer = {subscription.handle.pointer: (subscription, take)
-                          for subscription, take in self._takers.items()}
-
-            def listen(until: float) -> None:
-                waits = True
-                while waits:
-                    wait_set.clear_entities()
-                    for handle in handles:
-                        wait_set.add_subscription(handle)
-                    left = until - time.monotonic()
-                    waits = left > 0.0
-                    wait_set.wait(int(left * 1e9) if waits else 0)
-                    for pointer in wait_set.get_ready_entities('subscription'):
-                        subscription, take = by_pointer[pointer]
-                        taken = subscription.handle.take_message(subscription.msg_type, True)
-                        if taken is not None:
-                            take(taken[0], time.monotonic_ns())
-
-            yield listen
+    def listen(self, until: float) -> None:
+        """Take what comes up to an instant of the steady clock [s]."""
+        waits = True
+        while waits:
+            self._wait_set.clear_entities()
+            for subscription, _ in self._takers.values():
+                self._wait_set.add_subscription(subscription.handle)
+            left = until - time.monotonic()
+            waits = left > 0.0
+            self._wait_set.wait(int(left * 1e9) if waits else 0)
+            for pointer in self._wait_set.get_ready_entities('subscription'):
+                subscription, take = self._takers[pointer]
+                taken = subscription.handle.take_message(subscription.msg_type, True)
+                if taken is not None:
+                    take(taken[0], time.monotonic_ns())
 
     def wait_until(self, done: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
         """Listen until something is so; raises TimeoutError if it does not become so."""
         end = time.monotonic() + patience
-        with self._listening() as listen:
-            while not done():
-                if time.monotonic() > end:
-                    raise TimeoutError(f'waited {patience} s until {what}: {self.values}')
-                listen(time.monotonic() + 0.002)
+        while not done():
+            if time.monotonic() > end:
+                raise TimeoutError(f'waited {patience} s until {what}: {self.values}')
+            self.listen(time.monotonic() + 0.002)
 
     def wait_for_listener(self) -> None:
         """Wait until somebody listens to odometry and sends outputs."""
@@ -278,11 +208,6 @@ class Feeder:
         self.wait_until(lambda: self._odometry.get_subscription_count() > 0
                         and self._fix.get_subscription_count() > 0
                         and self.values.get('prepared') == '1', 'the node is ready', 300.0)
-
-    def rest(self, seconds: float) -> None:
-        """Only listen for a while."""
-        with self._listening() as listen:
-            listen(time.monotonic() + seconds)
 
     def settle(self) -> None:
         """Wait until the node has processed all that was sent and not lost, and has said so."""
@@ -308,10 +233,8 @@ class Feeder:
 
     def _send_odometry(self, speed: float) -> int:
         """Send odometry as of now; return when that began [ns]."""
-        x, y, theta = drifting(self._way)
-        data = self._odometry_template.fill(
-            self._stamp_ns, x=x, y=y, qz=math.sin(0.5 * theta), qw=math.cos(0.5 * theta),
-            speed=speed)
+        pose = Prediction(np.array(drifting(self._way)), np.zeros((3, 3)))
+        data = odometry_cdr(self._stamp_ns, pose, _moving(speed), 'odom', 'base_link')
         self._n_sent += 1
         begin_ns = time.monotonic_ns()
         self._odometry.publish(data)
@@ -319,30 +242,33 @@ class Feeder:
 
     def _send_fix(self) -> None:
         position = np.array(truth(self._way)) + self._rng.normal(0.0, SIGMA_FIX, 2)
-        latitude, longitude, _ = self._plane.to_geodetic(position)
+        message = NavSatFix(position_covariance_type=2, position_covariance=(
+            SIGMA_FIX**2 * np.diag((1.0, 1.0, 4.0))).ravel())
+        message.header.frame_id = 'gps'
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._stamp_ns, SECOND)
+        message.status.status = 0
+        message.latitude, message.longitude, _ = self._plane.to_geodetic(position).tolist()
         self._n_sent += 1
-        self._fix.publish(self._fix_template.fill(
-            self._stamp_ns, latitude=latitude, longitude=longitude))
+        self._fix.publish(message)
 
     def fill(self, nodes: int) -> float:
         """Make the node drive until it has so many hidden nodes; return how long that took [s]."""
         begin = time.monotonic()
-        with self._listening() as listen:
-            for k in range(nodes + 1):
-                self._advance(FILL_STEP, FILL_SPEED)
-                self._send_odometry(FILL_SPEED)
-                if k % FILL_FIXES == 0:
-                    self._send_fix()
-                if not self._newest_output:
-                    # before its first estimate the node answers nothing
-                    listen(time.monotonic() + 0.02)
-                patience = time.monotonic() + PATIENCE
-                while self._newest_output and self._busy():
-                    listen(time.monotonic() + 0.001)
-                    if time.monotonic() > patience:
-                        raise TimeoutError(f'the node does not go on: {self.values}')
-                if k % 50 == 0:
-                    listen(0.0)
+        for k in range(nodes + 1):
+            self._advance(FILL_STEP, FILL_SPEED)
+            self._send_odometry(FILL_SPEED)
+            if k % FILL_FIXES == 0:
+                self._send_fix()
+            if not self._newest_output:
+                # before its first estimate the node answers nothing
+                self.listen(time.monotonic() + 0.02)
+            patience = time.monotonic() + PATIENCE
+            while self._newest_output and self._busy():
+                self.listen(time.monotonic() + 0.001)
+                if time.monotonic() > patience:
+                    raise TimeoutError(f'the node does not go on: {self.values}')
+            if k % 50 == 0:
+                self.listen(0.0)
         self.settle()
         return time.monotonic() - begin
 
@@ -369,20 +295,19 @@ class Feeder:
         every, count = max(round(rate / FIX_RATE), 1), round(rate * seconds)
         gc.collect()
         gc.disable()
-        with self._listening() as listen:
-            cpu, begin = cpu_seconds(), time.monotonic()
-            for k in range(count):
-                due = begin + k / rate
-                listen(due)
-                self._advance(1.0 / rate, SPEED)
-                sent_ns = self._send_odometry(SPEED)
-                phase.sent_ns[self._stamp_ns] = sent_ns
-                phase.late_ns.append(sent_ns - int(due * 1e9))
-                if k % every == 0:
-                    self._send_fix()
-            listen(begin + count / rate)
-            phase.cpu = (cpu_seconds() - cpu) / (time.monotonic() - begin)
-            listen(time.monotonic() + STRAGGLERS)
+        cpu, begin = cpu_seconds(), time.monotonic()
+        for k in range(count):
+            due = begin + k / rate
+            self.listen(due)
+            self._advance(1.0 / rate, SPEED)
+            sent_ns = self._send_odometry(SPEED)
+            phase.sent_ns[self._stamp_ns] = sent_ns
+            phase.late_ns.append(sent_ns - int(due * 1e9))
+            if k % every == 0:
+                self._send_fix()
+        self.listen(begin + count / rate)
+        phase.cpu = (cpu_seconds() - cpu) / (time.monotonic() - begin)
+        self.listen(time.monotonic() + STRAGGLERS)
         gc.enable()
         if self._newest_output and stamp_of(self._newest_output) == self._stamp_ns:
             position = deserialize_message(self._newest_output, Odometry).pose.pose.position

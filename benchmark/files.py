@@ -6,6 +6,7 @@ Worlds from graph files: recordings and the public sets, put into the order of a
 Node k comes with all edges whose later end is k. `EDGE2` is read in TORO's order.
 """
 
+from functools import cache
 import os
 from pathlib import Path
 
@@ -20,12 +21,12 @@ from pose_graph_ros.core.io.g2o import read_g2o
 DATA = Path(os.environ.get('POSE_GRAPH_DATA') or (
     Path(__file__).resolve().parents[2] / 'shared' / 'data'))
 """Where the public data are."""
-DEFAULT_FOLDER = DATA / 'graphs'
 SUFFIXES = ('.g2o', '.graph')
 TRUTH_MARKS = ('_gt', 'groundtruth')
 """What the names of ground-truth files hold; those are passed over."""
 
 
+@cache
 def load_folder(folder: Path) -> tuple[list[World], list[str]]:
     """
     Read all graphs of a folder.
@@ -39,7 +40,7 @@ def load_folder(folder: Path) -> tuple[list[World], list[str]]:
 
     """
     worlds, complaints = [], []
-    for path in sorted(folder.iterdir()):
+    for path in sorted(folder.glob('*')):
         truth = any(mark in path.stem.lower() for mark in TRUTH_MARKS)
         if path.suffix not in SUFFIXES or truth:
             continue

@@ -12,13 +12,14 @@ estimates are judged by its own `error`. Its recursion needs a large stack from 
 nodes on (`ulimit -s unlimited`); the benchmark stays below that.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-import time
+from typing import Any
 
 import gtsam
 import numpy as np
 
-from benchmark.runs import Plan, quiet, Run
+from benchmark.runs import Plan, Run, run
 from benchmark.worlds import World
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -31,63 +32,73 @@ MAX_ITERATIONS = 100
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """How iSAM2 relinearizes."""
+    """iSAM2, or with a lag the `IncrementalFixedLagSmoother` on it, and how it relinearizes."""
 
     skip: int
     """Every so many updates ..."""
     threshold: float
     """... the variables that have moved by more than this [m, rad]."""
+    lag: int = 0
+    """[nodes]; 0: the whole graph."""
 
     @property
     def name(self) -> str:
         """As the tables have it."""
         return f'GTSAM skip {self.skip}'
 
-    def params(self, factorization: str) -> gtsam.ISAM2Params:
-        """Return the parameters of iSAM2 with a factorisation, `CHOLESKY` or `QR`."""
+    def smoother(self, factorization: str) -> gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother:
+        """Return a smoother with a factorisation, `CHOLESKY` or `QR`."""
         params = gtsam.ISAM2Params()
         params.relinearizeSkip = self.skip
         params.setRelinearizeThreshold(self.threshold)
         params.setFactorization(factorization)
-        return params
+        if self.lag == 0:
+            return gtsam.ISAM2(params)
+        # as with its default parameters: slots of factors that have gone are used again
+        params.findUnusedFactorSlots = True
+        return gtsam.IncrementalFixedLagSmoother(float(self.lag), params)
 
     def __call__(self, world: World, plan: Plan) -> Run:
-        """Run iSAM2 over a world, with its fastest factorisation that works."""
+        """Run it over a world, with its fastest factorisation that works."""
+        engine = _Peer(self, world, 'CHOLESKY')
         try:
-            return self._run(world, plan, 'CHOLESKY')
-        except RuntimeError as error:
-            where = f'Cholesky gives up after {error.args[1]} of {world.n_nodes} steps'
-        run = self._run(world, plan, 'QR')
-        run.note = f'QR ({where})' + (f'; {run.note}' if run.note else '')
-        return run
-
-    def _run(self, world: World, plan: Plan, factorization: str) -> Run:
-        isam = gtsam.ISAM2(self.params(factorization))
-        models = Models()
-        seconds = np.zeros(world.n_nodes)
-        run = Run(self.name, seconds)
-        total = 0.0
-        with quiet():
-            for k in range(world.n_nodes):
-                factors, values = step_of(world, k, isam, models)
-                begin = time.perf_counter()
-                try:
-                    isam.update(factors, values)
-                except RuntimeError as error:
-                    raise RuntimeError(str(error), k) from error
-                seconds[k] = time.perf_counter() - begin
-                total += seconds[k]
-                if k in plan.samples:
-                    run.samples[k] = poses_of(isam.calculateEstimate())
-                if total > plan.limit:
-                    run.seconds = seconds[:k + 1]
-                    run.samples[k] = poses_of(isam.calculateEstimate())
-                    run.note = f'first {k + 1} steps, {plan.limit:.0f} s'
-                    break
-        return run
+            return run(self.name, engine, world, plan)
+        except RuntimeError:
+            where = f'Cholesky gives up after {engine.step} of {world.n_nodes} steps'
+        done = run(self.name, _Peer(self, world, 'QR'), world, plan)
+        done.note = f'QR ({where})' + (f'; {done.note}' if done.note else '')
+        return done
 
 
 FAST, CAREFUL = Setting(10, 0.1), Setting(1, 0.01)
+
+
+class _Peer:
+    """A smoother of GTSAM on a world."""
+
+    def __init__(self, setting: Setting, world: World, factorization: str) -> None:
+        self.isam, self.world, self.lag = setting.smoother(factorization), world, setting.lag
+        self.models, self.step = Models(), 0
+
+    def next(self, k: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return what is called in a step."""
+        self.step = k
+        arrived = step_of(self.world, k, self.isam, self.models)
+        if self.lag == 0:
+            return self.isam.update, arrived
+        return self._update, (k, *arrived, {k: float(k)})
+
+    def _update(self, k: int, *arrived: Any) -> gtsam.Pose2:
+        self.isam.update(*arrived)
+        return self.isam.calculateEstimatePose2(k)
+
+    def check(self, _k: int, result: Any) -> FloatArray | None:
+        """Return the newest pose with a lag."""
+        return None if self.lag == 0 else np.array((result.x(), result.y(), result.theta()))
+
+    def poses(self) -> FloatArray:
+        """Return the estimate."""
+        return poses_of(self.isam.calculateEstimate())
 
 
 class Models:

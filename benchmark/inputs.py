@@ -3,193 +3,249 @@
 """
 Measure what the engine makes of measurements as they come: late, correlated, wrong.
 
-    .venv/bin/python -m benchmark.inputs --out docs/benchmarks/inputs
-
 The normalised estimation error squared (NEES) of a pose is e^T C^-1 e / 3, with e its error and C
 the covariance that was claimed for it: 1 in the mean if the claim is right.
 """
 
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
-import sys
-import time
+from dataclasses import dataclass
 
 import numpy as np
 
-from benchmark import drives, inputs_gyro, kept_sections, report
-from benchmark.drives import Kind
-from benchmark.files import DATA
-from benchmark.metrics import Metric
-from benchmark.section import say, Section, Table
+from benchmark import drives
+from benchmark.drives import Drive, Event, nees, off_truth, path_rms, rms, SECOND
+from benchmark.section import Options, Section
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
-    CovariancePolicy,
+    BackendConfig,
+    GyroSource,
     Loss,
     MeasurementSource,
-    OdometryNoise,
     POSITIONS,
 )
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.measurements import (
-    Answer,
-    GlobalPose,
-    Measurement,
-    OdometrySample,
-    Position,
-)
-from pose_graph_ros.core.sources.validation import validate
+from pose_graph_ros.core.measurements import OdometrySample, Position
+from pose_graph_ros.offline.simulation.settings import Fixes, Gyro
 
-SECTIONS = 'nees', 'gyro', 'husky', 'arrival', 'outliers', 'plaza', 'door', 'stamps', 'cost'
+TITLE = 'Measurements as they come'
+RUNS = 100
 NEES = 0.8, 1.3
 """What is asked for."""
 WEAK = 1.5
 """The upper bound with 30 fixes, which show little of their errors."""
 UPDATE_EVERY = 0.5
-PLAZA = Path('robot', 'plaza1')
+WALK = 5e-4, 0.02, 2e-5
+"""Angle random walk, bias and its walk of a gyroscope [rad, s]."""
+GYRO = GyroSource(sigma_rate=WALK[0], sigma_bias=WALK[1], sigma_bias_walk=WALK[2])
+BEGIN, END = 100.0, 160.0
+"""Of an outage [s]."""
+DRIFT, TIMES_BETTER = 2e-3, 3.0
 
-MOWER = Kind('mower, 1 m/s, fixes of 1 m at 1 Hz')
-CAR = Kind('car, 15 m/s, fixes of 1 m at 1 Hz', speed=15.0, odometry_rate=20.0)
-SHORT = Kind('mower, fixes at 10 Hz whose errors live for 5 s', duration=60.0, period=0.1, tau=5.0)
-GNSS = Kind('mower, fixes at 2 Hz, errors live for 60 s, a tenth white', duration=300.0,
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What is simulated."""
+
+    name: str
+    duration: float = 120.0
+    """[s]"""
+    period: float = 1.0
+    """Of the fixes [s]."""
+    tau: float = 0.0
+    """Time constant of the errors of the fixes [s]; 0: white."""
+    white_share: float = 0.0
+    """Of the variance of the fixes, if they are correlated."""
+    outliers: float = 0.0
+    """Share of the fixes that are tens of metres off."""
+    world: str = 'grid'
+
+    def drive(self, seed: int) -> Drive:
+        """Simulate a drive with fixes of 1 m."""
+        fixes = Fixes(self.period, 1.0, 0.0) if self.tau == 0.0 else Fixes(
+            self.period, self.white_share**0.5, (1.0 - self.white_share)**0.5, self.tau)
+        drive = drives.simulated(seed, self.duration, self.world, fixes)
+        rng = np.random.default_rng((seed, 2))
+        return drive.moved(rng.random(len(drive.fixes)) < self.outliers,
+                           rng.uniform(-50.0, 50.0, drive.fixes.shape))
+
+
+CART = Kind('cart, 2 m/s, fixes of 1 m at 1 Hz')
+CAR = Kind('car, 7 m/s, fixes of 1 m at 1 Hz', world='drive')
+SHORT = Kind('cart, fixes at 10 Hz whose errors live for 5 s', duration=60.0, period=0.1, tau=5.0)
+GNSS = Kind('cart, fixes at 2 Hz, errors live for 60 s, a tenth white', duration=300.0,
             period=0.5, tau=60.0, white_share=0.1)
 FURTHER = tuple(
-    Kind(f'mower, a fix every {period:.0f} s, errors live for {tau:.0f} s', duration=duration,
+    Kind(f'cart, a fix every {period:.0f} s, errors live for {tau:.0f} s', duration=duration,
          period=period, tau=tau, white_share=0.05)
     for duration, tau in ((600.0, 10.0), (600.0, 60.0), (900.0, 300.0)) for period in (1.0, 5.0))
-BRIEF = Kind('mower, 30 fixes at 1 Hz', duration=30.0), *(
-    Kind(f'mower, 30 fixes at 1 Hz whose errors live for {tau:.0f} s', duration=30.0, tau=tau,
+BRIEF = Kind('cart, 30 fixes at 1 Hz', duration=30.0), *(
+    Kind(f'cart, 30 fixes at 1 Hz whose errors live for {tau:.0f} s', duration=30.0, tau=tau,
          white_share=0.05) for tau in (10.0, 60.0, 300.0))
+DISTURBED = Kind('cart, a tenth of the fixes wrong', outliers=0.1)
 
 
-def uncertainty(runs: int, cases: Sequence[str] = ()) -> Section:
-    """
-    Measure the NEES of the newest pose.
+def _backend(source: MeasurementSource) -> PoseGraphBackend:
+    """Return an engine that takes the fixes as a source with these settings."""
+    return PoseGraphBackend(BackendConfig(measurements={'fix': source}))
 
-    Parameters
-    ----------
-    runs : int, seeded ones of each drive
-    cases : sequence of str, only drives and treatments whose names hold one of these; all if empty
 
-    """
+def uncertainty(options: Options) -> Section:
+    """Measure the NEES of the newest pose."""
     section = Section(
         'Is the claimed uncertainty right?',
         'The newest pose at the end of a drive, over seeded runs; NEES with its standard error. '
         f'Asked for: NEES of {NEES[0]} to {NEES[1]} for white errors, for correlated ones that '
         'are treated so (*a bias* is told the true time constant), and with the default, without '
         f'a parameter being set; at most {WEAK} with 30 fixes.')
-    table = Table('', ('drive', 'fixes treated as', 'NEES', 'error, rms [m]', 'claimed [m]',
-                       'unaligned', 'tau found [s]', 'runs'))
-    defaults = {'white': MeasurementSource(), 'default': POSITIONS}
-    for kind, treatments in (
-            (MOWER, defaults), (CAR, defaults),
-            (SHORT, _treatments(SHORT)), (GNSS, _treatments(GNSS)),
-            (BRIEF[0], defaults), *((kind, defaults | {'a bias': _told(kind)})
-                                    for kind in (*BRIEF[1:], *FURTHER))):
+    section.table('', 'drive', 'fixes treated as', 'NEES', 'error, rms [m]',
+                  'claimed [m]', 'unaligned', 'tau found [s]', 'runs')
+    runs = 2 if options.quick else options.runs or RUNS
+    for kind in (CART, CAR, SHORT, GNSS, *BRIEF, *FURTHER):
+        treatments = {'white': MeasurementSource(), 'default': POSITIONS}
+        if kind.tau > 0.0:
+            treatments['a bias'] = MeasurementSource(correlation_time=kind.tau)
         for name, source in treatments.items():
-            if len(cases) > 0 and not any(case in f'{kind.name}, {name}' for case in cases):
-                continue
-            nees, error, claimed, taus, missing = [], [], [], [], 0
-            for seed in range(runs):
-                drive = drives.simulate(kind, seed, OdometryNoise())
-                backend = drives.new_backend(source)
-                for _ in drives.feed(backend, drive.events(), UPDATE_EVERY):
-                    pass
-                backend.update()
-                estimate = backend.estimate()
-                assert estimate is not None
-                if estimate.alignment is not AlignmentState.ALIGNED:
-                    missing += 1
-                    continue
-                off = estimate.T_map_base - drive.truth[-1]
-                off[2] = se2.wrap(off[2])
-                nees.append(off @ np.linalg.solve(estimate.covariance, off) / 3.0)
-                error.append(off[0]**2 + off[1]**2)
-                claimed.append(np.trace(estimate.covariance[:2, :2]))
-                taus.append(backend.reports()['fix'].errors.tau)
-            mean, chance = float(np.mean(nees)), float(np.std(nees)) / np.sqrt(len(nees))
-            table.add(kind.name, name, f'{mean:.2f} ± {chance:.2f}',
-                      f'{np.sqrt(np.mean(error)):.2f}', f'{np.sqrt(np.mean(claimed)):.2f}',
-                      str(missing), f'{np.median(taus):.1f}', str(runs))
-            say('  ' + ' | '.join(table.rows[-1]))
-            beside = name == 'a bias' and kind in (*BRIEF, *FURTHER)
-            if (name == 'white' and kind.tau > 0.0) or beside:
-                continue
-            section.metrics += [
-                Metric(f'{kind.name}, {name}: NEES, from above', mean,
-                       target=WEAK if kind in BRIEF else NEES[1]),
-                Metric(f'{kind.name}, {name}: NEES, from below', mean, target=NEES[0],
-                       higher_is_better=True)]
-    section.tables.append(table)
+            if options.wants(f'{kind.name}, {name}'):
+                _uncertainty(section, kind, name, source, runs)
     return section
 
 
-def _treatments(kind: Kind) -> dict[str, MeasurementSource]:
-    return {
-        'white': MeasurementSource(), 'default': POSITIONS,
-        'a bias': _told(kind)}
+def _uncertainty(
+    section: Section, kind: Kind, name: str, source: MeasurementSource, runs: int,
+) -> None:
+    found, squares, claimed, taus, missing = [], [], [], [], 0
+    for seed in range(runs):
+        drive, backend = kind.drive(seed), _backend(source)
+        for _ in drives.feed(backend, drive.events(), UPDATE_EVERY):
+            pass
+        backend.update()
+        estimate = backend.estimate(with_path=False)
+        if estimate is None or estimate.alignment is not AlignmentState.ALIGNED:
+            missing += 1
+            continue
+        off, covariance = off_truth(backend, drive.truth)
+        found.append(nees(off, covariance))
+        squares.append(off[0]**2 + off[1]**2)
+        claimed.append(np.trace(covariance[:2, :2]))
+        taus.append(backend.reports()['fix'].errors.tau)
+    mean, chance = float(np.mean(found)), float(np.std(found)) / np.sqrt(len(found))
+    section.tables[0].add(
+        kind.name, name, f'{mean:.2f} ± {chance:.2f}', f'{np.sqrt(np.mean(squares)):.2f}',
+        f'{np.sqrt(np.mean(claimed)):.2f}', str(missing), f'{np.median(taus):.1f}', str(runs))
+    beside = name == 'a bias' and kind in (*BRIEF, *FURTHER)
+    if (name != 'white' or kind.tau == 0.0) and not beside:
+        _ask_nees(section, f'{kind.name}, {name}: NEES', mean,
+                  WEAK if kind in BRIEF else NEES[1])
 
 
-def _told(kind: Kind) -> MeasurementSource:
-    return MeasurementSource(correlation_time=kind.tau)
+def _ask_nees(section: Section, key: str, value: float, most: float) -> None:
+    section.ask(f'{key}, from above', value, most=most)
+    section.ask(f'{key}, from below', value, least=NEES[0])
 
 
-def arrival(runs: int) -> Section:
+def gyroscope(options: Options) -> Section:
+    """Measure heading and pose in outages of the fixes, with a gyroscope and without."""
+    section = Section(
+        'A gyroscope', f'Drives of {END:.0f} s at up to 2 m/s that begin with rest; odometry at '
+        '20 Hz, a gyroscope at 100 Hz, fixes of 0.5 m at 1 Hz but for the last 60 s. The errors '
+        'are those that the engine is told, but for the drift of the wheels. Root mean square of '
+        'the error of the heading during the outage, of the position at its end; NEES of the '
+        'heading (mean over the outage) and of the newest pose (at its end) with their standard '
+        f'errors. Asked for: the heading {TIMES_BETTER:.0f} times better with drifting wheels, '
+        f'and NEES of {NEES[0]} to {NEES[1]} where all errors are as told.')
+    table = section.table('', 'drive', 'heading by', 'heading [mrad]', 'position [m]',
+                          'NEES of heading', 'NEES of pose', 'worse with it', 'runs')
+    runs = 2 if options.quick else max((options.runs or RUNS) * 2 // 5, 2)
+    for drift in (DRIFT, 0.0):
+        kind = f'wheels that drift by {1e3 * drift:g} mrad/m' if drift else 'wheels as told'
+        found = {name: np.array([_outage(drift, seed, gyro=name != 'wheels')
+                                 for seed in range(runs)]) for name in ('wheels', 'gyroscope')}
+        alone, both = (each[:, 0] for each in found.values())
+        for name, each in found.items():
+            heading, *claims, distance = each.T
+            table.add(kind, name, f'{1e3 * rms(heading):.1f}', f'{rms(distance):.2f}',
+                      *(f'{np.mean(v):.2f} ± {np.std(v) / np.sqrt(runs):.2f}' for v in claims),
+                      f'{np.sum(both > alone)}' if name != 'wheels' else '', str(runs))
+        if drift:
+            section.ask('gyroscope, heading in an outage of 60 s, times better',
+                        rms(alone) / rms(both), least=TIMES_BETTER)
+        else:
+            for what, values in zip(('heading', 'pose'), claims, strict=True):
+                _ask_nees(section, f'gyroscope, NEES of the {what}', float(np.mean(values)),
+                          NEES[1])
+    return section
+
+
+def _outage(drift: float, seed: int, *, gyro: bool) -> tuple[float, float, float, float]:
+    """Return rms [rad] and NEES of the heading in the outage, NEES and error [m] at its end."""
+    drive = drives.simulated(seed, END, fixes=Fixes(1.0, 0.5, 0.0), every=1, drift=drift,
+                             gyro=Gyro(*WALK) if gyro else None)
+    begin_ns = int(drive.odometry.stamps_ns[0]) + round(BEGIN * SECOND)
+    events = [(source, event) for source, event in drive.events()
+              if not isinstance(event, Position) or event.stamp_ns < begin_ns]
+    backend = PoseGraphBackend(BackendConfig(
+        measurements={'fix': MeasurementSource()}, gyros={'gyro': GYRO}))
+    errors = [off_truth(backend, drive.truth) for stamp_ns in drives.feed(backend, events, 1.0)
+              if stamp_ns >= begin_ns]
+    off, covariance = (np.array(each) for each in zip(*errors, strict=True))
+    return (rms(off[:, 2]), float(np.mean(off[:, 2]**2 / covariance[:, 2, 2])),
+            nees(*errors[-1]), float(np.hypot(*off[-1, :2])))
+
+
+def arrival(options: Options) -> Section:
     """Measure what delays, disorder and duplicates change."""
     section = Section(
         'Does the order of arrival matter?',
         'The same drive with its fixes prompt, and late. Largest difference of a position from '
         'the prompt run, after the last update and after the closing optimisation. Asked for: '
         'a few millimetres, and 1e-9 m.')
-    table = Table('', ('drive', 'fixes', 'before closing [m]', 'after closing [m]'))
-    for kind, source in ((MOWER, MeasurementSource()),
+    table = section.table('', 'drive', 'fixes', 'before closing [m]', 'after closing [m]')
+    for kind, source in ((CART, MeasurementSource()),
                          (SHORT, MeasurementSource(correlation_time=SHORT.tau)),
-                         (Kind('mower, a tenth of the fixes wrong', outliers=0.1),
-                          MeasurementSource(loss=Loss.CAUCHY))):
-        worst: dict[str, list[tuple[float, float]]] = {}
-        for seed in range(runs):
-            drive = drives.simulate(kind, seed, OdometryNoise())
-            prompt = _paths(drives.new_backend(source), drive.events())
-            for name, events in _late(drive.events(), np.random.default_rng(seed)).items():
-                paths = _paths(drives.new_backend(source), events)
-                worst.setdefault(name, []).append(tuple(  # type: ignore[arg-type]
-                    _distance(*pair) for pair in zip(prompt, paths, strict=True)))
+                         (DISTURBED, MeasurementSource(loss=Loss.CAUCHY))):
+        worst: dict[str, list[list[float]]] = {}
+        for seed in range(_few(options)):
+            events = kind.drive(seed).events()
+            prompt = _paths(source, events)
+            for name, late in _late(events, np.random.default_rng(seed)).items():
+                worst.setdefault(name, []).append([
+                    float(np.max(np.hypot(*(one.poses - other.poses)[:, :2].T)))
+                    for one, other in zip(prompt, _paths(source, late), strict=True)])
         for name, values in worst.items():
             before, after = np.max(values, axis=0)
             table.add(kind.name, name, f'{before:.1e}', f'{after:.1e}')
-            section.metrics += [
-                Metric(f'{kind.name}, {name}: before closing', float(before), ' m', target=5e-3),
-                Metric(f'{kind.name}, {name}: after closing', float(after), ' m', target=1e-9)]
-            say(f'{kind.name}, {name}: {before:.1e} {after:.1e}')
-    section.tables.append(table)
+            section.ask(f'{kind.name}, {name}: before closing', before, ' m', most=5e-3)
+            section.ask(f'{kind.name}, {name}: after closing', after, ' m', most=1e-9)
     return section
 
 
-Event = OdometrySample | Measurement
+def _few(options: Options) -> int:
+    return 1 if options.quick else max((options.runs or RUNS) // 20, 1)
+
+
+def _delayed(events: list[Event], delays: list[float]) -> list[Event]:
+    """Return events in the order in which they come, each so much after its stamp [s]."""
+    key = [event.stamp_ns + delay * SECOND
+           for (_, event), delay in zip(events, delays, strict=True)]
+    return [events[k] for k in np.argsort(key, kind='stable')]
 
 
 def _late(events: list[Event], rng: np.random.Generator) -> dict[str, list[Event]]:
     """Return the same events in other orders of arrival."""
-    def ordered(delays: list[float]) -> list[Event]:
-        key = [event.stamp_ns + delay * drives.SECOND
-               for event, delay in zip(events, delays, strict=True)]
-        return [events[k] for k in np.argsort(key, kind='stable')]
-
-    fix = [not isinstance(event, OdometrySample) for event in events]
-    twice = ordered([30.0 * rng.random() if late else 0.0 for late in fix])
-    again = [event for event in events if not isinstance(event, OdometrySample)]
+    fix = np.array([not isinstance(event, OdometrySample) for _, event in events])
+    random = rng.random((3, len(events)))
     return {
-        'late by 1 s': ordered([float(late) for late in fix]),
-        'late by up to 60 s, in any order': ordered(
-            [60.0 * rng.random() if late else 0.0 for late in fix]),
-        'odometry in disorder within 0.2 s': ordered(
-            [0.0 if late else 0.2 * rng.random() for late in fix]),
-        'late by up to 30 s, and all of them twice': twice + again}
+        'late by 1 s': _delayed(events, fix.astype(float).tolist()),
+        'late by up to 60 s, in any order': _delayed(events, (60.0 * random[0] * fix).tolist()),
+        'odometry in disorder within 0.2 s': _delayed(events, (0.2 * random[1] * ~fix).tolist()),
+        'late by up to 30 s, and all of them twice': [
+            *_delayed(events, (30.0 * random[2] * fix).tolist()),
+            *(events[k] for k in np.flatnonzero(fix))]}
 
 
-def _paths(backend: PoseGraphBackend, events: list[Event]) -> tuple[Trajectory, Trajectory]:
+def _paths(source: MeasurementSource, events: list[Event]) -> tuple[Trajectory, Trajectory]:
+    """Return the paths before and after the closing optimisation."""
+    backend = _backend(source)
     for _ in drives.feed(backend, events, UPDATE_EVERY):
         pass
     backend.finish()
@@ -203,225 +259,51 @@ def _paths(backend: PoseGraphBackend, events: list[Event]) -> tuple[Trajectory, 
     return before.path, after.path
 
 
-def _distance(one: Trajectory, other: Trajectory) -> float:
-    assert np.array_equal(one.stamps_ns, other.stamps_ns)
-    return float(np.max(np.hypot(*(one.poses - other.poses)[:, :2].T)))
-
-
-def outliers(runs: int) -> Section:
+def outliers(options: Options) -> Section:
     """Measure what a loss does against wrong fixes."""
     section = Section(
         'Wrong fixes', 'Fixes of 1 m at 1 Hz of which some are up to 50 m off, with the '
         'covariance of the others. Position error of the closed path, rms over nodes and runs.')
-    table = Table('', ('share of wrong fixes', *(loss.value for loss in Loss)))
+    table = section.table('', 'share of wrong fixes', *(loss.value for loss in Loss))
     for share in (0.0, 0.05, 0.2):
-        cells = []
-        for loss in Loss:
-            squares = []
-            for seed in range(runs):
-                drive = drives.simulate(
-                    Kind('', outliers=share), seed, OdometryNoise())
-                path = _paths(drives.new_backend(MeasurementSource(loss=loss)), drive.events())[1]
-                truth = Trajectory(drive.stamps_ns, drive.truth).at(path.stamps_ns)
-                squares.append(np.mean(np.sum((path.poses - truth)[:, :2]**2, axis=1)))
-            cells.append(f'{np.sqrt(np.mean(squares)):.2f} m')
-        table.add(f'{100 * share:.0f} %', *cells)
-        say(f'{share}: {cells}')
-    section.tables.append(table)
+        made = [Kind('', outliers=share).drive(seed) for seed in range(_few(options))]
+        table.add(f'{100 * share:.0f} %', *(f'{rms(np.array(each)):.2f} m' for each in (
+            [path_rms(_paths(MeasurementSource(loss=loss), drive.events())[1], drive.truth)
+             for drive in made] for loss in Loss)))
     return section
 
 
-def plaza(runs: int, data: Path) -> Section:
-    """
-    Measure a lawn mower's drive, where the data is there.
-
-    Parameters
-    ----------
-    runs : int, seeded ones of each delay
-    data : Path, folder with public data
-
-    """
-    folder = data / PLAZA
+def plaza(options: Options) -> Section:
+    """Measure a lawn mower's drive, where the data is there."""
     section = Section(
         'A lawn mower', 'Plaza 1 (1933 s, 1.86 km): dead reckoning at 5 Hz, fixes made from the '
         'truth with seeded noise of 1 m at 1 Hz. Position error of the closed path. Asked for: '
         '0.35 m, also with fixes that come 1 s late.')
-    if not folder.is_dir():
+    if not (options.data / drives.PLAZA).is_dir():
         section.notes.append('The data is not there.')
         return section
-    odometry, truth = (np.genfromtxt(folder / name, delimiter=',', skip_header=1)
-                       for name in ('odom.csv', 'gt.csv'))
-    truth = truth[np.append(True, np.diff(np.round(truth[:, 0] * 1e9)) > 0)]
-    reference = Trajectory(np.round(truth[:, 0] * 1e9).astype(np.int64), truth[:, 1:4])
-    samples = [OdometrySample(round(row[0] * 1e9), row[1:4]) for row in odometry]
-    table = Table('', ('fixes', 'rms [m]', 'newest pose while driving, rms [m]'))
+    table = section.table('', 'fixes', 'rms [m]', 'newest pose while driving, rms [m]')
     for delay in (0.0, 1.0, 60.0):
         closed, newest = [], []
-        for seed in range(runs):
-            rng = np.random.default_rng(seed)
-            stamps = np.arange(samples[0].stamp_ns + drives.SECOND, reference.stamps_ns[-1],
-                               drives.SECOND)
-            where = reference.at(stamps)[:, :2] + rng.normal(0.0, 1.0, (len(stamps), 2))
-            fixes: list[Event] = [Position(int(stamp), position, np.eye(2), np.zeros(2))
-                                  for stamp, position in zip(stamps, where, strict=True)]
-            events = [*samples, *fixes]
-            late = [delay * isinstance(event, Position) for event in events]
-            order = np.argsort([event.stamp_ns + d * drives.SECOND
-                                for event, d in zip(events, late, strict=True)], kind='stable')
-            backend = drives.new_backend(MeasurementSource())
-            for _ in drives.feed(backend, [events[k] for k in order], UPDATE_EVERY):
-                estimate = backend.estimate()
+        for seed in range(_few(options)):
+            drive = drives.plaza(options.data, seed)
+            events = drive.events()
+            late = [delay * isinstance(event, Position) for _, event in events]
+            backend = _backend(MeasurementSource())
+            for _ in drives.feed(backend, _delayed(events, late), UPDATE_EVERY):
+                estimate = backend.estimate(with_path=False)
                 if (estimate is not None and estimate.alignment is AlignmentState.ALIGNED
-                        and reference.covers(estimate.path.stamps_ns[-1])):
-                    at = reference.at(estimate.path.stamps_ns[-1])
-                    newest.append(np.sum((estimate.T_map_base - at)[:2]**2))
+                        and drive.truth.covers(estimate.stamp_ns)):
+                    newest.append(off_truth(backend, drive.truth)[0][:2])
             backend.optimize()
             estimate = backend.estimate()
             assert estimate is not None
-            inside = reference.covers(estimate.path.stamps_ns)
-            off = estimate.path.poses[inside] - reference.at(estimate.path.stamps_ns[inside])
-            closed.append(np.mean(np.sum(off[:, :2]**2, axis=1)))
-        rms = float(np.sqrt(np.mean(closed)))
-        table.add(f'{delay:.0f} s late', f'{rms:.3f}', f'{np.sqrt(np.mean(newest)):.3f}')
-        section.metrics.append(Metric(f'plaza 1, {delay:.0f} s late', rms, ' m', target=0.35))
-        say(f'plaza, {delay} s: {rms:.3f}')
-    section.tables.append(table)
+            closed.append(path_rms(estimate.path, drive.truth))
+        error = rms(np.array(closed))
+        table.add(f'{delay:.0f} s late', f'{error:.3f}', f'{rms(np.array(newest)):.3f}')
+        section.ask(f'plaza 1, {delay:.0f} s late', error, ' m', most=0.35)
     return section
 
 
-BAD = {
-    'all zero': np.zeros((3, 3)), 'zero yaw': np.diag((1.0, 1.0, 0.0)),
-    'NaN': np.full((3, 3), np.nan), 'NaN yaw': np.diag((1.0, 1.0, np.nan)),
-    'infinite': np.diag((np.inf, np.inf, np.inf)),
-    'infinite x and y, yaw 0.01': np.diag((np.inf, np.inf, 0.01)),
-    'infinite yaw': np.diag((1.0, 1.0, np.inf)),
-    '1.8e308': np.diag((1.8e308, 1.8e308, 1.8e308)), '-1': np.diag((-1.0, -1.0, -1.0)),
-    'negative x': np.diag((-1.0, 1.0, 0.01)),
-    'NaN beside the diagonal': np.array(((1.0, np.nan, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.01))),
-    'asymmetric': np.array(((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 0.01))),
-    'correlation beyond 1': np.array(((1.0, 3.0, 0.0), (3.0, 1.0, 0.0), (0.0, 0.0, 0.01))),
-    '1e-30': 1e-30 * np.eye(3), '1e12': 1e12 * np.eye(3)}
-
-
-def door() -> Section:
-    """Tabulate what becomes of bad covariances."""
-    section = Section(
-        'Bad covariances', 'What the door makes of a global pose with a bad covariance of x, y '
-        'and yaw, with default settings, and where repair is off.')
-    table = Table('', ('covariance', 'repaired', 'taken as', 'sigmas taken', 'not repaired'))
-    for name, cov in BAD.items():
-        given = GlobalPose(1, np.zeros(3), cov)
-        mended = validate(given, CovariancePolicy())
-        refused = validate(given, CovariancePolicy(repair=False))
-        no = refused.reason if isinstance(refused, Answer) else 'taken'
-        if isinstance(mended, Answer):
-            table.add(name, f'refused: {mended.reason}', '', '', no)
-            continue
-        taken = mended.measurement
-        variances = (np.diagonal(taken.covariance) if isinstance(taken, GlobalPose | Position)
-                     else np.array([getattr(taken, 'variance')]))  # noqa: B009
-        table.add(name, ', '.join(mended.repairs) or 'sound', type(taken).__name__,
-                  ', '.join(f'{s:.3g}' for s in np.sqrt(variances)), no)
-    section.tables.append(table)
-    return section
-
-
-def stamps() -> Section:
-    """Tabulate what becomes of bad stamps."""
-    section = Section(
-        'Bad stamps', 'What the engine answers after 10 s of odometry at 10 Hz. (The node refuses '
-        'odometry whose stamp leaps by more than a minute beforehand.)')
-    table = Table('', ('what comes', 'stamp', 'answer'))
-    newest, tenth = 11 * drives.SECOND, drives.SECOND // 10
-
-    def odometry(stamp_ns: int) -> OdometrySample:
-        return OdometrySample(stamp_ns, np.array((stamp_ns * 1e-9, 0.0, 0.0)))
-
-    def fix(stamp_ns: int) -> Position:
-        return Position(stamp_ns, np.zeros(2), np.eye(2), np.zeros(2))
-
-    for name, stamp_ns, make in (
-            ('odometry', 0, odometry), ('odometry', -1, odometry), ('odometry', newest, odometry),
-            ('odometry, in the window', newest - tenth // 2, odometry),
-            ('odometry, before the window', newest - 5 * drives.SECOND - 1, odometry),
-            ('odometry, an hour ahead', newest + 3600 * drives.SECOND, odometry),
-            ('odometry, beyond the clock', 2**63 - 1, odometry),
-            ('fix', 0, fix), ('fix', -1, fix), ('fix, before any odometry', 1, fix),
-            ('fix, late', newest - 5 * drives.SECOND, fix),
-            ('fix, the same again', newest - 5 * drives.SECOND, fix),
-            ('fix, newer than odometry', newest + tenth, fix),
-            ('fix, an hour ahead', newest + 3600 * drives.SECOND, fix)):
-        backend = drives.new_backend(MeasurementSource())
-        for stamp in range(drives.SECOND, newest + 1, tenth):
-            backend.add_odometry(odometry(stamp))
-        event = make(stamp_ns)
-        if name.endswith('again'):
-            backend.add_measurement(fix(stamp_ns), 'fix')
-        answer = (backend.add_odometry(event) if isinstance(event, OdometrySample)
-                  else backend.add_measurement(event, 'fix'))
-        table.add(name, f'{stamp_ns * 1e-9:g} s', answer.reason or answer.status.value)
-    section.tables.append(table)
-    return section
-
-
-def cost() -> Section:
-    """Time what one message costs."""
-    section = Section('Cost', 'Mean time of one call, in a drive of 20 000 samples at 100 Hz.')
-    drive = drives.simulate(
-        Kind('', duration=200.0, odometry_rate=100.0, period=0.1), 0, OdometryNoise())
-    backend = drives.new_backend(MeasurementSource())
-    spent = {'odometry sample': [0.0, 0], 'fix': [0.0, 0], 'update at 2 Hz': [0.0, 0]}
-    due = 0
-    for event in drive.events():
-        name = 'odometry sample' if isinstance(event, OdometrySample) else 'fix'
-        begin = time.perf_counter()
-        if isinstance(event, OdometrySample):
-            backend.add_odometry(event)
-        else:
-            backend.add_measurement(event, 'fix')
-        spent[name][0] += time.perf_counter() - begin
-        spent[name][1] += 1
-        if event.stamp_ns >= due:
-            begin = time.perf_counter()
-            backend.update()
-            spent['update at 2 Hz'][0] += time.perf_counter() - begin
-            spent['update at 2 Hz'][1] += 1
-            due = event.stamp_ns + drives.SECOND // 2
-    table = Table('', ('what', 'us'))
-    for name, (seconds, count) in spent.items():
-        table.add(name, f'{1e6 * seconds / count:.0f}')
-    section.tables.append(table)
-    return section
-
-
-def main(arguments: list[str]) -> int:
-    """Run all sections and write the page; return 1 if a figure is not what is asked for."""
-    parser = argparse.ArgumentParser(prog='python -m benchmark.inputs', description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--runs', type=int, default=100, metavar='N',
-                        help='seeded runs of each drive (default %(default)s)')
-    parser.add_argument('--data', type=Path, default=DATA, metavar='DIR',
-                        help='folder with public data; what is not there is skipped')
-    parser.add_argument('--out', type=Path, default=Path('build/benchmark/inputs'), metavar='DIR')
-    parser.add_argument('--only', choices=SECTIONS, action='append',
-                        help='only these sections; others of the page stay')
-    parser.add_argument('--case', action='append', default=[], metavar='TEXT',
-                        help='of the section nees, only drives and treatments with one of these '
-                        'in their names; other rows of the page stay')
-    options = parser.parse_args(arguments)
-    few = max(options.runs // 20, 1)
-    made = {'nees': lambda: uncertainty(options.runs, options.case),
-            'gyro': lambda: inputs_gyro.outages(max(options.runs * 2 // 5, 2)),
-            'husky': lambda: inputs_gyro.husky(options.data),
-            'arrival': lambda: arrival(few), 'outliers': lambda: outliers(few),
-            'plaza': lambda: plaza(few, options.data),
-            'door': door, 'stamps': stamps, 'cost': cost}
-    for name in options.only or SECTIONS:
-        sections = kept_sections.merged(options.out, {name: made[name]()}, SECTIONS,
-                                        rows=len(options.case) > 0)
-    return report.conclude(sections, options.out, 'benchmark.inputs', ['--out', str(options.out)],
-                           title='Measurements as they come', about=__doc__)
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))
+SECTIONS = {'nees': uncertainty, 'gyro': gyroscope, 'arrival': arrival, 'outliers': outliers,
+            'plaza': plaza}

@@ -3,8 +3,6 @@
 """
 Measure the real node over DDS: rates, latencies, processor and memory, with graphs of some size.
 
-    .venv/bin/python -m benchmark.load --out docs/benchmarks/load
-
 The node is a process of its own, with default parameters but for a fixed datum and no closing
 optimisation in the pauses. The graph is filled by a drive with a hidden node at each sample of
 odometry; then a robot drives at 2 m/s, with fixes at 10 Hz. Latency is the time from before the
@@ -13,12 +11,10 @@ clock of the sender, and holds the way there and back. The echo is a process tha
 it gets: what DDS and rclpy cost alone. Pacing is how late the sender itself was.
 """
 
-import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 import os
 from pathlib import Path
-import shlex
 import signal
 import subprocess
 import sys
@@ -27,15 +23,14 @@ import time
 
 import numpy as np
 
-from benchmark import report
 from benchmark.feeder import DATUM, Feeder, Phase
-from benchmark.metrics import Metric
-from benchmark.section import say, Section, Table
+from benchmark.section import Options, Section
 from pose_graph_ros.adapters.output_cdr import path_cdr
 from pose_graph_ros.cli.demo import isolated_environment
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.ros.spinning import EventsExecutor
 
+TITLE = 'The node under load'
 NODE = 'pose_graph_ros.ros.main'
 PARAMETERS = (f'datum:=[{DATUM[0]}, {DATUM[1]}]', 'closing_silence:=0.0')
 # What is asked for, with a graph of the largest size.
@@ -61,7 +56,7 @@ class Process:
     """A process under test, and what the system says of it."""
 
     def __init__(
-        self, module: str, environment: dict[str, str], parameters: Sequence[str] = (),
+        self, module: str, environment: dict[str, str], parameters: tuple[str, ...] = (),
     ) -> None:
         arguments = [part for parameter in parameters for part in ('-p', parameter)]
         if len(arguments) > 0:
@@ -102,13 +97,11 @@ class Process:
 
 @contextmanager
 def started(
-    module: str, parameters: Sequence[str] = (), *, path: bool = False,
-    feeder_type: type[Feeder] = Feeder,
+    module: str, parameters: tuple[str, ...] = (),
 ) -> Iterator[tuple[Process, Feeder]]:
     """Start a process and a feeder that talk to each other alone."""
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \
-            isolated_environment(Path(log)) as environment, \
-            feeder_type(environment, listens_to_path=path) as feeder:
+            isolated_environment(Path(log)) as environment, Feeder(environment) as feeder:
         process = Process(module, environment, parameters)
         try:
             yield process, feeder
@@ -140,145 +133,122 @@ HEADER = ('odometry [Hz]', 'sent', 'lost', 'no output', 'p50 [ms]', 'p99 [ms]', 
           'CPU [% of a core]', 'pacing p50 / p99 [ms]')
 
 
-def echo(rates: Sequence[float], seconds: float) -> tuple[Section, dict[float, Phase]]:
-    """Measure a process that does nothing but send back; return also its phases by rate."""
+FLOOR: dict[float, Phase] = {}
+"""Phases of the echo by rate, where it has been measured."""
+
+
+def echo(options: Options) -> Section:
+    """Measure a process that does nothing but send back."""
     section = Section(
         'The floor: an echo', 'A node of rclpy that republishes the bytes of each odometry '
         'message. No lost messages are counted: it has no diagnostics.')
-    floor: dict[float, Phase] = {}
     for title, parameters, higher in (
             ('as rclpy.spin runs it', (), LADDER[1:3]),
             ('by the EventsExecutor, as the node', ('events:=true',), ())):
-        table = Table(title, HEADER)
         if parameters and EventsExecutor is None:
             continue
+        table = section.table(title, *HEADER)
         with started('benchmark.echo', parameters) as (process, feeder):
             feeder.wait_for_listener()
-            feeder.rest(1.0)
-            for rate in (*rates, *higher):
-                phase = feeder.run(rate, seconds, process.cpu_seconds)
-                floor.setdefault(rate, phase)
+            feeder.listen(time.monotonic() + 1.0)
+            for rate in (*options.rates, *higher):
+                phase = feeder.run(rate, _seconds(options), process.cpu_seconds)
+                FLOOR.setdefault(rate, phase)
                 table.add(*cells(phase))
-                say(f'echo {title}: {" ".join(cells(phase))}')
-        section.tables.append(table)
-    return section, floor
+    return section
 
 
-def beside(nodes: int, phase: Phase, floor: Phase | None) -> list[Metric]:
-    """Return what the node takes beside the echo, where something is asked of it."""
-    if floor is None or phase.rate not in (CPU_RATE, LATENCY_RATE):
-        return []
-    key = f'{nodes} nodes, {phase.rate:.0f} Hz'
-    metrics = [Metric(f'{key}: CPU beside the echo', phase.cpu / floor.cpu, ' times',
-                      target=CPU_BESIDE)]
-    if phase.rate == LATENCY_RATE and len(phase.latency) > 0 and len(floor.latency) > 0:
-        metrics.append(Metric(
-            f'{key}: latency, p99, beside the echo',
-            float(np.percentile(phase.latency, 99) / np.percentile(floor.latency, 99)), ' times',
-            target=LATENCY_BESIDE))
-    return metrics
+def _seconds(options: Options) -> float:
+    return 3.0 if options.quick else options.seconds
 
 
-def graphs(
-    nodes: Sequence[int], rates: Sequence[float], seconds: float, floor: Mapping[float, Phase], *,
-    path: bool,
-) -> list[Section]:
+def _sizes(options: Options) -> tuple[int, ...]:
+    return (1000,) if options.quick else options.sizes or (1000, 10_000, LARGE)
+
+
+def graphs(options: Options) -> Section:
     """Measure the node with graphs of some sizes."""
-    rate_section = Section(
-        'Rates and latencies', f'{seconds:.0f} s at each rate, fixes at 10 Hz; '
-        + ('`path` has a subscriber.' if path else '`path` has no subscriber.'))
-    memory_section = Section(
-        'Memory and filling', 'Of the node, after the graph was filled, and at the end.')
-    sizes = Table('', ('hidden nodes', 'filled in [s]', 'samples a second', 'resident [MB]',
-                       'anonymous [MB]', 'files [MB]', 'at the end [MB]', 'peak [MB]',
-                       'highest rate without loss [Hz]', 'update mean / most [ms]',
-                       'error of the output [m]'))
-    for count in nodes:
-        with started(NODE, PARAMETERS, path=path) as (process, feeder):
+    section = Section(
+        'Rates, latencies and memory', f'{_seconds(options):.0f} s at each rate, fixes at 10 Hz; '
+        '`path` has no subscriber. Memory of the node after the graph was filled, and at the end.')
+    for count in _sizes(options):
+        with started(NODE, PARAMETERS) as (process, feeder):
             feeder.wait_until_ready()
-            feeder.rest(0.5)
-            seconds_filled = feeder.fill(count)
+            feeder.listen(time.monotonic() + 0.5)
+            filled = feeder.fill(count)
             memory = process.memory()
-            say(f'{count} nodes in {seconds_filled:.1f} s: {memory}, {feeder.values}')
-            table = Table(f'{feeder.values["hidden_nodes"]} hidden nodes',
-                          HEADER + (('paths',) if path else ()))
+            table = section.table(f'{feeder.values["hidden_nodes"]} hidden nodes', *HEADER)
             error = 0.0
-            for rate in rates:
-                phase = measured(process, feeder, rate, seconds)
-                table.add(*cells(phase), *((str(phase.paths),) if path else ()))
-                say(f'  {" ".join(cells(phase))}, {phase.error:.2f} m')
+            for rate in options.rates:
+                phase = measured(process, feeder, rate, _seconds(options))
+                table.add(*cells(phase))
                 error = float(np.fmax(error, phase.error))
-                rate_section.metrics += asked(count, phase)
-                rate_section.metrics += beside(count, phase, floor.get(rate))
+                _ask(section, count, phase)
             solves = f'{feeder.values["solve_mean_ms"]} / {feeder.values["solve_max_ms"]}'
-            best, ladder = highest_rate(process, feeder)
-            for phase in ladder:
-                table.add(*cells(phase), *((str(phase.paths),) if path else ()))
-            rate_section.tables.append(table)
+            best = 0.0
+            for rate in LADDER:
+                phase = measured(process, feeder, rate, 5.0)
+                table.add(*cells(phase))
+                if phase.lost > 0 or phase.missing > 0:
+                    break
+                best = rate
             end = process.memory()
-        sizes.add(str(count), f'{seconds_filled:.1f}', f'{count / seconds_filled:.0f}',
+        sizes = section.table(
+            '', 'hidden nodes', 'filled in [s]', 'samples a second', 'resident [MB]',
+            'anonymous [MB]', 'files [MB]', 'at the end [MB]', 'peak [MB]',
+            'highest rate without loss [Hz]', 'update mean / most [ms]', 'error of the output [m]')
+        sizes.add(str(count), f'{filled:.1f}', f'{count / filled:.0f}',
                   *(f'{memory[name]:.0f}' for name in ('VmRSS', 'RssAnon', 'RssFile')),
                   f'{end["VmRSS"]:.0f}', f'{end["VmHWM"]:.0f}', f'{best:.0f}', solves,
                   f'{error:.2f}')
-        target = MEMORY if count == LARGE else None
-        memory_section.metrics += [
-            Metric(f'{count} nodes: resident set', max(memory['VmRSS'], end['VmRSS']), ' MB',
-                   target=target),
-            Metric(f'{count} nodes: highest rate without loss', best, ' Hz')]
-    memory_section.tables.append(sizes)
-    return [rate_section, memory_section]
+        section.ask(f'{count} nodes: resident set', max(memory['VmRSS'], end['VmRSS']), ' MB',
+                    most=MEMORY if count == LARGE else None)
+        section.ask(f'{count} nodes: highest rate without loss', best, ' Hz')
+    return section
 
 
-def asked(nodes: int, phase: Phase) -> list[Metric]:
-    """Return the figures that something is asked of."""
-    key = f'{nodes} nodes, {phase.rate:.0f} Hz'
-    large = nodes == LARGE
-    metrics = []
-    if phase.rate == LATENCY_RATE:
-        latency = float(np.percentile(phase.latency, 99)) if len(phase.latency) > 0 else np.inf
-        metrics += [
-            Metric(f'{key}: messages lost', float(phase.lost), target=0.0 if large else None),
-            Metric(f'{key}: outputs missing', float(phase.missing), target=0.0 if large else None),
-            Metric(f'{key}: latency, p99', latency, ' ms', target=LATENCY if large else None)]
+def _ask(section: Section, nodes: int, phase: Phase) -> None:
+    """Add the figures that something is asked of, also beside the echo."""
+    key, floor = f'{nodes} nodes, {phase.rate:.0f} Hz', FLOOR.get(phase.rate)
+
+    def ask(what: str, value: float, unit: str, most: float) -> None:
+        section.ask(f'{key}: {what}', value, unit, most=most if nodes == LARGE else None)
+
     if phase.rate == CPU_RATE:
-        metrics.append(Metric(
-            f'{key}: CPU', 100.0 * phase.cpu, ' %', target=100.0 * CPU if large else None))
-    return metrics
+        ask('CPU', 100.0 * phase.cpu, ' %', 100.0 * CPU)
+    if floor is not None and phase.rate in (CPU_RATE, LATENCY_RATE):
+        section.ask(f'{key}: CPU beside the echo', phase.cpu / floor.cpu, ' times',
+                    most=CPU_BESIDE)
+    if phase.rate == LATENCY_RATE:
+        latency, least = (np.percentile(each.latency, 99) if each is not None and len(
+            each.latency) > 0 else np.inf for each in (phase, floor))
+        ask('messages lost', phase.lost, '', 0.0)
+        ask('outputs missing', phase.missing, '', 0.0)
+        ask('latency, p99', latency, ' ms', LATENCY)
+        if floor is not None:
+            section.ask(f'{key}: latency, p99, beside the echo', latency / least, ' times',
+                        most=LATENCY_BESIDE)
 
 
-def highest_rate(process: Process, feeder: Feeder) -> tuple[float, list[Phase]]:
-    """Go up in rate until something is lost; return the highest rate before that, and all."""
-    best, phases = 0.0, []
-    for rate in LADDER:
-        phase = measured(process, feeder, rate, 5.0)
-        phases.append(phase)
-        say(f'  {" ".join(cells(phase))}')
-        if phase.lost > 0 or phase.missing > 0:
-            break
-        best = rate
-    return best, phases
-
-
-def path_time(nodes: int) -> Section:
+def path_time(_options: Options) -> Section:
     """Time the serialisation of a long path."""
-    section = Section('The path', f'nav_msgs/Path of {nodes} poses to bytes.')
+    section = Section('The path', f'nav_msgs/Path of {LARGE} poses to bytes.')
     rng = np.random.default_rng(0)
-    path = Trajectory(np.arange(1, nodes + 1) * 200_000_000 + 1_700_000_000_000_000_000,
-                      rng.normal(0.0, 1.0, (nodes, 3)))
+    path = Trajectory(np.arange(1, LARGE + 1) * 200_000_000 + 1_700_000_000_000_000_000,
+                      rng.normal(0.0, 1.0, (LARGE, 3)))
     times = []
     for _ in range(20):
         begin = time.perf_counter()
         data = path_cdr(path, 1, 'map')
         times.append(1e3 * (time.perf_counter() - begin))
-    table = Table('', ('poses', 'bytes', 'p50 [ms]', 'most [ms]'))
-    table.add(str(nodes), str(len(data)), f'{np.median(times):.2f}', f'{max(times):.2f}')
-    section.tables.append(table)
-    section.metrics.append(Metric(f'path of {nodes} poses serialised', float(np.median(times)),
-                                  ' ms', target=PATH_TIME if nodes == LARGE else None))
+    table = section.table('', 'poses', 'bytes', 'p50 [ms]', 'most [ms]')
+    table.add(str(LARGE), str(len(data)), f'{np.median(times):.2f}', f'{max(times):.2f}')
+    section.ask(f'path of {LARGE} poses serialised', float(np.median(times)), ' ms',
+                most=PATH_TIME)
     return section
 
 
-def starting() -> Section:
+def starting(_options: Options) -> Section:
     """Time the start of the node up to its being ready, from compiled kernels."""
     section = Section(
         'The start', 'From the start of the process until its log says that it listens and has '
@@ -293,47 +263,16 @@ def starting() -> Section:
             feeder.wait_until_ready()
             heard.append(time.monotonic() - begin)
             memory = process.memory()
-    table = Table('', ('start', 'ready by its log [s]', 'heard by a peer [s]', 'resident [MB]'))
+    table = section.table(
+        '', 'start', 'ready by its log [s]', 'heard by a peer [s]', 'resident [MB]')
     table.add('first, may compile', f'{said[0]:.2f}', f'{heard[0]:.2f}', '')
     for k in range(1, STARTS + 1):
         table.add(str(k), f'{said[k]:.2f}', f'{heard[k]:.2f}', '')
     table.add('median', f'{np.median(said[1:]):.2f}', f'{np.median(heard[1:]):.2f}',
               f'{memory["VmRSS"]:.0f}')
-    say(f'start: {said}, {heard}')
-    section.tables.append(table)
-    section.metrics += [
-        Metric('start, by its log', float(np.median(said[1:])), ' s', target=START_TIME),
-        Metric('start, heard by a peer', float(np.median(heard[1:])), ' s', target=START_TIME)]
+    section.ask('start, by its log', float(np.median(said[1:])), ' s', most=START_TIME)
+    section.ask('start, heard by a peer', float(np.median(heard[1:])), ' s', most=START_TIME)
     return section
 
 
-def main(arguments: list[str]) -> int:
-    """Measure and write the page; return 1 if a figure is not what is asked for."""
-    parser = argparse.ArgumentParser(prog='python -m benchmark.load', description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--nodes', type=int, nargs='+', default=[1000, 10_000, LARGE],
-                        metavar='N', help='sizes of the graph (default %(default)s)')
-    parser.add_argument('--rates', type=float, nargs='+', default=[50.0, 200.0, 500.0, 1000.0],
-                        metavar='HZ', help='of odometry (default %(default)s)')
-    parser.add_argument('--seconds', type=float, default=20.0, metavar='S',
-                        help='at each rate (default %(default)s)')
-    parser.add_argument('--path', action='store_true', help='listen to the path, too')
-    parser.add_argument('--quick', action='store_true', help='1000 nodes, 3 s at each rate')
-    parser.add_argument('--out', type=Path, default=Path('build/benchmark/load'), metavar='DIR')
-    options = parser.parse_args(arguments)
-    nodes, seconds = ([1000], 3.0) if options.quick else (options.nodes, options.seconds)
-    start = starting()
-    echoes, floor = echo(options.rates, seconds)
-    sections = [start, echoes, *graphs(nodes, options.rates, seconds, floor, path=options.path),
-                path_time(LARGE)]
-    command = shlex.join(['python', '-m', 'benchmark.load', *arguments])
-    about = (__doc__ or '').strip().split('\n\n')[-1].replace('\n', ' ')
-    page = report.write(sections, options.out, command, title='The node under load',
-                        remarks=about)
-    metrics = [metric for section in sections for metric in section.metrics]
-    say(f'{report.summary(metrics)}; see {page}')
-    return 0 if all(metric.reached for metric in metrics) else 1
-
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))
+SECTIONS = {'start': starting, 'echo': echo, 'graphs': graphs, 'path': path_time}

@@ -10,12 +10,9 @@ reported, not gated.
 
 from dataclasses import dataclass
 import json
-import math
 from pathlib import Path
 
 BASELINE = Path(__file__).with_name('baseline.json')
-FAR = 1000.0
-"""Factors beyond are not spelt out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,18 +53,11 @@ class Metric:
         return self.value >= self.target if self.higher_is_better else self.value <= self.target
 
     def status(self) -> str:
-        """Return what was asked for, and by how much it is reached or not."""
+        """Return what was asked for, and whether it is reached."""
         if self.target is None:
             return ''
         sign = 'at least' if self.higher_is_better else 'at most'
-        better, worse = ((self.value, self.target) if self.higher_is_better
-                         else (self.target, self.value))
-        if self.reached:
-            word, factor = 'reached, by', better / worse if worse > 0.0 else math.inf
-        else:
-            word, factor = 'NOT reached, short by', worse / better if better > 0.0 else math.inf
-        how_far = f'{factor:.2f}x' if factor < FAR else 'far'
-        return f'{sign} {self.target:.4g}: {word} {how_far}'
+        return f'{sign} {self.target:.4g}: {"reached" if self.reached else "NOT reached"}'
 
     def worse_than(self, before: float) -> bool:
         """Tell whether the figure is worse than it was, beyond its slack."""

@@ -7,39 +7,49 @@ A step's time is all that a caller from Python pays: building the tables and the
 and with its return an estimate of all nodes that is up to date (`poses` is a view). A step that
 brings no more than the edge from the node before goes through `extend`; what else a step brings
 goes through `update`, as in the back end.
+
+Estimates taken during a run, of any tool, are compared with the batch optimum of the graph as it
+was then. The excess is half the chi2 above that optimum, found from the estimate itself, each tool
+under its own error model. So it tells how well the tool follows the minimum that it is in; whether
+that is the best one, the final chi2 tells. The excess hides soft modes, hence the position
+distance, in metres and in posterior sigmas.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
-import itertools
+from dataclasses import dataclass
 import math
 import time
 from typing import Any
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import linalg
 
-from benchmark.runs import Plan, quiet, Run
+from benchmark import runs
+from benchmark.runs import Plan, Run, Tool
 from benchmark.worlds import chain, laps, World
 from pose_graph_ros.core.batch import linear_starts, optimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 NAME, REFINED = 'ours', 'ours, refined'
+FIRST_SIGMA = 1e-5
+"""Of the pose of node 0, as GTSAM has it, where nodes go [m, rad]."""
+NEVER = 10**9
+"""A lag with which none goes."""
 BATCH = SolverConfig(max_iterations=100, step_tolerance=1e-5)
 SINGLE = SolverConfig(max_iterations=1)
+EXACT = SolverConfig(max_iterations=200, step_tolerance=1e-10)
 AfterStep = Callable[[IncrementalSmoother, int], None]
 
 
-def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
+def run(
+    world: World, plan: Plan, after_step: AfterStep | None = None, engine: 'Ours | None' = None,
+) -> Run:
     """
-    Run the smoother over a world.
+    Run the smoother over a world; RuntimeError if a step fails.
 
     Parameters
     ----------
@@ -47,47 +57,17 @@ def run(world: World, plan: Plan, after_step: AfterStep | None = None) -> Run:
     plan : Plan
     after_step : callable, optional
         Called with the smoother and the step, outside of what is timed.
-
-    Raises
-    ------
-    RuntimeError
-        If a step fails, saying which and why.
+    engine : Ours, optional, if it is not that of the whole graph
 
     """
-    smoother = IncrementalSmoother()
-    steps = Steps(world)
-    seconds = np.zeros(world.n_nodes)
-    done = Run(NAME, seconds)
-    total = 0.0
-    with quiet():
-        for k in range(world.n_nodes):
-            step = steps.extending if steps.plain[k] else steps.updating
-            begin = time.perf_counter()
-            result = step(smoother, k)
-            seconds[k] = time.perf_counter() - begin
-            total += seconds[k]
-            if result.status is optimizer.Status.FAILED:
-                raise RuntimeError(f'{world.name}, step {k}: {result.reason}')
-            if after_step is not None:
-                after_step(smoother, k)
-            if k in plan.samples or total > plan.limit:
-                done.samples[k] = smoother.poses.copy()
-            if total > plan.limit:
-                done.seconds, done.note = seconds[:k + 1], f'first {k + 1} steps'
-                break
-    return done
+    engine = engine or Ours(world)
+    smoother = engine.smoother
+    return runs.run(engine.name, engine, world, plan, None if after_step is None else (
+        lambda k: after_step(smoother, k)))
 
 
 def run_refined(world: World, plan: Plan) -> Run:
-    """
-    Run the smoother over a world, and refine each sample, as the node does between two updates.
-
-    Parameters
-    ----------
-    world : World
-    plan : Plan
-
-    """
+    """Run the smoother over a world, and refine each sample, as the node does between updates."""
     seconds: list[float] = []
 
     def refine(smoother: IncrementalSmoother, k: int) -> None:
@@ -103,72 +83,55 @@ def run_refined(world: World, plan: Plan) -> Run:
     return done
 
 
-def position_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
-    """
-    Return the covariances of the positions of all nodes after a step, shape (step + 1, 2, 2).
+def kept(lag: int, every: int = 20) -> tuple[str, Tool]:
+    """Return name and tool of a smoother from which nodes go, so many at a time."""
+    name = (f'{NAME}, unlimited' if lag == NEVER else
+            f'{NAME}, one at a time' if every == 1 else NAME)
+    return name, lambda world, plan: run(world, plan, None, Ours(world, name, lag, every))
 
-    Parameters
-    ----------
-    world : World
-    step : int
-    poses : ndarray, shape (step + 1, 3), the optimum
 
-    """
+def fresh_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
+    """Return the covariances of all nodes after a step, all linearized at poses, (N, 3, 3)."""
     edges, observed = world.part(step)
     smoother = IncrementalSmoother()
     smoother.update(GraphUpdate(hidden=poses, edges=edges, observed=observed, fix=(0,)))
-    return smoother.covariances()[:, :2, :2]
+    return smoother.covariances()
 
 
 def warm_up() -> None:
-    """Run the smoother on small worlds, so that nothing is compiled while times are taken."""
-    for world in _small_worlds():
+    """Run everything on small worlds, so that nothing is compiled while times are taken."""
+    for world in (chain(100), chain(100, 'late'), laps(120, 60)):
         run_refined(world, Plan(frozenset({world.n_nodes - 1})))
-
-
-def warm_up_batch() -> None:
-    """Do the same with the batch optimiser."""
-    for world in _small_worlds():
+        for every in (1, 20):
+            kept(70, every)[1](world, Plan())
+        smoother = smoothed(world)
+        smoother.newest_covariance()
+        smoother.covariances()
+        smoother.joint_covariance(1, 2)
         graph = world.graph(world.dead_reckoning())
         solve_from_nothing(graph)
         solve(graph)
 
 
-def warm_up_covariances() -> None:
-    """Do the same with covariances."""
-    for world in _small_worlds():
-        smoother = smoothed(world)
-        smoother.newest_covariance()
-        smoother.covariances()
-        smoother.joint_covariance(1, 2)
-        iterate(world.graph(smoother.poses.copy()))
-
-
-def _small_worlds() -> tuple[World, ...]:
-    return chain(100), chain(100, 'late'), laps(120, 60)
-
-
 def smoothed(world: World) -> IncrementalSmoother:
     """Return the smoother after all of a world."""
-    seen: dict[str, IncrementalSmoother] = {}
-    run(world, Plan(), lambda smoother, _: seen.update(last=smoother))
-    return seen['last']
+    engine = Ours(world)
+    run(world, Plan(), None, engine)
+    return engine.smoother
 
 
-class Steps:
+class Ours:
     """
-    What arrives in each step, as a caller has it: lists of arrays, nothing prepared.
+    Our smoother, and what arrives in each step, as a caller has it: lists of arrays.
 
-    Parameters
-    ----------
-    world : World
-    first_sigma : float, of a global pose of node 0 [m, rad]; 0: it is fixed
-
+    With a lag [nodes] older nodes go, `every` so many at a time, and node 0 is not fixed, as it
+    could not go.
     """
 
-    def __init__(self, world: World, first_sigma: float = 0.0) -> None:
+    def __init__(self, world: World, name: str = NAME, lag: int = 0, every: int = 20) -> None:
         edges = world.edges
-        self.world, self.first_sigma = world, first_sigma
+        self.world, self.name, self.lag, self.every = world, name, lag, every
+        self.smoother, self.kept = IncrementalSmoother(), 0
         self.edge_stops = [0, *world.edge_stops.tolist()]
         self.observed_stops = [0, *world.observed_stops.tolist()]
         self.i, self.j = edges.i.tolist(), edges.j.tolist()
@@ -181,12 +144,36 @@ class Steps:
             self.ahead.append(ahead)
             self.plain.append(ahead and edge_stop == edge + 1 and seen_stop == seen)
 
+    def next(self, k: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return what is called in a step."""
+        step = self.extending if self.plain[k] else self.updating
+        return (self.lagging, (step, k)) if self.lag else (step, (self.smoother, k))
+
+    def check(self, k: int, result: Any) -> FloatArray | None:
+        """Raise if a step has failed, saying which and why; return the newest pose with a lag."""
+        result, newest = result if self.lag else (result, None)
+        if result.status is optimizer.Status.FAILED:
+            raise RuntimeError(f'{self.world.name}, step {k}: {result.reason}')
+        return newest
+
+    def poses(self) -> FloatArray:
+        """Return the estimate."""
+        return self.smoother.poses.copy()
+
+    def lagging(self, step: Any, k: int) -> tuple[UpdateResult, FloatArray]:
+        """Do a step, let old nodes go, and read the newest pose."""
+        result = step(self.smoother, k)
+        if k - self.lag - self.kept >= self.every:
+            self.smoother.forget(range(self.kept, self.kept + self.every))
+            self.kept += self.every
+        return result, self.smoother.poses[-1].copy()
+
     def _first(self) -> GraphUpdate:
         first = self.world.first[None]
-        if self.first_sigma == 0.0:
+        if self.lag == 0:
             return GraphUpdate(hidden=first, fix=(0,))
         return GraphUpdate(hidden=first, observed=ObservedNodes(
-            [0], None, first, np.eye(3)[None] / self.first_sigma**2, [ObservedKind.GLOBAL_POSE]))
+            [0], None, first, np.eye(3)[None] / FIRST_SIGMA**2, [ObservedKind.GLOBAL_POSE]))
 
     def extending(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do a step that only adds a node to the end."""
@@ -253,56 +240,57 @@ def start_of_batch(world: World) -> FloatArray:
     return linear_starts.chordal(world.graph(world.dead_reckoning()))
 
 
-def _jacobians(
-    poses: FloatArray, ends: tuple[IntArray, ...],
-    errors: Callable[[FloatArray, list[IntArray]], FloatArray],
-) -> list[FloatArray]:
-    """Return the derivatives of errors by the poses of each end, (M, 3, 3), by differences."""
-    size, step = len(ends[0]), 1e-6
-    # each constraint gets ends of its own, so that all of them can be moved at once
-    own = np.concatenate([poses[end] for end in ends])
-    at = [np.arange(k * size, (k + 1) * size) for k in range(len(ends))]
-    found = []
-    for rows in at:
-        columns = []
-        for k in range(3):
-            moved = [own.copy(), own.copy()]
-            moved[0][rows, k] -= step
-            moved[1][rows, k] += step
-            difference = errors(moved[1], at) - errors(moved[0], at)
-            difference[:, 2] = se2.wrap(difference[:, 2])
-            columns.append(difference / (2.0 * step))
-        found.append(np.stack(columns, axis=2))
-    return found
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """Figures of S samples of a run."""
+
+    steps: FloatArray
+    """After which each was taken, shape (S,)."""
+    half_chi2: FloatArray
+    """Half of chi2 above the optimum, shape (S,)."""
+    worst: FloatArray
+    """Largest distance of a node to its place in the optimum, shape (S,) [m]."""
+    sigmas: FloatArray
+    """Largest such distance in posterior sigmas of the position, shape (S,)."""
+    final_chi2: float
+    """chi2 of the last sample, without a factor 1/2."""
+    optimum_chi2: float
+    """chi2 of the optimum that the last sample leads to."""
+
+    def figures(self) -> tuple[float, float, float]:
+        """Return median, 95 % and maximum of the excess."""
+        return (float(np.median(self.half_chi2)), float(np.percentile(self.half_chi2, 95)),
+                float(np.max(self.half_chi2)))
 
 
-def oracle_covariances(graph: Graph, nodes: list[int]) -> FloatArray:
-    """Return covariances, shape (len(nodes), 3, 3), from the plain sparse system: slow, sure."""
-    edges, observed, size = graph.edges, graph.observed, 3 * graph.n_nodes
-    blocks = []
-    A, B = _jacobians(graph.poses, (edges.i, edges.j), lambda poses, at: (
-        error_functions.edge_errors(poses, replace(edges, i=at[0], j=at[1]))))
-    for (i, left), (j, right) in itertools.product(((edges.i, A), (edges.j, B)), repeat=2):
-        blocks.append((i, j, np.swapaxes(left, 1, 2) @ edges.weighted_information @ right))
-    A, = _jacobians(graph.poses, (observed.node,), lambda poses, at: (
-        error_functions.observed_errors(poses, replace(observed, node=at[0]))))
-    blocks.append((observed.node, observed.node,
-                   np.swapaxes(A, 1, 2) @ observed.weighted_information @ A))
-    three = np.arange(3)
-    rows = [np.broadcast_to(3 * i[:, None, None] + three[:, None], block.shape)
-            for i, _, block in blocks]
-    columns = [np.broadcast_to(3 * j[:, None, None] + three, block.shape)
-               for _, j, block in blocks]
-    H = sparse.csc_array(
-        (np.concatenate([block.ravel() for *_, block in blocks]),
-         (np.concatenate([row.ravel() for row in rows]),
-          np.concatenate([column.ravel() for column in columns]))), (size, size))
-    free = np.flatnonzero(~np.repeat(graph.fixed, 3))
-    factor = linalg.splu(H[free][:, free].tocsc())
-    found = []
-    for node in nodes:
-        at = np.searchsorted(free, 3 * node) + three
-        unit = np.zeros((len(free), 3))
-        unit[at, three] = 1.0
-        found.append(factor.solve(unit)[at])
-    return np.array(found)
+def excess(world: World, run: Run) -> Excess:
+    """Judge the samples of a run of either tool."""
+    steps = sorted(run.samples)
+    rows = []
+    for step in steps:
+        before, after, best = optimum(world, step, run.samples[step], run.tool)
+        off = (run.samples[step] - best)[1:, :2]     # node 0 is fixed
+        weighted = np.linalg.solve(
+            fresh_covariances(world, step, best)[1:, :2, :2], off[..., None])[..., 0]
+        rows.append((before, after, np.max(np.hypot(*off.T)),
+                     np.sqrt(np.max(np.sum(off * weighted, axis=1)))))
+    table = np.array(rows)
+    return Excess(
+        np.array(steps, dtype=float), np.maximum(0.5 * (table[:, 0] - table[:, 1]), 0.0),
+        table[:, 2], table[:, 3], float(table[-1, 0]), float(table[-1, 1]))
+
+
+def optimum(
+    world: World, step: int, poses: FloatArray, tool: str,
+) -> tuple[float, float, FloatArray]:
+    """Return chi2 of poses and of the minimum below them, and its poses, as the tool has them."""
+    if tool.startswith('GTSAM'):
+        # only here: the rest of the benchmark can be imported without GTSAM
+        from benchmark import gtsam_peer  # noqa: PLC0415
+
+        factors, start = gtsam_peer.whole_graph(world, step), gtsam_peer.values_of(poses)
+        best = gtsam_peer.optimum(factors, start)
+        return (2.0 * factors.error(start), 2.0 * factors.error(best), gtsam_peer.poses_of(best))
+    graph = world.graph(poses, step)
+    before = graph.energies().chi2
+    return before, optimizer.optimize(graph, EXACT).chi2, graph.poses

@@ -12,99 +12,57 @@ import json
 import os
 from pathlib import Path
 import platform
-import shlex
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-import numpy as np
 
-from benchmark.metrics import Metric
-from benchmark.online import EXCESS_FLOOR
-from benchmark.section import Curve, say, Section, Table
+from benchmark.section import Curve, Section, Table
 
-COLOURS = {'ours': '#0072B2', 'ours, refined': '#009E73', 'GTSAM skip 10': '#E69F00',
-           'GTSAM skip 1': '#D55E00'}
+COLOURS = {'ours': '#0072B2', 'GTSAM skip 10': '#E69F00', 'GTSAM skip 1': '#D55E00'}
 INK, GREY, GRID = '#222222', '#666666', '#E2E2E2'
 PANEL, DPI = (5.3, 3.1), 100
 """Size of a panel [inch] and dots per inch."""
-COLUMNS = 3
 VERSIONS = ('gtsam', 'numpy', 'scipy', 'numba')
 
 
-AGAINST_GTSAM = (
-    'Times of steps are in microseconds. Ours is all that a caller from Python pays, an '
-    'up-to-date estimate included; of GTSAM only `ISAM2.update` is counted. Runs of the '
-    'tools are interleaved in one process, figures are medians over the runs. A ratio is '
-    "GTSAM's time divided by ours. Excess is half of chi2 above the batch optimum of the "
-    'graph so far, each tool under its own error model.')
-
-
 def write(
-    sections: list[Section], folder: Path, command: str, *,
-    title: str = 'Benchmark: pose_graph_ros against GTSAM', remarks: str = AGAINST_GTSAM,
+    sections: list[Section], folder: Path, command: str, *, title: str, about: str,
+    curves: list[Curve],
 ) -> Path:
     """
-    Write the report.
-
-    Returns
-    -------
-    Path
-        Of README.md.
-
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    curves = [curve for section in sections for curve in section.curves]
-    parts = [f'# {title}', '', *_environment(command), '', remarks, '',
-             '## Requirements', '', *_verdicts(sections)]
-    for name, heading, draw in (
-            ('step_time', 'Time of a step against the size of the graph', _draw_step_time),
-            ('excess', 'Excess along the run', _draw_excess)):
-        chosen = [curve for curve in curves if curve.picture == name.replace('_', ' ')]
-        if len(chosen) > 0:
-            draw(chosen, folder / f'{name}.png')
-            parts += [f'## {heading}', '', f'![{heading}]({name}.png)', '']
-    for section in sections:
-        parts += [f'## {section.title}', '', section.about, '']
-        for table in section.tables:
-            parts += _markdown(table)
-        for note in section.notes:
-            parts += [f'- {note}']
-        parts += [''] if section.notes else []
-    path = folder / 'README.md'
-    path.write_text('\n'.join(parts).rstrip() + '\n', encoding='utf-8')
-    figures = {metric.key: {'value': metric.value, 'unit': metric.unit, 'target': metric.target,
-                            'reached': metric.reached}
-               for section in sections for metric in section.metrics}
-    (folder / 'metrics.json').write_text(json.dumps(figures, indent=1) + '\n', encoding='ascii')
-    return path
-
-
-def conclude(
-    sections: list[Section], folder: Path, module: str, arguments: list[str], *, title: str,
-    about: str | None,
-) -> int:
-    """
-    Write the report of a benchmark of its own; return 1 if a figure is not what is asked for.
+    Write the report, and return the path of README.md.
 
     Parameters
     ----------
     sections : list of Section
     folder : Path
-    module : str
-        With its arguments, the command.
-    arguments : list of str
+    command : str, by which all of them are made
     title : str
-    about : str, optional
-        The module's docstring, whose last paragraph becomes the remarks.
+    about : str, a docstring, whose last paragraph becomes the remarks
+    curves : list of Curve
 
     """
-    command = shlex.join(['python', '-m', module, *arguments])
-    path = write(sections, folder, command, title=title,
-                 remarks=(about or '').strip().split('\n\n')[-1].replace('\n', ' '))
-    metrics = [metric for section in sections for metric in section.metrics]
-    say(f'{summary(metrics)}; see {path}')
-    return 0 if all(metric.reached for metric in metrics) else 1
+    remarks = about.strip().split('\n\n')[-1].replace('\n', ' ')
+    parts = [f'# {title}', '', *_environment(command), '', remarks, '',
+             '## Requirements', '', *_verdicts(sections)]
+    picture = folder / 'step_time.png'
+    if len(curves) > 0:
+        _draw_step_time(curves, picture)
+    if picture.exists():
+        parts += [f'![Time of a step against the size of the graph]({picture.name})', '']
+    for section in sections:
+        parts += [f'## {section.title}', '', section.about, '']
+        for table in section.tables:
+            parts += _markdown(table)
+        parts += [*(f'- {note}' for note in section.notes), '']
+    path = folder / 'README.md'
+    path.write_text('\n'.join(parts).rstrip() + '\n', encoding='utf-8')
+    figures = {metric.key: {'value': metric.value, 'unit': metric.unit, 'target': metric.target,
+                            'reached': metric.reached}
+               for section in sections for metric in section.metrics}
+    (folder / 'metrics.json').write_text(json.dumps(figures, indent=1) + '\n', encoding='utf-8')
+    return path
 
 
 def _environment(command: str) -> list[str]:
@@ -135,17 +93,12 @@ def _verdicts(sections: list[Section]) -> list[str]:
     table = Table('', ('requirement', 'measured', 'asked for'))
     for section in sections:
         if section.failed:
-            table.add(section.title, 'failed', section.notes[-1])
+            table.rows.append((section.title, 'failed', section.notes[0]))
         for metric in section.metrics:
             if metric.target is not None:
-                table.add(metric.key, f'{metric.value:.4g}{metric.unit}', metric.status())
+                table.rows.append((metric.key, f'{metric.value:.4g}{metric.unit}',
+                                   metric.status()))
     return _markdown(table)
-
-
-def summary(metrics: list[Metric]) -> str:
-    """Return one line: how many of the requirements are reached."""
-    asked = [metric for metric in metrics if metric.target is not None]
-    return f'{sum(metric.reached for metric in asked)} of {len(asked)} figures reach what is asked'
 
 
 def _markdown(table: Table) -> list[str]:
@@ -158,47 +111,29 @@ def _markdown(table: Table) -> list[str]:
 
 
 def _draw_step_time(curves: list[Curve], file: Path) -> None:
-    figure, (axes,) = _figure(1)
-    labelled = set()
+    figure, (axes,) = panels('chain')
     for curve in curves:
-        label = None if curve.tool in labelled else curve.tool
-        labelled.add(curve.tool)
-        axes.plot(curve.x, curve.y, color=COLOURS[curve.tool], linewidth=1.6, label=label)
+        named = curve.tool in axes.get_legend_handles_labels()[1]
+        axes.plot(curve.x, curve.y, color=COLOURS[curve.tool], linewidth=1.6,
+                  label=None if named else curve.tool)
     axes.set(xscale='log', yscale='log', xlabel='nodes', ylabel='mean time of a step [us]')
-    axes.set_title('chain', loc='left', fontsize=11, fontweight='bold', color=INK)
     axes.legend(frameon=False, fontsize=9)
     figure.savefig(file)
 
 
-def _draw_excess(curves: list[Curve], file: Path) -> None:
-    panels = list(dict.fromkeys(curve.panel for curve in curves))
-    figure, grid = _figure(len(panels))
-    for panel, axes in zip(panels, grid, strict=True):
-        for curve in curves:
-            if curve.panel == panel:
-                axes.plot(curve.x, np.maximum(curve.y, EXCESS_FLOOR), color=COLOURS[curve.tool],
-                          linewidth=1.4, marker='.', markersize=4, label=curve.tool)
-        axes.set(yscale='log', xlabel='step', ylabel='excess')
-        axes.set_ylim(bottom=0.5 * EXCESS_FLOOR)
-        axes.set_title(panel, loc='left', fontsize=11, fontweight='bold', color=INK)
-    grid[0].legend(frameon=False, fontsize=9)
-    figure.savefig(file)
-
-
-def _figure(panels: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with so many panels, and the panels."""
-    columns = min(panels, COLUMNS)
-    rows = -(-panels // columns)
-    figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), dpi=DPI, facecolor='white',
+def panels(*titles: str, size: tuple[float, float] = PANEL) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel of some size [inch] for each title, and the panels."""
+    figure = Figure(figsize=(size[0] * len(titles), size[1]), dpi=DPI, facecolor='white',
                     layout='constrained')
     FigureCanvasAgg(figure)
     grid = []
-    for k in range(panels):
-        axes = figure.add_subplot(rows, columns, k + 1)
+    for k, title in enumerate(titles):
+        axes = figure.add_subplot(1, len(titles), k + 1)
         axes.spines[['top', 'right']].set_visible(False)
         axes.spines[['left', 'bottom']].set_color(GREY)
         axes.tick_params(which='both', colors=GREY, labelsize=9)
         axes.grid(color=GRID, linewidth=0.8)
         axes.set_axisbelow(True)
+        axes.set_title(title, loc='left', fontsize=11, fontweight='bold', color=INK)
         grid.append(axes)
     return figure, grid

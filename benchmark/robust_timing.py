@@ -4,31 +4,23 @@
 How long updates and the work between them take while closures are judged.
 
 Two back ends, one that judges and one that believes everything, get the same samples in turn.
-Times are those of the processor, which other processes change least; `benchmark.robust_node`
-measures the real node by the clock.
+Times are those of the processor, which other processes change least.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from itertools import chain
 import time
 
 import numpy as np
 
-from benchmark import streets
-from benchmark.metrics import Metric
-from benchmark.robust_closures import add, closing, Recording
-from benchmark.robust_worlds import (
-    LOOSE,
-    of_world,
-    OUTDOORS,
-    place_recognition,
-    with_false,
-)
-from benchmark.section import say, Section, Table
+from benchmark import worlds
+from benchmark.parts import resident_bytes
+from benchmark.recordings import add, CLOSURES, closures, Recording
+from benchmark.section import Options, Section
+from benchmark.wrong_closures import of_world, simulated, with_false
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Robust
-from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.warm_up import warm_up
 
 LONGEST, SLOWER = 0.05, 1.3
@@ -66,33 +58,13 @@ class Timed:
         self.steps.append(time.thread_time() - begin)
 
 
-def drive(recording: Recording, kinds: Sequence[Robust], idle: float = IDLE) -> list[Timed]:
-    """
-    Feed a recording to back ends of some kinds, one sample to each in turn.
-
-    Parameters
-    ----------
-    recording : Recording
-    kinds : sequence of Robust
-    idle : float, time for the work after each update [s]
-
-    Returns
-    -------
-    list of Timed
-
-    """
+def drive(recording: Recording, kinds: Sequence[Robust]) -> list[Timed]:
+    """Feed a recording to back ends of some kinds, one sample to each in turn."""
     runs = [Timed(PoseGraphBackend(recording.config(kind))) for kind in kinds]
-    closure = 0
-    for stamp, pose in zip(recording.stamps_ns.tolist(), recording.odometry, strict=True):
-        begin = closure
-        while closure < len(recording.ends) and recording.arrival_ns[closure] <= stamp:
-            closure += 1
+    for step in recording.steps():
         for run in runs:
-            run.backend.add_odometry(
-                OdometrySample(stamp, pose, twist_variance=recording.twist_variance))
-            for k in range(begin, closure):
-                add(run.backend, recording, k)
-            run.update(idle)
+            add(run.backend, *step)
+            run.update(IDLE)
     return runs
 
 
@@ -107,54 +79,40 @@ def flood(run: Timed, recording: Recording, count: int) -> tuple[float, list[flo
     count : int
 
     """
-    before, rng, updates = memory(), np.random.default_rng(1), len(run.updates)
-    n = len(recording.stamps_ns) - 10
+    before, rng, updates = resident_bytes(), np.random.default_rng(1), len(run.updates)
+    n, information = len(recording.stamps_ns) - 10, recording.loops().information[0]
+    none = recording.only(np.zeros(len(recording.ends), dtype=bool))
     for _ in range(count // BATCH):
         i, j = np.sort(rng.choice(n, (2, BATCH)), axis=0)
-        wrong = closing(
-            recording.only(np.zeros(len(recording.ends), dtype=bool)), i, j + 1,
-            rng.uniform(-1.0, 1.0, (BATCH, 3)) * (100.0, 100.0, 3.0),
-            np.tile(recording.covariances[0], (BATCH, 1, 1)))
-        for k in range(BATCH):
-            add(run.backend, wrong, k)
+        wrong = none.closing(closures(
+            i, j + 1, rng.uniform(-1.0, 1.0, (BATCH, 3)) * (100.0, 100.0, 3.0), information))
+        _, arriving = zip(*wrong.steps(), strict=True)
+        for closure in chain.from_iterable(arriving):
+            run.backend.add_measurement(closure, CLOSURES)
         run.update(IDLE)
-    return memory() - before, run.updates[updates:]
-
-
-def memory() -> float:
-    """Return the resident size of the process [MB]."""
-    status = Path('/proc/self/status').read_text(encoding='ascii')
-    line, = (line for line in status.splitlines() if line.startswith('VmRSS'))
-    return int(line.split()[1]) / 1024.0
-
-
-def city(n: int) -> Recording:
-    """Return a drive through a city, with as many right closures."""
-    world = streets.city(n)
-    return of_world(replace(world, name='city', observed=world.observed.rows(slice(0)),
-                            observed_stops=np.zeros(world.n_nodes, dtype=np.int64)))
+    return 1e-6 * (resident_bytes() - before), run.updates[updates:]
 
 
 def drives(n: int) -> list[Recording]:
     """Return drives of n nodes whose closures are right, from tight odometry to loose one."""
-    front_end = replace(LOOSE, right=n // 10, single=0, groups=0)
-    return [city(n), of_world(streets.corridor(n)),
-            place_recognition(replace(OUTDOORS, step=1.0, n=n), front_end, 2.5, 0)]
+    world = worlds.city(n)
+    city = replace(world, name='city', observed=world.observed.rows(slice(0)),
+                   observed_stops=np.zeros(world.n_nodes, dtype=np.int64))
+    return [of_world(city), of_world(worlds.corridor(n)), simulated('hall', 1.4 * n, 0)]
 
 
-def timing(*, quick: bool) -> Section:
+def timing(options: Options) -> Section:
     """Measure drives without wrong closures, with random ones and with groups of them."""
-    n = LARGE // 5 if quick else LARGE
+    n = LARGE // 5 if options.quick else LARGE
     section = Section(
         'Time of judging', f'Drives of {n} nodes, at an update for each node and {1e3 * IDLE:.0f} '
         'ms for the work after it. Times of the processor in ms. A step is an update with that '
         f'work. Asked for: no update above {1e3 * LONGEST:.0f} ms; without wrong closures steps '
         f'that take at most {SLOWER} times those of a back end that believes everything, over '
         'the same samples in turn.')
-    table = Table('', (
-        'drive', 'wrong', 'robust', 'update mean', 'p99', 'max', 'slice p99', 'max', 'step mean',
-        'p99', 'believed', 'end of stream [s]'))
-    section.tables.append(table)
+    table = section.table(
+        '', 'drive', 'wrong', 'robust', 'update mean', 'p99', 'max', 'slice p99', 'max',
+        'step mean', 'p99', 'believed', 'end of stream [s]')
     warm_up()
     for clean in drives(n):
         for share, group in ((0.0, 1), (0.1, 1), (0.3, 10), (0.5, 1)):
@@ -162,7 +120,7 @@ def timing(*, quick: bool) -> Section:
             kinds = (Robust.JUDGED, Robust.NONE) if share == 0.0 else (Robust.JUDGED,)
             runs = drive(recording, kinds)
             name = f'{100 * share:.0f} %' + (f', groups of {group}' if group > 1 else '')
-            section.metrics += _asked(f'{clean.name}, {name} wrong', runs, large=n >= LARGE)
+            _ask(section, f'{clean.name}, {name} wrong', runs, large=n >= LARGE)
             for kind, run in zip(kinds, runs, strict=True):
                 believed, start = _believed(run.backend), time.thread_time()
                 run.backend.optimize()
@@ -170,8 +128,7 @@ def timing(*, quick: bool) -> Section:
                     np.mean(run.updates), *_quantiles(run.updates), *_quantiles(run.slices),
                     np.mean(run.steps), np.quantile(run.steps, 0.99))), believed,
                     f'{time.thread_time() - start:.1f}')
-                say(f'  {" | ".join(table.rows[-1])}')
-    count = FLOOD // 10 if quick else FLOOD
+    count = FLOOD // 10 if options.quick else FLOOD
     grown, updates = flood(runs[0], recording, count)
     section.notes.append(
         f'{count} further wrong closures, {BATCH} with each update: the process grows by '
@@ -180,18 +137,15 @@ def timing(*, quick: bool) -> Section:
     return section
 
 
-def _asked(name: str, runs: Sequence[Timed], *, large: bool) -> list[Metric]:
-    """Return the figures that something is asked of, in a large graph."""
+def _ask(section: Section, name: str, runs: Sequence[Timed], *, large: bool) -> None:
+    """Add the figures that something is asked of, in a large graph."""
     first, slower = runs[0], SLOWER if large else None
-    metrics = [Metric(f'{name}: longest update', max(first.updates), ' s', target=LONGEST),
-               Metric(f'{name}: longest slice', max(first.slices), ' s', target=LONGEST)]
+    section.ask(f'{name}: longest update', max(first.updates), ' s', most=LONGEST)
+    section.ask(f'{name}: longest slice', max(first.slices), ' s', most=LONGEST)
     for other in runs[1:]:
-        metrics += [
-            Metric(f'{name}: steps slower by', float(
-                np.mean(first.steps) / np.mean(other.steps)), target=slower),
-            Metric(f'{name}: steps slower by, p99', float(
-                np.quantile(first.steps, 0.99) / np.quantile(other.steps, 0.99)), target=slower)]
-    return metrics
+        for what, figure in (('', np.mean), (', p99', lambda v: np.quantile(v, 0.99))):
+            section.ask(f'{name}: steps slower by{what}', figure(first.steps) / figure(
+                other.steps), most=slower)
 
 
 def _quantiles(times: Sequence[float]) -> tuple[float, float]:

@@ -3,23 +3,21 @@
 """
 Online runs of one tool over one world: the time of each step, and estimates taken along the way.
 
-Both tools are run by a function `run(world, plan) -> Run`, interleaved and several times over.
-Times are wall time of one thread. Taking an estimate is not part of a step's time.
+Tools are run by a function `run(world, plan) -> Run`, interleaved and several times over. Times
+are wall time of one thread. Taking an estimate is not part of a step's time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 import gc
-from typing import TYPE_CHECKING
+import time
+from typing import Any, Protocol
 
 import numpy as np
 
 from benchmark.worlds import World
 from pose_graph_ros.core.geometry.se2 import FloatArray
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 MICROSECOND = 1e-6
 
@@ -41,8 +39,10 @@ class Run:
     tool: str
     seconds: FloatArray
     """Time of each step, shape (steps,) [s]; fewer than the world has nodes if it ended early."""
+    newest: FloatArray
+    """Newest pose after each step, shape (steps, 3), of tools that read it."""
     samples: dict[int, FloatArray] = field(default_factory=dict)
-    """Estimates, shape (step + 1, 3), after the steps of the plan and after the last one."""
+    """Estimates of the last nodes, shape (W, 3), after steps of the plan and after the last."""
     refinement: list[float] = field(default_factory=list)
     """Time of each iteration of the refinements at the samples [s]."""
     note: str = ''
@@ -54,26 +54,75 @@ class Run:
         return len(self.seconds)
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """Figures of the time of a step over the same first steps of several runs [us]."""
+class Engine(Protocol):
+    """A tool on a world, step by step."""
 
-    mean: float
-    p50: float
-    p99: float
-    maximum: float
-    total: float
-    """Of all the steps [s]."""
+    def next(self, k: int) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return what is called in a step, and with what: the call is what is timed."""
+
+    def check(self, k: int, result: Any) -> FloatArray | None:
+        """Raise if a step has failed; return the newest pose if the step has read it."""
+
+    def poses(self) -> FloatArray:
+        """Return the estimate of all nodes that are kept, shape (W, 3)."""
 
 
-def timing(runs: list[Run], steps: int | None = None) -> Timing:
-    """Return the medians over runs of the figures of the first steps (all by default)."""
+Tool = Callable[[World, Plan], Run]
+
+
+def run(
+    tool: str, engine: Engine, world: World, plan: Plan,
+    after_step: Callable[[int], None] | None = None,
+) -> Run:
+    """
+    Run a tool over a world.
+
+    Parameters
+    ----------
+    tool : str, its name
+    engine : Engine
+    world : World
+    plan : Plan
+    after_step : callable, optional
+        Called with the step, outside of what is timed.
+
+    """
+    n, total = world.n_nodes, 0.0
+    done = Run(tool, np.zeros(n), np.zeros((n, 3)))
+    seconds = done.seconds
+    with quiet():
+        for k in range(n):
+            step, arguments = engine.next(k)
+            begin = time.perf_counter()
+            result = step(*arguments)
+            seconds[k] = time.perf_counter() - begin
+            total += seconds[k]
+            newest = engine.check(k, result)
+            if newest is not None:
+                done.newest[k] = newest
+            if after_step is not None:
+                after_step(k)
+            if k in plan.samples or total > plan.limit:
+                done.samples[k] = engine.poses()
+            if total > plan.limit:
+                done.seconds, done.newest = seconds[:k + 1], done.newest[:k + 1]
+                done.note = f'first {k + 1} steps, {plan.limit:.0f} s'
+                break
+    return done
+
+
+def timing(runs: list[Run], stop: int | None = None, begin: int = 1) -> FloatArray:
+    """
+    Return figures of the time of a step, over the same steps of several runs, medians over runs.
+
+    These are mean, p50, p99 and maximum [us], and the total [s].
+    """
     rows = []
-    for run in runs:
-        seconds = run.seconds[1:steps] / MICROSECOND
-        rows.append((np.mean(seconds), *np.percentile(seconds, (50, 99)), np.max(seconds),
-                     np.sum(seconds) * MICROSECOND))
-    return Timing(*np.median(rows, axis=0).tolist())
+    for each in runs:
+        us = each.seconds[begin:stop] / MICROSECOND
+        rows.append((np.mean(us), *np.percentile(us, (50, 99)), np.max(us),
+                     np.sum(us) * MICROSECOND))
+    return np.asarray(np.median(rows, axis=0))
 
 
 def sample_steps(n: int, every: int) -> frozenset[int]:
@@ -82,8 +131,7 @@ def sample_steps(n: int, every: int) -> frozenset[int]:
 
 
 def interleaved(
-    world: World, tools: dict[str, Callable[[World, Plan], Run]], plan: Plan, repeats: int,
-    long: float = 60.0,
+    world: World, tools: dict[str, Tool], plan: Plan, repeats: int, long: float = 60.0,
 ) -> dict[str, list[Run]]:
     """
     Run all tools over a world, one after the other, and that `repeats` times.
@@ -101,7 +149,7 @@ def interleaved(
 
 
 @contextmanager
-def quiet() -> 'Iterator[None]':
+def quiet() -> Iterator[None]:
     """Keep Python's garbage collector out of what is timed."""
     gc.collect()
     gc.disable()

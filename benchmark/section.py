@@ -1,18 +1,22 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a row of the requirements is asked to do, and what it hands back."""
+"""What a section of a page is asked to do, what it hands back, and where it is kept."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from functools import cache
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+import json
 from pathlib import Path
 import sys
+from typing import Any
 
-from benchmark import files
-from benchmark.metrics import Metric
-from benchmark.runs import Plan, Run
+from benchmark.files import DATA, load_folder
+from benchmark.metrics import Metric, RATIO, Slack
 from benchmark.worlds import World
 from pose_graph_ros.core.geometry.se2 import FloatArray
+
+KEPT = 'sections.json'
+LABELS = 2
+"""Cells at the begin of a row that name it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,26 +25,37 @@ class Options:
 
     quick: bool = False
     repeats: int = 3
-    data: Path | None = None
-    """Folder with graph files."""
-    worlds: tuple[str, ...] = ()
-    """Only worlds whose names hold one of these, ignoring case; all if empty."""
-    limit: float = 200.0
-    """The time after which a run of one tool over one world is cut [s]."""
+    """Runs of each tool that is timed."""
+    runs: int | None = None
+    """Seeded drives of each kind."""
+    data: Path = DATA
+    """Folder with public data."""
+    cases: tuple[str, ...] = ()
+    """Only what has one of these in its name, ignoring case; all if empty."""
+    limit: float = 60.0
+    """The time after which a run of one tool is cut [s]."""
     gtsam: bool = True
     """Whether to run GTSAM at all."""
+    sizes: tuple[int, ...] = ()
+    hours: float | None = None
+    rates: tuple[float, ...] = (50.0, 200.0, 500.0, 1000.0)
+    seconds: float = 20.0
+    out: Path = Path()
+    """Folder of the page."""
 
     def wants(self, name: str) -> bool:
-        """Tell whether a world is to be measured."""
-        return not self.worlds or any(part.lower() in name.lower() for part in self.worlds)
+        """Tell whether a world, a drive or a graph is to be measured."""
+        return not self.cases or any(part.lower() in name.lower() for part in self.cases)
 
     def chosen(self, worlds: Iterable[tuple[str, Callable[[], World]]]) -> list[World]:
-        """Make the worlds that are to be measured, and say so."""
-        made = []
-        for name, make in worlds:
-            if self.wants(name):
-                made.append(make())
-        return made
+        """Make the worlds that are to be measured."""
+        return [make() for name, make in worlds if self.wants(name)]
+
+    def file_worlds(self, notes: list[str], most: float = float('inf')) -> list[World]:
+        """Return the wanted worlds from graph files up to a size; complaints go to the notes."""
+        worlds, complaints = load_folder(self.data / 'graphs')
+        notes += complaints
+        return [world for world in worlds if self.wants(world.name) and world.n_nodes <= most]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,18 +67,16 @@ class Table:
     rows: list[tuple[str, ...]] = field(default_factory=list)
 
     def add(self, *cells: str) -> None:
-        """Add a row."""
+        """Add a row, and tell it whoever waits."""
         assert len(cells) == len(self.header)
         self.rows.append(cells)
+        say('  ' + ' | '.join(cells))
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A line of a picture."""
+    """Time of a step of a tool [us] against the size of the graph."""
 
-    picture: str
-    """`step time` or `excess`."""
-    panel: str
     tool: str
     x: FloatArray
     y: FloatArray
@@ -71,7 +84,7 @@ class Curve:
 
 @dataclass(slots=True)
 class Section:
-    """Everything that one row of the requirements has found."""
+    """Everything that one section has found."""
 
     title: str
     about: str
@@ -80,34 +93,56 @@ class Section:
     notes: list[str] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     failed: bool = False
-    """Whether the row could not be measured."""
+    """Whether it could not be measured."""
+
+    def table(self, caption: str, *header: str) -> Table:
+        """Add a table."""
+        self.tables.append(Table(caption, header))
+        return self.tables[-1]
+
+    def ask(
+        self, key: str, value: float, unit: str = '', slack: Slack | None = None, *,
+        most: float | None = None, least: float | None = None,
+    ) -> None:
+        """Add a figure, what is asked of it, and by how much it may get worse, if it is gated."""
+        self.metrics.append(Metric(
+            key, float(value), unit, slack, most if least is None else least,
+            higher_is_better=least is not None or slack is RATIO))
 
 
-Tool = Callable[[World, Plan], Run]
+def kept_with(
+    folder: Path, name: str, made: Section, order: Sequence[str], *, rows: bool,
+) -> list[Section]:
+    """Keep a section, perhaps with `rows` of before; return it with those that were kept."""
+    file = folder / KEPT
+    kept: dict[str, Section] = {}
+    if file.exists():
+        kept = {key: _section(values) for key, values in json.loads(
+            file.read_text(encoding='utf-8')).items()}
+    merges = rows and name in kept and not (made.failed or kept[name].failed)
+    kept[name] = _with_rows(kept[name], made) if merges else made
+    kept = {key: kept[key] for key in order if key in kept}
+    file.write_text(json.dumps(
+        {key: asdict(replace(section, curves=[])) for key, section in kept.items()}, indent=1)
+        + '\n', encoding='utf-8')
+    return list(kept.values())
 
 
-def peers(options: Options, *, careful: bool = True) -> dict[str, Tool]:
-    """Return the runs of GTSAM that ours are compared with: none without GTSAM."""
-    if not options.gtsam:
-        return {}
-    # the rest of the benchmark can be used without GTSAM
-    from benchmark.gtsam_peer import CAREFUL, FAST  # noqa: PLC0415
-
-    return {setting.name: setting for setting in ((FAST, CAREFUL) if careful else (FAST,))}
-
-
-def file_worlds(options: Options, notes: list[str]) -> list[World]:
-    """Return the wanted worlds of the folder with graph files; complaints go to the notes."""
-    if options.data is None:
-        return []
-    worlds, complaints = _folder(options.data)
-    notes += [text for text in complaints if text not in notes]
-    return [world for world in worlds if options.wants(world.name)]
+def _with_rows(old: Section, new: Section) -> Section:
+    """Return a section with the rows, figures and notes of an older one that it does not have."""
+    for table, before in zip(new.tables, old.tables, strict=True):
+        again = {tuple(row[:LABELS]) for row in table.rows}
+        table.rows[:0] = [row for row in before.rows if tuple(row[:LABELS]) not in again]
+    made = {metric.key for metric in new.metrics}
+    new.metrics[:0] = [metric for metric in old.metrics if metric.key not in made]
+    new.notes[:0] = [note for note in old.notes if note not in new.notes]
+    return new
 
 
-@cache
-def _folder(folder: Path) -> tuple[list[World], list[str]]:
-    return files.load_folder(folder)
+def _section(values: dict[str, Any]) -> Section:
+    tables = [Table(**table) for table in values['tables']]
+    metrics = [Metric(**metric) for metric in values['metrics']]
+    return Section(**values | {'tables': tables, 'metrics': metrics})
 
 
 def say(text: str) -> None:

@@ -90,7 +90,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
     return SimulatedGraph(
-        truth, _composed(poses[0], odometry.mean), Edges.joined((odometry, loops)), group,
+        truth, composed(poses[0], odometry.mean), Edges.joined((odometry, loops)), group,
         ObservedNodes.joined((fixes, absolute)),
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
@@ -115,7 +115,7 @@ def _odometry(
                  np.full(n, EdgeKind.ODOMETRY))
 
 
-def _composed(first: FloatArray, steps: FloatArray) -> FloatArray:
+def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
     """Return the poses that steps (N, 3) lead to, shape (N + 1, 3)."""
     heading = first[2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
     moves = np.einsum('nij,nj->ni', se2.rotation(heading[:-1]), steps[:, :2])

@@ -3,21 +3,29 @@
 """
 Drives of any length round and round a course, made piece by piece from a seed.
 
+A day at 50 Hz is too long for `pose_graph_ros.offline.simulation`, which makes a drive at once.
+
 The noise is what the engine is told: odometry has that of its default model, fixes and closures
 have white errors with the covariances that come with them. But the engine sums up the turns that
 odometry shows, whose noise lengthens the sum the more the shorter the steps are: at 1 m/s on a
 course of 60 m or 120 m its variance of the heading is 2 % too small or 4 % too large at 10 Hz,
 14 % or 29 % too large at 50 Hz. The truth goes along a closed course, each lap a little to one
 side of the last.
+
+The exact estimate of a drive knows all there is to know, and does without the engine: a Kalman
+filter for the errors of the poses at all instants that matter, linear at the truth, with the
+covariances by which the noise was drawn and each measurement at its own instant. Its NEES is one
+in the mean over drives; over a few drives it is what their noise happens to make it.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 
-from benchmark.worlds import integrate
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import ThinningConfig, WindowConfig, WindowPrior
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import (
@@ -26,12 +34,17 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
+from pose_graph_ros.offline.simulation.graph import composed
+from pose_graph_ros.offline.simulation.motion import path_length
+from pose_graph_ros.offline.simulation.sensors import model_variances
 
 SECOND = 1_000_000_000
 START_NS = 1_000 * SECOND
 PIECE = 600.0
 """Length of what is made at once [s]."""
 FIXES, CLOSURES = 'fix', 'loop_closure'
+UNKNOWN = 1e4
+"""Variance of a pose that nothing is known of [m^2, rad^2]."""
 FINE = 20_000
 """Points of the course between which is interpolated."""
 
@@ -53,8 +66,6 @@ class Course:
     """[s]; 0: there are none."""
     fix_sigma: float = 1.0
     """Of a coordinate [m]."""
-    fix_tau: float = 0.0
-    """Time constant of the errors of fixes, but for a white fifth of their sigma [s]; 0: white."""
     closure_period: float = 10.0
     """[s]; 0: there are none."""
     closure_sigma: tuple[float, float, float] = (0.1, 0.1, 0.02)
@@ -111,26 +122,10 @@ class Course:
             times = step * np.arange(begin, min(begin + count, n))
             truth = self.truth(times)
             moves = se2.between(np.concatenate((before, truth[:-1])), truth)
-            poses = integrate(last, self._noisy(moves, rng))[1:]
+            noise = np.sqrt(model_variances(moves)) * rng.standard_normal(moves.shape)
+            poses = composed(last, se2.compose(moves, noise))[1:]
             before, last = truth[-1:], poses[-1]
             yield times, poses, self._others(float(times[0]), float(times[-1]), rng)
-
-    def _noisy(self, moves: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return motions with the noise of the model."""
-        sigmas = np.sqrt(odometry_variances(moves))
-        return np.asarray(se2.compose(moves, sigmas * rng.standard_normal(moves.shape)))
-
-    def _fix_errors(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Return the errors of the fixes of a piece, shape (n, 2) [m]."""
-        white = self.fix_sigma * rng.standard_normal((n, 2))
-        if self.fix_tau == 0.0:
-            return white
-        phi = np.exp(-self.fix_period / self.fix_tau)
-        errors = np.sqrt(1.0 - phi**2) * rng.standard_normal((n, 2))
-        errors[:1] /= np.sqrt(1.0 - phi**2)
-        for k in range(1, n):
-            errors[k] += phi * errors[k - 1]
-        return np.asarray(self.fix_sigma * np.sqrt(0.96) * errors + 0.2 * white)
 
     def _others(
         self, begin: float, end: float, rng: np.random.Generator,
@@ -139,7 +134,8 @@ class Course:
         found: list[tuple[str, Measurement]] = []
         if self.fix_period > 0.0:
             times = _every(self.fix_period, begin, end)
-            places = self.truth(times)[:, :2] + self._fix_errors(len(times), rng)
+            places = self.truth(times)[:, :2] + self.fix_sigma * rng.standard_normal(
+                (len(times), 2))
             known, arm = self.fix_sigma**2 * np.eye(2), np.zeros(2)
             found += [(FIXES, Position(stamp, place, known, arm)) for stamp, place in zip(
                 self.stamps(times).tolist(), places, strict=True)]
@@ -163,35 +159,116 @@ class Course:
         return sorted(found, key=lambda item: item[1].stamp_ns)
 
 
-def odometry_variances(moves: FloatArray) -> FloatArray:
-    """Return the variances of (x, y, theta) of short motions by odometry, shape (N, 3)."""
-    noise = OdometryNoise()
-    distance, turn = np.hypot(moves[:, 0], moves[:, 1]), np.abs(moves[:, 2])
-    return np.column_stack((
-        noise.sigma_distance**2 * distance, noise.sigma_lateral**2 * distance,
-        noise.sigma_heading_distance**2 * distance + noise.sigma_heading_turn**2 * turn))
-
-
 def _every(period: float, begin: float, end: float) -> FloatArray:
     """Return the multiples of a period between two times."""
     first = max(int(np.ceil(begin / period)), 1)
     return period * np.arange(first, int(np.floor(end / period)) + 1)
 
 
+@cache
 def _course(length: float) -> tuple[FloatArray, FloatArray]:
     """Return path length along a closed course, shape (M,), and its poses, shape (M, 3)."""
-    if length not in _COURSES:
-        angle = np.linspace(0.0, 2.0 * np.pi, FINE + 1)
-        radius = 1.0 + 0.25 * np.cos(3.0 * angle) + 0.1 * np.sin(2.0 * angle)
-        points = radius[:, None] * np.column_stack((1.4 * np.cos(angle), np.sin(angle)))
-        moves = np.diff(points, axis=0)
-        along = np.concatenate(([0.0], np.cumsum(np.hypot(*moves.T))))
-        points, along = points * (length / along[-1]), along * (length / along[-1])
-        slope = np.gradient(points, along, axis=0)
-        slope[0] = slope[-1] = 0.5 * (slope[0] + slope[-1])
-        heading = np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))
-        _COURSES[length] = along, np.column_stack((points, heading))
-    return _COURSES[length]
+    angle = np.linspace(0.0, 2.0 * np.pi, FINE + 1)
+    radius = 1.0 + 0.25 * np.cos(3.0 * angle) + 0.1 * np.sin(2.0 * angle)
+    points = radius[:, None] * np.column_stack((1.4 * np.cos(angle), np.sin(angle)))
+    along = path_length(points)
+    points, along = points * (length / along[-1]), along * (length / along[-1])
+    slope = np.gradient(points, along, axis=0)
+    slope[0] = slope[-1] = 0.5 * (slope[0] + slope[-1])
+    return along, np.column_stack((points, np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))))
 
 
-_COURSES: dict[float, tuple[FloatArray, FloatArray]] = {}
+WINDOWS: dict[str, dict[str, Any]] = {
+    'unlimited': {},
+    '90 s': {'window': WindowConfig(seconds=90)},
+    '90 s sparse': {'window': WindowConfig(seconds=90, prior=WindowPrior.SPARSE)},
+    '600 s': {'window': WindowConfig(seconds=600)},
+    'thinning 2 m': {'thinning': ThinningConfig(cell=2.0)}}
+"""Arguments of `BackendConfig` for a window, by name."""
+
+
+def exact_nees(course: Course, looks: IntArray) -> FloatArray:
+    """
+    Return the NEES of the newest pose, divided by 3, at some stamps, shape (L,).
+
+    Without fixes the first pose is known, else nothing is known of it.
+
+    Parameters
+    ----------
+    course : Course
+    looks : ndarray of int64, shape (L,), ascending stamps of samples of odometry [ns]
+
+    """
+    pieces = list(course.pieces())
+    time, measured = (np.concatenate([piece[k] for piece in pieces]) for k in (0, 1))
+    truth, others = course.truth(time), [each for piece in pieces for _, each in piece[2]]
+    moves = se2.between(truth[:-1], truth[1:])
+    noise = se2.between(moves, se2.between(measured[:-1], measured[1:]))
+    variances = model_variances(moves)
+    # a closure of these drives names its reference by stamp
+    stamps = looks.tolist() + [each.reference_ns for each in others
+                               if isinstance(each, LoopClosure)]
+    at_sample: dict[int, list[LoopClosure | Position]] = {
+        sample: [] for sample in _samples(course, stamps)}
+    for each in others:
+        assert isinstance(each, LoopClosure | Position)
+        at_sample.setdefault(_samples(course, [each.stamp_ns])[0], []).append(each)
+    wanted, found = {*_samples(course, looks.tolist())}, list[float]()
+    # errors of all instants so far, each in the frame of its pose, and their covariance
+    error, covariance = np.zeros(3), np.zeros((3, 3))
+    if course.fix_period > 0.0:
+        covariance += UNKNOWN * np.eye(3)
+    columns, last = {0: slice(0, 3)}, 0
+    for sample in sorted(at_sample):
+        if sample >= len(time):
+            break
+        if sample > last:
+            motion, offset, spread = np.eye(3), np.zeros(3), np.zeros((3, 3))
+            for k in range(last, sample):
+                step = se2.adjoint(se2.inverse(moves[k]))
+                motion, offset = step @ motion, step @ offset + noise[k]
+                spread = step @ spread @ step.T + np.diag(variances[k])
+            across = motion @ covariance[-3:]
+            covariance = np.block([[covariance, across.T],
+                                   [across, across[:, -3:] @ motion.T + spread]])
+            error = np.append(error, motion @ error[-3:] + offset)
+            columns[sample], last = slice(len(error) - 3, len(error)), sample
+        for each in at_sample[sample]:
+            jacobian, residual, known = _linear(course, each, columns, len(error))
+            gain = np.linalg.solve(
+                jacobian @ covariance @ jacobian.T + known, jacobian @ covariance).T
+            error = error + gain @ (residual - jacobian @ error)
+            covariance = covariance - gain @ jacobian @ covariance
+            covariance = 0.5 * (covariance + covariance.T)
+        if sample in wanted:
+            newest = error[-3:]
+            found.append(float(newest @ np.linalg.solve(covariance[-3:, -3:], newest)) / 3.0)
+    return np.array(found)
+
+
+def _linear(
+    course: Course, measurement: LoopClosure | Position, columns: dict[int, slice], size: int,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the Jacobian of a measurement by the errors of poses, its error and covariance."""
+    new = _samples(course, [measurement.stamp_ns])[0]
+    pose = _truth(course, measurement.stamp_ns)
+    if isinstance(measurement, Position):
+        jacobian = np.zeros((2, size))
+        jacobian[:, columns[new]] = se2.rotation(pose[2]) @ np.eye(2, 3)
+        return jacobian, measurement.position - pose[:2], measurement.covariance
+    assert measurement.reference_ns is not None
+    true = se2.between(_truth(course, measurement.reference_ns), pose)
+    jacobian = np.zeros((3, size))
+    jacobian[:, columns[new]] = np.eye(3)
+    old = _samples(course, [measurement.reference_ns])[0]
+    jacobian[:, columns[old]] = -se2.adjoint(se2.inverse(true))
+    return jacobian, se2.between(true, measurement.pose), np.diag(np.square(course.closure_sigma))
+
+
+def _truth(course: Course, stamp_ns: int) -> FloatArray:
+    return course.truth(np.array([(stamp_ns - START_NS) / SECOND]))[0]
+
+
+def _samples(course: Course, stamps_ns: list[int]) -> list[int]:
+    """Return the numbers of the samples of odometry next to stamps [ns]."""
+    return [round((stamp - START_NS) / SECOND * course.odometry_rate) for stamp in stamps_ns]

@@ -9,19 +9,18 @@ best rigid motion, as nothing ties them to the truth. The truth decides nothing 
 """
 
 from collections import defaultdict, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import time
 
 import numpy as np
 
-from benchmark.worlds import integrate
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
     BackendConfig,
     LOOP_CLOSURES,
     NoiseFrom,
-    OdometryNoise,
     OdometrySource,
     Robust,
 )
@@ -33,6 +32,7 @@ from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
+from pose_graph_ros.offline.simulation.graph import composed
 
 SECOND = 1_000_000_000
 TRUE, FAR = 3.0, 6.0
@@ -42,6 +42,9 @@ UPDATE_EVERY = 10
 SMALLEST_RMS = 0.5
 """Of odometry: what the path is compared with while driving is at least this [m]."""
 CLOSURES = 'loop_closure'
+B25B = ('false_loops/B25b_0.150.g2o', 'false_loops/Bicocca25b_GT_GPS.g2o',
+        'false_loops/B25b_timestamps.txt')
+M3500 = 'graphs/input_M3500_g2o.g2o', 'graphs/manhattanOlson3500_groundtruth.txt'
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,26 +54,31 @@ class Recording:
     name: str
     stamps_ns: IntArray
     """Shape (N,)."""
-    odometry: FloatArray
-    """`T_odom_base`, shape (N, 3)."""
+    chain: Edges
+    """Odometry from each pose to the next."""
     truth: Trajectory
-    ends: IntArray
-    """Stamps of the reference and of the other end [ns], shape (M, 2)."""
-    poses: FloatArray
-    """`T_reference_base`, shape (M, 3)."""
-    covariances: FloatArray
-    """In the axes of the reference, shape (M, 3, 3)."""
-    arrival_ns: IntArray
-    """Shape (M,), not descending."""
     twist_variance: FloatArray | None = None
     """What the odometry itself claims, shape (3,) per second; None: the model is used."""
+    ends: IntArray = field(default_factory=lambda: np.empty((0, 2), dtype=np.int64))
+    """Stamps of the reference and of the other end [ns], shape (M, 2)."""
+    poses: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    """`T_reference_base`, shape (M, 3)."""
+    covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+    """In the axes of the reference, shape (M, 3, 3)."""
+    arrival_ns: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Shape (M,), not descending."""
+
+    @property
+    def odometry(self) -> FloatArray:
+        """`T_odom_base`, shape (N, 3)."""
+        return composed(np.zeros(3), self.chain.mean)
 
     def errors(self) -> FloatArray:
         """Return how far off the closures are, shape (M,) [m]."""
         true = se2.between(*(self.truth.at(stamps) for stamps in self.ends.T))
         return np.asarray(np.hypot(*(self.poses - true)[:, :2].T))
 
-    def only(self, chosen: BoolArray) -> 'Recording':
+    def only(self, chosen: BoolArray | IntArray) -> 'Recording':
         """Return the recording with some of its closures."""
         return replace(self, ends=self.ends[chosen], poses=self.poses[chosen],
                        covariances=self.covariances[chosen], arrival_ns=self.arrival_ns[chosen])
@@ -80,23 +88,53 @@ class Recording:
         order = np.argsort(arrival_ns, kind='stable')
         return replace(self.only(order), arrival_ns=arrival_ns[order])
 
-    def config(self, robust: Robust, noise_factor: float = 1.0) -> BackendConfig:
-        """
-        Return the settings of a run: the defaults, but for these.
-
-        Parameters
-        ----------
-        robust : Robust
-        noise_factor : float, on all sigmas of the model of odometry
-
-        """
-        noise = OdometryNoise()
-        noise = replace(noise, **{
-            name: noise_factor * getattr(noise, name) for name in noise.__dataclass_fields__})
-        source = OdometrySource(noise, NoiseFrom.MODEL if self.twist_variance is None
+    def config(self, robust: Robust) -> BackendConfig:
+        """Return the settings of a run: the defaults, but for `robust`."""
+        source = OdometrySource(noise_from=NoiseFrom.MODEL if self.twist_variance is None
                                 else NoiseFrom.TWIST)
         return BackendConfig(odometry={'odom': source},
                              measurements={CLOSURES: replace(LOOP_CLOSURES, robust=robust)})
+
+    def steps(self) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
+        """Yield the samples of odometry, each with the closures that arrive after it."""
+        closures = [LoopClosure(stamp, pose, cov, reference_ns=reference)
+                    for (reference, stamp), pose, cov in zip(
+                        self.ends.tolist(), self.poses, self.covariances, strict=True)]
+        stops = np.searchsorted(self.arrival_ns, self.stamps_ns, side='right')
+        stops[-1] = len(closures)
+        begin = 0
+        for stamp, pose, end in zip(
+                self.stamps_ns.tolist(), self.odometry, stops.tolist(), strict=True):
+            yield (OdometrySample(stamp, pose, twist_variance=self.twist_variance),
+                   closures[begin:end])
+            begin = end
+
+    def loops(self) -> Edges:
+        """Return the closures as edges, their information in the axes of the later pose."""
+        i, j = np.searchsorted(self.stamps_ns, self.ends).T
+        information = [np.linalg.inv(covariance.turned(each, float(pose[2])))
+                       for each, pose in zip(self.covariances, self.poses, strict=True)]
+        return Edges(i, j, self.poses, np.array(information),
+                     np.full(len(i), EdgeKind.LOOP_CLOSURE))
+
+    def closing(self, loops: Edges) -> 'Recording':
+        """Return the recording with further closures, which come when their later node has."""
+        ends = np.column_stack((self.stamps_ns[loops.i], self.stamps_ns[loops.j]))
+        turned = np.array([
+            covariance.turned(np.linalg.inv(information), -float(mean[2]))
+            for information, mean in zip(loops.information, loops.mean, strict=True)])
+        arrival = np.concatenate((self.arrival_ns, ends.max(axis=1)))
+        return replace(
+            self, ends=np.concatenate((self.ends, ends)),
+            poses=np.concatenate((self.poses, loops.mean)), arrival_ns=arrival,
+            covariances=np.concatenate((self.covariances, turned.reshape(-1, 3, 3)))
+            ).ordered(arrival)
+
+
+def closures(i: IntArray, j: IntArray, means: FloatArray, information: FloatArray) -> Edges:
+    """Return closures between nodes, shape (M,); information of shape (3, 3) or (M, 3, 3)."""
+    return Edges(i, j, means, np.broadcast_to(information, (len(i), 3, 3)),
+                 np.full(len(i), EdgeKind.LOOP_CLOSURE))
 
 
 @dataclass(slots=True)
@@ -115,7 +153,6 @@ class Run:
     """Of all calls of the back end."""
     longest_idle: float
     """Longest slice of work between updates [s]."""
-    states: dict[str, int] = field(default_factory=dict)
 
 
 def feed(recording: Recording, config: BackendConfig) -> Run:
@@ -123,13 +160,10 @@ def feed(recording: Recording, config: BackendConfig) -> Run:
     backend = PoseGraphBackend(config)
     live: dict[int, tuple[float, float]] = {}
     updates: list[float] = []
-    idle, due, closure = 0.0, UPDATE_EVERY, 0
+    idle, due = 0.0, UPDATE_EVERY
     begin = time.perf_counter()
-    for stamp, pose in zip(recording.stamps_ns.tolist(), recording.odometry, strict=True):
-        backend.add_odometry(OdometrySample(stamp, pose, twist_variance=recording.twist_variance))
-        while closure < len(recording.ends) and recording.arrival_ns[closure] <= stamp:
-            add(backend, recording, closure)
-            closure += 1
+    for step in recording.steps():
+        add(backend, *step)
         if backend.graph.n_nodes >= due:
             due = backend.graph.n_nodes + UPDATE_EVERY
             start = time.perf_counter()
@@ -142,21 +176,21 @@ def feed(recording: Recording, config: BackendConfig) -> Run:
             fit = fits(estimate.path, recording.truth)
             live[estimate.stamp_ns] = float(fit.last[-1]), float(fit.rms[-1])
             begin += time.perf_counter() - looked
-    for late in range(closure, len(recording.ends)):
-        add(backend, recording, late)
     backend.optimize()
     seconds = time.perf_counter() - begin
     estimate = backend.estimate()
     assert estimate is not None
-    kept, states = kept_closures(backend, recording)
-    return Run(backend, estimate.path, kept, live, np.array(updates), seconds, idle, states)
+    return Run(backend, estimate.path, kept_closures(backend, recording), live,
+               np.array(updates), seconds, idle)
 
 
-def add(backend: PoseGraphBackend, recording: Recording, k: int) -> None:
-    """Add closure k of a recording."""
-    reference, stamp = recording.ends[k].tolist()
-    backend.add_measurement(LoopClosure(
-        stamp, recording.poses[k], recording.covariances[k], reference_ns=reference), CLOSURES)
+def add(
+    backend: PoseGraphBackend, sample: OdometrySample, closures: list[LoopClosure],
+) -> None:
+    """Add a sample of odometry, and closures."""
+    backend.add_odometry(sample)
+    for closure in closures:
+        backend.add_measurement(closure, CLOSURES)
 
 
 def drain(backend: PoseGraphBackend) -> float:
@@ -170,27 +204,17 @@ def drain(backend: PoseGraphBackend) -> float:
             return longest
 
 
-def kept_closures(
-    backend: PoseGraphBackend, recording: Recording,
-) -> tuple[BoolArray, dict[str, int]]:
-    """Return which closures take part, shape (M,), and the number of them by state."""
-    if not hasattr(backend, 'verdicts'):
-        return np.ones(len(recording.ends), dtype=bool), {}
+def kept_closures(backend: PoseGraphBackend, recording: Recording) -> BoolArray:
+    """Return which closures take part, shape (M,)."""
     # several closures may be between the same two poses, right ones and wrong ones
     verdicts: defaultdict[tuple[int, int | None], deque[Verdict]] = defaultdict(deque)
     for verdict in backend.verdicts():
         if verdict.source == CLOSURES:
             verdicts[verdict.stamp_ns, verdict.reference_ns].append(verdict)
     if len(verdicts) == 0:
-        return np.ones(len(recording.ends), dtype=bool), {}
-    kept, states = [], dict[str, int]()
-    for reference, stamp in recording.ends.tolist():
-        same = verdicts[stamp, reference]
-        verdict = same.popleft() if len(same) > 0 else None
-        kept.append(verdict is not None and verdict.state.in_graph)
-        state = 'forgotten' if verdict is None else verdict.state.value
-        states[state] = states.get(state, 0) + 1
-    return np.array(kept, dtype=bool), states
+        return np.ones(len(recording.ends), dtype=bool)
+    same = (verdicts[stamp, reference] for reference, stamp in recording.ends.tolist())
+    return np.array([len(each) > 0 and each.popleft().state.in_graph for each in same], dtype=bool)
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,59 +315,32 @@ def read_recording(graph: Path, truth: Path, stamps: Path | None = None) -> Reco
     chain = chain[np.unique(edges.i[chain], return_index=True)[1]]
     if len(chain) != n - 1:
         raise ValueError(f'{graph.name}: odometry between all consecutive nodes is expected')
-    odometry = integrate(np.zeros(3), edges.mean[chain])
     time_ns = (SECOND * np.arange(1, n + 1) if stamps is None
                else np.round(np.loadtxt(stamps)[:n] * SECOND).astype(np.int64))
     loops = edges.rows(np.setdiff1d(np.arange(len(edges)), chain))
-    twist = np.diagonal(np.linalg.inv(edges.information[chain[0]])).copy()
-    return closing(Recording(
-        graph.stem, time_ns, odometry, _truth(truth, time_ns, odometry),
-        np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), np.empty((0, 3, 3)),
-        np.empty(0, dtype=np.int64), twist if stamps is None else None),
-        loops.i, loops.j, loops.mean, np.linalg.inv(loops.information))
+    odometry = edges.rows(chain)
+    return Recording(
+        graph.stem, time_ns, odometry, _truth(truth, time_ns, odometry.mean),
+        claimed_twist(odometry) if stamps is None else None).closing(loops)
 
 
-def _truth(file: Path, stamps_ns: IntArray, odometry: FloatArray) -> Trajectory:
+def claimed_twist(chain: Edges) -> FloatArray:
+    """Return what odometry with a pose in every second claims, shape (3,) per second."""
+    return np.diagonal(np.linalg.inv(chain.information[0])).copy()
+
+
+def _truth(file: Path, stamps_ns: IntArray, chain: FloatArray) -> Trajectory:
     lines = [line.split() for line in file.read_text(encoding='utf-8').splitlines()]
     poses = np.array([words[2:5] for words in lines if words[:1] == ['VERTEX_SE2']], dtype=float)
     if len(poses) == 0:
         steps = {int(words[1]): words[3:6] for words in lines
                  if words[:1] in (['EDGE2'], ['EDGE_SE2']) and int(words[2]) == int(words[1]) + 1}
-        poses = integrate(np.zeros(3), np.array([steps[k] for k in sorted(steps)], dtype=float))
+        poses = composed(np.zeros(3), np.array([steps[k] for k in sorted(steps)], dtype=float))
     if len(poses) == len(stamps_ns):
         return Trajectory(stamps_ns, poses)
     shares = [np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
-              for path in (odometry, poses)]
+              for path in (composed(np.zeros(3), chain), poses)]
     shares = [share / share[-1] for share in shares]
     heading = np.unwrap(poses[:, 2])
     return Trajectory(stamps_ns, se2.wrapped(np.column_stack([
         np.interp(shares[0], shares[1], column) for column in (*poses[:, :2].T, heading)])))
-
-
-def closing(
-    recording: Recording, i: IntArray, j: IntArray, means: FloatArray, covariances: FloatArray,
-) -> Recording:
-    """
-    Return a recording with further closures, which come when their later node has come.
-
-    Parameters
-    ----------
-    recording : Recording
-    i, j : ndarray, shape (M,)
-        Numbers of the poses of odometry.
-    means : ndarray, shape (M, 3)
-        Pose of j in i.
-    covariances : ndarray, shape (M, 3, 3)
-        In the axes of pose j, as in g2o files.
-
-    """
-    ends = np.column_stack((recording.stamps_ns[i], recording.stamps_ns[j]))
-    turned = np.array([covariance.turned(cov, -float(mean[2]))
-                       for cov, mean in zip(covariances, means, strict=True)]).reshape(-1, 3, 3)
-    arrival = np.concatenate((recording.arrival_ns, ends.max(axis=1)))
-    return replace(
-        recording, ends=np.concatenate((recording.ends, ends)),
-        poses=np.concatenate((recording.poses, means)), arrival_ns=arrival,
-        covariances=np.concatenate((recording.covariances, turned))).ordered(arrival)
-
-
