@@ -104,7 +104,7 @@ def _turned(
     """Return the motion since the newest node, and its noise, with what a gyroscope says."""
     gyros, nodes = parts.pipeline.gyros, parts.nodes
     rotation = None if len(gyros.streams) == 0 else gyros.newest(
-        int(nodes.stamps_ns[-1]), nodes.newest_ns, parts.factors.gyros.values(parts.graph))
+        int(nodes.stamps_ns[-1]), nodes.newest_ns, parts.factors.gyro_rates(parts.graph))
     if rotation is None or noise[2, 2] == 0.0:
         return motion, noise
     angle, variance = rotation

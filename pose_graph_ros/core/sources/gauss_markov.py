@@ -21,7 +21,7 @@ The process is the same backwards in time, so a late state before that one hangs
 """
 
 import bisect
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
@@ -93,35 +93,24 @@ class Additions:
         return self.first.observed + len(self.observed) - 1
 
 
-class GaussMarkovBias:
-    """The bias of one source: a chain of states in the graph."""
+class BiasChain:
+    """States of a bias in the graph, each for a bin of time."""
 
-    def __init__(self, errors: CorrelatedErrors) -> None:
-        self.errors = errors
-        self._width_ns = max(round(errors.tau * 1e9 / SOURCES.bins), 1)
-        self._numbers: list[int] = []  # of the bins, increasing
+    def __init__(self, width_ns: int) -> None:
+        self._width_ns = width_ns
+        self._begins_ns: list[int] = []  # stamps at which the bins begin, increasing [ns]
         self.nodes: list[int] = []  # ids of their states
         # ids of the edges to the states before; of the first state that of its prior
         self._ties: list[int] = []
         # these lists as they were before the update that has changed them
-        self._before: tuple[list[int], list[int], list[int]] | None = None
+        self._before: list[list[int]] | None = None
 
-    def leaving(self, oldest_ns: int | None) -> list[int]:
-        """Return the states before the oldest measurement that is left, but the newest."""
-        last = max(len(self._numbers) - 1, 0)
-        end = last if oldest_ns is None else min(
-            bisect.bisect_left(self._numbers, oldest_ns // self._width_ns), last)
-        return self.nodes[:end]
+    @property
+    def _columns(self) -> list[list[int]]:
+        return [self._begins_ns, self.nodes, self._ties]
 
-    def forget(self, nodes: Collection[int]) -> None:
-        """Forget states that have left the graph, the oldest ones, by their ids."""
-        kept = [k for k, node in enumerate(self.nodes) if node not in nodes]
-        if len(kept) == len(self.nodes):
-            return
-        self._numbers, self.nodes, self._ties = (
-            [each[k] for k in kept] for each in (self._numbers, self.nodes, self._ties))
-        if len(kept) > 0 and NO_TRANSITION not in self._ties:
-            self._ties[0] = NO_TRANSITION
+    def _fill(self, columns: Sequence[list[int]]) -> None:
+        self._begins_ns, self.nodes, self._ties = columns
 
     def begin(self) -> None:
         """Begin an update that `rollback` can revert."""
@@ -130,19 +119,52 @@ class GaussMarkovBias:
     def rollback(self) -> None:
         """Remove what was added since `begin`."""
         if self._before is not None:
-            self._numbers, self.nodes, self._ties = self._before
+            self._fill(self._before)
             self._before = None
 
+    def _keep(self) -> None:
+        if self._before is None:
+            self._before = [[*column] for column in self._columns]
+
+    def forget(self, nodes: Collection[int]) -> None:
+        """Forget states that have left the graph, the oldest ones, by their ids."""
+        kept = [k for k, node in enumerate(self.nodes) if node not in nodes]
+        if len(kept) == len(self.nodes):
+            return
+        self._fill([[column[k] for k in kept] for column in self._columns])
+        if len(kept) > 0 and NO_TRANSITION not in self._ties:
+            self._ties[0] = NO_TRANSITION
+
+    def begin_ns(self, node: int) -> int | None:
+        """Return when the bin of a state begins [ns], by its id; None for another source's."""
+        return self._begins_ns[self.nodes.index(node)] if node in self.nodes else None
+
+
+class GaussMarkovBias(BiasChain):
+    """The bias of one source: a chain of states in the graph."""
+
+    def __init__(self, errors: CorrelatedErrors) -> None:
+        super().__init__(max(round(errors.tau * 1e9 / SOURCES.bins), 1))
+        self.errors = errors
+
+    def leaving(self, oldest_ns: int | None) -> list[int]:
+        """Return the states before the oldest measurement that is left, but the newest."""
+        end = last = max(len(self.nodes) - 1, 0)
+        if oldest_ns is not None:
+            begin_ns = oldest_ns - oldest_ns % self._width_ns
+            end = min(bisect.bisect_left(self._begins_ns, begin_ns), last)
+        return self.nodes[:end]
+
     def saved(self) -> SavedBins:
-        return SavedBins(self._width_ns, *(np.array(each, dtype=np.int64) for each in (
-            self._numbers, self.nodes, self._ties)))
+        begins_ns, nodes, ties = (np.array(each, dtype=np.int64) for each in self._columns)
+        return SavedBins(self._width_ns, begins_ns // self._width_ns, nodes, ties)
 
     def restore(self, saved: SavedBins) -> bool:
         """Restore saved states; return False if their bins have another width."""
         if saved.width_ns != self._width_ns:
             return False
-        self._numbers, self.nodes, self._ties = (
-            each.tolist() for each in (saved.numbers, saved.rows, saved.ties))
+        self._fill([each.tolist() for each in (
+            saved.numbers * saved.width_ns, saved.rows, saved.ties)])
         return True
 
     def add(
@@ -155,63 +177,54 @@ class GaussMarkovBias:
         what the motion since the node adds to the variances of its position and heading
         [m^2, rad^2].
         """
-        number, rest_ns = divmod(stamp_ns, self._width_ns)
-        at = bisect.bisect_left(self._numbers, number)
-        if at == len(self._numbers) or self._numbers[at] != number:
-            self._make_bin(at, number, additions)
+        rest_ns = stamp_ns % self._width_ns
+        begin_ns = stamp_ns - rest_ns
+        at = bisect.bisect_left(self._begins_ns, begin_ns)
+        if at == len(self.nodes) or self._begins_ns[at] != begin_ns:
+            self._make_bin(at, begin_ns, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
         return additions.add_edge(biased_constraint(
             observed, noise, self.nodes[at], phi, self.errors))
 
     def preview(self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray) -> Edges | None:
         """Return the edge of a measurement to the last state before it; None without one."""
-        at = bisect.bisect(self._numbers, stamp_ns // self._width_ns) - 1
+        at = bisect.bisect(self._begins_ns, stamp_ns) - 1
         if at < 0:
             return None
-        gap_ns = abs(stamp_ns - (self._numbers[at] + 0.5) * self._width_ns)
+        gap_ns = abs(stamp_ns - self._begins_ns[at] - self._width_ns / 2)
         return biased_constraint(observed, noise, self.nodes[at], self._phi(gap_ns), self.errors)
-
-    def begin_ns(self, node: int) -> int | None:
-        """Return when the bin of a state begins [ns], by its id; None for another source's."""
-        return self._numbers[self.nodes.index(node)] * self._width_ns if (
-            node in self.nodes) else None
 
     def _phi(self, gap_ns: float) -> float:
         return math.exp(-gap_ns * 1e-9 / self.errors.tau)
 
-    def _make_bin(self, at: int, number: int, additions: Additions) -> None:
+    def _make_bin(self, at: int, begin_ns: int, additions: Additions) -> None:
         """
         Add the state of a bin between its neighbours in time.
 
         Transitions lead away from the state with the prior: back to it, or, from late states
         before one that the prior of the graph is on, forward.
         """
-        if self._before is None:
-            self._before = [*self._numbers], [*self.nodes], [*self._ties]
-        before, after = at - 1 if at > 0 else None, at if at < len(self._numbers) else None
+        self._keep()
+        before, after = at - 1 if at > 0 else None, at if at < len(self.nodes) else None
         if NO_TRANSITION in self._ties[at:]:
             before, after = after, before
         node = additions.add_bias()
-        tie = self._add_transition(node, number, before, additions)
+        if before is None:
+            tie = additions.add_observed(ObservedNodes(
+                [node], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
+        else:
+            tie = self._tied(
+                node, self.nodes[before], begin_ns - self._begins_ns[before], additions)
         if after is not None:
             removed = additions.remove_observed if before is None else additions.remove_edges
             removed.append(self._ties[after])
             self._ties[after] = self._tied(
-                self.nodes[after], node, self._numbers[after] - number, additions)
-        for column, value in ((self._numbers, number), (self.nodes, node), (self._ties, tie)):
+                self.nodes[after], node, self._begins_ns[after] - begin_ns, additions)
+        for column, value in zip(self._columns, (begin_ns, node, tie), strict=True):
             column.insert(at, value)
 
-    def _add_transition(
-        self, node: int, number: int, before: int | None, additions: Additions,
-    ) -> int:
-        """Return the id of the edge to the bin before, by its place, or of the first's prior."""
-        if before is None:
-            return additions.add_observed(ObservedNodes(
-                [node], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
-        return self._tied(node, self.nodes[before], number - self._numbers[before], additions)
-
-    def _tied(self, node: int, before: int, n_bins: int, additions: Additions) -> int:
-        phi = self._phi(abs(n_bins) * self._width_ns)
+    def _tied(self, node: int, before: int, gap_ns: int, additions: Additions) -> int:
+        phi = self._phi(abs(gap_ns))
         return additions.add_edge(Edges(
             [node], [before], np.zeros((1, 3)), _INFORMATION[None] / (1.0 - phi * phi),
             [EdgeKind.BIAS], bias=np.array([(0.0, 0.0, phi, phi)])))
