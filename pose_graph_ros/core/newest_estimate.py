@@ -41,7 +41,7 @@ def estimate(
 ) -> Estimate:
     """Return the present estimate; there must be a hidden node."""
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
-    state, sigma = parts.alignment.copy()
+    state, sigma = parts.alignment.state, parts.alignment.sigma
     node = Corrected(graph.poses_of(nodes.ids[-1]), newest_covariance)
     if state is AlignmentState.ALIGNED:
         node = corrected(parts, smoother, node)

@@ -169,14 +169,6 @@ class AlignmentMonitor:
         """Whether the graph lies in the map."""
         return self.state is AlignmentState.ALIGNED
 
-    def copy(self) -> tuple[AlignmentState, float]:
-        """Return the state for `restore`."""
-        return self.state, self.sigma
-
-    def restore(self, state: tuple[AlignmentState, float]) -> None:
-        """Set the state to one returned by `copy`, if the graph could not be aligned."""
-        self.state, self.sigma = state
-
     def saved(self) -> SavedAlignment:
         """Return the state and the stored measurements."""
         table = _table(self._evidence)

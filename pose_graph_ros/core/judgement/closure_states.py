@@ -16,6 +16,7 @@ from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import ODOMETRY
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
+    Column,
     Decision,
     Judged,
     Judgements,
@@ -66,40 +67,15 @@ CLOSURE = np.dtype([
 
 
 class ClosureStates(Judgements):
+    edge, state, stamps_ns, since_ns = Column(), Column(), Column(), Column()
+    decision, distance, forgotten = Column(), Column(), Column()
+
     def __init__(self) -> None:
         super().__init__(CLOSURE, n_left=3)  # of these some were used, and some doubted
 
     @property
-    def edge(self) -> IntArray:
-        return np.asarray(self.records['edge'])
-
-    @property
-    def state(self) -> IntArray:
-        return np.asarray(self.records['state'])
-
-    @property
-    def stamps_ns(self) -> IntArray:
-        return np.asarray(self.records['stamps_ns'])
-
-    @property
-    def since_ns(self) -> IntArray:
-        return np.asarray(self.records['since_ns'])
-
-    @property
-    def decision(self) -> IntArray:
-        return np.asarray(self.records['decision'])
-
-    @property
-    def distance(self) -> FloatArray:
-        return np.asarray(self.records['distance'])
-
-    @property
     def in_graph(self) -> BoolArray:
         return np.asarray(USED[self.state])
-
-    @property
-    def forgotten(self) -> BoolArray:
-        return np.asarray(self.records['forgotten'])
 
     @property
     def judged(self) -> BoolArray:

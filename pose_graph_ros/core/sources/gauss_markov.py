@@ -241,41 +241,26 @@ def biased_constraint(
     mean of the variances of x and y. m is phi times the state plus a white rest of variance
     1 - phi^2.
     """
-    factors, information, mean = np.zeros(2), np.zeros((3, 3)), observed.mean[0].copy()
-    given, kind, offset = observed.information[0], observed.kind[0], observed.offset[0]
-    if kind == ObservedKind.HEADING:
-        own = _own(1.0 / float(given[2, 2]), noise[1])
-        factors[1], rest = _split(errors.correlated * own, phi)
-        information[2, 2] = 1.0 / (errors.white * own + rest + noise[1])
-    elif kind == ObservedKind.POSITION:
-        cov = np.linalg.inv(given[:2, :2])
-        total = 0.5 * float(np.trace(cov))
-        own = _own(total, noise[0])
-        factors[0], rest = _split(errors.correlated * own, phi)
-        information[:2, :2] = covariance.information(
-            errors.white * own / total * cov + (rest + noise[0]) * np.eye(2))
-    else:
-        cov = covariance.turned(np.linalg.inv(given), -float(mean[2]))
-        total, total_heading = 0.5 * float(np.trace(cov[:2, :2])), float(cov[2, 2])
-        own, own_heading = _own(total, noise[0]), _own(total_heading, noise[1])
-        factors[0], rest = _split(errors.correlated * own, phi)
-        factors[1], rest_heading = _split(errors.correlated * own_heading, phi)
-        scale = np.sqrt((own / total, own / total, own_heading / total_heading))
-        information = covariance.information(
-            errors.white * scale[:, None] * cov * scale
-            + np.diag((rest + noise[0], rest + noise[0], rest_heading + noise[1])))
+    mean, offset = observed.mean[0].copy(), observed.offset[0]
+    kind, given, information = observed.kind[0], observed.information[0], np.zeros((3, 3))
+    rows = np.flatnonzero(np.diagonal(given) > 0.0)  # what is measured: position, heading or both
+    block = np.ix_(rows, rows)
+    cov = np.linalg.inv(given[block])
+    if kind == ObservedKind.GLOBAL_POSE:
+        cov = covariance.turned(cov, -float(mean[2]))
+    is_heading = (rows == 2).astype(np.int64)
+    total = np.diagonal(cov).copy()
+    total[rows < 2] = 0.5 * np.sum(total[rows < 2])
+    # without that of the motion since the node
+    own = np.maximum(total - noise[is_heading], SOURCES.least_own * total)
+    correlated, scale = errors.correlated * own, np.sqrt(own / total)
+    # of the correlated part, the state does not explain all
+    rest = correlated * (1.0 - phi * phi) + noise[is_heading]
+    information[block] = covariance.information(
+        errors.white * scale[:, None] * cov * scale + np.diag(rest))
+    factors = np.zeros(2)
+    factors[is_heading] = phi * np.sqrt(correlated) * np.where(is_heading, STRETCH, 1.0)
     if kind != ObservedKind.POSITION:
         mean[2] = se2.wrap(mean[2] - offset[2])
     return Edges([observed.node[0]], [bias], [mean], [information], [EdgeKind.BIAS],
-                 weight=observed.weight,
-                 bias=[(offset[0], offset[1], phi * factors[0], STRETCH * phi * factors[1])])
-
-
-def _own(total: float, noise: float) -> float:
-    """Return the variance of a measurement without that of the motion since its node."""
-    return max(total - noise, SOURCES.least_own * total)
-
-
-def _split(variance: float, phi: float) -> tuple[float, float]:
-    """Return f, and the variance of the part of `f m(t)` that the state does not explain."""
-    return math.sqrt(variance), variance * (1.0 - phi * phi)
+                 weight=observed.weight, bias=[(offset[0], offset[1], *factors)])

@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Constraints that are attached to hidden nodes: on their way into the graph, and in it."""
 
-from collections.abc import Collection
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,8 +42,10 @@ class QueuedEdge(NamedTuple):
     stamp_ns: int = -1  # of the loop closure [ns]; -1 for an edge of odometry
     reference_ns: int = -1  # stamp of its other end [ns]
 
-    def is_on(self, nodes: Collection[int]) -> bool:
-        return int(self.edge.i[0]) in nodes or int(self.edge.j[0]) in nodes
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Ids of the nodes that it is on."""
+        return int(self.edge.i[0]), int(self.edge.j[0])
 
 
 class AttachedMeasurement(NamedTuple):
@@ -50,6 +53,11 @@ class AttachedMeasurement(NamedTuple):
     observed: ObservedNodes  # its constraint if its error is treated as white
     measurement: Absolute
     attachment: Attachment
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Id of the node that it is on."""
+        return (self.attachment.node,)
 
 
 @dataclass(slots=True)
@@ -64,13 +72,11 @@ class Queue:
         return len(self.edges) + len(self.observed) + len(self.turns)
 
     def extend(self, other: 'Queue') -> None:
-        self.edges += other.edges
-        self.observed += other.observed
-        self.turns += other.turns
+        self.replace_by(self.joined(other))
 
     def joined(self, other: 'Queue') -> 'Queue':
-        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed],
-                     [*self.turns, *other.turns])
+        return Queue(self.edges + other.edges, self.observed + other.observed,
+                     self.turns + other.turns)
 
     def newest(self, n: int) -> 'Queue':
         return Queue(self.edges[-n:], self.observed[-n:], self.turns[-n:])
@@ -78,17 +84,14 @@ class Queue:
     def replace_by(self, other: 'Queue') -> None:
         self.edges, self.observed, self.turns = other.edges, other.observed, other.turns
 
-    def drop(self, nodes: Collection[int]) -> list[str]:
+    def drop(self, nodes: set[int]) -> list[str]:
         """Return the sources of the constraints on nodes that have left, after removing them."""
-        gone = [each.source for each in self.edges if each.is_on(nodes)]
-        gone += [each.source for each in self.observed if each.attachment.node in nodes]
-        gone += [turn.source for turn in self.turns if turn.i in nodes or turn.j in nodes]
-        if len(gone) > 0:
-            self.turns = [
-                turn for turn in self.turns if turn.i not in nodes and turn.j not in nodes]
-            self.edges = [each for each in self.edges if not each.is_on(nodes)]
-            self.observed = [
-                each for each in self.observed if each.attachment.node not in nodes]
+        every: Iterator[QueuedEdge | AttachedMeasurement | Turn] = chain(
+            self.edges, self.observed, self.turns)
+        gone = [each.source for each in every if not nodes.isdisjoint(each.ends)]
+        self.edges = [each for each in self.edges if nodes.isdisjoint(each.ends)]
+        self.observed = [each for each in self.observed if nodes.isdisjoint(each.ends)]
+        self.turns = [each for each in self.turns if nodes.isdisjoint(each.ends)]
         return gone
 
     def halves(self) -> 'tuple[Queue, Queue]':
