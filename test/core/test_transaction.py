@@ -105,19 +105,6 @@ def test_an_update_that_fails_at_any_step_changes_nothing(
         backend.estimate().path.poses, whole.estimate().path.poses, atol=1e-6)
 
 
-def test_a_graph_that_was_moved_is_moved_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = PoseGraphBackend(CONFIG)
-    drive(backend, 0, 8)
-    poses = backend.graph.poses.copy()
-    with monkeypatch.context() as patch:
-        patch.setattr(backend._factors, 'build', fails)
-        assert backend.update().status is Status.FAILED
-    np.testing.assert_array_equal(backend.graph.poses, poses)
-    assert not backend._alignment.is_aligned
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend._alignment.is_aligned
-
-
 def test_what_was_committed_survives_a_later_solve_that_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -201,14 +201,13 @@ def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
 
 def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> ObservedNodes:
     """Return the observed nodes of measurements, with the rows of their hidden nodes."""
-    table = _table(measurements)
-    return ObservedNodes(graph.node_rows(table.node), *table.columns[1:])
+    return _table(measurements).renumbered(graph.node_rows)
 
 
 def _numbered(nodes: HiddenNodes, table: ObservedNodes) -> ObservedNodes:
     """Return observed nodes by the rows of `HiddenNodes.recent_poses`, which has no biases."""
     ids = nodes.ids[nodes.n_frozen:]
-    return ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
+    return table.renumbered(lambda some: np.searchsorted(ids, some))
 
 
 def _noise(nodes: HiddenNodes) -> OdometryNoise:

@@ -9,7 +9,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
@@ -150,11 +150,8 @@ class FactorBuilder:
 
     def held(self) -> dict[str, tuple[IntArray, Held]]:
         """Return the stamps of all measurements in the map [ns], and what holds them."""
-        every = {source: each.held(np.arange(len(each)))
-                 for source, each in self._constraints.items()}
-        return {source: (self._constraints[source].rows.values[:, 0], held._replace(
-            is_edge=held.is_edge | self._has_given_bias(source)))
-            for source, held in every.items()}
+        return {source: (each.rows.values[:, 0], each.held())
+                for source, each in self._constraints.items()}
 
     def errors_in_use(self, source: str) -> CorrelatedErrors | None:
         """Return the statistics of the errors of a source in use; None for white errors."""
@@ -183,15 +180,11 @@ class FactorBuilder:
             biases += gyro.leaving(edges)
         for source, constraints in self._constraints.items():
             models = [each[source] for each in (self._error_models, others) if source in each]
-            left = constraints.rows.values[~self.leaving(source, edges, observed), 0]
+            left = constraints.rows.values[~constraints.leaving(edges, observed), 0]
             oldest_ns = int(np.min(left)) if len(left) > 0 else None
             for model in models:
                 biases += model.leaving(oldest_ns)
         return biases
-
-    def leaving(self, source: str, edges: IntArray, observed: IntArray) -> BoolArray:
-        return self._constraints[source].leaving(
-            edges, observed, added_as_edges=self._has_given_bias(source))
 
     def forget(
         self, nodes: IntArray, edges: IntArray, observed: IntArray,
@@ -204,7 +197,7 @@ class FactorBuilder:
             gyro.forget_edges(edges)
         self._abandoned = [node for node in self._abandoned if node not in gone]
         for source, constraints in self._constraints.items():
-            kept[source] = constraints.forget(self.leaving(source, edges, observed))
+            kept[source] = constraints.forget(constraints.leaving(edges, observed))
         for known in self._pose_edges.values():
             known.select(np.flatnonzero(~np.isin(known.values, edges)))
         return kept
@@ -226,7 +219,10 @@ class FactorBuilder:
                 self._reweighting.add(held_by, loss, threshold, edge=True)
                 self._reweighting.set_base_weight(number, 0.0)
             if kind is not LoopClosure:
-                constraints = self._constraints.setdefault(source, SourceConstraints())
+                if source not in self._constraints:
+                    self._constraints[source] = SourceConstraints(
+                        as_edges=self._has_given_bias(source))
+                constraints = self._constraints[source]
                 constraints.append(stamp_ns, number, noise, held_by)
             else:
                 edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
@@ -238,8 +234,7 @@ class FactorBuilder:
     def origin(self, number: int, *, edge: bool) -> ConstraintOrigin | None:
         """Return where a constraint comes from; None if this builder has not added it."""
         for source, constraints in self._constraints.items():
-            stamp_ns = constraints.stamp_ns(
-                number, edge=edge, added_as_edges=self._has_given_bias(source))
+            stamp_ns = constraints.stamp_ns(number, edge=edge)
             if stamp_ns is not None:
                 return ConstraintOrigin(source, stamp_ns)
         for source, edges in self._pose_edges.items() if edge else ():
@@ -303,7 +298,8 @@ class FactorBuilder:
         if not same and settings.finds_correlation:
             self._error_models.pop(source, None)
         same = same and settings.finds_correlation >= (saved.errors is not None)
-        self._constraints[source] = constraints = SourceConstraints()
+        self._constraints[source] = constraints = SourceConstraints(
+            as_edges=self._has_given_bias(source))
         if same:
             constraints.restore(saved)
         constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints)
@@ -327,8 +323,8 @@ class FactorBuilder:
                 if each.report is not None and each.report.energy > 0.0}
 
     def report(self, source: str, graph: Graph) -> SourceReport:
-        constraints, biased = self._constraints[source], self._has_given_bias(source)
-        used = constraints.used(graph, added_as_edges=biased)
+        constraints = self._constraints[source]
+        used = constraints.held().weights(graph, graph.weights) > 0.0
         return source_report.report(
-            graph, constraints.rows.values[used], biased=biased,
+            graph, constraints.rows.values[used], biased=constraints.as_edges,
             in_use=self.errors_in_use(source), found=self._settings(source).finds_correlation)

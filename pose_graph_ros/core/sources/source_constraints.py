@@ -156,6 +156,13 @@ class Held(NamedTuple):
     ids: IntArray
     is_edge: BoolArray
 
+    def weights(self, graph: Graph, by_row: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Return their weights, given those of the edges and observed nodes of a graph by row."""
+        weights = np.empty(len(self.ids))
+        weights[self.is_edge] = by_row[0][graph.edge_rows(self.ids[self.is_edge])]
+        weights[~self.is_edge] = by_row[1][graph.observed_rows(self.ids[~self.is_edge])]
+        return weights
+
 
 class SourceConstraints:
     """
@@ -165,7 +172,9 @@ class SourceConstraints:
     an edge to the bias holds it instead. So it can become white again, or get another bias.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, as_edges: bool = False) -> None:
+        # whether they are added as edges, to a bias with a given time constant
+        self.as_edges = as_edges
         # stamp [ns] of each measurement, and the id of what it was first added as
         self.rows = GrowingArray((2,), np.int64)
         # what the motion since the node adds to its variances; see `motion_noise`
@@ -188,8 +197,8 @@ class SourceConstraints:
         """Number of measurements, with those that have left the graph."""
         return len(self) + self.n_gone
 
-    def leaving(self, edges: IntArray, observed: IntArray, *, added_as_edges: bool) -> BoolArray:
-        return np.asarray(np.isin(self.rows.values[:, 1], edges if added_as_edges else observed))
+    def leaving(self, edges: IntArray, observed: IntArray) -> BoolArray:
+        return np.asarray(np.isin(self.rows.values[:, 1], edges if self.as_edges else observed))
 
     def forget(self, gone: BoolArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
@@ -208,22 +217,14 @@ class SourceConstraints:
         self.noise.append_one(noise)
         self.edges.append_one(edge)
 
-    def held(self, which: IntArray) -> Held:
+    def held(self, which: IntArray | slice = slice(None)) -> Held:
         edges = self.edges.values[which]
-        return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]), edges >= 0)
+        return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]),
+                    (edges >= 0) | self.as_edges)
 
-    def used(self, graph: Graph, *, added_as_edges: bool) -> BoolArray:
-        """Return which measurements have a weight above 0, shape (K,)."""
-        held = self.held(np.arange(len(self)))
-        is_edge = held.is_edge | added_as_edges
-        used = np.empty(len(self), dtype=bool)
-        used[is_edge] = graph.edges_at(held.ids[is_edge]).weight > 0.0
-        used[~is_edge] = graph.observed_at(held.ids[~is_edge]).weight > 0.0
-        return used
-
-    def stamp_ns(self, number: int, *, edge: bool, added_as_edges: bool) -> int | None:
+    def stamp_ns(self, number: int, *, edge: bool) -> int | None:
         """Return the stamp of the measurement that a constraint holds [ns], or None."""
-        if edge is added_as_edges:
+        if edge is self.as_edges:
             # ids are appended in increasing order
             at = int(np.searchsorted(self.rows.values[:, 1], number))
             found = at < len(self.rows) and self.rows.values[at, 1] == number
