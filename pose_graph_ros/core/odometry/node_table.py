@@ -95,7 +95,7 @@ class ThinnedNodes:
         mean, noise = self._stored(number)
         while (further := self._anchor(anchor)) >= 0:
             before, noise_before = self._stored(anchor)
-            noise = _passed_on(mean, noise_before, noise)
+            noise = passed_on(mean, noise_before, noise)
             mean, anchor = se2.compose(before, mean), further
         return Place(anchor, mean, noise)
 
@@ -120,7 +120,7 @@ class ThinnedNodes:
             further[inside] = anchors[by[inside]] >= 0
             passed, by = passed[further], by[further]
             mean = relative[passed].astype(np.float64)
-            noise[passed] = _upper(_passed_on(mean, _full(noise[by]), _full(noise[passed])))
+            noise[passed] = _upper(passed_on(mean, _full(noise[by]), _full(noise[passed])))
             relative[passed] = se2.compose(relative[by].astype(np.float64), mean)
             anchors[passed] = anchors[by]
         return ThinnedPlaces(
@@ -145,7 +145,7 @@ class ThinnedNodes:
         self.add(saved.numbers, saved.anchors, saved.relative, _full(saved.noise))
 
 
-def _passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
+def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
     """
     Return the covariances of motions to some places and on from there, in the frames at the end.
 
@@ -292,7 +292,7 @@ class NodeTable:
         if place is None:
             return Attachment(int(self.ids[number]), mean, noise)
         return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
-                          _passed_on(mean, place.noise, noise))
+                          passed_on(mean, place.noise, noise))
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""

@@ -184,3 +184,12 @@ def test_what_was_measured_on_nodes_that_have_left_is_no_evidence_any_more() -> 
     np.testing.assert_allclose(
         se2.between(found[30], found[:30]), se2.between(graph.poses[30], graph.poses[:30]),
         atol=1e-9)
+
+
+def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
+    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
+    some = aligned_with(fixes(range(5), wrong))
+    some.stop_rechecking()
+    some.add(fixes(range(5, 65)))
+    assert len(some.saved().node) == 0
+    assert some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES) is None

@@ -17,6 +17,7 @@ from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 SECOND = 10**9
 LAP = 60  # duration of a round [s]
@@ -209,3 +210,23 @@ def test_of_many_new_closures_an_update_tests_some_and_the_work_the_others(
     assert np.count_nonzero(tested) == (0 if large else in_update)
     settle(backend)
     assert states(backend) == n * [True]
+
+
+def test_one_that_was_never_used_is_doubted_since_it_came_not_since_the_end() -> None:
+    """As in a replay, where what waits in a large graph is judged at the end."""
+    state = closure_states.ClosureStates()
+    state.append([NewConstraint(True, 0, 'loop', 5 * SECOND, LoopClosure, SECOND)], 6 * SECOND)
+    for before, after, now, since in (
+            (State.WAITING, State.DOUBTED, 90, 6), (State.DOUBTED, State.BELIEVED, 91, 91),
+            (State.BELIEVED, State.WEAKLY_BELIEVED, 92, 91),
+            (State.WEAKLY_BELIEVED, State.WAITING, 93, 93)):
+        state.state[0] = closure_states.STATES.index(after)
+        state.announce(0, closure_states.STATES.index(before), now * SECOND)
+        assert state.since_ns[0] == since * SECOND
+
+
+def test_a_decision_on_a_loaded_graph_is_since_its_newest_node() -> None:
+    saved = driven(0.0, 8.0).saved()
+    backend = PoseGraphBackend.restored(None, saved)
+    backend.decide('loop/0', Decision.OUT)
+    assert backend.verdicts()[0].since_ns == saved.nodes.stamps_ns[-1]

@@ -147,3 +147,11 @@ def test_a_long_gap_at_the_end_of_a_loaded_graph_is_a_restart(saved_ns: int) -> 
     for until_ns, saved in ((limit_ns, saved_ns), (limit_ns + 1, END - 1)):
         mean, _ = gap_motion(timeline(3.0), END, until_ns, saved)
         np.testing.assert_allclose(mean, [3.0 * MEMORY_TIME, 0.0, 0.0], atol=1e-9)
+
+
+def test_a_single_sample_gives_no_speed() -> None:
+    one = OdometryTimeline()
+    one.append(next_row(None, END, (1.0, 2.0, 0.3)))
+    mean, noise = gap_motion(one, END, END + SECOND, -1)
+    np.testing.assert_array_equal(mean, 0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(noise)), SIGMA)

@@ -206,3 +206,11 @@ def test_thinning_does_not_take_what_is_left_out_for_rest() -> None:
     assert thinned.covers(stamps[92])
     assert thinned.covers(stamps[50])
     assert not thinned.covers(stamps[50], closely=True)
+
+
+def test_at_rest_nothing_is_known_of_the_usual_noise() -> None:
+    timeline, row = OdometryTimeline(), None
+    for stamp_ns in (1, 2, 3):
+        row = next_row(row, stamp_ns, (1.0, 2.0, 0.5))
+        timeline.append(row)
+    np.testing.assert_array_equal(timeline.usual_variances(), 0.0)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The statistics of errors: the likelihood by an oracle, what is found, and what is not."""
 
+from dataclasses import replace
 import itertools
 
 import numpy as np
@@ -18,6 +19,7 @@ from pose_graph_ros.core.graph.constraints import (
 )
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.error_estimate import measured_path, PathOdometry, search
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
@@ -27,6 +29,7 @@ from pose_graph_ros.core.sources.error_likelihood import (
     RATE_VARIANCE,
     SCALE_VARIANCE,
 )
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
 
@@ -261,3 +264,14 @@ def test_a_path_without_known_errors_is_as_likely_with_them_as_states() -> None:
             *path, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, True)
         values.append((value, rate, scale))
     np.testing.assert_allclose(values[1], values[0], rtol=1e-4, atol=1e-6)
+
+
+def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(error_estimate, 'SOURCES', replace(
+        SOURCES, newest_positions=10, older_positions=5))
+    found = to_the_end(measured_path(
+        line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)))
+    assert len(found.seconds) == 15
+    np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))
