@@ -80,7 +80,7 @@ class PoseGraphBackend:
         self.verdicts, self.verdict_totals = self._judge.verdicts, self._judge.totals
         self.verdict_changes = self._judge.changes
         self._factors = FactorBuilder(self._config, self._reweighting)
-        self.gyro_biases = self._factors.gyros.values
+        self.gyro_biases = self._factors.gyro_rates
         self.disagreement = lambda: disagreement.find(self._smoother, self._nodes, self._factors)
         self._tuner = ErrorTuner(
             self._smoother, self._nodes, self._factors, self._reweighting, self._judge)

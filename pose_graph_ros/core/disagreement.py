@@ -108,8 +108,8 @@ def edges_by_source(
         for kind in (EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY):
             if np.any(kinds == kind):
                 found.setdefault((source, kind.name.lower()), there[kinds == kind])
-    for source, each in factors.gyros.edges().items():
-        found[source, 'turn'] = each[graph.edge_rows(each) >= 0]
+    for source, bias in factors.gyros.items():
+        found[source, 'turn'] = bias.edges[graph.edge_rows(bias.edges) >= 0]
     return found
 
 

@@ -39,7 +39,7 @@ from pose_graph_ros.core.sources.gauss_markov import (
     CorrelatedErrors,
     GaussMarkovBias,
 )
-from pose_graph_ros.core.sources.source_constraints import Held, SourceConstraints
+from pose_graph_ros.core.sources.source_constraints import SourceConstraints
 
 # Number of measurements that a step moves, online and at the end of a stream.
 PART, WHOLE = 100, 5000
@@ -166,8 +166,8 @@ class ErrorTuner:
         self._past = {}
         for source in self._factors.finding():
             constraints = self._factors.constraints(source)
-            gone = np.flatnonzero(self._factors.leaving(source, edges, observed))
-            used = gone[self._weights(constraints.held(gone), graph.weights) > 0.0]
+            gone = np.flatnonzero(constraints.leaving(edges, observed))
+            used = gone[constraints.held(gone).weights(graph, graph.weights) > 0.0]
             stamps_ns, ids = constraints.rows.values[used].T
             self._past[source] = error_estimate.left_behind(
                 graph, self._odometry(AS_CLAIMED), stamps_ns, ids, past=constraints.past,
@@ -293,25 +293,16 @@ class ErrorTuner:
         correlated: bool = False, reference: OdometryErrors = AS_CLAIMED,
     ) -> error_estimate.Search:
         """Search with the measurements of a source whose edges or observed nodes have a weight."""
-        weights = self._weights(constraints.held(np.arange(len(constraints))), by_row)
-        used = constraints.rows.values[weights > 0.0]
+        graph = self._smoother.graph
+        used = constraints.rows.values[constraints.held().weights(graph, by_row) > 0.0]
         path = yield from error_estimate.measured_path(
-            self._smoother.graph, self._odometry(reference), used[:, 0], used[:, 1],
+            graph, self._odometry(reference), used[:, 0], used[:, 1],
             constraints.past)
         return (yield from error_estimate.search(path, correlated=correlated))
 
     def _odometry(self, reference: OdometryErrors) -> error_estimate.PathOdometry:
         return error_estimate.PathOdometry(
             self._nodes.ids, self._nodes.stamps_ns, self._nodes.errors, reference)
-
-    def _weights(
-        self, held: Held, by_row: tuple[FloatArray, FloatArray],
-    ) -> FloatArray:
-        """Return the weights of what holds some measurements, given those of a graph by row."""
-        graph, weights = self._smoother.graph, np.empty(len(held.ids))
-        weights[held.is_edge] = by_row[0][graph.edge_rows(held.ids[held.is_edge])]
-        weights[~held.is_edge] = by_row[1][graph.observed_rows(held.ids[~held.is_edge])]
-        return weights
 
     def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""
@@ -352,7 +343,7 @@ class ErrorTuner:
         """Have others hold some measurements; return whether the solver succeeded."""
         graph, model = self._smoother.graph, change.model
         held = constraints.held(some)
-        weights = self._weights(held, graph.weights)
+        weights = held.weights(graph, graph.weights)
         additions = Additions(graph.next_ids)
         added = constraints.rows.values[some]
         new = change.before[some] if change.undoing else np.full(len(some), -1)

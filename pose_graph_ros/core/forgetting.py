@@ -200,7 +200,7 @@ class Thinner:
         """Return the ids of nodes that do not leave, as something is to be added to them."""
         parts, found = self._parts, set(self._tuner.needed)
         for queue in (parts.pipeline.queue, parts.quarantine):
-            found.update(int(end[0]) for each in queue.edges for end in (each.edge.i, each.edge.j))
+            found.update(end for each in queue.edges for end in each.ends)
             found.update(each.attachment.node for each in queue.observed)
         return found
 

@@ -41,7 +41,7 @@ def estimate(
 ) -> Estimate:
     """Return the present estimate; there must be a hidden node."""
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
-    state, sigma = parts.alignment.copy()
+    state, sigma = parts.alignment.state, parts.alignment.sigma
     node = Corrected(graph.poses_of(nodes.ids[-1]), newest_covariance)
     if state is AlignmentState.ALIGNED:
         node = corrected(parts, smoother, node)
@@ -104,7 +104,7 @@ def _turned(
     """Return the motion since the newest node, and its noise, with what a gyroscope says."""
     gyros, nodes = parts.pipeline.gyros, parts.nodes
     rotation = None if len(gyros.streams) == 0 else gyros.newest(
-        int(nodes.stamps_ns[-1]), nodes.newest_ns, parts.factors.gyros.values(parts.graph))
+        int(nodes.stamps_ns[-1]), nodes.newest_ns, parts.factors.gyro_rates(parts.graph))
     if rotation is None or noise[2, 2] == 0.0:
         return motion, noise
     angle, variance = rotation

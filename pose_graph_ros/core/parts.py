@@ -97,7 +97,8 @@ def capture(
         newest_covariance=as_matrix(newest_covariance), chi2=chi2, n_left_out=len(left_out),
         datum=datum, gyros=parts.pipeline.gyros.saved(
             parts.pipeline.queue.turns + parts.quarantine.turns),
-        gyro_biases=parts.factors.gyros.saved())
+        gyro_biases={
+            name: bias.saved() for name, bias in parts.factors.gyros.items()})
 
 
 def restore(parts: Parts, saved: SavedGraph) -> None:
@@ -124,7 +125,7 @@ def _restore(parts: Parts, saved: SavedGraph) -> None:
     for name, gyro in saved.gyros.items():
         parts.pipeline.queue.turns += parts.pipeline.gyros.restore(name, gyro)
     for name, bias in saved.gyro_biases.items():
-        parts.factors.gyros.restore(name, bias)
+        parts.factors.gyro_bias(name).restore(bias)
     parts.reweighting.restore(saved.edge_losses, saved.observed_losses)
     parts.alignment.load(saved.alignment)
     parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))

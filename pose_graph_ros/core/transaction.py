@@ -11,7 +11,7 @@ takes about log2 n attempts, and all halves that pass are added on the way.
 from collections.abc import Callable
 from dataclasses import replace
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Self
 
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch.optimizer import Status
@@ -44,7 +44,7 @@ class Transaction:
     ) -> None:
         self._graph, self._nodes, self._alignment = graph, nodes, alignment
         self._factors, self._judge = factors, judge
-        self._before = alignment.copy()
+        self._before = alignment.state, alignment.sigma
         self._poses: tuple[FloatArray, FloatArray] | None = None
         self.queue = Queue()  # the new constraints
         self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)  # result of the solver
@@ -83,7 +83,7 @@ class Transaction:
             poses, frozen = self._poses
             self._graph.set_poses(poses)
             self._nodes.set_frozen(frozen)
-        self._alignment.restore(self._before)
+        self._alignment.state, self._alignment.sigma = self._before
         self.failure = str(error)
         if not isinstance(error, LinearSolveError):
             self.failure = f'{type(error).__name__}: {error}'
@@ -96,13 +96,6 @@ MOST_ATTEMPTS = 32
 
 # adds what is in the queue of the pipeline; returns the report, and the constraints left over
 Update = Callable[[], tuple[UpdateReport, Queue]]
-
-
-class Isolated(NamedTuple):
-    """Result of a search."""
-
-    bad: list[tuple[Queue, str]]  # single constraints that cannot be added, and why
-    untried: Queue  # constraints that were not added, as there were no attempts left
 
 
 def update_isolated(
@@ -165,9 +158,13 @@ def update_with_all(
     return report
 
 
-def isolate(failed: Queue, reason: str, attempt: Callable[[Queue], str]) -> Isolated:
+def isolate(
+    failed: Queue, reason: str, attempt: Callable[[Queue], str],
+) -> tuple[list[tuple[Queue, str]], Queue]:
     """
     Return the bad constraints of a queue that cannot be added whole, after adding the rest.
+
+    With each comes why. Second come those for which there were no attempts left.
 
     `attempt` adds all constraints of a queue, or none; it returns why it cannot, or ''.
     """
@@ -176,7 +173,7 @@ def isolate(failed: Queue, reason: str, attempt: Callable[[Queue], str]) -> Isol
     while True:
         while len(suspects) > 1:
             if attempts >= MOST_ATTEMPTS:
-                return Isolated(bad, suspects.joined(untried))
+                return bad, suspects.joined(untried)
             half, rest = suspects.halves()
             attempts, reason = attempts + 1, attempt(half)
             suspects, untried = (
@@ -186,8 +183,8 @@ def isolate(failed: Queue, reason: str, attempt: Callable[[Queue], str]) -> Isol
         if reason != '':
             bad.append((suspects, reason))
         if len(untried) == 0 or attempts >= MOST_ATTEMPTS:
-            return Isolated(bad, untried)
+            return bad, untried
         attempts, reason = attempts + 1, attempt(untried)
         if reason == '':
-            return Isolated(bad, Queue())
+            return bad, Queue()
         suspects, untried = untried, Queue()

@@ -203,7 +203,7 @@ def test_the_drive_is_one_that_asks_for_something() -> None:
         assert np.sqrt(np.mean(off**2)) < 0.25
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(st.integers(0, 2), st.booleans(), st.integers(0, 2**32 - 1),
        st.sampled_from((0.1, 2.0, LONGEST_DELAY)), st.sampled_from((1, 7, 50, 400)))
 def test_delayed_shuffled_and_doubled_messages_give_the_same_path(

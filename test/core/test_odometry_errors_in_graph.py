@@ -22,7 +22,7 @@ from pose_graph_ros.core.odometry.motion import OdometryErrors
 SECOND = 1_000_000_000
 RATE, LONGER = 0.006, 0.01
 """What odometry turns too little [rad/s], and by which part its way is too long."""
-OUTAGE, ASIDE, BACK, END = 200, 260, 290, 400
+OUTAGE, ASIDE, BACK, END = 150, 200, 220, 270
 """When fixes end, come again but 40 m aside, and are right again [s]."""
 
 
@@ -83,7 +83,7 @@ def test_constant_errors_are_taken_out_and_fixes_aside_after_an_outage_are_refus
     aside = (newest[:, 0] >= ASIDE * SECOND) & (newest[:, 0] < BACK * SECOND)
     at = np.round(newest[aside, 0] * 5 / SECOND).astype(int)
     error = np.hypot(*(newest[aside, 1:] - truth[at, :2]).T)
-    assert np.max(error) < 4.0      # m, after 60 to 90 s without a right fix
+    assert np.max(error) < 4.0      # m, after 50 to 70 s without a right fix
     backend.optimize()
     estimate = backend.estimate()
     assert estimate is not None
@@ -110,7 +110,7 @@ def test_neither_the_order_of_arrival_nor_a_file_in_between_changes_the_path() -
     late = [event.stamp_ns + (30 * SECOND * random.random() if isinstance(event, Position) else 0)
             for event in events]
     shuffled = [events[k] for k in np.argsort(late, kind='stable')]
-    half = next(k for k, event in enumerate(events) if event.stamp_ns > 120 * SECOND)
+    half = next(k for k, event in enumerate(events) if event.stamp_ns > 130 * SECOND)
     backends = [fed(events)[0], fed(shuffled)[0]]
     begun = fed(events[:half])[0]
     backends.append(fed(events[half - 10:], backend=PoseGraphBackend.restored(
@@ -119,7 +119,7 @@ def test_neither_the_order_of_arrival_nor_a_file_in_between_changes_the_path() -
     paths = []
     for backend in backends:
         backend.optimize()
-        assert backend.estimate().odometry_errors.rate == pytest.approx(RATE, abs=6e-4)
+        assert backend.estimate().odometry_errors.rate == pytest.approx(RATE, abs=1e-3)
         paths.append(backend.estimate().path.poses)
     np.testing.assert_allclose(paths[1], paths[0], atol=1e-5)
     np.testing.assert_allclose(paths[2], paths[0], atol=1e-5)
@@ -138,10 +138,10 @@ def test_errors_of_odometry_are_found_in_a_window() -> None:
 
 def test_where_a_person_has_put_the_robot_is_not_changed_by_errors_of_odometry() -> None:
     events, truth = drive(5)
-    half = next(k for k, event in enumerate(events) if event.stamp_ns > 150 * SECOND)
+    half = next(k for k, event in enumerate(events) if event.stamp_ns > 120 * SECOND)
     backend = fed(events[:half])[0]
     assert backend.estimate().odometry_errors.turn < 1.0
-    placed = GlobalPose(150 * SECOND, truth[750] + (5.0, 0.0, 0.0), np.diag((0.25, 0.25, 0.01)))
+    placed = GlobalPose(120 * SECOND, truth[600] + (5.0, 0.0, 0.0), np.diag((0.25, 0.25, 0.01)))
     assert backend.set_pose(placed, 'initialpose').status is AnswerStatus.ACCEPTED
     edge, before = backend.graph.edges.rows(slice(-1, None)), backend.estimate().odometry_errors
     again = PoseGraphBackend.restored(None, backend.saved())

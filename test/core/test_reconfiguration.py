@@ -243,18 +243,6 @@ def test_another_reorder_window_takes_what_comes_late_from_then_on() -> None:
     assert backend.add_odometry(sample(9)).reason == 'out_of_order'
 
 
-def test_another_patience_lets_another_odometry_lead_sooner() -> None:
-    def run(*patience: float) -> PoseGraphBackend:
-        backend = PoseGraphBackend(replace(CONFIG, odometry_patience=patience[0]))
-        feed(backend, DRIVE[:HALF])
-        backend.configure(replace(CONFIG, odometry_patience=patience[-1]))
-        return feed(backend, only(DRIVE[HALF:HALF + 100], 'visual'))
-
-    assert run(600.0).estimate().primary == 'odom'
-    assert run(600.0, 1.0).estimate().primary == 'visual'
-    assert run(1.0, 600.0).estimate().primary == 'odom'
-
-
 # --- Measurements --------------------------------------------------------------------------------
 
 @pytest.mark.parametrize('change', [

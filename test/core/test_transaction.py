@@ -105,19 +105,6 @@ def test_an_update_that_fails_at_any_step_changes_nothing(
         backend.estimate().path.poses, whole.estimate().path.poses, atol=1e-6)
 
 
-def test_a_graph_that_was_moved_is_moved_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = PoseGraphBackend(CONFIG)
-    drive(backend, 0, 8)
-    poses = backend.graph.poses.copy()
-    with monkeypatch.context() as patch:
-        patch.setattr(backend._factors, 'build', fails)
-        assert backend.update().status is Status.FAILED
-    np.testing.assert_array_equal(backend.graph.poses, poses)
-    assert not backend._alignment.is_aligned
-    assert backend.optimize().status is Status.CONVERGED
-    assert backend._alignment.is_aligned
-
-
 def test_what_was_committed_survives_a_later_solve_that_fails(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -211,21 +198,21 @@ def driven(n_bad: int, smoother: Picky, *, aligned: bool = True) -> PoseGraphBac
     """Return an engine with fixes, poses and closures for the next update, some of them bad."""
     backend = PoseGraphBackend(smoother=smoother)
     rng = np.random.default_rng(2)
-    for k in range(400):
+    for k in range(200):
         x = 0.1 * k
         backend.add_odometry(OdometrySample(SECOND + k * SECOND // 10, np.array([x, 0.0, 0.0])))
         if aligned and k == 20:
             backend.add_measurement(
                 GlobalPose(2 * SECOND, np.array([1.0, 0.0, 0.0]), 0.01 * np.eye(3)), 'start')
             backend.update()
-    wrong = set(rng.choice(np.arange(40, 360), n_bad, replace=False).tolist())
-    for k in range(40, 360):
+    wrong = set(rng.choice(np.arange(40, 160), n_bad, replace=False).tolist())
+    for k in range(40, 160):
         x = 0.1 * k + 0.1 * rng.standard_normal()
         backend.add_measurement(Position(
             SECOND + k * SECOND // 10 + 1, np.array([POISON if k in wrong else x, 0.0]),
             0.01 * np.eye(2), np.zeros(2)), 'fix')
     backend.add_measurement(LoopClosure(
-        31 * SECOND, np.array([10.0, 0.0, 0.0]), 0.01 * np.eye(3), reference_ns=21 * SECOND),
+        18 * SECOND, np.array([10.0, 0.0, 0.0]), 0.01 * np.eye(3), reference_ns=8 * SECOND),
         'scan')
     return backend
 
@@ -242,19 +229,19 @@ def test_one_bad_fix_of_many_is_set_aside_by_its_name(aligned: bool) -> None:
     assert name.startswith('fix at ')
     assert report.reason == f'{name}: broken on purpose'
     assert backend.counts['solver', 'failed'] == 1
-    # log2 of 321 constraints and a few; each success is followed by up to three reweightings
+    # log2 of 121 constraints and a few; each success is followed by up to three reweightings
     assert smoother.asked - before <= 4 * 14
     for _ in range(3):
         backend.update()
-    assert backend.graph.n_observed == 319 + aligned
+    assert backend.graph.n_observed == 119 + aligned
     assert backend.estimate().alignment is AlignmentState.ALIGNED
     assert backend.n_quarantined == 1
     # it is tried again with the next full optimisation, and once it is good it gets in
     assert backend.optimize().status is Status.FAILED
-    assert (backend.n_quarantined, backend.graph.n_observed) == (1, 319 + aligned)
+    assert (backend.n_quarantined, backend.graph.n_observed) == (1, 119 + aligned)
     smoother.picky = False
     assert backend.optimize().status is Status.CONVERGED
-    assert (backend.n_quarantined, backend.graph.n_observed) == (0, 320 + aligned)
+    assert (backend.n_quarantined, backend.graph.n_observed) == (0, 120 + aligned)
     whole = driven(1, Picky(), aligned=aligned)
     whole._smoother.picky = False
     whole.optimize()
@@ -273,14 +260,14 @@ def test_many_bad_ones_are_set_aside_over_the_next_updates() -> None:
         quarantined.append(backend.n_quarantined)
     assert quarantined == sorted(set(quarantined))  # each update finds at least one
     backend.update()
-    assert backend.graph.n_observed == 301
+    assert backend.graph.n_observed == 101
     assert all(name.startswith('fix at ') for name in backend.set_aside(3))
 
 
 def test_a_stream_ends_with_all_good_ones_in_the_graph() -> None:
     backend = driven(20, Picky())
     assert backend.optimize().status is Status.FAILED
-    assert (backend.n_quarantined, backend.graph.n_observed) == (20, 301)
+    assert (backend.n_quarantined, backend.graph.n_observed) == (20, 101)
 
 
 def test_a_solver_that_always_fails_is_not_asked_for_each_constraint(
@@ -294,6 +281,6 @@ def test_a_solver_that_always_fails_is_not_asked_for_each_constraint(
         before = smoother.asked
         assert backend.update().reason == 'out of order'
         assert smoother.asked == before + 2
-    assert backend.n_quarantined == 321
+    assert backend.n_quarantined == 121
     assert backend.optimize().status is Status.CONVERGED
-    assert backend.graph.n_observed == 321
+    assert backend.graph.n_observed == 121

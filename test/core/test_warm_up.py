@@ -33,62 +33,40 @@ def run_alone(code: str, **environment: str) -> str:
 
 LONG_RUN = """
 from helpers.all_kernels import call_all_kernels
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.warm_up import warm_up
 
 def signatures():
     return {name: list(map(str, kernel.signatures)) for name, kernel in jit._registered.items()}
 
+PoseGraphBackend()
+compiled = [name for name, kernel in jit._registered.items() if kernel.signatures]
+assert not compiled, compiled   # so that a node is up before anything is compiled
 assert warm_up() > 0.0
+missing = [name for name in jit.declared() if not jit.is_cached(name)]
+assert jit.is_cached(), missing     # the next start finds the code of all kernels
 before = signatures()
 call_all_kernels(700)
 call_all_kernels(300, max_iterations=1)
 grown = {name: found for name, found in signatures().items() if found != before[name]}
 assert not grown, grown
 """
-BUILD = """
-from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.compiled import jit
-
-PoseGraphBackend()
-compiled = [name for name, kernel in jit._registered.items() if kernel.signatures]
-assert not compiled, compiled
-"""
-KEPT = """
-from pose_graph_ros.core.compiled import jit
-from pose_graph_ros.core.warm_up import warm_up
-
-warm_up()
-missing = [name for name in jit.declared() if not jit.is_cached(name)]
-assert jit.is_cached(), missing
-"""
 
 
 @pytest.mark.timeout(300)
-def test_a_long_run_after_the_warm_up_compiles_nothing() -> None:
+def test_only_the_warm_up_compiles_and_a_long_run_after_it_nothing() -> None:
     run_alone(LONG_RUN)
 
 
-def test_a_backend_is_built_without_compiling() -> None:
-    """So that a node is up before anything is compiled."""
-    run_alone(BUILD)
-
-
-@pytest.mark.timeout(300)
-def test_the_next_start_finds_the_code_of_all_kernels() -> None:
-    run_alone(KEPT)
-
-
-def test_it_can_be_stopped_between_two_kernels() -> None:
-    run_alone("""
-from pose_graph_ros.core import warm_up
-loaded = []
-warm_up.jit.compile_kernels = loaded.extend
-warm_up.warm_up(lambda: len(loaded) == 3)
-assert len(loaded) == 3, loaded
-warm_up.warm_up()
-assert loaded[3:] == warm_up.jit.declared()
-""")
+def test_it_can_be_stopped_between_two_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[str] = []
+    monkeypatch.setattr(jit, 'can_be_kept', lambda: False)
+    monkeypatch.setattr(jit, 'compile_kernels', loaded.extend)
+    warm_up.warm_up(lambda: len(loaded) == 3)
+    assert len(loaded) == 3, loaded
+    warm_up.warm_up()
+    assert loaded[3:] == jit.declared()
 
 
 PACKAGE = 'helped_kernels_of_a_test'
@@ -209,12 +187,11 @@ def test_what_a_helper_has_compiled_is_loaded(
     assert capfd.readouterr() == ('', '')
 
 
-@pytest.mark.parametrize('helper', ['die', 'there is no such function'])
 def test_without_its_helpers_a_process_compiles_all(
-    warm: Callable[..., ModuleType], started: list[str], helper: str,
+    warm: Callable[..., ModuleType], started: list[str],
 ) -> None:
-    module = warm(helper, helper)
-    assert started == [helper, helper]
+    module = warm('die', 'there is no such function')
+    assert started == ['die', 'there is no such function']
     assert module.twice.stats.cache_misses.total() == 1
 
 

@@ -169,14 +169,6 @@ class AlignmentMonitor:
         """Whether the graph lies in the map."""
         return self.state is AlignmentState.ALIGNED
 
-    def copy(self) -> tuple[AlignmentState, float]:
-        """Return the state for `restore`."""
-        return self.state, self.sigma
-
-    def restore(self, state: tuple[AlignmentState, float]) -> None:
-        """Set the state to one returned by `copy`, if the graph could not be aligned."""
-        self.state, self.sigma = state
-
     def saved(self) -> SavedAlignment:
         """Return the state and the stored measurements."""
         table = _table(self._evidence)
@@ -209,14 +201,13 @@ def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
 
 def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> ObservedNodes:
     """Return the observed nodes of measurements, with the rows of their hidden nodes."""
-    table = _table(measurements)
-    return ObservedNodes(graph.node_rows(table.node), *table.columns[1:])
+    return _table(measurements).renumbered(graph.node_rows)
 
 
 def _numbered(nodes: HiddenNodes, table: ObservedNodes) -> ObservedNodes:
     """Return observed nodes by the rows of `HiddenNodes.recent_poses`, which has no biases."""
     ids = nodes.ids[nodes.n_frozen:]
-    return ObservedNodes(np.searchsorted(ids, table.node), *table.columns[1:])
+    return table.renumbered(lambda some: np.searchsorted(ids, some))
 
 
 def _noise(nodes: HiddenNodes) -> OdometryNoise:

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closure_states import (
     ClosureStates,
     DOUBTED,
+    NEVER,
     OUT,
     STATES,
     USED,
@@ -30,8 +30,6 @@ from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
-
-_NEVER = -1
 
 
 class Retests:
@@ -45,60 +43,41 @@ class Retests:
     a time in proportion to the drive.
     """
 
-    def __init__(self) -> None:
-        self._round, self._turns, self._failures, self._resting = self._columns = tuple(
-            GrowingArray((), np.int64) for _ in range(4))
-
-    def append(self, count: int) -> None:
-        for column, value in zip(self._columns, (_NEVER, 0, 0, 0), strict=True):
-            column.append(np.full(count, value))
-
-    def truncate(self, size: int) -> None:
-        for column in self._columns:
-            column.truncate(size)
-
-    def select(self, kept: IntArray) -> None:
-        for column in self._columns:
-            column.select(kept)
+    def __init__(self, states: ClosureStates) -> None:
+        self._states = states
 
     def due(self, now: int, next_node: int, *, failed: bool = True) -> BoolArray:
         """Return which closures may be tested, shape (M,)."""
-        return np.asarray((self._round.values < now) & (self._turns.values < BELIEF.most_turns)
-                          & ~self.resting(next_node) & (failed | (self._failures.values == 0)))
+        return np.asarray((self._states.round < now) & (self._states.turns < BELIEF.most_turns)
+                          & ~self.resting(next_node) & (failed | (self._states.failures == 0)))
 
     def resting(self, next_node: int) -> BoolArray:
         """Return which closures wait for a node with an id from this on, shape (M,)."""
-        return np.asarray(self._resting.values > next_node)
-
-    def failures(self, numbers: IntArray) -> IntArray:
-        """Return with how many updates some closures have failed."""
-        return np.asarray(self._failures.values[numbers])
+        return np.asarray(self._states.resting > next_node)
 
     def tested(self, numbers: IntArray | slice, now: int) -> None:
-        self._round.values[numbers] = now
+        self._states.round[numbers] = now
 
     def again(self, numbers: Iterable[int] | slice) -> None:
         """Have closures tested, whatever was found before."""
         chosen = numbers if isinstance(numbers, slice) else [*numbers]
-        self._round.values[chosen], self._resting.values[chosen] = _NEVER, 0
+        self._states.round[chosen], self._states.resting[chosen] = NEVER, 0
 
     def thrown_out(self, numbers: IntArray) -> None:
-        self._turns.values[numbers] += 1
+        self._states.turns[numbers] += 1
 
     def failed(self, numbers: Iterable[int], n_nodes: int, next_node: int) -> None:
         """Let closures rest, as the iterations diverge where their belief is changed."""
         chosen = [*numbers]
-        doublings = np.minimum(self._failures.values[chosen], BELIEF.rest_doublings)
-        self._failures.values[chosen] += 1
-        self._round.values[chosen] = _NEVER
-        self._resting.values[chosen] = next_node + np.maximum(
+        doublings = np.minimum(self._states.failures[chosen], BELIEF.rest_doublings)
+        self._states.failures[chosen] += 1
+        self._states.round[chosen] = NEVER
+        self._states.resting[chosen] = next_node + np.maximum(
             (BELIEF.rest_share * n_nodes * 2.0**doublings).astype(np.int64), BELIEF.least_rest)
 
     def begin_turns(self) -> None:
         """Let all closures in again that have taken turns, as another one has come."""
-        self._turns.values[:] = 0
-
-
+        self._states.turns[:] = 0
 
 
 class BeliefRule:
@@ -111,13 +90,13 @@ class BeliefRule:
     source speaks for it: it is believed weakly.
     """
 
-    def __init__(self, states: ClosureStates, table: ClosureTable, retests: Retests) -> None:
-        self._states, self._table, self._retests = states, table, retests
+    def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
+        self._states, self._table = states, table
 
     def choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
         """Return what to believe of closures that have passed; of wide gates only one."""
         chosen: dict[int, State] = {}
-        failures = self._retests.failures(passed)
+        failures = self._states.failures[passed]
         for k in np.lexsort((chance, failures)).tolist():
             if (chance[k] > BELIEF.narrow_chance or failures[k] > 0) and len(chosen) > 0:
                 break

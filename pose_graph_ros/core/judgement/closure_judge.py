@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -54,12 +53,10 @@ class ClosureJudge:
         self._table = ClosureTable(self._chain)
         self.states = self._states = ClosureStates()
         self.reports = ClosureReports(self._states, self._table)
-        self._retests = Retests()
-        self._rule = BeliefRule(self._states, self._table, self._retests)
+        self._retests = Retests(self._states)
+        self._rule = BeliefRule(self._states, self._table)
         self._final = (0, 0, 0, -1)  # next ids of the graph and round at the last final decision
         self._n_staged = 0
-        # whether a clique of closures outside of the graph supports one that is doubted
-        self._corroborated = GrowingArray((), np.bool_)
         self._search = SetSearch(self._states, self._table)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
@@ -73,7 +70,7 @@ class ClosureJudge:
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(edges))
         self._states.append(new, now_ns)
-        self._append_unknown(n)
+        self._scales.add_sources()
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
             chosen = self._rule.choose(*self._test(numbers[:BELIEF.tests_of_new]))
@@ -98,17 +95,10 @@ class ClosureJudge:
     def _is_large(self) -> bool:
         return self._smoother.graph.n_nodes > BELIEF.large
 
-    def _append_unknown(self, n: int) -> None:
-        self._retests.append(n)
-        self._corroborated.append(np.zeros(n, dtype=bool))
-        self._scales.add_sources()
-
     def rollback(self) -> None:
         self.reports.forget()
         self._table.drop(self._n_staged)
         self._states.drop(self._n_staged)
-        self._retests.truncate(len(self._states))
-        self._corroborated.truncate(len(self._states))
         self._n_staged = 0
 
     def commit(self) -> None:
@@ -118,7 +108,7 @@ class ClosureJudge:
         for number in range(begin, len(self._states)):
             self._states.announce(number, -1, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
-            self._table.forget(self._states.forget(source, self._corroborated.values).tolist())
+            self._table.forget(self._states.forget(source).tolist())
         if np.any(self._states.in_graph[begin:]):
             self._beliefs.round += 1
             self._beliefs.set_base_weights(np.arange(begin, len(self._states)))
@@ -137,8 +127,8 @@ class ClosureJudge:
                 numbers.tolist(), np.where(passes, WAITING, DOUBTED).tolist(), strict=True):
             before = int(self._states.state[number])
             self._states.state[number] = state
-            if state == DOUBTED and not self._corroborated.values[number]:
-                self._corroborated.values[number] = self._rule.is_corroborated(
+            if state == DOUBTED and not self._states.corroborated[number]:
+                self._states.corroborated[number] = self._rule.is_corroborated(
                     number, ~self._states.in_graph)
             if number < len(self._states) - self._n_staged:
                 self._states.announce(number, before, self._beliefs.now_ns)
@@ -272,7 +262,7 @@ class ClosureJudge:
             # all others get other numbers
             kept = np.setdiff1d(np.arange(len(states)), gone)
             self._beliefs.trial.renumber(np.searchsorted(kept, np.arange(len(states))))
-            for table in (states, self._table, self._retests, self._corroborated):
+            for table in (states, self._table):
                 table.select(kept)
             self.reports.forget()
         self._chain.forget(nodes)
@@ -314,8 +304,7 @@ class ClosureJudge:
 
     def _look_for_another_set(self) -> bool:
         """Do a part of the search of another set; tell whether there was anything to do."""
-        more = self._search.work(
-            self._smoother.graph, self._corroborated.values, self._beliefs.round)
+        more = self._search.work(self._smoother.graph, self._beliefs.round)
         if self._search.found is not None:
             self._beliefs.try_set(self._search.found)
         return more
@@ -331,7 +320,7 @@ class ClosureJudge:
         self._scales.set_state(saved.scales.tolist(), [0] * len(saved.scales))
         used = saved.left[:, 1].tolist() or [0] * len(saved.scales)
         self._beliefs.scales_left[:] = map(ScaleLeft, used, saved.scales.tolist())
-        self._append_unknown(len(saved.rows))
+        self._scales.add_sources()
 
     def totals(self) -> dict[str, SourceVerdicts]:
         return self.reports.totals(self._beliefs.scales)

@@ -16,6 +16,7 @@ from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import ODOMETRY
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
+    Column,
     Decision,
     Judged,
     Judgements,
@@ -28,6 +29,7 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers, Pairs, Triples
 from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
+NEVER = -1  # round of the last test of one that was not tested
 STATES, DECISIONS = tuple(State), tuple(Decision)
 WAITING, WEAK, BELIEVED, DOUBTED = (STATES.index(state) for state in (
     State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED, State.DOUBTED))
@@ -62,44 +64,25 @@ CLOSURE = np.dtype([
     ('decision', np.int64),  # index of what a person has decided
     ('distance', np.float64),  # squared Mahalanobis, when it was tested last; nan if it was not
     ('forgotten', np.bool_),  # hopeless, and not judged again
+    # whether a clique of closures outside of the graph supports it while it is doubted
+    ('corroborated', np.bool_),
+    # what its next test waits for, see `Retests`: round of the last one, times that it was thrown
+    # out in turn, updates that have diverged with it, and the node until which it rests
+    ('round', np.int64), ('turns', np.int64), ('failures', np.int64), ('resting', np.int64),
 ])
 
 
 class ClosureStates(Judgements):
+    edge, state, stamps_ns, since_ns = Column(), Column(), Column(), Column()
+    decision, distance, forgotten, corroborated = Column(), Column(), Column(), Column()
+    round, turns, failures, resting = Column(), Column(), Column(), Column()
+
     def __init__(self) -> None:
         super().__init__(CLOSURE, n_left=3)  # of these some were used, and some doubted
 
     @property
-    def edge(self) -> IntArray:
-        return np.asarray(self.records['edge'])
-
-    @property
-    def state(self) -> IntArray:
-        return np.asarray(self.records['state'])
-
-    @property
-    def stamps_ns(self) -> IntArray:
-        return np.asarray(self.records['stamps_ns'])
-
-    @property
-    def since_ns(self) -> IntArray:
-        return np.asarray(self.records['since_ns'])
-
-    @property
-    def decision(self) -> IntArray:
-        return np.asarray(self.records['decision'])
-
-    @property
-    def distance(self) -> FloatArray:
-        return np.asarray(self.records['distance'])
-
-    @property
     def in_graph(self) -> BoolArray:
         return np.asarray(USED[self.state])
-
-    @property
-    def forgotten(self) -> BoolArray:
-        return np.asarray(self.records['forgotten'])
 
     @property
     def judged(self) -> BoolArray:
@@ -130,13 +113,13 @@ class ClosureStates(Judgements):
             left[:] = left[0] + 1, left[1] + int(USED[state]), left[2] + int(state == DOUBTED)
         self._records.select(kept)
 
-    def forget(self, source: int, supported: BoolArray) -> IntArray:
+    def forget(self, source: int) -> IntArray:
         """Forget closures of a source if too many are not believed, hopeless ones first."""
         kept = np.flatnonzero((self.source == source) & ~self.in_graph & self.judged)
         if len(kept) <= BELIEF.most_waiting:
             return kept[:0]
         doubted = self.state[kept] == DOUBTED
-        hopeless = doubted & ~supported[kept] & (
+        hopeless = doubted & ~self.corroborated[kept] & (
             self.distance[kept] > BELIEF.hopeless_closure * GATE)
         order = np.lexsort((self.stamps_ns[kept, 0], ~doubted, ~hopeless))
         gone = np.sort(kept[order[:len(kept) - BELIEF.left_waiting]])
@@ -155,7 +138,7 @@ class ClosureStates(Judgements):
             source = self.index_of(one.source)
             self._records.append_one(np.array((
                 one.number, source, self.next_number(source), (one.stamp_ns, one.reference_ns),
-                WAITING, now_ns, AUTO, np.nan, False), dtype=CLOSURE))
+                WAITING, now_ns, AUTO, np.nan, False, False, NEVER, 0, 0, 0), dtype=CLOSURE))
 
     def drop(self, count: int) -> None:
         self._records.truncate(len(self) - count)
@@ -186,7 +169,7 @@ class ClosureStates(Judgements):
         self.fill(saved.sources, saved.left, saved.numbers, {
             'edge': saved.rows, 'source': saved.source, 'stamps_ns': saved.stamps_ns,
             'state': saved.state, 'since_ns': saved.since_ns, 'decision': saved.decision,
-            'distance': distance})
+            'distance': distance, 'round': NEVER})
 
 
 class ClosureReports:

@@ -240,7 +240,7 @@ class SetSearch:
         self._began = 0
         self.found: Found | None = None  # what the last part has ended with
 
-    def work(self, graph: Graph, corroborated: BoolArray, now: int) -> bool:
+    def work(self, graph: Graph, now: int) -> bool:
         """Go on with a trial, or begin one if enough speaks for it; tell if there was any."""
         self.found = None
         if self._parts is not None and self._began != now:
@@ -248,7 +248,7 @@ class SetSearch:
             return True
         if self._parts is None:
             against = np.flatnonzero(
-                corroborated & ~self._states.in_graph & self._states.judged)
+                self._states.corroborated & ~self._states.in_graph & self._states.judged)
             if len(against) < self._next:
                 return False
             self._next = max(len(against) + BELIEF.more_corroborated,

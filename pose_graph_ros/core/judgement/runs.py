@@ -24,6 +24,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.trajectory import fit_motion
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
@@ -240,22 +241,19 @@ def _thinned(states: list[tuple[int, Track]], now_ns: int) -> list[tuple[int, Tr
 
 
 def fitted(seen: Sequence[Observation], chain: OdometryChain) -> Track | None:
-    """Return the pose at the first position that puts odometry on all (Umeyama, 1991), or None."""
+    """Return the pose at the first position that puts odometry on all, or None."""
     begin = Track(seen[0].node, np.zeros(3), np.zeros((3, 3)))
     here = np.array([se2.transform(
         begin.moved(chain, each.node).pose[None], each.offset[None, :2])[0] for each in seen])
     there = np.array([each.mean[:2] for each in seen])
     variance = float(np.mean([np.trace(each.noise) for each in seen])) / 2.0
-    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-    spread = float(np.sum(a**2))
+    spread = float(np.sum((here - here.mean(axis=0))**2))
     if variance > BELIEF.fitted_heading**2 * spread:
         return None
-    theta = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    pose = np.array((0.0, 0.0, theta))
-    off = b - se2.transform(pose[None], a)
+    pose = fit_motion(here, there)
+    off = there - se2.transform(pose, here)
     if float(np.sum(off**2)) > BELIEF.fitted_d2 * len(seen) * variance:
         return None
-    pose[:2] = there.mean(axis=0) - se2.transform(pose[None], here.mean(axis=0)[None])[0]
     lever = float(np.sum(here.mean(axis=0)**2)) / spread
     position = variance * (1.0 / len(seen) + lever)
     return Track(seen[0].node, pose, np.diag((position, position, variance / spread)))

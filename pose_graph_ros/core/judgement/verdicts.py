@@ -98,12 +98,24 @@ class SourceVerdicts(NamedTuple):
 Records = npt.NDArray[Any]
 
 
+class Column:
+    """A column of the records of `Judgements`, writeable, by its name."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, owner: 'Judgements', kind: type) -> npt.NDArray[Any]:
+        return np.asarray(owner.records[self._name])
+
+
 class Judgements:
     """
     Judged constraints, one record each, and changes that are to be announced.
 
     They are named by their source and a number, which are columns of the records.
     """
+
+    source = Column()  # indices of their sources, shape (M,)
 
     def __init__(self, record: np.dtype[Any], n_left: int) -> None:
         self.sources: list[str] = []
@@ -120,11 +132,6 @@ class Judgements:
     def records(self) -> Records:
         """All records, writeable, shape (M,)."""
         return self._records.values
-
-    @property
-    def source(self) -> IntArray:
-        """Indices of their sources, shape (M,)."""
-        return np.asarray(self.records['source'])
 
     def next_number(self, source: int) -> int:
         """Return the number of the next one of a source, by its index."""

@@ -15,7 +15,7 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.jumps import gap_motion
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
-from pose_graph_ros.core.odometry.node_table import NodeTable, SavedNodes, SavedSpan
+from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, SavedSpan
 from pose_graph_ros.core.odometry.several_sources import (
     choose_first,
     find_silence,
@@ -274,9 +274,7 @@ class HiddenNodes(NodeTable):
         """Append a motion and its covariance to those from the newest node to `_base_ns`."""
         if self._span is None:
             return mean, noise
-        adjoint = se2.adjoint(se2.inverse(mean))
-        return (se2.compose(self._span[0], mean),
-                adjoint @ self._span[1] @ adjoint.T + noise)
+        return se2.compose(self._span[0], mean), passed_on(mean, self._span[1], noise)
 
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:

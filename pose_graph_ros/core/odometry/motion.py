@@ -116,18 +116,11 @@ class OdometryErrors(NamedTuple):
 
     def motions(self, means: FloatArray, seconds: FloatArray) -> FloatArray:
         """Return motions, as odometry says them, without their constant errors."""
-        # at a constant rate the chord turns by half of what the end turns by
-        c, s = np.cos(0.5 * self.rate * seconds), np.sin(0.5 * self.rate * seconds)
-        x, y, length = means[:, 0], means[:, 1], 1.0 + self.scale
-        return np.column_stack((length * (c * x - s * y), length * (s * x + c * y),
-                                means[:, 2] + self.rate * seconds))
+        return _bent(means, self.rate * seconds, 1.0 + self.scale)
 
     def as_odometry_says(self, means: FloatArray, seconds: FloatArray) -> FloatArray:
         """Undo `motions`."""
-        c, s = np.cos(0.5 * self.rate * seconds), np.sin(0.5 * self.rate * seconds)
-        x, y, length = means[:, 0], means[:, 1], 1.0 / (1.0 + self.scale)
-        return np.column_stack((length * (c * x + s * y), length * (c * y - s * x),
-                                means[:, 2] - self.rate * seconds))
+        return _bent(means, -self.rate * seconds, 1.0 / (1.0 + self.scale))
 
     def covariances(self, claimed: FloatArray) -> FloatArray:
         """Return covariances of motions, shape (M, 3, 3), from those that odometry claims."""
@@ -162,6 +155,15 @@ class OdometryErrors(NamedTuple):
 
 
 AS_CLAIMED = OdometryErrors()
+
+
+def _bent(means: FloatArray, turn: FloatArray, length: float) -> FloatArray:
+    """Return motions that turn by more at a constant rate, and are longer by a factor."""
+    # the chord turns by half of what the end turns by
+    c, s = np.cos(0.5 * turn), np.sin(0.5 * turn)
+    x, y = means[:, 0], means[:, 1]
+    return np.column_stack((
+        length * (c * x - s * y), length * (s * x + c * y), means[:, 2] + turn))
 
 
 def changed(

@@ -50,6 +50,9 @@ class ThinnedPlaces:
     noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
 
 
+THINNED = np.dtype([('anchor', np.int32), ('relative', np.float32, 3), ('noise', np.float32, 6)])
+
+
 class ThinnedNodes:
     """
     Nodes by number, each with its place relative to another one, its anchor.
@@ -63,9 +66,7 @@ class ThinnedNodes:
     def __init__(self) -> None:
         # by number, from the first node that is not frozen on; -1 for nodes that are in the graph
         self._first, self._size = 0, 0
-        self._anchors = GrowingArray((), np.int32)
-        self._relative = GrowingArray((3,), np.float32)
-        self._noise = GrowingArray((6,), np.float32)
+        self._rows = GrowingArray((), THINNED)
 
     def __len__(self) -> int:
         return self._size
@@ -77,13 +78,13 @@ class ThinnedNodes:
         if len(numbers) == 0:
             return
         rows = numbers - self._first
-        more = int(np.max(rows)) + 1 - len(self._anchors)
+        more = int(np.max(rows)) + 1 - len(self._rows)
         if more > 0:
-            self._anchors.append(np.full(more, -1))
-            self._relative.append(np.zeros((more, 3)))
-            self._noise.append(np.zeros((more, 6)))
-        self._anchors.values[rows] = anchors
-        self._relative.values[rows], self._noise.values[rows] = relative, _upper(noise)
+            self._rows.append(np.zeros(more, THINNED))
+            self._rows.values['anchor'][-more:] = -1
+        table = self._rows.values
+        table['anchor'][rows], table['relative'][rows] = anchors, relative
+        table['noise'][rows] = _upper(noise)
         self._size += len(rows)
 
     def place(self, number: int) -> Place | None:
@@ -94,23 +95,22 @@ class ThinnedNodes:
         mean, noise = self._stored(number)
         while (further := self._anchor(anchor)) >= 0:
             before, noise_before = self._stored(anchor)
-            noise = _passed_on(mean, noise_before, noise)
+            noise = passed_on(mean, noise_before, noise)
             mean, anchor = se2.compose(before, mean), further
         return Place(anchor, mean, noise)
 
     def _anchor(self, number: int) -> int:
         row = number - self._first
-        return int(self._anchors.values[row]) if 0 <= row < len(self._anchors) else -1
+        return int(self._rows.values['anchor'][row]) if 0 <= row < len(self._rows) else -1
 
     def _stored(self, number: int) -> tuple[PoseVector, Covariance]:
-        row = number - self._first
-        return (self._relative.values[row].astype(np.float64),
-                _full(self._noise.values[row:row + 1])[0])
+        row = self._rows.values[number - self._first]
+        return row['relative'].astype(np.float64), _full(row['noise'][None])[0]
 
     def places(self) -> ThinnedPlaces:
         """Return the places of all nodes, relative to nodes that are in the graph."""
         anchors, relative, noise = (
-            array.values for array in (self._anchors, self._relative, self._noise))
+            self._rows.values[name] for name in ('anchor', 'relative', 'noise'))
         rows = np.flatnonzero(anchors >= 0)
         passed = rows
         while len(passed) > 0:
@@ -120,7 +120,7 @@ class ThinnedNodes:
             further[inside] = anchors[by[inside]] >= 0
             passed, by = passed[further], by[further]
             mean = relative[passed].astype(np.float64)
-            noise[passed] = _upper(_passed_on(mean, _full(noise[by]), _full(noise[passed])))
+            noise[passed] = _upper(passed_on(mean, _full(noise[by]), _full(noise[passed])))
             relative[passed] = se2.compose(relative[by].astype(np.float64), mean)
             anchors[passed] = anchors[by]
         return ThinnedPlaces(
@@ -134,10 +134,9 @@ class ThinnedNodes:
         The anchors of the others must not be before it.
         """
         self.places()
-        n = min(number - self._first, len(self._anchors))
-        self._size -= int(np.count_nonzero(self._anchors.values[:n] >= 0))
-        for array in (self._anchors, self._relative, self._noise):
-            array.drop_first(n)
+        n = min(number - self._first, len(self._rows))
+        self._size -= int(np.count_nonzero(self._rows.values['anchor'][:n] >= 0))
+        self._rows.drop_first(n)
         self._first = number
 
     def restore(self, saved: ThinnedPlaces, first: int) -> None:
@@ -146,7 +145,7 @@ class ThinnedNodes:
         self.add(saved.numbers, saved.anchors, saved.relative, _full(saved.noise))
 
 
-def _passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
+def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
     """
     Return the covariances of motions to some places and on from there, in the frames at the end.
 
@@ -293,7 +292,7 @@ class NodeTable:
         if place is None:
             return Attachment(int(self.ids[number]), mean, noise)
         return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
-                          _passed_on(mean, place.noise, noise))
+                          passed_on(mean, place.noise, noise))
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""

@@ -134,6 +134,11 @@ class Turn(NamedTuple):
     rest_rate: float = 0.0  # mean rate at rest, which is the bias [rad/s]
     rest_variance: float = 0.0  # of that rate [rad^2/s^2]; 0 if the robot was not at rest
 
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Ids of the nodes that it is on."""
+        return self.i, self.j
+
 
 @dataclass(frozen=True, slots=True)
 class SavedGyro:

@@ -89,10 +89,9 @@ def _named(
 
 def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
     """Return the names of constraints that are not in the graph, as in `ConstraintEnergy`."""
-    ends = [(source, np.searchsorted(nodes.ids, (edge.i[0], edge.j[0])).tolist())
-            for source, edge, *_ in queue.edges]
-    ends += [(turn.source, np.searchsorted(nodes.ids, (turn.i, turn.j)).tolist())
-             for turn in queue.turns]
-    return [f'{source} x{i} - x{j}' for source, (i, j) in ends] + [
+    ends = [(each.source, each.ends) for each in queue.edges]
+    ends += [(each.source, each.ends) for each in queue.turns]
+    return ['{} x{} - x{}'.format(source, *np.searchsorted(nodes.ids, pair).tolist())
+            for source, pair in ends] + [
         f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
         f'x{int(np.searchsorted(nodes.ids, each.attachment.node))}' for each in queue.observed]

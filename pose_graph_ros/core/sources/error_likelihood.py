@@ -308,25 +308,20 @@ class PastPath:
 
     def continued(self, stamps_ns: IntArray, path: MeasuredPath) -> MeasuredPath:
         """Return the path with these positions before those that are in the graph."""
-        motion, noise, way, lever = _with_next(self, path)
         stamps_ns = np.maximum.accumulate(np.concatenate((self.stamps_ns, stamps_ns)))
         seconds = np.asarray((stamps_ns - stamps_ns[:1]) * 1e-9, dtype=np.float64)
+        taken_out = np.zeros((len(seconds), 2))
+        taken_out[len(self.stamps_ns):] = path.taken_out
+        position, variance, offset, motion, noise, way, lever = _with_next(self, path)
         return MeasuredPath(
-            seconds, np.concatenate((self.position, path.position)),
-            np.concatenate((self.variance, path.variance)),
-            np.concatenate((self.offset, path.offset)), motion, np.ascontiguousarray(noise), way,
-            lever, np.concatenate((
-                np.zeros((len(motion) - len(path.taken_out), 2)), path.taken_out)))
+            seconds, position, variance, offset, motion, noise, way, lever, taken_out)
 
     def extended(
         self, stamps_ns: IntArray, path: MeasuredPath, node: int,
     ) -> 'PastPath':
-        motion, noise, way, lever = _with_next(self, path)
-        grown = PastPath(
-            np.concatenate((self.stamps_ns, stamps_ns)),
-            np.concatenate((self.position, path.position)),
-            np.concatenate((self.variance, path.variance)),
-            np.concatenate((self.offset, path.offset)), motion, upper(noise), node, way, lever)
+        position, variance, offset, motion, noise, way, lever = _with_next(self, path)
+        grown = PastPath(np.concatenate((self.stamps_ns, stamps_ns)), position, variance, offset,
+                         motion, upper(noise), node, way, lever)
         return grown.thinned() if len(grown.stamps_ns) > 2 * SOURCES.kept_positions else grown
 
     def thinned(self) -> 'PastPath':
@@ -354,14 +349,18 @@ def no_past(node: int) -> PastPath:
 
 
 def _with_next(past: PastPath, path: MeasuredPath) -> _Motions:
-    """Return the motions of a path, the last of which is joined with the first of others."""
+    """
+    Return the positions of both, and the motions, those where one path ends joined.
+    """
     last = past.motion, full(past.noise), past.way, past.lever
-    if len(path.motion) == 0:
-        return tuple(column[:-1] for column in last)
     new = path.motion, path.noise, path.way, path.lever
-    joined = _joined(tuple(column[-1:] for column in last), tuple(column[:1] for column in new))
-    return tuple(np.concatenate((one[:-1], both, other[1:]))
-                 for one, both, other in zip(last, joined, new, strict=True))
+    joined = _joined(tuple(column[-1:][:len(path.motion)] for column in last),
+                     tuple(column[:1] for column in new))
+    return (np.concatenate((past.position, path.position)),
+            np.concatenate((past.variance, path.variance)),
+            np.concatenate((past.offset, path.offset)),
+            *(np.concatenate((one[:-1], both, other[1:]))
+              for one, both, other in zip(last, joined, new, strict=True)))
 
 
 def _joined(first: _Motions, second: _Motions) -> _Motions:

@@ -9,13 +9,18 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.sources import source_report
-from pose_graph_ros.core.sources.gauss_markov import Additions, CorrelatedErrors, GaussMarkovBias
-from pose_graph_ros.core.sources.gyro_bias import GyroBiases
+from pose_graph_ros.core.sources.gauss_markov import (
+    Additions,
+    BiasChain,
+    CorrelatedErrors,
+    GaussMarkovBias,
+)
+from pose_graph_ros.core.sources.gyro_bias import GyroBias
 from pose_graph_ros.core.sources.measurement_constraints import motion_noise
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_constraints import (
@@ -50,13 +55,14 @@ class FactorBuilder:
         self._pose_edges: dict[str, GrowingArray] = {}  # ids of the edges between poses, by source
         self.new: list[NewConstraint] = []  # constraints of the update that was built last
         self._n_new_bias_edges = 0
-        self.gyros = GyroBiases(config)  # biases of gyroscopes, and the edges of their rotations
+        # biases of gyroscopes, and the edges of their rotations
+        self.gyros: dict[str, GyroBias] = {}
         self._abandoned: list[int] = []  # ids of biases that hold no measurement any more
         self.n_bias_edges = 0  # number of edges of the graph that end at a bias
 
     @property
-    def _models(self) -> list[GaussMarkovBias | GyroBiases]:
-        return [*self._error_models.values(), self.gyros]
+    def _chains(self) -> list[tuple[str, BiasChain]]:
+        return [*self._error_models.items(), *self.gyros.items()]
 
     @property
     def n_measurements(self) -> int:
@@ -68,15 +74,16 @@ class FactorBuilder:
         Return the update that adds a queue to the graph, to be followed by `commit` or `rollback`.
         """
         additions = Additions(graph.next_ids)
-        for model in self._models:
-            model.begin()
+        for _, chain in self._chains:
+            chain.begin()
         self.new = [
             NewConstraint(True, additions.add_edge(edge), source, stamp_ns, LoopClosure, reference)
             for source, edge, stamp_ns, reference in queue.edges]
         self.new += [self._add(attached, additions) for attached in sorted(
             queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
-        self.gyros.add(queue.turns, graph, additions)
-        self._n_new_bias_edges = len(additions.edges) - len(queue.edges) - self.gyros.n_new
+        for turn in sorted(queue.turns, key=lambda turn: turn.stamp_ns):
+            self.gyro_bias(turn.source).add(turn, graph, additions)
+        self._n_new_bias_edges = len(additions.edges) - len(queue.edges) - len(queue.turns)
         return additions.update()
 
     def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
@@ -95,6 +102,15 @@ class FactorBuilder:
             return NewConstraint(True, edge, source, stamp_ns, kind)
         added = additions.add_observed(observed.weighted(0.0))
         return NewConstraint(False, added, source, stamp_ns, kind, noise=noise, held_by=edge)
+
+    def gyro_bias(self, source: str) -> GyroBias:
+        """Return the bias of a gyroscope, which may be new."""
+        return self.gyros.setdefault(source, GyroBias(self.config.gyro(source)))
+
+    def gyro_rates(self, graph: Graph) -> dict[str, float]:
+        """Return the newest estimate of the bias of each gyroscope [rad/s]."""
+        rows = {source: int(graph.node_rows(bias.newest)) for source, bias in self.gyros.items()}
+        return {source: float(graph.poses[row, 0]) for source, row in rows.items() if row >= 0}
 
     def error_model(self, source: str) -> GaussMarkovBias | None:
         """Return the model of the errors of a source in use; None for white errors."""
@@ -134,11 +150,8 @@ class FactorBuilder:
 
     def held(self) -> dict[str, tuple[IntArray, Held]]:
         """Return the stamps of all measurements in the map [ns], and what holds them."""
-        every = {source: each.held(np.arange(len(each)))
-                 for source, each in self._constraints.items()}
-        return {source: (self._constraints[source].rows.values[:, 0], held._replace(
-            is_edge=held.is_edge | self._has_given_bias(source)))
-            for source, held in every.items()}
+        return {source: (each.rows.values[:, 0], each.held())
+                for source, each in self._constraints.items()}
 
     def errors_in_use(self, source: str) -> CorrelatedErrors | None:
         """Return the statistics of the errors of a source in use; None for white errors."""
@@ -147,9 +160,10 @@ class FactorBuilder:
 
     def set_error_model(self, source: str, model: GaussMarkovBias | None) -> None:
         old = self._error_models.pop(source, None)
-        if isinstance(old, GaussMarkovBias):
+        if old is not None:
             self.abandon(old)
         if model is not None:
+            model.begin()   # what it has by now is in the graph
             self._error_models[source] = model
         self._constraints[source].n_reported = 0
 
@@ -161,39 +175,36 @@ class FactorBuilder:
         self, edges: IntArray, observed: IntArray, others: Mapping[str, GaussMarkovBias],
     ) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
-        biases = [*self._abandoned, *self.gyros.leaving(edges)]
+        biases = [*self._abandoned]
+        for gyro in self.gyros.values():
+            biases += gyro.leaving(edges)
         for source, constraints in self._constraints.items():
             models = [each[source] for each in (self._error_models, others) if source in each]
-            left = constraints.rows.values[~self.leaving(source, edges, observed), 0]
+            left = constraints.rows.values[~constraints.leaving(edges, observed), 0]
             oldest_ns = int(np.min(left)) if len(left) > 0 else None
             for model in models:
-                if isinstance(model, GaussMarkovBias):
-                    biases += model.leaving(oldest_ns)
+                biases += model.leaving(oldest_ns)
         return biases
-
-    def leaving(self, source: str, edges: IntArray, observed: IntArray) -> BoolArray:
-        return self._constraints[source].leaving(
-            edges, observed, added_as_edges=self._has_given_bias(source))
 
     def forget(
         self, nodes: IntArray, edges: IntArray, observed: IntArray,
     ) -> dict[str, IntArray]:
         """Return the numbers of the measurements that are left, after forgetting the others."""
         gone, kept = {*nodes.tolist()}, {}
-        self.gyros.forget(gone, edges)
+        for _, chain in self._chains:
+            chain.forget(gone)
+        for gyro in self.gyros.values():
+            gyro.forget_edges(edges)
         self._abandoned = [node for node in self._abandoned if node not in gone]
         for source, constraints in self._constraints.items():
-            model, left = self._error_models.get(source), self.leaving(source, edges, observed)
-            if model is not None:
-                model.forget(gone)
-            kept[source] = constraints.forget(left)
+            kept[source] = constraints.forget(constraints.leaving(edges, observed))
         for known in self._pose_edges.values():
             known.select(np.flatnonzero(~np.isin(known.values, edges)))
         return kept
 
     def rollback(self) -> None:
-        for model in self._models:
-            model.rollback()
+        for _, chain in self._chains:
+            chain.rollback()
 
     def commit(self) -> None:
         self.n_bias_edges += self._n_new_bias_edges
@@ -208,38 +219,40 @@ class FactorBuilder:
                 self._reweighting.add(held_by, loss, threshold, edge=True)
                 self._reweighting.set_base_weight(number, 0.0)
             if kind is not LoopClosure:
-                constraints = self._constraints.setdefault(source, SourceConstraints())
+                if source not in self._constraints:
+                    self._constraints[source] = SourceConstraints(
+                        as_edges=self._has_given_bias(source))
+                constraints = self._constraints[source]
                 constraints.append(stamp_ns, number, noise, held_by)
             else:
                 edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
                 edges.append_one(number)
-        self.gyros.commit()
         # from here on there is nothing that `rollback` could forget
-        for model in self._error_models.values():
-            model.begin()
+        for _, chain in self._chains:
+            chain.begin()
 
     def origin(self, number: int, *, edge: bool) -> ConstraintOrigin | None:
         """Return where a constraint comes from; None if this builder has not added it."""
         for source, constraints in self._constraints.items():
-            stamp_ns = constraints.stamp_ns(
-                number, edge=edge, added_as_edges=self._has_given_bias(source))
+            stamp_ns = constraints.stamp_ns(number, edge=edge)
             if stamp_ns is not None:
                 return ConstraintOrigin(source, stamp_ns)
         for source, edges in self._pose_edges.items() if edge else ():
             at = int(np.searchsorted(edges.values, number))
             if at < len(edges) and edges.values[at] == number:
                 return ConstraintOrigin(source, -1)
-        gyro = self.gyros.source_of(number) if edge else None
-        return None if gyro is None else ConstraintOrigin(gyro, -1)
+        for source, gyro in self.gyros.items() if edge else ():
+            if number in gyro.edges:
+                return ConstraintOrigin(source, -1)
+        return None
 
     def bias_origin(self, node: int) -> ConstraintOrigin | None:
         """Return the source of a bias, by its id, and when its bin begins."""
-        for source, model in self._error_models.items():
-            begin_ns = model.begin_ns(node)
+        for source, chain in self._chains:
+            begin_ns = chain.begin_ns(node)
             if begin_ns is not None:
                 return ConstraintOrigin(source, begin_ns)
-        found = self.gyros.begin_of(node)
-        return None if found is None else ConstraintOrigin(*found)
+        return None
 
     def saved(self) -> dict[str, SavedSource]:
         """Return the state of each source, with empty `seen_ns` and `seen_references`."""
@@ -285,7 +298,8 @@ class FactorBuilder:
         if not same and settings.finds_correlation:
             self._error_models.pop(source, None)
         same = same and settings.finds_correlation >= (saved.errors is not None)
-        self._constraints[source] = constraints = SourceConstraints()
+        self._constraints[source] = constraints = SourceConstraints(
+            as_edges=self._has_given_bias(source))
         if same:
             constraints.restore(saved)
         constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints)
@@ -309,8 +323,8 @@ class FactorBuilder:
                 if each.report is not None and each.report.energy > 0.0}
 
     def report(self, source: str, graph: Graph) -> SourceReport:
-        constraints, biased = self._constraints[source], self._has_given_bias(source)
-        used = constraints.used(graph, added_as_edges=biased)
+        constraints = self._constraints[source]
+        used = constraints.held().weights(graph, graph.weights) > 0.0
         return source_report.report(
-            graph, constraints.rows.values[used], biased=biased,
+            graph, constraints.rows.values[used], biased=constraints.as_edges,
             in_use=self.errors_in_use(source), found=self._settings(source).finds_correlation)

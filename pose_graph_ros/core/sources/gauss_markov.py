@@ -21,7 +21,7 @@ The process is the same backwards in time, so a late state before that one hangs
 """
 
 import bisect
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
@@ -93,35 +93,24 @@ class Additions:
         return self.first.observed + len(self.observed) - 1
 
 
-class GaussMarkovBias:
-    """The bias of one source: a chain of states in the graph."""
+class BiasChain:
+    """States of a bias in the graph, each for a bin of time."""
 
-    def __init__(self, errors: CorrelatedErrors) -> None:
-        self.errors = errors
-        self._width_ns = max(round(errors.tau * 1e9 / SOURCES.bins), 1)
-        self._numbers: list[int] = []  # of the bins, increasing
+    def __init__(self, width_ns: int) -> None:
+        self._width_ns = width_ns
+        self._begins_ns: list[int] = []  # stamps at which the bins begin, increasing [ns]
         self.nodes: list[int] = []  # ids of their states
         # ids of the edges to the states before; of the first state that of its prior
         self._ties: list[int] = []
         # these lists as they were before the update that has changed them
-        self._before: tuple[list[int], list[int], list[int]] | None = None
+        self._before: list[list[int]] | None = None
 
-    def leaving(self, oldest_ns: int | None) -> list[int]:
-        """Return the states before the oldest measurement that is left, but the newest."""
-        last = max(len(self._numbers) - 1, 0)
-        end = last if oldest_ns is None else min(
-            bisect.bisect_left(self._numbers, oldest_ns // self._width_ns), last)
-        return self.nodes[:end]
+    @property
+    def _columns(self) -> list[list[int]]:
+        return [self._begins_ns, self.nodes, self._ties]
 
-    def forget(self, nodes: Collection[int]) -> None:
-        """Forget states that have left the graph, the oldest ones, by their ids."""
-        kept = [k for k, node in enumerate(self.nodes) if node not in nodes]
-        if len(kept) == len(self.nodes):
-            return
-        self._numbers, self.nodes, self._ties = (
-            [each[k] for k in kept] for each in (self._numbers, self.nodes, self._ties))
-        if len(kept) > 0 and NO_TRANSITION not in self._ties:
-            self._ties[0] = NO_TRANSITION
+    def _fill(self, columns: Sequence[list[int]]) -> None:
+        self._begins_ns, self.nodes, self._ties = columns
 
     def begin(self) -> None:
         """Begin an update that `rollback` can revert."""
@@ -130,19 +119,52 @@ class GaussMarkovBias:
     def rollback(self) -> None:
         """Remove what was added since `begin`."""
         if self._before is not None:
-            self._numbers, self.nodes, self._ties = self._before
+            self._fill(self._before)
             self._before = None
 
+    def _keep(self) -> None:
+        if self._before is None:
+            self._before = [[*column] for column in self._columns]
+
+    def forget(self, nodes: Collection[int]) -> None:
+        """Forget states that have left the graph, the oldest ones, by their ids."""
+        kept = [k for k, node in enumerate(self.nodes) if node not in nodes]
+        if len(kept) == len(self.nodes):
+            return
+        self._fill([[column[k] for k in kept] for column in self._columns])
+        if len(kept) > 0 and NO_TRANSITION not in self._ties:
+            self._ties[0] = NO_TRANSITION
+
+    def begin_ns(self, node: int) -> int | None:
+        """Return when the bin of a state begins [ns], by its id; None for another source's."""
+        return self._begins_ns[self.nodes.index(node)] if node in self.nodes else None
+
+
+class GaussMarkovBias(BiasChain):
+    """The bias of one source: a chain of states in the graph."""
+
+    def __init__(self, errors: CorrelatedErrors) -> None:
+        super().__init__(max(round(errors.tau * 1e9 / SOURCES.bins), 1))
+        self.errors = errors
+
+    def leaving(self, oldest_ns: int | None) -> list[int]:
+        """Return the states before the oldest measurement that is left, but the newest."""
+        end = last = max(len(self.nodes) - 1, 0)
+        if oldest_ns is not None:
+            begin_ns = oldest_ns - oldest_ns % self._width_ns
+            end = min(bisect.bisect_left(self._begins_ns, begin_ns), last)
+        return self.nodes[:end]
+
     def saved(self) -> SavedBins:
-        return SavedBins(self._width_ns, *(np.array(each, dtype=np.int64) for each in (
-            self._numbers, self.nodes, self._ties)))
+        begins_ns, nodes, ties = (np.array(each, dtype=np.int64) for each in self._columns)
+        return SavedBins(self._width_ns, begins_ns // self._width_ns, nodes, ties)
 
     def restore(self, saved: SavedBins) -> bool:
         """Restore saved states; return False if their bins have another width."""
         if saved.width_ns != self._width_ns:
             return False
-        self._numbers, self.nodes, self._ties = (
-            each.tolist() for each in (saved.numbers, saved.rows, saved.ties))
+        self._fill([each.tolist() for each in (
+            saved.numbers * saved.width_ns, saved.rows, saved.ties)])
         return True
 
     def add(
@@ -155,63 +177,54 @@ class GaussMarkovBias:
         what the motion since the node adds to the variances of its position and heading
         [m^2, rad^2].
         """
-        number, rest_ns = divmod(stamp_ns, self._width_ns)
-        at = bisect.bisect_left(self._numbers, number)
-        if at == len(self._numbers) or self._numbers[at] != number:
-            self._make_bin(at, number, additions)
+        rest_ns = stamp_ns % self._width_ns
+        begin_ns = stamp_ns - rest_ns
+        at = bisect.bisect_left(self._begins_ns, begin_ns)
+        if at == len(self.nodes) or self._begins_ns[at] != begin_ns:
+            self._make_bin(at, begin_ns, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
         return additions.add_edge(biased_constraint(
             observed, noise, self.nodes[at], phi, self.errors))
 
     def preview(self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray) -> Edges | None:
         """Return the edge of a measurement to the last state before it; None without one."""
-        at = bisect.bisect(self._numbers, stamp_ns // self._width_ns) - 1
+        at = bisect.bisect(self._begins_ns, stamp_ns) - 1
         if at < 0:
             return None
-        gap_ns = abs(stamp_ns - (self._numbers[at] + 0.5) * self._width_ns)
+        gap_ns = abs(stamp_ns - self._begins_ns[at] - self._width_ns / 2)
         return biased_constraint(observed, noise, self.nodes[at], self._phi(gap_ns), self.errors)
-
-    def begin_ns(self, node: int) -> int | None:
-        """Return when the bin of a state begins [ns], by its id; None for another source's."""
-        return self._numbers[self.nodes.index(node)] * self._width_ns if (
-            node in self.nodes) else None
 
     def _phi(self, gap_ns: float) -> float:
         return math.exp(-gap_ns * 1e-9 / self.errors.tau)
 
-    def _make_bin(self, at: int, number: int, additions: Additions) -> None:
+    def _make_bin(self, at: int, begin_ns: int, additions: Additions) -> None:
         """
         Add the state of a bin between its neighbours in time.
 
         Transitions lead away from the state with the prior: back to it, or, from late states
         before one that the prior of the graph is on, forward.
         """
-        if self._before is None:
-            self._before = [*self._numbers], [*self.nodes], [*self._ties]
-        before, after = at - 1 if at > 0 else None, at if at < len(self._numbers) else None
+        self._keep()
+        before, after = at - 1 if at > 0 else None, at if at < len(self.nodes) else None
         if NO_TRANSITION in self._ties[at:]:
             before, after = after, before
         node = additions.add_bias()
-        tie = self._add_transition(node, number, before, additions)
+        if before is None:
+            tie = additions.add_observed(ObservedNodes(
+                [node], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
+        else:
+            tie = self._tied(
+                node, self.nodes[before], begin_ns - self._begins_ns[before], additions)
         if after is not None:
             removed = additions.remove_observed if before is None else additions.remove_edges
             removed.append(self._ties[after])
             self._ties[after] = self._tied(
-                self.nodes[after], node, self._numbers[after] - number, additions)
-        for column, value in ((self._numbers, number), (self.nodes, node), (self._ties, tie)):
+                self.nodes[after], node, self._begins_ns[after] - begin_ns, additions)
+        for column, value in zip(self._columns, (begin_ns, node, tie), strict=True):
             column.insert(at, value)
 
-    def _add_transition(
-        self, node: int, number: int, before: int | None, additions: Additions,
-    ) -> int:
-        """Return the id of the edge to the bin before, by its place, or of the first's prior."""
-        if before is None:
-            return additions.add_observed(ObservedNodes(
-                [node], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
-        return self._tied(node, self.nodes[before], number - self._numbers[before], additions)
-
-    def _tied(self, node: int, before: int, n_bins: int, additions: Additions) -> int:
-        phi = self._phi(abs(n_bins) * self._width_ns)
+    def _tied(self, node: int, before: int, gap_ns: int, additions: Additions) -> int:
+        phi = self._phi(abs(gap_ns))
         return additions.add_edge(Edges(
             [node], [before], np.zeros((1, 3)), _INFORMATION[None] / (1.0 - phi * phi),
             [EdgeKind.BIAS], bias=np.array([(0.0, 0.0, phi, phi)])))
@@ -228,41 +241,26 @@ def biased_constraint(
     mean of the variances of x and y. m is phi times the state plus a white rest of variance
     1 - phi^2.
     """
-    factors, information, mean = np.zeros(2), np.zeros((3, 3)), observed.mean[0].copy()
-    given, kind, offset = observed.information[0], observed.kind[0], observed.offset[0]
-    if kind == ObservedKind.HEADING:
-        own = _own(1.0 / float(given[2, 2]), noise[1])
-        factors[1], rest = _split(errors.correlated * own, phi)
-        information[2, 2] = 1.0 / (errors.white * own + rest + noise[1])
-    elif kind == ObservedKind.POSITION:
-        cov = np.linalg.inv(given[:2, :2])
-        total = 0.5 * float(np.trace(cov))
-        own = _own(total, noise[0])
-        factors[0], rest = _split(errors.correlated * own, phi)
-        information[:2, :2] = covariance.information(
-            errors.white * own / total * cov + (rest + noise[0]) * np.eye(2))
-    else:
-        cov = covariance.turned(np.linalg.inv(given), -float(mean[2]))
-        total, total_heading = 0.5 * float(np.trace(cov[:2, :2])), float(cov[2, 2])
-        own, own_heading = _own(total, noise[0]), _own(total_heading, noise[1])
-        factors[0], rest = _split(errors.correlated * own, phi)
-        factors[1], rest_heading = _split(errors.correlated * own_heading, phi)
-        scale = np.sqrt((own / total, own / total, own_heading / total_heading))
-        information = covariance.information(
-            errors.white * scale[:, None] * cov * scale
-            + np.diag((rest + noise[0], rest + noise[0], rest_heading + noise[1])))
+    mean, offset = observed.mean[0].copy(), observed.offset[0]
+    kind, given, information = observed.kind[0], observed.information[0], np.zeros((3, 3))
+    rows = np.flatnonzero(np.diagonal(given) > 0.0)  # what is measured: position, heading or both
+    block = np.ix_(rows, rows)
+    cov = np.linalg.inv(given[block])
+    if kind == ObservedKind.GLOBAL_POSE:
+        cov = covariance.turned(cov, -float(mean[2]))
+    is_heading = (rows == 2).astype(np.int64)
+    total = np.diagonal(cov).copy()
+    total[rows < 2] = 0.5 * np.sum(total[rows < 2])
+    # without that of the motion since the node
+    own = np.maximum(total - noise[is_heading], SOURCES.least_own * total)
+    correlated, scale = errors.correlated * own, np.sqrt(own / total)
+    # of the correlated part, the state does not explain all
+    rest = correlated * (1.0 - phi * phi) + noise[is_heading]
+    information[block] = covariance.information(
+        errors.white * scale[:, None] * cov * scale + np.diag(rest))
+    factors = np.zeros(2)
+    factors[is_heading] = phi * np.sqrt(correlated) * np.where(is_heading, STRETCH, 1.0)
     if kind != ObservedKind.POSITION:
         mean[2] = se2.wrap(mean[2] - offset[2])
     return Edges([observed.node[0]], [bias], [mean], [information], [EdgeKind.BIAS],
-                 weight=observed.weight,
-                 bias=[(offset[0], offset[1], phi * factors[0], STRETCH * phi * factors[1])])
-
-
-def _own(total: float, noise: float) -> float:
-    """Return the variance of a measurement without that of the motion since its node."""
-    return max(total - noise, SOURCES.least_own * total)
-
-
-def _split(variance: float, phi: float) -> tuple[float, float]:
-    """Return f, and the variance of the part of `f m(t)` that the state does not explain."""
-    return math.sqrt(variance), variance * (1.0 - phi * phi)
+                 weight=observed.weight, bias=[(offset[0], offset[1], *factors)])

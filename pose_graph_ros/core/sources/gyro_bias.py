@@ -14,20 +14,19 @@ the nodes, so the order of arrival does not matter.
 """
 
 import bisect
-from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.config import BackendConfig, GyroSource
+from pose_graph_ros.core.config import GyroSource
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.turns import Turn
 from pose_graph_ros.core.saved_columns import Integers, Pairs
-from pose_graph_ros.core.sources.gauss_markov import Additions
+from pose_graph_ros.core.sources.gauss_markov import Additions, BiasChain, NO_TRANSITION
 from pose_graph_ros.core.sources.settings import SOURCES
 
 
@@ -39,34 +38,26 @@ class SavedGyroBias:
     edges: Pairs  # ids of the edges of its rotations, and of their states, shape (E, 2)
 
 
-class GyroBias:
+class GyroBias(BiasChain):
     def __init__(self, source: GyroSource) -> None:
+        super().__init__(round(source.bias_period * 1e9))
         self._source = source
-        self._width_ns = round(source.bias_period * 1e9)
-        self._begins_ns: list[int] = []  # stamps at which the bins of the states begin [ns]
-        self._ids: list[int] = []
         # ids of the edges of its rotations, and of the states that these have for an end
         self._edges = GrowingArray((2,), np.int64)
-        self.new: list[tuple[int, int]] = []  # such edges, of the update that was begun
-        self._n_before = 0
+        self._n_settled = 0  # number of these before the update that was begun
 
     @property
     def newest(self) -> int:
         """Id of the newest state; -1 before the first."""
-        return self._ids[-1] if self._ids else -1
+        return self.nodes[-1] if self.nodes else -1
 
     def begin(self) -> None:
-        self._n_before = len(self._ids)
-        self.new.clear()
+        super().begin()
+        self._n_settled = len(self._edges)
 
     def rollback(self) -> None:
-        del self._begins_ns[self._n_before:], self._ids[self._n_before:]
-        self.new.clear()
-
-    def commit(self) -> None:
-        for edge in self.new:
-            self._edges.append_one(edge)
-        self.begin()
+        super().rollback()
+        self._edges.truncate(self._n_settled)
 
     @property
     def edges(self) -> IntArray:
@@ -79,10 +70,10 @@ class GyroBias:
         if not self._begins_ns or begin_ns > self._begins_ns[-1]:
             self._make_state(begin_ns, turn, graph, additions)
         # one that was set aside for long has the state of the bin before, if its own has none
-        state = self._ids[max(bisect.bisect_right(self._begins_ns, turn.stamp_ns) - 1, 0)]
+        state = self.nodes[max(bisect.bisect_right(self._begins_ns, turn.stamp_ns) - 1, 0)]
         if turn.rest_variance > 0.0:
             additions.add_observed(_observed(state, turn.rest_rate, turn.rest_variance))
-        self.new.append((additions.add_edge(turn_edge(turn, state)), state))
+        self._edges.append_one((additions.add_edge(turn_edge(turn, state)), state))
 
     def _make_state(
         self, begin_ns: int, turn: Turn, graph: Graph, additions: Additions,
@@ -96,8 +87,10 @@ class GyroBias:
             value = float(graph.poses[known, 0] if known >= 0
                           else additions.biases[before - additions.first.node][0])
         state = additions.add_bias(value, dimension=1)
-        self._begins_ns.append(begin_ns)
-        self._ids.append(state)
+        self._keep()
+        for column, number in zip(
+                self._columns, (begin_ns, state, NO_TRANSITION), strict=True):
+            column.append(number)
         if gap <= SOURCES.switched_off:
             additions.add_edge(Edges(
                 [state], [before], np.zeros((1, 3)),
@@ -110,32 +103,24 @@ class GyroBias:
         """Return the ids of the states that nothing needs once some edges have left the graph."""
         needed = self._edges.values[~np.isin(self.edges, edges), 1]
         oldest = int(np.min(needed, initial=self.newest))
-        return self._ids[:bisect.bisect_left(self._ids, oldest)]
+        return self.nodes[:bisect.bisect_left(self.nodes, oldest)]
 
-    def forget(self, nodes: set[int], edges: IntArray) -> None:
-        """Forget states and edges that have left the graph, by their ids."""
+    def forget_edges(self, edges: IntArray) -> None:
+        """Forget edges that have left the graph, by their ids."""
         self._edges.select(np.flatnonzero(~np.isin(self.edges, edges)))
-        kept = [k for k, state in enumerate(self._ids) if state not in nodes]
-        self._begins_ns = [self._begins_ns[k] for k in kept]
-        self._ids = [self._ids[k] for k in kept]
-
-    def begin_ns(self, state: int) -> int | None:
-        """Return when the bin of a state begins [ns], by its id; None for another source's."""
-        at = bisect.bisect_left(self._ids, state)
-        known = at < len(self._ids) and self._ids[at] == state
-        return self._begins_ns[at] if known else None
 
     def saved(self) -> SavedGyroBias:
         # a restored chain may have begun with bins of another width
         unit_ns = math.gcd(self._width_ns, *self._begins_ns)
         return SavedGyroBias(unit_ns, np.array(self._begins_ns, dtype=np.int64) // unit_ns,
-                             np.array(self._ids, dtype=np.int64), self._edges.values.copy())
+                             np.array(self.nodes, dtype=np.int64), self._edges.values.copy())
 
     def restore(self, saved: SavedGyroBias) -> None:
         """Restore saved states; if bins have another width by now, the chain goes on with it."""
-        self._begins_ns = (saved.numbers * saved.width_ns).tolist()
-        self._ids = saved.ids.tolist()
+        self._fill([(saved.numbers * saved.width_ns).tolist(), saved.ids.tolist(),
+                    len(saved.ids) * [NO_TRANSITION]])
         self._edges.append(saved.edges)
+        self.begin()
 
 
 def _information(variance: float) -> FloatArray:
@@ -157,69 +142,3 @@ def turn_edge(turn: Turn, state: int) -> Edges:
     return Edges(
         [turn.i], [turn.j], np.array([(0.0, 0.0, turn.angle)]), information, [EdgeKind.TURN],
         bias=np.array([(0.0, 0.0, 0.0, turn.seconds)]), k=[state])
-
-
-class GyroBiases:
-    def __init__(self, config: BackendConfig) -> None:
-        self._config = config
-        self._biases: dict[str, GyroBias] = {}
-
-    @property
-    def n_new(self) -> int:
-        """Number of rotations that were added since `begin`."""
-        return sum(len(bias.new) for bias in self._biases.values())
-
-    def begin(self) -> None:
-        for bias in self._biases.values():
-            bias.begin()
-
-    def rollback(self) -> None:
-        for bias in self._biases.values():
-            bias.rollback()
-
-    def commit(self) -> None:
-        for bias in self._biases.values():
-            bias.commit()
-
-    def add(self, turns: Sequence[Turn], graph: Graph, additions: Additions) -> None:
-        """Add the edges of rotations to an update, in the order of their stamps."""
-        for turn in sorted(turns, key=lambda turn: turn.stamp_ns):
-            self._bias(turn.source).add(turn, graph, additions)
-
-    def _bias(self, source: str) -> GyroBias:
-        return self._biases.setdefault(source, GyroBias(self._config.gyro(source)))
-
-    def leaving(self, edges: IntArray) -> list[int]:
-        return [state for bias in self._biases.values() for state in bias.leaving(edges)]
-
-    def forget(self, nodes: set[int], edges: IntArray) -> None:
-        for bias in self._biases.values():
-            bias.forget(nodes, edges)
-
-    def edges(self) -> dict[str, IntArray]:
-        return {source: bias.edges for source, bias in self._biases.items()}
-
-    def source_of(self, edge: int) -> str | None:
-        """Return the source of an edge, by its id; None if it is not of a gyroscope."""
-        return next((source for source, bias in self._biases.items() if edge in bias.edges), None)
-
-    def begin_of(self, state: int) -> tuple[str, int] | None:
-        """Return source and begin [ns] of the bin of a state, by its id; None for others."""
-        for source, bias in self._biases.items():
-            begin_ns = bias.begin_ns(state)
-            if begin_ns is not None:
-                return source, begin_ns
-        return None
-
-    def values(self, graph: Graph) -> dict[str, float]:
-        """Return the newest estimate of the bias of each source [rad/s]."""
-        states = {source: bias.newest for source, bias in self._biases.items()}
-        rows = graph.node_rows(np.array(list(states.values()), dtype=np.int64))
-        return {source: float(graph.poses[row, 0])
-                for source, row in zip(states, rows.tolist(), strict=True) if row >= 0}
-
-    def saved(self) -> dict[str, SavedGyroBias]:
-        return {source: bias.saved() for source, bias in self._biases.items()}
-
-    def restore(self, source: str, saved: SavedGyroBias) -> None:
-        self._bias(source).restore(saved)

@@ -52,7 +52,6 @@ class WaitingMeasurements:
     """Waiting measurements, ordered by the stamp at which they are due."""
 
     def __init__(self) -> None:
-        # in descending order of `due_ns`, then of `arrival`
         self._waiting: list[WaitingMeasurement] = []
         self._arrival = itertools.count()
 
@@ -62,8 +61,8 @@ class WaitingMeasurements:
     def push(self, source: str, measurement: PoseMeasurement) -> WaitingMeasurement | None:
         """Add a measurement; of too many the one due last is dropped, and returned."""
         waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
-        bisect.insort(self._waiting, waiting, key=_last_first)
-        return self._waiting.pop(0) if len(self) > SOURCES.most_waiting else None
+        bisect.insort(self._waiting, waiting)
+        return self._waiting.pop() if len(self) > SOURCES.most_waiting else None
 
     @property
     def measurements(self) -> list[tuple[str, PoseMeasurement]]:
@@ -71,20 +70,18 @@ class WaitingMeasurements:
 
     def until(self, stamp_ns: int) -> list[tuple[str, PoseMeasurement]]:
         """Return the measurements due up to a stamp [ns], with their sources, earliest first."""
-        return [(waiting.source, waiting.measurement) for waiting in itertools.takewhile(
-            lambda waiting: waiting.due_ns <= stamp_ns, reversed(self._waiting))]
+        return [(each.source, each.measurement)
+                for each in self._waiting[:self._n_due(stamp_ns)]]
 
     def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
         """Remove and return the measurements due up to a stamp [ns], the earliest first."""
-        at = bisect.bisect_left(self._waiting, (-covered_ns, -next(self._arrival)),
-                                key=_last_first)
-        due = self._waiting[at:]
-        del self._waiting[at:]
-        return due[::-1]
+        n = self._n_due(covered_ns)
+        due = self._waiting[:n]
+        del self._waiting[:n]
+        return due
 
-
-def _last_first(waiting: WaitingMeasurement) -> tuple[int, int]:
-    return -waiting.due_ns, -waiting.arrival
+    def _n_due(self, stamp_ns: int) -> int:
+        return bisect.bisect_right(self._waiting, stamp_ns, key=lambda each: each.due_ns)
 
 
 _NO_STAMPS: 'array[int]' = array('q')

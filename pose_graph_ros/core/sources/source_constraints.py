@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Constraints that are attached to hidden nodes: on their way into the graph, and in it."""
 
-from collections.abc import Collection
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,8 +42,10 @@ class QueuedEdge(NamedTuple):
     stamp_ns: int = -1  # of the loop closure [ns]; -1 for an edge of odometry
     reference_ns: int = -1  # stamp of its other end [ns]
 
-    def is_on(self, nodes: Collection[int]) -> bool:
-        return int(self.edge.i[0]) in nodes or int(self.edge.j[0]) in nodes
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Ids of the nodes that it is on."""
+        return int(self.edge.i[0]), int(self.edge.j[0])
 
 
 class AttachedMeasurement(NamedTuple):
@@ -50,6 +53,11 @@ class AttachedMeasurement(NamedTuple):
     observed: ObservedNodes  # its constraint if its error is treated as white
     measurement: Absolute
     attachment: Attachment
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Id of the node that it is on."""
+        return (self.attachment.node,)
 
 
 @dataclass(slots=True)
@@ -64,13 +72,11 @@ class Queue:
         return len(self.edges) + len(self.observed) + len(self.turns)
 
     def extend(self, other: 'Queue') -> None:
-        self.edges += other.edges
-        self.observed += other.observed
-        self.turns += other.turns
+        self.replace_by(self.joined(other))
 
     def joined(self, other: 'Queue') -> 'Queue':
-        return Queue([*self.edges, *other.edges], [*self.observed, *other.observed],
-                     [*self.turns, *other.turns])
+        return Queue(self.edges + other.edges, self.observed + other.observed,
+                     self.turns + other.turns)
 
     def newest(self, n: int) -> 'Queue':
         return Queue(self.edges[-n:], self.observed[-n:], self.turns[-n:])
@@ -78,17 +84,14 @@ class Queue:
     def replace_by(self, other: 'Queue') -> None:
         self.edges, self.observed, self.turns = other.edges, other.observed, other.turns
 
-    def drop(self, nodes: Collection[int]) -> list[str]:
+    def drop(self, nodes: set[int]) -> list[str]:
         """Return the sources of the constraints on nodes that have left, after removing them."""
-        gone = [each.source for each in self.edges if each.is_on(nodes)]
-        gone += [each.source for each in self.observed if each.attachment.node in nodes]
-        gone += [turn.source for turn in self.turns if turn.i in nodes or turn.j in nodes]
-        if len(gone) > 0:
-            self.turns = [
-                turn for turn in self.turns if turn.i not in nodes and turn.j not in nodes]
-            self.edges = [each for each in self.edges if not each.is_on(nodes)]
-            self.observed = [
-                each for each in self.observed if each.attachment.node not in nodes]
+        every: Iterator[QueuedEdge | AttachedMeasurement | Turn] = chain(
+            self.edges, self.observed, self.turns)
+        gone = [each.source for each in every if not nodes.isdisjoint(each.ends)]
+        self.edges = [each for each in self.edges if nodes.isdisjoint(each.ends)]
+        self.observed = [each for each in self.observed if nodes.isdisjoint(each.ends)]
+        self.turns = [each for each in self.turns if nodes.isdisjoint(each.ends)]
         return gone
 
     def halves(self) -> 'tuple[Queue, Queue]':
@@ -153,6 +156,13 @@ class Held(NamedTuple):
     ids: IntArray
     is_edge: BoolArray
 
+    def weights(self, graph: Graph, by_row: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """Return their weights, given those of the edges and observed nodes of a graph by row."""
+        weights = np.empty(len(self.ids))
+        weights[self.is_edge] = by_row[0][graph.edge_rows(self.ids[self.is_edge])]
+        weights[~self.is_edge] = by_row[1][graph.observed_rows(self.ids[~self.is_edge])]
+        return weights
+
 
 class SourceConstraints:
     """
@@ -162,7 +172,9 @@ class SourceConstraints:
     an edge to the bias holds it instead. So it can become white again, or get another bias.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, as_edges: bool = False) -> None:
+        # whether they are added as edges, to a bias with a given time constant
+        self.as_edges = as_edges
         # stamp [ns] of each measurement, and the id of what it was first added as
         self.rows = GrowingArray((2,), np.int64)
         # what the motion since the node adds to its variances; see `motion_noise`
@@ -185,8 +197,8 @@ class SourceConstraints:
         """Number of measurements, with those that have left the graph."""
         return len(self) + self.n_gone
 
-    def leaving(self, edges: IntArray, observed: IntArray, *, added_as_edges: bool) -> BoolArray:
-        return np.asarray(np.isin(self.rows.values[:, 1], edges if added_as_edges else observed))
+    def leaving(self, edges: IntArray, observed: IntArray) -> BoolArray:
+        return np.asarray(np.isin(self.rows.values[:, 1], edges if self.as_edges else observed))
 
     def forget(self, gone: BoolArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
@@ -205,22 +217,14 @@ class SourceConstraints:
         self.noise.append_one(noise)
         self.edges.append_one(edge)
 
-    def held(self, which: IntArray) -> Held:
+    def held(self, which: IntArray | slice = slice(None)) -> Held:
         edges = self.edges.values[which]
-        return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]), edges >= 0)
+        return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]),
+                    (edges >= 0) | self.as_edges)
 
-    def used(self, graph: Graph, *, added_as_edges: bool) -> BoolArray:
-        """Return which measurements have a weight above 0, shape (K,)."""
-        held = self.held(np.arange(len(self)))
-        is_edge = held.is_edge | added_as_edges
-        used = np.empty(len(self), dtype=bool)
-        used[is_edge] = graph.edges_at(held.ids[is_edge]).weight > 0.0
-        used[~is_edge] = graph.observed_at(held.ids[~is_edge]).weight > 0.0
-        return used
-
-    def stamp_ns(self, number: int, *, edge: bool, added_as_edges: bool) -> int | None:
+    def stamp_ns(self, number: int, *, edge: bool) -> int | None:
         """Return the stamp of the measurement that a constraint holds [ns], or None."""
-        if edge is added_as_edges:
+        if edge is self.as_edges:
             # ids are appended in increasing order
             at = int(np.searchsorted(self.rows.values[:, 1], number))
             found = at < len(self.rows) and self.rows.values[at, 1] == number

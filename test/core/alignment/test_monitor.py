@@ -9,7 +9,7 @@ import pytest
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor, AlignmentState
-from pose_graph_ros.core.config import BackendConfig, NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.config import BackendConfig, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -101,23 +101,6 @@ def test_positions_lead_from_local_over_unaligned_to_aligned() -> None:
     assert some.find(GRAPH, fixes(range(12)), NODES) is None
 
 
-def drifting(sigma: float, noise_from: NoiseFrom, scale: float) -> AlignmentMonitor:
-    """Return the alignment after 12 fixes and odometry with a heading that is uncertain."""
-    noise = OdometryNoise(sigma_heading_distance=sigma, sigma_heading_turn=0.0)
-    nodes = driven(70, OdometrySource(noise, noise_from, covariance_scale=scale), twist=(
-        noise.sigma_distance**2 / scale, noise.sigma_lateral**2 / scale, 4.0 * sigma**2))
-    some = AlignmentMonitor(CONFIG)
-    assert some.find(graph_at(nodes.odometry), fixes(range(12)), nodes) is not None
-    return some
-
-
-def test_the_angle_is_as_uncertain_as_the_odometry_in_the_graph() -> None:
-    twice = drifting(0.02, NoiseFrom.MODEL, 1.0)
-    assert twice.sigma > 1.1 * drifting(0.01, NoiseFrom.MODEL, 1.0).sigma
-    for other in (drifting(0.01, NoiseFrom.TWIST, 1.0), drifting(0.005, NoiseFrom.TWIST, 4.0)):
-        assert other.sigma == pytest.approx(twice.sigma, rel=0.05)
-
-
 def test_biases_in_the_graph_are_no_way_of_the_robot() -> None:
     nodes = driven(12, begin=(900.0, 400.0, 0.0))
     graph = Graph()
@@ -162,15 +145,6 @@ def test_a_wrong_first_angle_is_corrected_and_its_sigma_too() -> None:
     assert some.is_aligned
 
 
-def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
-    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
-    some = aligned_with(fixes(range(5), wrong))
-    some.stop_rechecking()
-    some.add(fixes(range(5, 65)))
-    assert len(some.saved().node) == 0
-    assert some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES) is None
-
-
 @pytest.mark.parametrize('n', [0, 1, 20])
 def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
     wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
@@ -181,7 +155,7 @@ def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
         one.add(first)
     other = AlignmentMonitor(CONFIG)
     other.load(one.saved())
-    assert other.copy() == one.copy()
+    assert (other.state, other.sigma) == (one.state, one.sigma)
     assert_same_value(other.saved(), one.saved())
     assert one.saved().sources == (('gps', 'beacon')[:min(n, 2)] if n != 1 else ('gps',))
     for each in (one, other):
@@ -210,3 +184,12 @@ def test_what_was_measured_on_nodes_that_have_left_is_no_evidence_any_more() -> 
     np.testing.assert_allclose(
         se2.between(found[30], found[:30]), se2.between(graph.poses[30], graph.poses[:30]),
         atol=1e-9)
+
+
+def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
+    wrong = se2.compose(T_MAP_ODOM, np.array([0.0, 0.0, 1.5]))
+    some = aligned_with(fixes(range(5), wrong))
+    some.stop_rechecking()
+    some.add(fixes(range(5, 65)))
+    assert len(some.saved().node) == 0
+    assert some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES) is None

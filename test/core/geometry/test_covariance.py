@@ -155,33 +155,6 @@ def test_the_parts_of_a_straight_increment_compose_to_the_whole(
     np.testing.assert_allclose(total, whole, rtol=1e-9, atol=1e-15)
 
 
-@given(st.floats(0.0, 3.0), st.floats(0.0, 3.0))
-def test_the_parts_of_a_turn_in_place_compose_to_the_whole(first: float, second: float) -> None:
-    parts = [odometry(np.array([0.0, 0.0, turn]), 0.0, turn, floor=False)
-             for turn in (first, second)]
-    whole = odometry(np.array([0.0, 0.0, first + second]), 0.0, first + second, floor=False)
-    np.testing.assert_allclose(
-        composed(*parts, np.array([0.0, 0.0, second])), whole, atol=ROUNDING)
-
-
-VARIANCE = np.array([0.04, 0.01, 0.0025])
-
-
-def test_the_variance_that_a_motion_brings_is_added_and_its_heading_sweeps_the_end() -> None:
-    increment = np.array([3.0, 1.0, 0.7])
-    silent = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_distance=0.0,
-                           sigma_heading_turn=0.0)
-    cov = odometry_covariance(
-        silent, Motion(increment, 4.0, 0.7, VARIANCE), floor=False)
-    # the same heading noise by the model
-    by_path = OdometryNoise(sigma_distance=0.0, sigma_lateral=0.0, sigma_heading_turn=0.0,
-                            sigma_heading_distance=float(np.sqrt(VARIANCE[2] / 4.0)))
-    expected = odometry(increment, 4.0, 0.7, by_path, floor=False)
-    expected[0, 0] += VARIANCE[0]
-    expected[1, 1] += VARIANCE[1]
-    np.testing.assert_allclose(cov, expected, atol=ROUNDING)
-
-
 # --- propagation -----------------------------------------------------------------------------
 
 @given(seeds)

@@ -15,7 +15,7 @@ from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.judgement import closure_judge, closure_states
 from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import Change, Decision, State
+from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
 from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
@@ -56,19 +56,6 @@ def settle(backend: PoseGraphBackend) -> None:
     backend.update()
     while not backend.refine().finished:
         pass
-
-
-def test_one_that_was_never_used_is_doubted_since_it_came_not_since_the_end() -> None:
-    """As in a replay, where what waits in a large graph is judged at the end."""
-    state = closure_states.ClosureStates()
-    state.append([NewConstraint(True, 0, 'loop', 5 * SECOND, LoopClosure, SECOND)], 6 * SECOND)
-    for before, after, now, since in (
-            (State.WAITING, State.DOUBTED, 90, 6), (State.DOUBTED, State.BELIEVED, 91, 91),
-            (State.BELIEVED, State.WEAKLY_BELIEVED, 92, 91),
-            (State.WEAKLY_BELIEVED, State.WAITING, 93, 93)):
-        state.state[0] = closure_states.STATES.index(after)
-        state.announce(0, closure_states.STATES.index(before), now * SECOND)
-        assert state.since_ns[0] == since * SECOND
 
 
 def test_verdicts_tell_origin_reason_and_error() -> None:
@@ -143,13 +130,6 @@ def test_a_person_overrules_and_takes_it_back() -> None:
     assert backend.verdict_changes() == []
 
 
-def test_a_decision_on_a_loaded_graph_is_since_its_newest_node() -> None:
-    saved = driven(0.0, 8.0).saved()
-    backend = PoseGraphBackend.restored(None, saved)
-    backend.decide('loop/0', Decision.OUT)
-    assert backend.verdicts()[0].since_ns == saved.nodes.stamps_ns[-1]
-
-
 def test_a_false_one_that_was_forced_in_where_nothing_contradicts_it_goes_again() -> None:
     backend = driven(30.0)
     assert states(backend) == [False]
@@ -166,17 +146,6 @@ def test_an_unknown_id_is_refused(name: str) -> None:
     answer = driven(0.0).decide(name, Decision.OUT)
     assert (answer.status, answer.reason) == (AnswerStatus.REJECTED, 'unknown_id')
     assert repr(name) in answer.detail
-
-
-def test_changes_name_the_state_before() -> None:
-    backend = driven(0.0, 0.0, 0.0)
-    backend.verdict_changes()
-    backend.decide('loop/2', Decision.OUT)
-    (change,) = [each for each in backend.verdict_changes() if each.id == 'loop/2']
-    assert isinstance(change, Change)
-    assert change.before is not None
-    assert (change.before.in_graph, change.after) == (True, State.DOUBTED)
-    assert backend.verdicts()[2].contradicted_by == ()
 
 
 @pytest.mark.parametrize('robust', [Robust.LOSS, Robust.NONE])
@@ -241,3 +210,23 @@ def test_of_many_new_closures_an_update_tests_some_and_the_work_the_others(
     assert np.count_nonzero(tested) == (0 if large else in_update)
     settle(backend)
     assert states(backend) == n * [True]
+
+
+def test_one_that_was_never_used_is_doubted_since_it_came_not_since_the_end() -> None:
+    """As in a replay, where what waits in a large graph is judged at the end."""
+    state = closure_states.ClosureStates()
+    state.append([NewConstraint(True, 0, 'loop', 5 * SECOND, LoopClosure, SECOND)], 6 * SECOND)
+    for before, after, now, since in (
+            (State.WAITING, State.DOUBTED, 90, 6), (State.DOUBTED, State.BELIEVED, 91, 91),
+            (State.BELIEVED, State.WEAKLY_BELIEVED, 92, 91),
+            (State.WEAKLY_BELIEVED, State.WAITING, 93, 93)):
+        state.state[0] = closure_states.STATES.index(after)
+        state.announce(0, closure_states.STATES.index(before), now * SECOND)
+        assert state.since_ns[0] == since * SECOND
+
+
+def test_a_decision_on_a_loaded_graph_is_since_its_newest_node() -> None:
+    saved = driven(0.0, 8.0).saved()
+    backend = PoseGraphBackend.restored(None, saved)
+    backend.decide('loop/0', Decision.OUT)
+    assert backend.verdicts()[0].since_ns == saved.nodes.stamps_ns[-1]

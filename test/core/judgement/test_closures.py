@@ -10,20 +10,22 @@ import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
+from pose_graph_ros.core.config import (
+    BackendConfig,
+    MeasurementSource,
+    NodePolicy,
+    Robust,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.judgement import closures as cl
 from pose_graph_ros.core.judgement.closure_trial import SetSearch
-from pose_graph_ros.core.judgement.closures import claims, forward, GATE
+from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
-from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
+from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import (
-    AnswerStatus,
     GlobalPose,
     LoopClosure,
     OdometrySample,
@@ -48,7 +50,6 @@ def drive(seed: int) -> tuple[FloatArray, FloatArray]:
 
 
 TRUTH, ODOMETRY = drive(0)
-Closures = dict[int, list[LoopClosure]]
 
 
 def closure(i: int, j: int, z: FloatArray) -> LoopClosure:
@@ -85,10 +86,6 @@ def work(backend: PoseGraphBackend) -> None:
 
 def states(backend: PoseGraphBackend) -> dict[int, State]:
     return {each.stamp_ns // SECOND - 1: each.state for each in backend.verdicts()}
-
-
-def verdict(backend: PoseGraphBackend, j: int) -> Verdict:
-    return next(each for each in backend.verdicts() if each.stamp_ns == (j + 1) * SECOND)
 
 
 def error(backend: PoseGraphBackend) -> float:
@@ -154,46 +151,6 @@ def test_a_false_group_that_came_first_is_thrown_out_by_true_ones() -> None:
     run(true_ones(rng), begin=backend, first=66)
     assert all(not states(backend)[each.stamp_ns // SECOND - 1].in_graph for each in false)
     assert error(backend) < 0.5
-
-
-def test_a_person_forces_a_closure_in_and_out_and_takes_it_back() -> None:
-    rng = np.random.default_rng(5)
-    backend = run([*true_ones(rng), false := closure(10, 60, np.zeros(3))])
-    before = backend.graph.poses.copy()
-    at = false.stamp_ns // SECOND - 1
-    assert verdict(backend, at).state is State.DOUBTED
-    assert backend.decide(verdict(backend, at).id, Decision.IN).status is AnswerStatus.ACCEPTED
-    work(backend)
-    assert verdict(backend, at).state is State.BELIEVED
-    assert np.max(np.abs(backend.graph.poses - before)) > 0.1
-    assert backend.decide(verdict(backend, at).id, Decision.AUTO).status is AnswerStatus.ACCEPTED
-    work(backend)
-    assert verdict(backend, at).state is State.DOUBTED
-    assert np.allclose(backend.graph.poses, before, atol=0.02)
-    good = verdict(backend, 202)
-    assert good.state is State.BELIEVED
-    backend.decide(good.id, Decision.OUT)
-    work(backend)
-    assert verdict(backend, 202).state is State.DOUBTED
-    assert backend.decide('scan/9999', Decision.OUT).reason == 'unknown_id'
-
-
-def test_a_verdict_has_its_reasons() -> None:
-    rng = np.random.default_rng(6)
-    backend = run([*true_ones(rng), closure(110, 161, np.zeros(3))])
-    good, bad = verdict(backend, 202), verdict(backend, 161)
-    assert good.id.startswith('scan/')
-    assert good.reference_ns == 123 * SECOND
-    assert len(good.supported_by) >= 2
-    assert good.contradicted_by == ()
-    assert good.distance < np.sqrt(GATE) < bad.distance
-    assert bad.contradicted_by[0] == 'odometry'
-    assert np.linalg.norm(bad.residual[:2]) > 5.0
-    totals = backend.verdict_totals()['scan']
-    assert totals.counts[State.DOUBTED] == 1
-    assert [change.after for change in backend.verdict_changes()
-            if change.id == bad.id] == [State.DOUBTED]
-    assert backend.verdict_changes() == []
 
 
 def test_a_closure_that_fits_outside_of_the_graph_only_does_not_keep_the_judge_busy_for_ever(
@@ -323,30 +280,6 @@ def test_an_update_that_fails_leaves_the_judgement_as_it_was(
 
 
 # --- pieces --------------------------------------------------------------------------------------
-
-def test_claims_are_floored_and_lead_from_the_earlier_to_the_later_node() -> None:
-    rng = np.random.default_rng(10)
-    poses = rng.normal(0.0, 5.0, (2, 3))
-    z = se2.between(poses[1], poses[0]) + rng.normal(0.0, 1e-6, 3)
-    information = np.diag(SIGMAS**-2.0)
-    edges = Edges([1], [0], z[None], information[None], [EdgeKind.LOOP_CLOSURE])
-    claim = claims(edges)
-    assert (claim.i.tolist(), claim.j.tolist()) == ([0], [1])
-    # raised in the axes of the later node, whichever it was measured from
-    np.testing.assert_array_equal(claim.noise, claims(forward(edges)).noise)
-    given = np.linalg.inv(forward(edges).information[0])
-    np.maximum(np.diagonal(given), np.square(BELIEF.closure_floors), out=np.einsum('ii->i', given))
-    np.testing.assert_allclose(claim.noise[0], given, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize('factor', [0.5, 1.0, 2.5])
-def test_the_scale_of_the_sigmas_is_found_in_the_agreement_of_neighbours(factor: float) -> None:
-    rng = np.random.default_rng(18)
-    backend = run([
-        closure(j - LAP, j, se2.between(TRUTH[j - LAP], TRUTH[j])
-                + rng.normal(0.0, factor * SIGMAS)) for j in range(LAP + 2, LAP * LAPS)])
-    backend.optimize()
-    assert backend.verdict_totals()['scan'].scale == pytest.approx(max(factor, 1.0), rel=0.1)
 
 
 @pytest.mark.parametrize('correlation_time', [0.0, 10.0])

@@ -185,15 +185,6 @@ def test_nothing_is_decided_again_until_something_has_changed(
     assert believed(backend) == before
 
 
-def test_a_graph_without_a_solution_keeps_what_is_believed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    drive = DRIVES[0, False]
-    monkeypatch.setattr(final, 'decide', lambda *_, **__: None)
-    backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
-    assert len(believed(backend)) > 10
-
-
 def test_in_a_very_large_graph_the_set_is_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = DRIVES[1, False]
     monkeypatch.setattr(final, 'BELIEF', replace(BELIEF, most_at_end=100))

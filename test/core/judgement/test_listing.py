@@ -5,7 +5,6 @@
 from hypothesis import given, strategies as st
 import numpy as np
 
-from pose_graph_ros.core.judgement import verdicts
 from pose_graph_ros.core.judgement.verdicts import listed, MOST_OTHERS
 
 constraints = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()), max_size=40)
@@ -25,9 +24,3 @@ def test_the_newest_of_each_source_are_listed(
             expected.append(number)
     assert found.tolist() == expected
     assert listed(source, believed > 0, decided > 0, None).tolist() == list(range(len(source)))
-
-
-def test_doubted_ones_are_bounded_as_well() -> None:
-    n = verdicts.MOST_OTHERS + 7
-    none = np.zeros(n, dtype=bool)
-    assert listed(np.zeros(n, dtype=int), none, none, 0).tolist() == list(range(7, n))

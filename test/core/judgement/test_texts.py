@@ -7,27 +7,18 @@ from itertools import product
 import json
 import math
 
-from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
 from pose_graph_ros.core.judgement.texts import (
     as_json,
-    details,
-    joined,
-    nanoseconds,
-    number_of,
-    seconds,
     sentence,
     short,
     states_by_stamps,
-    total_values,
-    totals_text,
 )
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
-    SourceVerdicts,
     State,
     Verdict,
 )
@@ -55,16 +46,6 @@ def test_a_sentence_says_state_and_reason() -> None:
         'Not used since 1700.500, as a person has decided')
 
 
-def test_times_may_be_those_of_the_drive() -> None:
-    start = 1_600_000_000_000
-    assert sentence(CLOSURE, start).startswith('Doubted and not used since 100.5 s: it was')
-    wrong = replace(CLOSURE, kind=Judged.ODOMETRY, contradicted_by=())
-    assert sentence(wrong, start) == (
-        'Doubted and not used since 100.5 s: it is wrong by 5.00 m and 0.20 rad, somewhere '
-        'between 0.0 s and 95.2 s.')
-    assert 'between 1600.000 and 1695.250.' in sentence(wrong)
-
-
 @pytest.mark.parametrize(('state', 'decision', 'distance'), list(product(
     State, Decision, (math.nan, 0.5))))
 def test_every_state_has_a_sentence_of_its_own(
@@ -76,43 +57,6 @@ def test_every_state_has_a_sentence_of_its_own(
     assert text.endswith('.')
     others = {sentence(replace(verdict, state=other)) for other in State if other is not state}
     assert (text in others) == (decision is not Decision.AUTO)
-
-
-def test_details_have_all_that_is_known() -> None:
-    assert details(CLOSURE) == {
-        'kind': 'loop_closure', 'stamp': '1695.250000000',
-        'reference_stamp': '1600.000000000',
-        'state': 'doubted', 'since': '1700.500', 'residual': '[4.000, -3.000, 0.200]',
-        'distance': '14.25', 'supported_by': '', 'contradicted_by': 'loop_closure/3, odometry',
-        'decision': 'auto'}
-    fix = replace(CLOSURE, kind=Judged.FIX, reference_ns=None)
-    assert details(fix)['reference_stamp'] == ''
-
-
-@given(st.integers(0, 2**62))
-def test_a_stamp_in_seconds_is_rounded_down_to_the_millisecond(stamp_ns: int) -> None:
-    whole, _, rest = seconds(stamp_ns).partition('.')
-    assert len(rest) == 3
-    assert nanoseconds(seconds(stamp_ns, 9)) == stamp_ns
-    assert 0 <= stamp_ns - int(whole) * 10**9 - int(rest) * 10**6 < 10**6
-
-
-def test_totals_name_the_states_that_occur() -> None:
-    totals = SourceVerdicts(
-        {State.BELIEVED: 7, State.WEAKLY_BELIEVED: 1, State.DOUBTED: 3}, 2.5, doubting=False)
-    assert totals_text(totals) == (
-        '3 doubted, 1 believed weakly, 7 believed, sigmas times 2.5')
-    assert total_values({'loop': totals}) == {
-        'loop.believed': '8', 'loop.believed_weakly': '1', 'loop.doubted': '3',
-        'loop.waiting': '0', 'loop.scale': '2.5'}
-    assert total_values({'loop': totals._replace(n_forgotten=4)})['loop.forgotten'] == '4'
-
-
-def test_lists_are_bounded_and_nouns_are_counted() -> None:
-    assert joined(['a', 'b']) == 'a, b'
-    assert joined([str(k) for k in range(7)]) == '0, 1, 2, 3, 4 and 2 more'
-    assert number_of(1, Judged.FIX) == '1 fix'
-    assert number_of(2, Judged.FIX) == '2 fixes'
 
 
 @pytest.mark.parametrize(('value', 'digits', 'text'), [

@@ -64,12 +64,6 @@ def test_a_track_moves_along_odometry(seed: int, begin: int, end: int) -> None:
     assert_allclose(moved.cov, moved.cov.T, atol=0.0)
 
 
-def test_a_track_moves_only_between_nodes_of_odometry() -> None:
-    rng = np.random.default_rng(0)
-    with pytest.raises(KeyError):
-        random_track(rng).moved(random_chain(rng, 3), 3)
-
-
 @settings(deadline=None, max_examples=100)
 @given(seed=seeds, size=st.sampled_from((2, 3)))
 def test_an_observation_is_taken_in(seed: int, size: int) -> None:

@@ -224,16 +224,6 @@ def test_a_silent_primary_source_is_replaced(silence: float) -> None:
     assert len(across) == (1 if silence < 20.0 else 0)
 
 
-def test_the_first_source_is_primary_again_when_the_other_is_silent() -> None:
-    arrivals = by_stamp({
-        'wheel': without(WHEEL, 10.0, 15.0), 'visual': without(VISUAL, 20.0, 99.0)})
-    nodes, made, _ = grown(arrivals)
-    times = (nodes.stamps_ns - EPOCH) * 1e-9
-    assert made.sources == ['visual' if 10.0 <= t < 20.0 else 'wheel' for t in times]
-    assert times[-1] > 29.0
-    assert_true(nodes, made)
-
-
 @pytest.mark.parametrize('begin', [8.0, 9.95, 10.5, 14.0])
 def test_a_source_that_began_late_can_become_primary(begin: float) -> None:
     visual = np.arange(begin, 30.0, 0.07)
@@ -271,30 +261,13 @@ def test_no_motion_is_lost_if_nodes_are_refused_while_the_primary_source_changes
         atol=1e-3)
 
 
-@pytest.mark.parametrize('late', [0.0, 0.5, 1.9])
-def test_the_preferred_source_may_begin_a_little_later(late: float) -> None:
-    nodes, made, _ = grown(by_stamp({'wheel': WHEEL[late <= WHEEL], 'visual': VISUAL}))
-    assert set(made.sources) == {'wheel'}
-    assert nodes.stamps_ns[0] == stamp_of(WHEEL[late <= WHEEL][0])
-
-
-@pytest.mark.parametrize('late', [2.5, 10.0, 100.0])
-def test_the_preferred_source_is_not_waited_for_longer(late: float) -> None:
-    nodes, made, edges = grown(by_stamp({'wheel': WHEEL[late <= WHEEL], 'visual': VISUAL}))
-    assert set(made.sources) == {'visual'}
-    assert nodes.stamps_ns[0] == stamp_of(VISUAL[0])
-    assert_true(nodes, made)
-    covered = np.count_nonzero(nodes.stamps_ns >= stamp_of(late))
-    assert len(edges) in ((covered - 1, covered - 2) if late < 30.0 else (0,))
-
-
 # --- Order of arrival ------------------------------------------------------------------------
 
 SILENCES = st.lists(st.tuples(
     st.sampled_from(list(FRAMES)), st.floats(0.0, 25.0), st.floats(1.7, 9.0)), max_size=5)
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(SILENCES, st.data(), st.sampled_from((0.0, 0.02, 0.24)))
 def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
     silences: list[tuple[str, float, float]], data: st.DataObject, spread: float,

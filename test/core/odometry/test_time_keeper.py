@@ -58,13 +58,6 @@ def test_bad_stamps_among_good_ones_change_nothing(bad: list[float]) -> None:
     assert one.keeper.now_ns <= round((NOW + 1.1 * len(bad) + 1.0) * SECOND)
 
 
-@pytest.mark.parametrize('away', [-50.0, -3600.0, 3600.0])
-def test_many_messages_within_less_than_a_second_are_no_evidence(away: float) -> None:
-    one = Given()
-    assert 'again' not in one.answers(*(NOW + away + 0.01 * step for step in range(99)))
-    assert one.goes_on()
-
-
 @pytest.mark.parametrize('away', [-50.0, -3600.0])
 def test_time_begins_again_once_stamps_behind_go_on_for_a_second(away: float) -> None:
     one, stamps = Given(), [NOW + away + 0.1 * step for step in range(11)]
@@ -145,13 +138,6 @@ def test_time_is_that_of_the_odometry_that_goes_on(wrong: str, away: float) -> N
         assert one.send(NOW + away + 0.1 * step, wrong) != 'again'
     assert not one.keeper.in_doubt
     assert one.keeper.now_ns == round((NOW + 29.9) * SECOND)
-
-
-def test_two_odometries_that_begin_again_are_one_new_beginning() -> None:
-    one = Given('odom', 'visual')
-    answers = [one.send(seconds, source) for seconds in BEGAN for source in ('odom', 'visual')]
-    assert answers.count('again') == 1
-    assert set(answers[40:]) == {'used'}
 
 
 def test_a_gyroscope_of_another_time_is_refused_and_has_no_say() -> None:

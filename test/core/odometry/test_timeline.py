@@ -76,24 +76,6 @@ def test_motion_is_that_of_a_slow_walk(data: st.DataObject) -> None:
     np.testing.assert_allclose(timeline.pose(end)[:2], b[:2], atol=ROUNDING)
 
 
-@given(st.data())
-def test_motions_compose_and_travel_adds_up(data: st.DataObject) -> None:
-    stamps = data.draw(stamp_lists)
-    timeline = filled(stamps, random_poses(np.random.default_rng(3), len(stamps)))
-    a, b, c = sorted(data.draw(st.tuples(*3 * (st.integers(stamps[0], stamps[-1]),))))
-    first, second, whole = timeline.motion(a, b), timeline.motion(b, c), timeline.motion(a, c)
-    np.testing.assert_allclose(
-        se2.compose(first.increment, second.increment)[:2], whole.increment[:2], atol=ROUNDING)
-    assert first.distance + second.distance == pytest.approx(whole.distance, abs=ROUNDING)
-    assert first.turn + second.turn == pytest.approx(whole.turn, abs=ROUNDING)
-
-
-def test_headings_are_interpolated_across_half_a_turn() -> None:
-    timeline = filled([0, 10], np.array([[0.0, 0.0, np.pi - 0.1], [0.0, 0.0, -np.pi + 0.1]]))
-    assert abs(timeline.pose(5)[2]) == pytest.approx(np.pi)
-    assert timeline.motion(0, 10).turn == pytest.approx(0.2)
-
-
 def test_instants_that_are_not_covered_are_rejected() -> None:
     timeline = OdometryTimeline()
     assert len(timeline) == 0
@@ -147,14 +129,6 @@ def test_variances_are_those_of_a_slow_walk(data: st.DataObject) -> None:
         assert np.all(part <= np.array([way.distance, way.distance, way.turn])**2 + ROUNDING)
 
 
-def test_at_rest_nothing_is_known_of_the_usual_noise() -> None:
-    timeline, row = OdometryTimeline(), None
-    for stamp_ns in (1, 2, 3):
-        row = next_row(row, stamp_ns, (1.0, 2.0, 0.5))
-        timeline.append(row)
-    np.testing.assert_array_equal(timeline.usual_variances(), 0.0)
-
-
 def test_the_noise_contains_the_effect_of_an_acceleration_between_samples() -> None:
     for rate in (1, 5, 20):
         times = np.arange(0.0, 4.0, 1.0 / rate)
@@ -181,23 +155,6 @@ def test_rest_is_covered_closely_but_not_a_gap_in_it(hold: int) -> None:
         assert timeline.covers(stamp)
         assert not timeline.covers(stamp, closely=True)
     assert timeline.covers(gap, closely=True)
-
-
-@given(st.lists(st.sampled_from((0, 1)), min_size=1, max_size=60), st.integers(0, 10**6))
-def test_leaving_out_rest_changes_no_motion(moves: list[int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    poses = np.cumsum(np.outer(moves, [0.3, 0.1, 0.05]), axis=0)
-    stamps = [EPOCH + k * SECOND // 10 for k in range(len(moves))]
-    timeline = filled(stamps, poses)
-    for _ in range(10):
-        a, b = np.sort(rng.integers(stamps[0], stamps[-1] + 1, 2)).tolist()
-        motion = timeline.motion(a, b)
-        expected = vector(np.linalg.inv(matrix(slow_pose(stamps, poses, a)))
-                          @ matrix(slow_pose(stamps, poses, b)))
-        np.testing.assert_allclose(motion.increment, expected, atol=ROUNDING)
-        distance, turn = slow_travel(stamps, poses, a, b)
-        assert motion.distance == pytest.approx(distance, abs=ROUNDING)
-        assert motion.turn == pytest.approx(turn, abs=ROUNDING)
 
 
 @given(st.lists(st.tuples(st.integers(1, 2_000_000_000), st.sampled_from((0, 0, 1))),
@@ -249,3 +206,11 @@ def test_thinning_does_not_take_what_is_left_out_for_rest() -> None:
     assert thinned.covers(stamps[92])
     assert thinned.covers(stamps[50])
     assert not thinned.covers(stamps[50], closely=True)
+
+
+def test_at_rest_nothing_is_known_of_the_usual_noise() -> None:
+    timeline, row = OdometryTimeline(), None
+    for stamp_ns in (1, 2, 3):
+        row = next_row(row, stamp_ns, (1.0, 2.0, 0.5))
+        timeline.append(row)
+    np.testing.assert_array_equal(timeline.usual_variances(), 0.0)

@@ -9,20 +9,16 @@ import jacobians
 import numpy as np
 import pytest
 from random_graphs import (
-    consistent_graph,
     random_edges_to_biases,
     random_graph,
-    random_information,
     random_poses,
 )
 from scipy.optimize import least_squares
-from slow_smoother import cliques, differences, EXACT, state, world
+from slow_smoother import differences, EXACT, state, world
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.linear_starts import chordal, joint
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig, SolverConfig
-from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions, factors, tables as tb
@@ -100,21 +96,6 @@ def test_energy_linearization_error_and_scale_are_those_of_the_formulas(seed: in
     np.testing.assert_allclose(
         table[~wrapped, tb.ERROR2], (error_functions.energies(rest, W) + turned)[~wrapped],
         rtol=1e-9, atol=1e-9)
-
-
-def test_a_rigid_motion_changes_the_error_of_a_bias_so_its_cliques_stay_in_the_map() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(
-        hidden=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], biases=np.zeros((1, 3)), observed=prior(2),
-        edges=Edges.joined([
-            Edges([0], [1], [[1.0, 0.0, 0.0]], [ODOMETRY], [EdgeKind.ODOMETRY]),
-            fix(0, 2, np.zeros(2), np.zeros(2), np.array([0.1, 1.0])),
-            fix(1, 2, np.array([0.0, 1.0]), np.zeros(2), np.array([0.1, 1.0]))])))
-    memory = smoother.graph.memory
-    for c in cliques(smoother.graph):
-        assert memory['clique_i'][c, tb.ANCHORED] == 1
-    # the two positions determine the heading, the bias does not
-    np.testing.assert_allclose(smoother.poses[0], [0.0, 0.0, np.pi / 2.0], atol=1e-6)
 
 
 # --- correlated noise ---------------------------------------------------------------------------
@@ -288,54 +269,6 @@ def test_the_batch_optimum_is_that_of_scipy(seed: int) -> None:
     off = graph.poses[free] - other.x.reshape(-1, 3)
     off[:, 2] = se2.wrap(off[:, 2])
     np.testing.assert_allclose(off, 0.0, atol=1e-6)
-
-
-def positions_with_biases(seed: int) -> tuple[Graph, FloatArray]:
-    """Return a graph with exact odometry and positions with biases, and its poses."""
-    rng, graph = np.random.default_rng(seed), consistent_graph(seed)
-    truth, n = graph.poses.copy(), graph.n_nodes
-    offset = rng.uniform(-1.0, 1.0, (n, 2))
-    mean = np.column_stack((se2.transform(truth, offset), np.zeros(n)))
-    information = random_information(rng, n)
-    information[:, 2] = information[:, :, 2] = 0.0
-    bias = np.column_stack((offset, rng.uniform(0.3, 1.0, (n, 2))))
-    graph.apply(GraphUpdate(
-        biases=np.zeros((2, 3)), observed=prior(n), free=[0],
-        edges=Edges.joined([
-            link(n + 1, n, 0.9),
-            Edges(np.arange(n), n + rng.integers(0, 2, n), mean, information,
-                  [EdgeKind.BIAS] * n, bias=bias)])))
-    return graph, np.vstack((truth, np.zeros((2, 3))))
-
-
-@pytest.mark.parametrize('seed', range(5))
-def test_without_a_guess_the_joint_start_is_taken(seed: int) -> None:
-    graph, truth = positions_with_biases(seed)
-    with pytest.raises(LinearSolveError, match='bias'):
-        chordal(graph)
-    graph.set_poses(random_poses(np.random.default_rng(seed), graph.n_nodes))
-    start = joint(graph)
-    np.testing.assert_allclose(start[:, :2], truth[:, :2], atol=1e-9)
-    np.testing.assert_allclose(se2.wrap(start[:, 2] - truth[:, 2]), 0.0, atol=1e-9)
-    result = optimizer.optimize_from_linear_start(graph, THOROUGH)
-    assert result.status is Status.CONVERGED
-    assert result.chi2 < 1e-15
-    np.testing.assert_allclose(graph.poses[:, :2], truth[:, :2], atol=1e-6)
-
-
-def test_the_joint_start_weighs_positions_by_both_variances() -> None:
-    graph = Graph()
-    bad = np.array([0.0, 8.0])
-    graph.apply(GraphUpdate(
-        hidden=np.zeros((2, 3)), biases=[[9.0, 9.0, 0.0], [5.0, 5.0, 0.1]], fix=[0, 3],
-        observed=prior(2),
-        edges=Edges.joined([
-            Edges([0], [1], [[2.0, 0.0, 0.0]], [np.diag([1.0, 1.0, 1e6])], [EdgeKind.ODOMETRY]),
-            fix(1, 2, bad, np.zeros(2), np.array([1.0, np.sqrt(3.0)]))])))
-    # information 1 against 1 / (1 + 3)
-    start = joint(graph)
-    np.testing.assert_allclose(start[1, :2], 0.8 * np.array([2.0, 0.0]) + 0.2 * bad, atol=1e-4)
-    np.testing.assert_array_equal(start[2:], [[0.0, 0.0, 0.0], [5.0, 5.0, 0.1]])
 
 
 def test_a_closure_that_contradicts_all_is_solved_for_on_a_copy(

@@ -138,19 +138,6 @@ def test_white_errors_are_not_taken_for_correlated_ones(settings: dict[str, floa
     assert sum(errors is not None for errors in taken) <= 1     # by chance in one of a hundred
 
 
-@pytest.mark.parametrize('settings', [
-    {'drift': 0.1}, {'turns': 0.1}, {'turns': 0.1, 'drift': 3.0}, {'turns': 0.05, 'drift': 5.0},
-    {'turns': 0.3, 'drift': 0.3, 'longer': 0.02}, {'drift': 0.1, 'longer': 0.01},
-    {'drift': 0.1, 'rate': 0.005}, {'drift': 0.1, 'longer': 0.01, 'rate': 0.002}], ids=str)
-def test_white_errors_beside_odometry_that_hardly_turns_by_itself_are_not_taken_for_correlated(
-    settings: dict[str, float],
-) -> None:
-    """As visual odometry: its headings are far better than the settings say, its scale is off."""
-    taken = [to_the_end(search(a_drive(seed, n=400, speed=8.0, **settings))).errors
-             for seed in range(8)]
-    assert taken == [None] * 8
-
-
 def test_errors_are_not_taken_for_white_or_correlated_to_and_fro() -> None:
     """It takes much to believe that they are correlated, and then much less to go on so."""
     changes = []
@@ -162,26 +149,6 @@ def test_errors_are_not_taken_for_white_or_correlated_to_and_fro() -> None:
             taken.append(to_the_end(search(drive, correlated=taken[-1])).errors is not None)
         changes.append(sum(one != other for one, other in itertools.pairwise(taken)))
     assert max(changes) <= 1
-
-
-@pytest.mark.parametrize(('n', 'period', 'tau'), [
-    (30, 1.0, 60.0), (30, 1.0, 300.0), (60, 1.0, 10.0), (120, 5.0, 30.0)])
-def test_correlated_errors_show_in_few_positions(n: int, period: float, tau: float) -> None:
-    """
-    Even where all of them are within one time constant: they scatter less than is claimed.
-
-    Fewer do not tell them from white errors beside odometry that is worse than it says.
-    """
-    found = [to_the_end(search(a_drive(seed, n=n, period=period, tau=tau))).errors
-             for seed in range(12)]
-    assert sum(errors is not None for errors in found) >= 10
-
-
-def test_correlated_errors_are_found_among_wrong_positions() -> None:
-    for seed in range(3):
-        found = to_the_end(search(a_drive(seed, n=400, tau=20.0, wrong=0.2))).errors
-        assert found is not None
-        assert 8.0 < found.tau < 50.0
 
 
 @pytest.mark.parametrize(('drift', 'tau', 'n'), [
@@ -297,15 +264,6 @@ def test_a_path_without_known_errors_is_as_likely_with_them_as_states() -> None:
             *path, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, True)
         values.append((value, rate, scale))
     np.testing.assert_allclose(values[1], values[0], rtol=1e-4, atol=1e-6)
-
-
-def test_a_long_path_is_joined_in_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)
-    at_once = to_the_end(measured_path(*arguments))
-    monkeypatch.setattr(error_estimate, 'SOURCES', replace(SOURCES, nodes_per_step=7))
-    assert len(list(measured_path(*arguments))) >= 40 // 7
-    for one, other in zip(to_the_end(measured_path(*arguments)), at_once, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(

@@ -12,6 +12,11 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import Position
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.gauss_markov import (
+    Additions,
+    CorrelatedErrors,
+    GaussMarkovBias,
+)
 from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
 
@@ -120,6 +125,18 @@ def test_an_update_that_is_rolled_back_is_built_again_as_it_was() -> None:
     assert_same_value(second.observed, first.observed)
     assert (second.remove_edges, second.remove_observed, second.weigh_observed) == (
         first.remove_edges, first.remove_observed, first.weigh_observed)
+
+
+def test_a_bias_that_came_into_use_stays_when_the_next_update_fails_before_it_is_built() -> None:
+    graph, (factors, _) = line(), builder()
+    committed(factors, graph, some([3, 4, 20]))
+    bias, additions = GaussMarkovBias(CorrelatedErrors(64.0, 1.0, 0.05)), Additions(graph.next_ids)
+    bias.begin()
+    bias.add(3 * SECOND, fix('white', 3).observed, np.zeros(2), additions)
+    graph.apply(additions.update())
+    factors.set_error_model('white', bias)
+    factors.rollback()
+    assert len(bias.nodes) == 1
 
 
 def restored(factors: FactorBuilder, config: BackendConfig) -> FactorBuilder:

@@ -19,6 +19,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
@@ -28,8 +29,8 @@ from pose_graph_ros.core.measurements import (
     YawRate,
 )
 from pose_graph_ros.core.odometry.turns import Turn
-from pose_graph_ros.core.sources.gauss_markov import Additions
-from pose_graph_ros.core.sources.gyro_bias import GyroBiases
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.source_constraints import Queue
 
 Events = list[tuple[str, OdometrySample | Measurement]]
 
@@ -84,9 +85,9 @@ def test_rest_measures_the_bias() -> None:
                for t, rate in zip(times.tolist(), rates.tolist(), strict=True)]
     events.sort(key=lambda event: event[1].stamp_ns)
     backend = finished(events)
-    value = backend._factors.gyros.values(backend.graph)['gyro']
+    value = backend.gyro_biases(backend.graph)['gyro']
     assert value == pytest.approx(bias, abs=4.0 * GYRO.sigma_rate / np.sqrt(8.0))
-    state = backend.graph.node_rows(np.array([backend._factors.gyros._bias('gyro').newest]))[0]
+    state = backend.graph.node_rows(np.array([backend._factors.gyros['gyro'].newest]))[0]
     sigma = np.sqrt(backend._smoother.covariances()[state, 0, 0])
     assert sigma == pytest.approx(GYRO.sigma_rate / np.sqrt(8.66), rel=0.1)
 
@@ -244,11 +245,10 @@ def test_the_newest_pose_has_the_rotation_by_the_gyroscope() -> None:
 
 
 def test_each_of_two_gyroscopes_goes_on_from_its_own_bias_within_an_update() -> None:
-    gyros, graph = GyroBiases(BackendConfig()), Graph()
+    graph = Graph()
     graph.apply(GraphUpdate(hidden=np.zeros((4, 3))))
-    additions = Additions(graph.next_ids)
-    gyros.add([Turn(source, k, k + 1, round((1.0 + 20.0 * k) * SECOND), 0.0, 1e-4, 1.0,
-                    rest_rate=rate, rest_variance=1e-6)
-               for k in range(3) for source, rate in (('left', 0.02), ('right', -0.01))],
-              graph, additions)
-    assert additions.update().biases[:, 0].tolist() == [0.02, -0.01] * 3
+    turns = [Turn(source, k, k + 1, round((1.0 + 20.0 * k) * SECOND), 0.0, 1e-4, 1.0,
+                  rest_rate=rate, rest_variance=1e-6)
+             for k in range(3) for source, rate in (('left', 0.02), ('right', -0.01))]
+    update = FactorBuilder(BackendConfig(), Reweighting()).build(Queue(turns=turns), graph)
+    assert update.biases[:, 0].tolist() == [0.02, -0.01] * 3

@@ -52,16 +52,6 @@ def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) ->
     assert not found.wrongly_white
 
 
-def test_what_is_known_of_the_errors_counts_for_whether_they_fit_badly() -> None:
-    graph = observed(4.0 * gauss_markov(100, 1.0), 1.0)
-    unknown, known = (report(graph, in_time(100), biased=False, in_use=in_use) for in_use in (
-        None, CorrelatedErrors(1.0, 15.0, 1.0)))
-    assert unknown.fits_badly
-    assert not known.fits_badly
-    assert known.strain == pytest.approx(unknown.energy / 16.0)
-    assert not report(graph, in_time(20), biased=False, in_use=None).fits_badly
-
-
 @pytest.mark.parametrize(('white', 'sigma', 'tau', 'wrong'), [
     (True, 1.0, 20.0, True),
     (False, 1.0, 20.0, False),      # known to be correlated
@@ -73,18 +63,6 @@ def test_errors_that_are_treated_as_white_but_are_not_are_noticed(
     found = report(observed(gauss_markov(600, tau), sigma), in_time(600), biased=False,
                    in_use=None if white else KNOWN)
     assert found.wrongly_white is wrong
-
-
-def test_neither_the_order_of_arrival_nor_repeated_stamps_change_the_residuals() -> None:
-    graph, rows = observed(gauss_markov(300, 20.0), 1.0), in_time(300)
-    expected = report(graph, rows, biased=False, in_use=None)
-    shuffled = rows[np.random.default_rng(0).permutation(300)]
-    np.testing.assert_allclose(
-        report(graph, shuffled, biased=False, in_use=None).errors, expected.errors)
-    twice = np.concatenate((rows, rows))
-    found = report(graph, twice, biased=False, in_use=None)
-    assert found.n == 600
-    np.testing.assert_allclose(found.errors, expected.errors)
 
 
 def test_of_a_biased_source_the_whole_error_counts_not_the_white_rest() -> None:

@@ -250,16 +250,6 @@ def test_an_override_of_the_position_alone_leaves_the_heading_to_the_message() -
     np.testing.assert_allclose(left.measurement.covariance, np.diag([0.25, 0.25, 0.09]))
 
 
-def test_a_statement_on_headings_alone_stays_one_under_an_override() -> None:
-    for override, sigma in (((0.5,), 0.1), ((0.5, 0.2), 0.2)):
-        policy = CovariancePolicy(override=override)
-        left = validate(closure(np.diag([INF, INF, 0.01])), policy).measurement
-        np.testing.assert_allclose(left.covariance, np.diag([INF, INF, sigma**2]))
-        left = validate(pose(np.diag([INF, INF, 0.01])), policy).measurement
-        assert isinstance(left, HeadingOnly)
-        assert left.variance == pytest.approx(sigma**2)
-
-
 # --- Headings --------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('heading', 'variance', 'left'), [
@@ -285,15 +275,6 @@ def test_when_the_heading_of_a_pose_is_used(
         assert isinstance(answer.measurement, GlobalPose)
         np.testing.assert_allclose(
             answer.measurement.covariance, np.diag([0.04, 0.09, left]))
-
-
-def test_a_pose_without_information_on_the_position_is_a_heading() -> None:
-    cov = np.diag([INF, 1e300, 0.01])
-    cov[0, 1] = cov[2, 0] = NAN
-    answer = validate(pose(cov), CovariancePolicy(scale=4.0))
-    assert answer.measurement == HeadingOnly(SECOND, 3.0, 0.04)
-    never = CovariancePolicy(heading=Heading.NEVER)
-    assert validate(pose(cov), never).reason == 'no_information'
 
 
 @pytest.mark.parametrize(('variance', 'said'), [
@@ -329,12 +310,3 @@ def test_values_and_stamps_are_checked_too() -> None:
             reason]
     far = LoopClosure(SECOND, np.zeros(3), GOOD, reference_ns=2**63)
     assert validate(far, REPAIR).reason == 'no_stamp'
-
-
-def test_no_measurement_is_changed_in_place() -> None:
-    for case in CASES.values():
-        for policy in POLICIES:
-            cov, before = case.cov.copy(), case.cov.tobytes()
-            for kind in KINDS:
-                validate(kind(cov), policy)
-            assert cov.tobytes() == before

@@ -3,25 +3,16 @@
 """Waiting measurements and stamps seen so far, compared with plain lists and sets."""
 
 
-from dataclasses import replace
 
 from hypothesis import given, strategies as st
 import numpy as np
-import pytest
 
-from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.measurements import (
-    AnswerStatus,
     HeadingOnly,
     LoopClosure,
     Measurement,
-    OdometrySample,
 )
-from pose_graph_ros.core.sources import pipeline
 from pose_graph_ros.core.sources.pipeline import SeenStamps, WaitingMeasurements
-from pose_graph_ros.core.sources.settings import SOURCES
-
-SECOND = 1_000_000_000
 
 
 def heading(stamp: int) -> HeadingOnly:
@@ -47,19 +38,6 @@ def test_what_is_due_comes_out_by_stamp_then_by_arrival(steps: list[tuple[bool, 
         assert len(pending) == len(plain)
 
 
-@given(st.lists(st.integers(0, 30), max_size=40), st.integers(1, 9))
-def test_where_there_are_too_many_the_latest_goes(stamps: list[int], most: int) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_waiting=most))
-        pending, plain = WaitingMeasurements(), []
-        for k, stamp in enumerate(stamps):
-            gone = pending.push(f'{k}', heading(stamp))
-            plain = sorted([*plain, (stamp, k)])
-            expected = plain.pop() if len(plain) > most else None
-            assert (None if gone is None else (gone.due_ns, int(gone.source))) == expected
-        assert [(w.due_ns, int(w.source)) for w in pending.pop_due(99)] == plain
-
-
 @given(st.lists(st.tuples(
     st.sampled_from('ab'), st.integers(1, 6), st.sampled_from((None, 'ns', 'node', 'none')),
     st.integers(0, 3), st.booleans()), max_size=60))
@@ -79,17 +57,3 @@ def test_what_has_come_before_is_known(
         elif not add:
             seen.remove(source, one)
             plain.discard(key)
-
-
-def test_a_dropped_measurement_may_be_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, 'SOURCES', replace(SOURCES, most_waiting=2))
-    backend = PoseGraphBackend()
-    ahead = heading(100 * SECOND)
-    for one in (ahead, heading(2 * SECOND), heading(SECOND)):
-        assert backend.add_measurement(one, 'compass').status is AnswerStatus.PENDING
-    assert backend.counts['compass', 'too_many_pending'] == 1
-    for k in range(30):
-        backend.add_odometry(OdometrySample((1 + k) * SECOND, np.array([1.0 * k, 0.0, 0.0])))
-    assert backend.n_waiting == 0
-    assert backend.add_measurement(ahead, 'compass').status is AnswerStatus.PENDING
-    assert backend.add_measurement(ahead, 'compass').reason == 'duplicate_stamp'
