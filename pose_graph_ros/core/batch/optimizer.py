@@ -226,7 +226,7 @@ def _minimize(
 ) -> Optimization:
     """Optimise from the present poses; the poses after a failure have no meaning."""
     head = graph.memory.head
-    symbolic.plant(head, cliques)
+    symbolic.plant_all(head, cliques)
     result = yield from minimize(gauss_newton.CompiledSystem(head), chi2, config)
     if result.status is Status.FAILED:
         node = graph.node_ids[head[tb.BAD_NODE]]
