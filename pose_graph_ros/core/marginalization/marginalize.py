@@ -71,7 +71,9 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
         is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
         if len(prior.nodes) == 2 and not prior.anchored and is_pose:
             edges.append(as_edge(prior))
-        elif len(prior.nodes) == 1 and is_pose:
+        # a heading that is next to unknown may have its minimum turns away, which a mean has not
+        elif len(prior.nodes) == 1 and is_pose and abs(
+                (_pseudo_inverse(prior.information) @ prior.vector)[2]) < np.pi:
             observed.append(as_observed(prior))
         else:
             priors.append(prior)
