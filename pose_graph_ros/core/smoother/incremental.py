@@ -365,8 +365,8 @@ class IncrementalSmoother:
             return UpdateResult(Status.FAILED, reason)
         left = self.graph.commit()
         status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
-        return UpdateResult(
-            status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist(), left=left)
+        return UpdateResult(status, '', *head[
+            tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())._replace(left=left)
 
     def _make_room(self) -> None:
         """Let the pools and the work space grow to what a kernel needs."""
