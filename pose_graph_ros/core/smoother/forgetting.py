@@ -89,17 +89,6 @@ def far_from_linear(head, nodes):  # type: ignore[no-untyped-def]
     return error2 > min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * len(nodes))
 
 
-@kernel
-def _has_node(head, c, v):  # type: ignore[no-untyped-def]
-    """Tell whether a node is in the separator of a clique."""
-    pool_i, row = tb.pool_i(head), tb.clique_i(head)[c]
-    begin = row[tb.NODES] + row[tb.N_FRONTAL]
-    found = False
-    for m in range(begin, begin + row[tb.N_SEPARATOR]):
-        found = found or pool_i[m] == v
-    return found
-
-
 @kernel(signature=(tb.HEAD, INTEGERS), allocates=True)
 def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
     """
@@ -128,7 +117,7 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
             child = clique_i[stack[depth], tb.CHILD]
             while child >= 0:
                 if (clique_i[child, tb.N_FRONTAL] > 0 and state[child] != _WHOLE
-                        and _has_node(head, child, v)):
+                        and prior_rows.is_in_separator(head, child, v)):
                     other = pool_i[clique_i[child, tb.NODES]]
                     transaction_log.log_node(head, other)
                     touch(head, other)

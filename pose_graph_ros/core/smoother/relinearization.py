@@ -108,12 +108,13 @@ def forget_waiting(head):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
+def relinearize(head):  # type: ignore[no-untyped-def]
     """
-    Linearize the worst waiting constraints again; the errors of the rest add up to `allowed`.
+    Linearize the worst waiting constraints again, until 0.4 of the budget remains.
 
     The nodes of the relinearized constraints are touched; the lists of the waiting are emptied.
     """
+    allowed = 0.4 * _budget(head)
     work_f, waiting = tb.work_f(head), tb.waiting(head)
     clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
     work_i = tb.work_i(head)
@@ -199,9 +200,3 @@ def solve(head):  # type: ignore[no-untyped-def]
         forget_waiting(head)
         return True
     return False
-
-
-@kernel
-def relinearize(head):  # type: ignore[no-untyped-def]
-    """Linearize the worst waiting constraints again, until 0.4 of the budget remains."""
-    _relinearize_worst(head, 0.4 * _budget(head))
