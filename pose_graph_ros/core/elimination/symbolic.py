@@ -357,7 +357,9 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
             node_i[cliques.nodes[m], tb.CLIQUE] = rows[k]
     for k in range(len(orphans)):
         transaction_log.log_clique(head, orphans[k])
-    for k in range(len(parent)):
+    for m in range(len(parent)):
+        # of siblings, the last one in postorder is the first to be found
+        k = len(rows) - 1 - m if m < len(rows) else m
         if parent[k] >= 0:
             child = rows[k] if k < len(rows) else orphans[k - len(rows)]
             row, above = clique_i[child], clique_i[rows[parent[k]]]
