@@ -86,12 +86,12 @@ class Problem:
         if self.plain is not None:
             self._held = self.plain.hold_parts()
             return self._held
-        from pose_graph_ros.core.elimination import symbolic  # noqa: PLC0415
+        from pose_graph_ros.core.batch.optimizer import loose_nodes  # noqa: PLC0415
 
         graph, held = self.engine, []
-        while (node := symbolic.loose_part(graph.memory.head)[0]) >= 0:
-            graph.apply(GraphUpdate(fix=[int(node)]))
-            held.append(int(node))
+        while len(loose := loose_nodes(graph)) > 0:
+            held.append(int(loose[0]))
+            graph.apply(GraphUpdate(fix=held[-1:]))
         return held
 
 

@@ -26,7 +26,7 @@ from pose_graph_ros.core.judgement.judge import Leaving
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
-from pose_graph_ros.core.smoother.incremental import Forgotten, IncrementalSmoother
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.window.sparse_removal import (
     cut_chains,
     LIMITS,
@@ -70,29 +70,21 @@ def n_leaving(config: WindowConfig, table: NodeTable, needed_ns: int | None = No
 
 def _beyond(config: WindowConfig, table: NodeTable, factor: float) -> int:
     """Return how many nodes lie beyond the window times a factor, in whole groups."""
-    first, stamps, travelled = table.n_frozen, table.stamps_ns, table.travelled
-    most = 0
-    if config.nodes > 0:
-        group = max(math.floor(LIMITS.group * config.nodes), 1)
-        begin = len(table) - math.ceil(factor * config.nodes)
-        most = begin // group * group - first
-    if config.seconds > 0.0:
-        limit_ns, group_ns = (
-            round(share * config.seconds * 1e9) for share in (factor, LIMITS.group))
-        # stamps are compared as integers: as floats they would be rounded to 0.2 us
-        begin_ns = int(stamps[-1]) - limit_ns - int(stamps[0])
-        begin_ns = begin_ns // max(group_ns, 1) * max(group_ns, 1) + int(stamps[0])
-        if stamps[first] < begin_ns:
-            most = max(most, int(np.searchsorted(stamps[first:], begin_ns)))
-    if config.metres > 0.0:
-        most = max(most, _before(travelled, factor * config.metres, LIMITS.group * config.metres))
+    n, first = len(table), table.n_frozen
+    # as integers: stamps as floats would be rounded to 0.2 us
+    since_ns, second_ns = table.stamps_ns[first:] - table.stamps_ns[0], 1e9 * config.seconds
+    travelled, most = table.travelled, 0
+    for places, newest, limit, group in (
+            (np.arange(first, n), n, math.ceil(factor * config.nodes),
+             max(math.floor(LIMITS.group * config.nodes), 1)),
+            (since_ns, int(since_ns[-1]), round(factor * second_ns),
+             max(round(LIMITS.group * second_ns), 1)),
+            (travelled, float(travelled[-1]), factor * config.metres,
+             LIMITS.group * config.metres)):
+        if limit > 0:
+            begin = math.floor((newest - limit) // group) * group
+            most = max(most, int(np.searchsorted(places, begin)))
     return most
-
-
-def _before(travelled: FloatArray, limit: float, group: float) -> int:
-    """Return how many path lengths, which increase, are farther than a limit from the last."""
-    begin = math.floor((travelled[-1] - limit) / group) * group
-    return int(np.searchsorted(travelled, begin)) if travelled[0] < begin else 0
 
 
 class Thinner:
@@ -206,7 +198,7 @@ class Thinner:
 
 
 def forget(
-    gone: Left | Forgotten, parts: Parts, tuner: ErrorTuner, decided: Leaving | None,
+    gone: Left, parts: Parts, tuner: ErrorTuner, decided: Leaving | None,
 ) -> None:
     """Let judge, reweighting, tuner and factors forget what has left the graph."""
     parts.judge.forget(gone.nodes, gone.edges, gone.observed, decided)
@@ -284,7 +276,7 @@ class Forgetting:
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         self._refuse(leaving)
 
-    def _gone(self, leaving: IntArray, prior: WindowPrior) -> Left | Forgotten | None:
+    def _gone(self, leaving: IntArray, prior: WindowPrior) -> Left | None:
         """Return what has left with nodes; None, and they all stay, if the solver has failed."""
         gone = None if prior is WindowPrior.DENSE else removed(
             self._smoother, sparse_marginalization(self._parts.graph, leaving))

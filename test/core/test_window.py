@@ -34,6 +34,7 @@ SECOND = 1_000_000_000
 RATE = 5
 LAP = 250
 WINDOW = WindowConfig(nodes=100)
+N = 900     # samples, five for each node
 
 Event = tuple[str, OdometrySample | Measurement]
 
@@ -88,7 +89,7 @@ def run(
 
 @functools.cache
 def without_a_window() -> Estimate:
-    estimate = run(drive(1500)[0], None).estimate()
+    estimate = run(drive(N)[0], None).estimate()
     assert estimate is not None
     return estimate
 
@@ -99,7 +100,7 @@ def without_a_window() -> Estimate:
 def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     window: WindowConfig,
 ) -> None:
-    events, truth = drive(1500)
+    events, truth = drive(N)
     part = run(events, window)
     one, other = without_a_window(), part.estimate()
     assert other is not None
@@ -111,8 +112,8 @@ def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     np.testing.assert_array_equal(one.path.stamps_ns, other.path.stamps_ns)
     errors = other.path.poses[:-1, :2] - truth[:-1:5][:len(other.path) - 1, :2]
     assert np.sqrt(np.mean(errors**2)) < 0.3
-    assert other.n_hidden == one.n_hidden > 290
-    assert other.n_frozen > 180
+    assert other.n_hidden == one.n_hidden > 170
+    assert other.n_frozen > 60
     assert part.graph.n_nodes - other.n_biases <= 115 + 1
     assert part.graph.n_edges < 300
     assert part.graph.n_observed < 150
@@ -120,7 +121,7 @@ def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
 
 
 def test_with_modelled_errors_a_sparse_prior_keeps_what_it_has_of_biases_dense() -> None:
-    events, _ = drive(1200)
+    events, _ = drive(600)
     correlated = {'fix': MeasurementSource(correlation_time=20.0)}
     found = [run(events, None, PoseGraphBackend(BackendConfig(
         window=WindowConfig(nodes=60, prior=prior), measurements=correlated)))
@@ -128,7 +129,7 @@ def test_with_modelled_errors_a_sparse_prior_keeps_what_it_has_of_biases_dense()
     one, other = (backend.estimate() for backend in found)
     assert one is not None
     assert other is not None
-    assert one.n_frozen == other.n_frozen > 120
+    assert one.n_frozen == other.n_frozen > 40
     assert found[1].graph.n_nodes == found[0].graph.n_nodes
     for prior in found[1].graph.priors:
         assert np.any(found[1].graph.is_bias[found[1].graph.node_rows(prior.nodes)])
@@ -139,7 +140,7 @@ def test_with_modelled_errors_a_sparse_prior_keeps_what_it_has_of_biases_dense()
 
 
 def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:
-    events, _ = drive(3000)
+    events, _ = drive(2 * N)
     backend, sizes, frozen = PoseGraphBackend(BackendConfig(window=WINDOW)), [], np.empty((0, 3))
     for number, event in enumerate(events):
         add(backend, event)
@@ -158,7 +159,7 @@ def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:
 
 
 def test_measurements_before_the_window_are_refused_and_counted() -> None:
-    events, _ = drive(1500)
+    events, _ = drive(N)
     backend = run(events, WINDOW)
     first = backend._nodes.n_frozen
     stamps = backend.node_stamps_ns
@@ -176,7 +177,7 @@ def test_measurements_before_the_window_are_refused_and_counted() -> None:
 
 
 def test_delayed_and_shuffled_within_the_window_the_path_is_the_same() -> None:
-    events, _ = drive(1500)
+    events, _ = drive(N)
     rng = np.random.default_rng(1)
     delays = [0.0 if source == 'odom' else rng.uniform(0.0, 20.0) * SECOND for source, _ in events]
     order = np.argsort([what.stamp_ns + delay for (_, what), delay in zip(
@@ -197,7 +198,7 @@ def test_delayed_and_shuffled_within_the_window_the_path_is_the_same() -> None:
 
 
 def test_a_path_that_has_left_moves_into_the_map_when_the_angle_is_found() -> None:
-    events, truth = drive(1500, first_fix=1000, closures=0)
+    events, truth = drive(N, first_fix=600, closures=0)
     backend, held = PoseGraphBackend(BackendConfig(window=WINDOW)), False
     for number, event in enumerate(events):
         add(backend, event)
@@ -218,7 +219,7 @@ def test_a_path_that_has_left_moves_into_the_map_when_the_angle_is_found() -> No
 
 
 def test_a_pose_that_is_set_and_a_smaller_window_at_run_time() -> None:
-    events, _ = drive(1500)
+    events, _ = drive(N)
     at = 2 * len(events) // 3
     backend = run(events[:at], WINDOW)
     pose = GlobalPose(0, np.array([50.0, 60.0, 1.0]), 0.01 * np.eye(3))
@@ -238,7 +239,7 @@ def test_a_pose_that_is_set_and_a_smaller_window_at_run_time() -> None:
 
 
 def test_a_closure_that_waits_holds_its_node_but_not_for_ever() -> None:
-    events, _ = drive(1500, closures=0)
+    events, _ = drive(N, closures=0)
     backend = PoseGraphBackend(BackendConfig(window=WindowConfig(nodes=40)))
     held = []
     for number, event in enumerate(events):

@@ -27,9 +27,10 @@ from pose_graph_ros.core.batch.levenberg_marquardt import (
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.sparse import components
 
 __all__ = [
     'SAME_MINIMUM',
@@ -42,6 +43,7 @@ __all__ = [
     'chi2_of',
     'from_linear_start',
     'in_parts',
+    'loose_nodes',
     'optimize',
     'optimize_from_linear_start',
     'optimize_from_two_starts',
@@ -174,18 +176,31 @@ def _start(graph: Graph, start: Start) -> FloatArray:
 
 def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
     """Return chi2, and a result if there is nothing to optimise or the poses are undetermined."""
-    head = graph.memory.head
     chi2 = chi2_of(graph)
     if not np.isfinite(chi2):
         return chi2, _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
         return chi2, BatchResult(Status.CONVERGED, '', 0, chi2)
-    node, count = symbolic.loose_part(head)
-    if node >= 0:
+    loose = loose_nodes(graph)
+    if len(loose) > 0:
         return chi2, _failed(
-            f'hidden node {graph.node_ids[node]} and {count - 1} others are connected to no fixed '
+            f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
             f'and no observed node: their poses are not determined', chi2)
     return chi2, None
+
+
+def loose_nodes(graph: Graph) -> IntArray:
+    """Return ids of nodes in parts without a fixed or observed node or an anchored prior."""
+    edges, observed, priors = graph.edges, graph.observed, graph.priors
+    edges = edges.rows(edges.weight > 0.0)
+    third = edges.k >= 0
+    starts = edges.i, edges.i[third], *(prior.nodes[:-1] for prior in priors)
+    ends = edges.j, edges.k[third], *(prior.nodes[1:] for prior in priors)
+    i, j = (graph.node_rows(np.concatenate(each)) for each in (starts, ends))
+    part = components(i, j, graph.n_nodes)
+    held = np.concatenate((graph.node_ids[graph.fixed], observed.node[observed.weight > 0.0],
+                           *(prior.nodes[:1] for prior in priors if prior.anchored)))
+    return graph.node_ids[~np.isin(part, part[graph.node_rows(held)])]
 
 
 def chi2_of(graph: Graph) -> float:
@@ -210,7 +225,7 @@ def _minimize(
 ) -> Optimization:
     """Optimise from the present poses; the poses after a failure have no meaning."""
     head = graph.memory.head
-    symbolic.plant(head, cliques)
+    symbolic.plant_all(head, cliques)
     result = yield from minimize(gauss_newton.CompiledSystem(graph.memory), chi2, config)
     if result.status is Status.FAILED:
         node = graph.node_ids[head[tb.BAD_NODE]]

@@ -8,6 +8,7 @@ from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
 from pose_graph_ros.core.graph import (
     factors,
+    incidence,
     normal_equations,
     prior_rows,
     tables as tb,
@@ -46,8 +47,8 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
     """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
     node_f = tb.node_f(head)
     pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
-    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
-    clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
+    node_i, edge_i, pool_i = tb.node_i(head), tb.edge_i(head), tb.pool_i(head)
+    clique_f, clique_i = tb.clique_f(head), tb.clique_i(head)
     row = clique_i[c]
     n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
     n_all = n_frontal + n_separator
@@ -65,41 +66,27 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
     any_fixed, any_padded, anchored = False, False, 0
     for k in range(n_frontal):
         v = nodes[k]
-        entry = node_i[v, tb.EDGE_LIST]
-        while entry >= 0:
-            e, side = entry >> 2, entry & 3
-            ends = edge_i[e]
-            entry = ends[tb.NEXT_I + side]
-            # an edge between frontal nodes is in all their lists: added from the first of its ends
-            at_i, at_j, at_k = 3 * k, 3 * k, -1
-            if ends[tb.END_K] < 0:
-                at = _place(head, ends[1 - side])
-                if at < 0 or (side == 1 and at < rows):
-                    continue
-                if side == 0:
-                    at_j = at
-                else:
-                    at_i = at
-            else:
+        at = incidence.first(head, v)
+        while at != incidence.END:
+            entry, side = incidence.entry_of(at), at & 3
+            at = incidence.following(head, v, at)
+            at_i, at_j, at_k = 3 * k, -1, -1
+            if entry >= 0:
+                ends = edge_i[entry]
                 at_i, at_j = _place(head, ends[tb.END_I]), _place(head, ends[tb.END_J])
-                at_k = _place(head, ends[tb.END_K])
-                if (min(at_i, at_j, at_k) < 0 or (side > 0 and at_i < rows)
-                        or (side == 2 and at_j < rows)):
+                if ends[tb.END_K] >= 0:
+                    at_k = _place(head, ends[tb.END_K])
+                # one between frontal nodes is in all their lists: added from the first of its ends
+                if (min(at_i, at_j) < 0 or (ends[tb.END_K] >= 0 and at_k < 0)
+                        or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
                     continue
             if relinearize:
-                transaction_log.log_constraint(head, e)
-                factors.linearize(head, e)
-            ends[tb.OWNER] = c
-            anchored |= anchors(ends[tb.EDGE_KIND])
-            normal_equations.add(head, e, at_i, at_j, at_k, front, ld)
-        entry = node_i[v, tb.OBSERVED_LIST]
-        while entry >= 0:
-            anchored = 1
-            if relinearize:
-                transaction_log.log_constraint(head, -1 - entry)
-                factors.linearize(head, -1 - entry)
-            normal_equations.add(head, -1 - entry, 3 * k, -1, -1, front, ld)
-            entry = observed_i[entry, tb.OBS_NEXT]
+                transaction_log.log_constraint(head, entry)
+                factors.linearize(head, entry)
+            if entry >= 0:
+                edge_i[entry, tb.OWNER] = c
+            anchored |= entry < 0 or anchors(edge_i[entry, tb.EDGE_KIND])
+            normal_equations.add(head, entry, at_i, at_j, at_k, front, ld)
         scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
         least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
@@ -160,22 +147,14 @@ def _place(head, v):  # type: ignore[no-untyped-def]
 @kernel
 def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     """Lower the bounds of a node's pivots, shape (3,), where its constraints are weak."""
-    edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
-    clique_i = tb.clique_i(head)
+    clique_i, at = tb.clique_i(head), incidence.first(head, v)
     weak_t = weak_r = 0.0
-    entry = node_i[v, tb.EDGE_LIST]
-    while entry >= 0:
-        e = entry >> 2
-        entry = edge_i[e, tb.NEXT_I + (entry & 3)]
-        t, r = normal_equations.weakest(edge_f[e])
+    while at != incidence.END:
+        f = factors.parts(head, incidence.entry_of(at))[0]
+        t, r = normal_equations.weakest(f)
         weak_t, weak_r = weak_t + t, weak_r + r
-    entry = node_i[v, tb.OBSERVED_LIST]
-    while entry >= 0:
-        t, r = normal_equations.weakest(observed_f[entry])
-        weak_t, weak_r = weak_t + t, weak_r + r
-        entry = observed_i[entry, tb.OBS_NEXT]
-    c = clique_i[node_i[v, tb.CLIQUE], tb.CHILD]
+        at = incidence.following(head, v, at)
+    c = clique_i[tb.node_i(head)[v, tb.CLIQUE], tb.CHILD]
     while c >= 0:
         if clique_i[c, tb.N_FRONTAL] == 0:
             t, r = prior_rows.weakest(head, c, v)

@@ -3,14 +3,14 @@
 """
 The structure of cliques: what `ordering` starts from, what becomes of its result, whole graphs.
 
-`structure` is the quotient graph of the nodes that an update orders, `amalgamate` merges the
-resulting cliques. `analyse` and `plant` are the symbolic factorisation of a whole graph, done once
-for all iterations of a batch optimisation.
+`structure` is the quotient graph of the nodes that an update orders, `in_postorder` merges and
+sorts the resulting cliques, and `plant` writes them into the tables. `analyse` and `plant_all` do
+so for a whole graph, once for all iterations of a batch optimisation.
 
-Its cliques are in postorder: children precede their parent, and each subtree is contiguous. So the
+Cliques are in postorder: children precede their parent, and each subtree is contiguous. So the
 elimination is a loop over all cliques, the back-substitution is the same loop in reverse, and the
 update matrices of the children are still in the processor's cache when the parent needs them.
-Separators are sorted by the order of elimination. Columns that are adjacent in a separator are
+In a whole graph, separators are sorted by the order of elimination. Columns that are adjacent are
 therefore mostly adjacent in the parent's front as well, and are added in runs.
 """
 
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from numba import types
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, INTEGERS, kernel
+from pose_graph_ros.core.compiled.jit import FLAG, INDICES, INTEGER, INTEGERS, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
@@ -37,7 +37,7 @@ class Cliques(NamedTuple):
 
     first: Any  # (C + 1,); the nodes of clique k are `nodes[first[k]:first[k + 1]]`
     n_frontal: Any  # (C,) number of frontal nodes, which come first; the others are the separator
-    parent: Any     # (C,), -1 for a root
+    parent: Any     # (C + O,), -1 for a root; the last ones are those of orphans
     nodes: Any
 
 
@@ -209,9 +209,10 @@ def analyse(head: tb.IntHead) -> Analysis:
     n_last = newest_last(order, int(head[tb.NEWEST]))
     start, adjacency = _adjacency(head, order)
     n_priors = len(start) - 1 - len(order)
-    cliques = _amalgamated(order, minimum_degree(
-        len(order), n_priors, 0, n_last, start, adjacency))
-    return Analysis(cliques, *_required_memory(head, cliques))
+    cliques = in_postorder(order, minimum_degree(
+        len(order), n_priors, 0, n_last, start, adjacency), 0, RELAXED_ZEROS, RELAXED_FRONTAL,
+        True)
+    return Analysis(cliques, *_memory_of_all(head, cliques))
 
 
 @kernel(signature=(tb.HEAD, INDICES), allocates=True)
@@ -222,54 +223,80 @@ def _adjacency(head, order):  # type: ignore[no-untyped-def]
     return start, adjacency
 
 
-@kernel(signature=(INDICES, ELIMINATED), allocates=True)
-def _amalgamated(order, eliminated):  # type: ignore[no-untyped-def]
-    """Return the cliques found by `minimum_degree`, amalgamated and in postorder."""
+@kernel(signature=(INDICES, ELIMINATED, INTEGER, INTEGER, INTEGER, FLAG), allocates=True)
+def in_postorder(  # type: ignore[no-untyped-def]
+    order, eliminated, n_before, most_zeros, most_frontal, sorts,
+):
+    """
+    Return the cliques found by `minimum_degree`, amalgamated and in postorder.
+
+    Its node k is `order[k]`; the first `n_before` are not in a clique with others. If asked for it
+    sorts separators, which pays where the same cliques are eliminated several times.
+    """
     n_raw, offset, raw_frontal, raw_parent, raw_nodes = eliminated
-    for m in range(offset[n_raw]):
-        raw_nodes[m] = order[raw_nodes[m]]
-    into, _ = amalgamate(
-        n_raw, raw_frontal, offset, raw_parent, 0, RELAXED_ZEROS, RELAXED_FRONTAL)
+    n_apart = 0
+    while n_apart < n_raw and raw_nodes[offset[n_apart]] < n_before:
+        n_apart += 1
+    into, n_frontal_of = amalgamate(
+        n_raw, raw_frontal, offset, raw_parent, n_apart, most_zeros, most_frontal)
     raw_order = _postorder(n_raw, into, raw_parent)
     n_cliques = len(raw_order)
     place = np.full(n_raw, -1, np.int32)
-    for k in range(n_cliques):
-        place[raw_order[k]] = k
-    n_frontal = np.zeros(n_cliques, np.int32)
-    n_separator = np.zeros(n_cliques, np.int32)
-    parent = np.full(n_cliques, -1, np.int32)
-    separators = np.empty((n_cliques, 2), np.int64)
-    for q in range(n_raw):
-        k = place[into[q]]
-        n_frontal[k] += raw_frontal[q]
-        if into[q] == q:
-            separators[k, 0], separators[k, 1] = offset[q] + raw_frontal[q], offset[q + 1]
-            n_separator[k] = separators[k, 1] - separators[k, 0]
-            if raw_parent[q] >= 0:
-                parent[k] = place[into[raw_parent[q]]]
+    n_frontal = np.empty(n_cliques, np.int32)
     first = np.zeros(n_cliques + 1, np.int32)
     for k in range(n_cliques):
-        first[k + 1] = first[k] + n_frontal[k] + n_separator[k]
-    nodes = np.empty(first[n_cliques], np.int32)
-    cliques = Cliques(first, n_frontal, parent, nodes)
-    filled = first[:n_cliques].copy()
-    for q in range(n_raw):  # the parts of a merged clique in their order of elimination
+        q = raw_order[k]
+        place[q] = k
+        n_frontal[k] = n_frontal_of[q]
+        first[k + 1] = first[k] + n_frontal[k] + offset[q + 1] - offset[q] - raw_frontal[q]
+    parent = np.full(n_cliques + len(raw_parent) - n_raw, -1, np.int32)
+    for k in range(len(parent)):
+        q = raw_parent[raw_order[k] if k < n_cliques else n_raw + k - n_cliques]
+        if q >= 0:
+            parent[k] = place[into[q]]
+    # the frontal nodes, the parts of a merged clique in their order of elimination
+    nodes, filled = np.empty(first[n_cliques], np.int32), first[:n_cliques].copy()
+    for q in range(n_raw):
         k = place[into[q]]
         for m in range(offset[q], offset[q] + raw_frontal[q]):
             nodes[filled[k]] = raw_nodes[m]
             filled[k] += 1
-    _write_separators(cliques, separators, raw_nodes, len(order))
-    return cliques
+    # the separators by the places of their nodes in the order of elimination
+    eliminated_at, at = np.empty(len(order), np.int32), 0
+    for k in range(n_cliques):
+        for m in range(first[k], filled[k]):
+            eliminated_at[nodes[m]] = at
+            at += 1
+    for k in range(n_cliques):
+        q = raw_order[k]
+        for m in range(offset[q] + raw_frontal[q], offset[q + 1]):  # they are nearly sorted
+            v, i = raw_nodes[m], filled[k]
+            while (sorts and i > first[k] + n_frontal[k]
+                    and eliminated_at[nodes[i - 1]] > eliminated_at[v]):
+                nodes[i] = nodes[i - 1]
+                i -= 1
+            nodes[i] = v
+            filled[k] += 1
+    for m in range(len(nodes)):
+        nodes[m] = order[nodes[m]]
+    return Cliques(first, n_frontal, parent, nodes)
 
 
 @kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
-def _required_memory(head, cliques):  # type: ignore[no-untyped-def]
+def _memory_of_all(head, cliques):  # type: ignore[no-untyped-def]
     """Return what cliques and priors need in both pools, and work space of the largest front."""
-    need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
+    need_f, need_i, largest = required_memory(cliques)
     for c in prior_rows.all_priors(head):
         n_separator = np.int64(tb.clique_i(head)[c, tb.N_SEPARATOR])
         need_f += pools.rounded(pools.n_values(0, n_separator))
         need_i += pools.rounded(n_separator)
+    return need_f, need_i, largest
+
+
+@kernel
+def required_memory(cliques):  # type: ignore[no-untyped-def]
+    """Return what cliques need in both pools, and work space of the largest front."""
+    need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
     for k in range(len(cliques.n_frontal)):
         n_all = np.int64(cliques.first[k + 1] - cliques.first[k])
         n_frontal = np.int64(cliques.n_frontal[k])
@@ -310,31 +337,40 @@ def _postorder(n_cliques, into, parent):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _write_separators(cliques, separators, raw_nodes, n):  # type: ignore[no-untyped-def]
-    """Write the separators, each sorted by the order of elimination."""
-    first, n_frontal, nodes = cliques.first, cliques.n_frontal, cliques.nodes
-    n_cliques = len(n_frontal)
-    order, position = np.empty(n, np.int32), np.empty(n, np.int32)
-    at = 0
-    for k in range(n_cliques):
+def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
+    """
+    Return the rows of new cliques without values, given memory for them.
+
+    The last parents are those of the orphans, rows of cliques that there are already.
+    """
+    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    first, n_frontal, parent = cliques.first, cliques.n_frontal, cliques.parent
+    rows = np.empty(len(n_frontal), np.int32)
+    for k in range(len(rows)):
+        rows[k] = transaction_log.take_clique(
+            head, np.int64(n_frontal[k]), np.int64(first[k + 1] - first[k] - n_frontal[k]))
+        at = clique_i[rows[k], tb.NODES]
+        for m in range(first[k], first[k + 1]):
+            pool_i[at + m - first[k]] = cliques.nodes[m]
         for m in range(first[k], first[k] + n_frontal[k]):
-            order[at], position[nodes[m]] = nodes[m], at
-            at += 1
-    for k in range(n_cliques):
-        places = nodes[first[k] + n_frontal[k]:first[k + 1]]
-        for m in range(len(places)):    # they are nearly sorted
-            place = position[raw_nodes[separators[k, 0] + m]]
-            i = m
-            while i > 0 and places[i - 1] > place:
-                places[i] = places[i - 1]
-                i -= 1
-            places[i] = place
-        for m in range(len(places)):
-            places[m] = order[places[m]]
+            transaction_log.log_node(head, cliques.nodes[m])
+            node_i[cliques.nodes[m], tb.CLIQUE] = rows[k]
+    for k in range(len(orphans)):
+        transaction_log.log_clique(head, orphans[k])
+    for m in range(len(parent)):
+        # of siblings, the last one in postorder is the first to be found
+        k = len(rows) - 1 - m if m < len(rows) else m
+        if parent[k] >= 0:
+            child = rows[k] if k < len(rows) else orphans[k - len(rows)]
+            row, above = clique_i[child], clique_i[rows[parent[k]]]
+            row[tb.PARENT], row[tb.SIBLING] = rows[parent[k]], above[tb.CHILD]
+            above[tb.CHILD] = child
+    head[tb.LOOSE] = -1
+    return rows
 
 
 @kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
-def plant(head, cliques):  # type: ignore[no-untyped-def]
+def plant_all(head, cliques):  # type: ignore[no-untyped-def]
     """
     Replace all cliques in the tables by those of a symbolic factorisation, without values.
 
@@ -342,91 +378,10 @@ def plant(head, cliques):  # type: ignore[no-untyped-def]
     elimination, behind those of the priors. No node is touched afterwards, and the log of the
     update is empty: a rollback is not possible.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    touched = tb.touched(head)
-    first, n_frontal = cliques.first, cliques.n_frontal
+    node_i, touched = tb.node_i(head), tb.touched(head)
     prior_rows.remove_cliques(head)
-    n_priors = head[tb.N_CLIQUES]
     for s in range(head[tb.N_TOUCHED]):
         node_i[touched[s], tb.TOUCHED] = 0
     head[tb.N_TOUCHED] = head[tb.STRUCTURE] = 0
-    for k in range(len(n_frontal)):
-        c = transaction_log.take_clique(
-            head, np.int64(n_frontal[k]), np.int64(first[k + 1] - first[k] - n_frontal[k]))
-        at = clique_i[c, tb.NODES]
-        for m in range(first[k], first[k + 1]):
-            pool_i[at + m - first[k]] = cliques.nodes[m]
-        for m in range(first[k], first[k] + n_frontal[k]):
-            node_i[cliques.nodes[m], tb.CLIQUE] = c
-    for k in range(len(n_frontal)):
-        if cliques.parent[k] >= 0:
-            attach(head, n_priors + cliques.parent[k], n_priors + k)
-    for c in range(n_priors):   # to the clique of the node that is eliminated first
-        parent = head[tb.N_CLIQUES]
-        for m in range(clique_i[c, tb.NODES], clique_i[c, tb.NODES] + clique_i[c, tb.N_SEPARATOR]):
-            parent = min(parent, node_i[pool_i[m], tb.CLIQUE])
-        attach(head, parent, c)
-    head[tb.LOOSE] = -1
+    plant(head, cliques, prior_rows.all_priors(head))
     head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
-
-
-@kernel
-def attach(head, parent, child):  # type: ignore[no-untyped-def]
-    """Make a clique a child of another one."""
-    clique_i = tb.clique_i(head)
-    clique_i[child, tb.PARENT] = parent
-    clique_i[child, tb.SIBLING], clique_i[parent, tb.CHILD] = clique_i[parent, tb.CHILD], child
-
-
-@kernel(signature=(tb.HEAD,), allocates=True)
-def loose_part(head):  # type: ignore[no-untyped-def]
-    """
-    Find the parts of the graph that contain no fixed and no observed node, nor an anchored prior.
-
-    Return the first hidden node in such a part, or -1, and the number of nodes in all of them.
-    """
-    edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
-    n = head[tb.N_NODES]
-    part = np.arange(n).astype(np.int32)  # union-find: an earlier node of the same part
-    for e in range(head[tb.N_EDGES]):
-        if edge_f[e, tb.WEIGHT] > 0.0:
-            _join(part, edge_i[e, tb.END_I], edge_i[e, tb.END_J])
-            if edge_i[e, tb.END_K] >= 0:
-                _join(part, edge_i[e, tb.END_I], edge_i[e, tb.END_K])
-    clique_i, pool_i, priors = tb.clique_i(head), tb.pool_i(head), prior_rows.all_priors(head)
-    for c in priors:
-        begin = clique_i[c, tb.NODES]
-        for m in range(begin + 1, begin + clique_i[c, tb.N_SEPARATOR]):
-            _join(part, pool_i[begin], pool_i[m])
-    held = np.zeros(n, np.bool_)
-    for c in priors:
-        if clique_i[c, tb.ANCHORED] != 0:
-            held[_first_node(part, pool_i[clique_i[c, tb.NODES]])] = True
-    for v in range(n):
-        if node_i[v, tb.FIXED] != 0:
-            held[_first_node(part, v)] = True
-    for k in range(head[tb.N_OBSERVED]):
-        if observed_f[k, tb.WEIGHT] > 0.0:
-            held[_first_node(part, observed_i[k, tb.OBS_NODE])] = True
-    node, count = -1, 0
-    for v in range(n - 1, -1, -1):
-        if not held[_first_node(part, v)]:
-            node = v
-            count += 1
-    return node, count
-
-
-@kernel
-def _join(part, v, w):  # type: ignore[no-untyped-def]
-    i, j = _first_node(part, v), _first_node(part, w)
-    part[max(i, j)] = min(i, j)
-
-
-@kernel
-def _first_node(part, v):  # type: ignore[no-untyped-def]
-    """Return the first node of the part that v is in, and shorten the path to it."""
-    while part[v] != v:
-        part[v] = part[part[v]]
-        v = part[v]
-    return v

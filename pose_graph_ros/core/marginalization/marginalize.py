@@ -71,7 +71,9 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
         is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
         if len(prior.nodes) == 2 and not prior.anchored and is_pose:
             edges.append(as_edge(prior))
-        elif len(prior.nodes) == 1 and is_pose:
+        # a heading that is next to unknown may have its minimum turns away, which a mean has not
+        elif len(prior.nodes) == 1 and is_pose and abs(
+                (_pseudo_inverse(prior.information) @ prior.vector)[2]) < np.pi:
             observed.append(as_observed(prior))
         else:
             priors.append(prior)
@@ -96,7 +98,7 @@ def marginal(
     H, b = equations(part)
     energy = part.energies().chi2
     for cut in cuts:
-        of_cut = _columns(part.node_rows(np.array([cut.node])))
+        of_cut = columns_of(part.node_rows(np.array([cut.node])))
         H[np.ix_(of_cut, of_cut)] -= cut.information
         b[of_cut] -= cut.vector
     for row in np.flatnonzero(inside & fixed):  # it is known to lie where it is
@@ -105,7 +107,7 @@ def marginal(
     scale = np.diagonal(H).copy()
     energy -= eliminate(H, b, np.flatnonzero(inside & ~fixed), scale)
     kept = np.flatnonzero(~inside)
-    columns = _columns(kept)
+    columns = columns_of(kept)
     U, u = H[np.ix_(columns, columns)], b[columns]
     tiny = np.diagonal(U) <= 1e-14 * scale[columns]     # what rounding leaves of zero
     U[tiny], U[:, tiny], u[tiny] = 0.0, 0.0, 0.0
@@ -202,17 +204,23 @@ def _part(
     of_edges &= ~np.isin(graph.edge_ids, without)
     of_observed = (np.isin(observed.node, leaving)
                    | np.isin(graph.observed_ids, more_observed)) & (observed.weight > 0.0)
-    edges, observed = edges.rows(of_edges), observed.rows(of_observed)
     priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
-    ends = _ends(edges).ravel()
+    ends = _ends(edges)[:, of_edges].ravel()
     ids = np.unique(np.concatenate((
-        leaving, ends[ends >= 0], observed.node, *(prior.nodes for prior in priors))))
-    rows = graph.node_rows(ids)
-    part = Graph()
+        leaving, ends[ends >= 0], observed.node[of_observed], *(each.nodes for each in priors))))
+    return part_of(graph, ids, of_edges, of_observed, priors)
+
+
+def part_of(
+    graph: Graph, ids: IntArray, edges: IntArray | BoolArray, observed: IntArray | BoolArray,
+    priors: Sequence[Prior] = (),
+) -> Graph:
+    """Return a graph of some nodes, by ids, and of some constraints on them alone, by rows."""
+    rows, part = graph.node_rows(ids), Graph()
     part.fill(GraphRows(
-        graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], edges, observed, ids,
-        graph.edge_ids[of_edges], graph.observed_ids[of_observed], graph.next_ids,
-        graph.dimension[rows], priors))
+        graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], graph.edges.rows(edges),
+        graph.observed.rows(observed), ids, graph.edge_ids[edges], graph.observed_ids[observed],
+        graph.next_ids, graph.dimension[rows], priors))
     return part
 
 
@@ -225,7 +233,7 @@ def equations(graph: Graph) -> tuple[FloatArray, FloatArray]:
     H = H + np.triu(H, 1).T
     for prior in graph.priors:
         rows = graph.node_rows(prior.nodes)
-        at = _columns(rows)
+        at = columns_of(rows)
         linear = model(prior, graph.poses[rows], graph.is_pose[rows])
         H[np.ix_(at, at)] += linear.information
         b[at] -= linear.gradient
@@ -262,7 +270,7 @@ def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) 
         left.remove(v)
         near = np.flatnonzero(linked[v])
         near = near[near != v]
-        at, columns = slice(3 * v, 3 * v + 3), _columns(near)
+        at, columns = slice(3 * v, 3 * v + 3), columns_of(near)
         inverse = _pseudo_inverse(H[at, at], scale[at])
         gain = H[columns, at] @ inverse
         decrease += float(b[at] @ inverse @ b[at])
@@ -295,7 +303,7 @@ def _semidefinite(matrix: FloatArray) -> FloatArray:
     return np.asarray(half @ half.T)
 
 
-def _columns(rows: IntArray) -> IntArray:
+def columns_of(rows: IntArray) -> IntArray:
     """Return the columns of nodes."""
     return np.asarray((3 * rows[:, None] + np.arange(3)).ravel())
 

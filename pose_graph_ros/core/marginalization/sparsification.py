@@ -27,6 +27,8 @@ by the prior, by the pose with which that is smallest.
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -193,15 +195,24 @@ def _candidates(
         rows = np.concatenate((rows, basis.reshape(n, 3, -1)))
         seen = np.concatenate((seen, free.reshape(n, 3, -1)))
         i, j = np.append(i, np.full(n, n)), np.append(j, np.arange(n))
-    covariance = np.matmul(rows, np.swapaxes(rows, 1, 2))
-    roots, weights = np.empty_like(covariance), np.zeros(len(rows))
-    if free.shape[1] > 0:
-        return _partly_determined(i, j, rows, seen)
-    factors = np.linalg.cholesky(covariance)
-    inverse = np.linalg.inv(factors)
-    rows, roots = np.matmul(inverse, rows), np.swapaxes(inverse, 1, 2)
-    weights = 2.0 * np.sum(np.log(np.diagonal(factors, axis1=1, axis2=2)), axis=1)
-    return _Candidates(i, j, rows, roots, weights)
+    roots, whitened = np.zeros((len(rows), 3, 3)), np.zeros_like(rows)
+    # both in units of the measurement's own coordinates
+    size = np.sqrt(np.sum(rows**2, axis=2) + np.sum(seen**2, axis=2))
+    size[size == 0.0] = 1.0
+    left, values, _ = np.linalg.svd(seen / size[:, :, None])
+    n_seen = np.count_nonzero(values > _SEEN, axis=1)
+    # undetermined directions count more than any covariance
+    weights = 1e3 * n_seen + 2.0 * np.sum(np.log(size), axis=1)
+    for n_unknown in range(3):  # each is restricted to what the prior determines of it
+        at, n_known = np.flatnonzero(n_seen == n_unknown), 3 - n_unknown
+        known = left[at, :, n_unknown:] / size[at, :, None]  # (., 3, n_known)
+        reduced = np.matmul(np.swapaxes(known, 1, 2), rows[at])
+        factors = np.linalg.cholesky(np.matmul(reduced, np.swapaxes(reduced, 1, 2)))
+        inverse = np.linalg.inv(factors)
+        whitened[at, :n_known] = np.matmul(inverse, reduced)
+        roots[at, :, :n_known] = np.matmul(known, np.swapaxes(inverse, 1, 2))
+        weights[at] += 2.0 * np.sum(np.log(np.diagonal(factors, axis1=1, axis2=2)), axis=1)
+    return _Candidates(i, j, whitened, roots, weights)
 
 
 def _relative(poses: FloatArray, at: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
@@ -212,31 +223,6 @@ def _relative(poses: FloatArray, at: FloatArray, i: IntArray, j: IntArray) -> Fl
     difference[:, 0] += arm[:, 1, None] * start[:, 2]
     difference[:, 1] -= arm[:, 0, None] * start[:, 2]
     return difference
-
-
-def _partly_determined(
-    i: IntArray, j: IntArray, rows: FloatArray, seen: FloatArray,
-) -> _Candidates:
-    """Return measurements restricted to what the prior determines of them."""
-    roots, weights = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
-    whitened = np.zeros_like(rows)
-    for m, (row, undetermined) in enumerate(zip(rows, seen, strict=True)):
-        # both in units of the measurement's own coordinates
-        size = np.sqrt(np.sum(row**2, axis=1) + np.sum(undetermined**2, axis=1))
-        size[size == 0.0] = 1.0
-        left, values, _ = np.linalg.svd(undetermined / size[:, None])
-        n_seen = np.count_nonzero(values > _SEEN)
-        # undetermined directions count more than any covariance
-        weights[m] = 1e3 * n_seen + 2.0 * np.sum(np.log(size))
-        if n_seen < 3:
-            known = left[:, n_seen:] / size[:, None]    # (3, d)
-            reduced = known.T @ row
-            factor = np.linalg.cholesky(reduced @ reduced.T)
-            inverse = np.linalg.inv(factor)
-            whitened[m, :3 - n_seen] = inverse @ reduced
-            roots[m, :, :3 - n_seen] = known @ inverse.T
-            weights[m] += 2.0 * np.sum(np.log(np.diagonal(factor)))
-    return _Candidates(i, j, whitened, roots, weights)
 
 
 def _with_biases(found: _Candidates, of_biases: list[_OfBias], n_poses: int) -> _Candidates:
@@ -252,21 +238,13 @@ def _with_biases(found: _Candidates, of_biases: list[_OfBias], n_poses: int) -> 
 
 
 def _spanning_tree(found: _Candidates, n: int) -> IntArray:
-    """Return the rows of the tree over n nodes with the smallest sum of weights (R. Prim)."""
-    weight, row = np.full((n, n), np.inf), np.zeros((n, n), dtype=np.int64)
-    weight[found.i, found.j] = weight[found.j, found.i] = found.weights
-    row[found.i, found.j] = row[found.j, found.i] = np.arange(len(found.i))
-    best, nearest = weight[0].copy(), np.zeros(n, dtype=np.int64)
-    best[0] = np.inf
-    outside = np.arange(n) > 0
-    tree = []
-    for _ in range(n - 1):
-        node = int(np.argmin(np.where(outside, best, np.inf)))
-        tree.append(row[nearest[node], node])
-        outside[node] = False
-        closer = weight[node] < best
-        best[closer], nearest[closer] = weight[node][closer], node
-    return np.sort(np.array(tree, dtype=np.int64))
+    """Return the rows of the tree over n nodes with the smallest sum of weights."""
+    ends = found.i, found.j
+    weights = found.weights - np.min(found.weights, initial=0.0) + 1.0  # 0 stands for no edge
+    row = np.zeros((n, n), dtype=np.int64)
+    row[ends] = np.arange(len(weights))
+    tree = minimum_spanning_tree(csr_array((weights, ends), shape=(n, n)))
+    return np.sort(row[tree.nonzero()])
 
 
 def _overestimated(

@@ -15,7 +15,14 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph import (
+    factors,
+    incidence,
+    pools,
+    prior_rows,
+    tables as tb,
+    transaction_log,
+)
 from pose_graph_ros.core.graph.editing import unlink
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
@@ -73,30 +80,13 @@ def far_from_linear(head, nodes):  # type: ignore[no-untyped-def]
 
     It is that of a step that moves as many nodes. An edge between two of them counts twice.
     """
-    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
-    edge_f, observed_f, scalars = tb.edge_f(head), tb.observed_f(head), tb.scalars(head)
-    error2 = 0.0
+    scalars, error2 = tb.scalars(head), 0.0
     for v in nodes:
-        entry = node_i[v, tb.EDGE_LIST]
-        while entry >= 0:
-            error2 += edge_f[entry >> 2, tb.ERROR2]
-            entry = edge_i[entry >> 2, tb.NEXT_I + (entry & 3)]
-        k = node_i[v, tb.OBSERVED_LIST]
-        while k >= 0:
-            error2 += observed_f[k, tb.ERROR2]
-            k = observed_i[k, tb.OBS_NEXT]
+        at = incidence.first(head, v)
+        while at != incidence.END:
+            error2 += factors.parts(head, incidence.entry_of(at))[0][tb.ERROR2]
+            at = incidence.following(head, v, at)
     return error2 > min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * len(nodes))
-
-
-@kernel
-def _has_node(head, c, v):  # type: ignore[no-untyped-def]
-    """Tell whether a node is in the separator of a clique."""
-    pool_i, row = tb.pool_i(head), tb.clique_i(head)[c]
-    begin = row[tb.NODES] + row[tb.N_FRONTAL]
-    found = False
-    for m in range(begin, begin + row[tb.N_SEPARATOR]):
-        found = found or pool_i[m] == v
-    return found
 
 
 @kernel(signature=(tb.HEAD, INTEGERS), allocates=True)
@@ -127,7 +117,7 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
             child = clique_i[stack[depth], tb.CHILD]
             while child >= 0:
                 if (clique_i[child, tb.N_FRONTAL] > 0 and state[child] != _WHOLE
-                        and _has_node(head, child, v)):
+                        and prior_rows.is_in_separator(head, child, v)):
                     other = pool_i[clique_i[child, tb.NODES]]
                     transaction_log.log_node(head, other)
                     touch(head, other)
@@ -142,27 +132,20 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
 @kernel
 def _drop_constraints(head, v, leaves):  # type: ignore[no-untyped-def]
     """Take the constraints of a leaving node out of all lists and sums; return their energy."""
-    edge_f, observed_f, node_i = tb.edge_f(head), tb.observed_f(head), tb.node_i(head)
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
-    energy = 0.0
-    entry = node_i[v, tb.EDGE_LIST]
-    while entry >= 0:
-        e, side = entry >> 2, entry & 3
-        entry = edge_i[e, tb.NEXT_I + side]
-        f = edge_f[e]
+    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
+    energy, at = 0.0, incidence.first(head, v)
+    while at != incidence.END:
+        entry = incidence.entry_of(at)
+        at = incidence.following(head, v, at)
+        f = factors.parts(head, entry)[0]
         if f[tb.WEIGHT] == 0.0:
             continue    # another of its ends has left just before
-        scale_by(head, e, -f[tb.WEIGHT])
-        for m in range(3):
-            if edge_i[e, m] >= 0 and not leaves[edge_i[e, m]]:
-                unlink(head, e, m)
+        scale_by(head, entry, -f[tb.WEIGHT])
+        for m in range(3 if entry >= 0 else 0):
+            if edge_i[entry, m] >= 0 and not leaves[edge_i[entry, m]]:
+                unlink(head, entry, m)
         energy += f[tb.ENERGY]
         f[tb.WEIGHT] = f[tb.ENERGY] = f[tb.ERROR2] = 0.0
-    entry = node_i[v, tb.OBSERVED_LIST]
-    while entry >= 0:
-        energy += observed_f[entry, tb.ENERGY]
-        observed_f[entry, tb.WEIGHT] = observed_f[entry, tb.ENERGY] = 0.0
-        entry = observed_i[entry, tb.OBS_NEXT]
     node_i[v, tb.CLIQUE] = node_i[v, tb.OBSERVED_LIST] = -1
     node_i[v, tb.EDGE_LIST] = tb.LEAVES
     head[tb.N_LEAVING] += 1
@@ -273,13 +256,10 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
 @kernel
 def _keep_waiting(head):  # type: ignore[no-untyped-def]
     """Take the constraints without a weight out of the list of the waiting."""
-    edge_f, observed_f, waiting = tb.edge_f(head), tb.observed_f(head), tb.waiting(head)
-    kept = 0
+    waiting, kept = tb.waiting(head), 0
     for n in range(head[tb.N_WAITING]):
-        entry = waiting[n]
-        weight = edge_f[entry, tb.WEIGHT] if entry >= 0 else observed_f[-1 - entry, tb.WEIGHT]
-        if weight > 0.0:
-            waiting[kept] = entry
+        if factors.parts(head, waiting[n])[0][tb.WEIGHT] > 0.0:
+            waiting[kept] = waiting[n]
             kept += 1
     head[tb.N_WAITING] = kept
 

@@ -23,6 +23,7 @@ from pose_graph_ros.core.geometry.se2 import (
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph_update import Left, NOTHING_LEFT
 from pose_graph_ros.core.smoother import (
     chain,
     covariances,
@@ -50,6 +51,7 @@ class UpdateResult(NamedTuple):
     eliminated: int = 0     # nodes whose cliques were, summed over the iterations
     visited: int = 0    # cliques that were solved for, summed over the iterations
     iterations: int = 0     # back-substitutions
+    left: Left = NOTHING_LEFT   # what the update has taken out of the graph
 
 
 class Refinement(NamedTuple):
@@ -57,15 +59,6 @@ class Refinement(NamedTuple):
 
     finished: bool  # nothing more can be done before the next update
     moved: float    # largest change of a coordinate of a position [m]
-
-
-class Forgotten(NamedTuple):
-    """What `IncrementalSmoother.forget` has taken out of the graph."""
-
-    nodes: IntArray     # ids, ascending
-    poses: Poses    # their last estimates
-    edges: IntArray     # ids of all edges that ended at them
-    observed: IntArray  # ids of all observed nodes on them
 
 
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', eliminated=1, visited=1, iterations=1)
@@ -228,7 +221,7 @@ class IncrementalSmoother:
             edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY],
                         [weight])))
 
-    def forget(self, nodes: Collection[int]) -> Forgotten:
+    def forget(self, nodes: Collection[int]) -> Left:
         """
         Take nodes out of the graph; what their constraints say about the others becomes priors.
 
@@ -242,11 +235,9 @@ class IncrementalSmoother:
         rows = self._may_leave(nodes)
         self._linearize(rows)
         self._order_first(rows)
-        poses = self.graph.poses[rows]
         while forgetting.drop(self._memory.head, rows) == tree_update.MORE_MEMORY:
             self._make_room()
-        left = self.graph.commit()
-        return Forgotten(left.nodes, poses, left.edges, left.observed)
+        return self.graph.commit()
 
     def linearize(self, nodes: Collection[int]) -> None:
         """
@@ -372,9 +363,10 @@ class IncrementalSmoother:
             reason = f'hidden node {node} is not determined'
             self.graph.rollback()
             return UpdateResult(Status.FAILED, reason)
-        self.graph.commit()
+        left = self.graph.commit()
         status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
-        return UpdateResult(status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
+        return UpdateResult(status, '', *head[
+            tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())._replace(left=left)
 
     def _make_room(self) -> None:
         """Let the pools and the work space grow to what a kernel needs."""

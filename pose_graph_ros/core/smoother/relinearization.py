@@ -13,84 +13,68 @@ import math
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph import factors, incidence, tables as tb, transaction_log
 from pose_graph_ros.core.graph.rows import touch
 from pose_graph_ros.core.smoother.back_substitution import back_substitute
 
 
-@kernel
-def _append_waiting(head, entry):  # type: ignore[no-untyped-def]
-    """Append an edge e as e, or an observed node k as -1 - k, to the list of the waiting."""
-    waiting = tb.waiting(head)
-    waiting[head[tb.N_WAITING]] = entry
-    head[tb.N_WAITING] += 1
+@kernel(forceinline=True)
+def set_waits(head, entry, waits):  # type: ignore[no-untyped-def]
+    """Note whether a constraint is listed as waiting, 1 or 0; return what was noted before."""
+    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    if entry >= 0:
+        before, edge_i[entry, tb.EDGE_WAITS] = edge_i[entry, tb.EDGE_WAITS], waits
+    else:
+        k = -1 - entry
+        before, observed_i[k, tb.OBS_WAITS] = observed_i[k, tb.OBS_WAITS], waits
+    return before
 
 
 @kernel
-def _adds_much(scalars, energy, error2):  # type: ignore[no-untyped-def]
-    """Add a constraint to the sums; tell whether its linearization error is large."""
-    scalars[tb.CHI2] += energy
-    scalars[tb.ERROR2_SUM] += error2
-    return error2 > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
-
-
-@kernel
-def _check_edge(head, e, frame):  # type: ignore[no-untyped-def]
+def _check_constraint(head, entry, frame):  # type: ignore[no-untyped-def]
     """
-    Evaluate an edge at the present estimate; it waits if its linearization error is large.
+    Evaluate a constraint at the present estimate; it waits if its linearization error is large.
 
     Frame is the turn of its clique, as for `factors.check`.
     """
-    edge_f, scalars, edge_i = tb.edge_f(head), tb.scalars(head), tb.edge_i(head)
-    transaction_log.log_energy(head, e)
-    f = edge_f[e]
+    scalars, (f, _, _, _, _) = tb.scalars(head), factors.parts(head, entry)
+    if entry >= 0:
+        transaction_log.log_energy(head, entry)
+    else:
+        transaction_log.log_constraint(head, entry)
     scalars[tb.CHI2] -= f[tb.ENERGY]
-    factors.check(head, e, frame)
-    if _adds_much(scalars, f[tb.ENERGY], f[tb.ERROR2]) and edge_i[e, tb.EDGE_WAITS] == 0:
-        edge_i[e, tb.EDGE_WAITS] = 1
-        _append_waiting(head, e)
-
-
-@kernel
-def _check_observed(head, k):  # type: ignore[no-untyped-def]
-    """Evaluate an observed node at the present estimate, as `_check_edge` does an edge."""
-    observed_f, scalars, observed_i = tb.observed_f(head), tb.scalars(head), tb.observed_i(head)
-    transaction_log.log_constraint(head, -1 - k)
-    f = observed_f[k]
-    scalars[tb.CHI2] -= f[tb.ENERGY]
-    factors.check(head, -1 - k, factors.NO_TURN)
-    if _adds_much(scalars, f[tb.ENERGY], f[tb.ERROR2]) and observed_i[k, tb.OBS_WAITS] == 0:
-        observed_i[k, tb.OBS_WAITS] = 1
-        _append_waiting(head, -1 - k)
+    factors.check(head, entry, frame)
+    scalars[tb.CHI2] += f[tb.ENERGY]
+    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
+    large = f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+    if large and set_waits(head, entry, 1) == 0:
+        tb.waiting(head)[head[tb.N_WAITING]] = entry
+        head[tb.N_WAITING] += 1
 
 
 @kernel
 def _check(head):  # type: ignore[no-untyped-def]
     """Check the constraints of all listed nodes, each constraint once."""
-    scalars = tb.scalars(head)
-    node_i, edge_i, observed_i = tb.node_i(head), tb.edge_i(head), tb.observed_i(head)
-    work_i = tb.work_i(head)
+    scalars, edge_i, work_i = tb.scalars(head), tb.edge_i(head), tb.work_i(head)
     iteration = head[tb.ITERATION]
     checks = work_i[head[tb.NODE_ROOM]:]
     scalars[tb.ERROR2_SUM] = 0.0
     owner, frame = -1, factors.NO_TURN  # edges that follow each other often have the same owner
     for n in range(head[tb.N_CHECKS]):
         v = checks[n]
-        entry = node_i[v, tb.EDGE_LIST]
-        while entry >= 0:
-            e, side = entry >> 2, entry & 3
-            if edge_i[e, tb.EDGE_CHECKED] != iteration:
-                edge_i[e, tb.EDGE_CHECKED] = iteration
-                if edge_i[e, tb.OWNER] != owner:
-                    owner = edge_i[e, tb.OWNER]
+        at = incidence.first(head, v)
+        while at != incidence.END:
+            entry = incidence.entry_of(at)
+            if entry < 0:
+                _check_constraint(head, entry, factors.NO_TURN)
+            elif edge_i[entry, tb.EDGE_CHECKED] != iteration:
+                edge_i[entry, tb.EDGE_CHECKED] = iteration
+                if edge_i[entry, tb.OWNER] != owner:
+                    owner = edge_i[entry, tb.OWNER]
                     phi = clique_frames.present_turn(head, owner)
                     frame = (phi, math.cos(phi), math.sin(phi))
-                _check_edge(head, e, frame)
-            entry = edge_i[e, tb.NEXT_I + side]
-        k = node_i[v, tb.OBSERVED_LIST]
-        while k >= 0:
-            _check_observed(head, k)
-            k = observed_i[k, tb.OBS_NEXT]
+                _check_constraint(head, entry, frame)
+            at = incidence.following(head, v, at)
 
 
 @kernel
@@ -118,33 +102,20 @@ def _check_turned(head):  # type: ignore[no-untyped-def]
 @kernel
 def forget_waiting(head):  # type: ignore[no-untyped-def]
     """Empty the lists of waiting constraints and turned frames without linearizing them again."""
-    edge_i, observed_i, waiting = tb.edge_i(head), tb.observed_i(head), tb.waiting(head)
     for n in range(head[tb.N_WAITING]):
-        entry = waiting[n]
-        if entry >= 0:
-            edge_i[entry, tb.EDGE_WAITS] = 0
-        else:
-            observed_i[-1 - entry, tb.OBS_WAITS] = 0
+        set_waits(head, tb.waiting(head)[n], 0)
     head[tb.N_WAITING] = head[tb.N_TURNED] = 0
 
 
 @kernel
-def _error2(head, entry):  # type: ignore[no-untyped-def]
-    edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
-    if entry >= 0:
-        return edge_f[entry, tb.ERROR2]
-    return observed_f[-1 - entry, tb.ERROR2]
-
-
-@kernel
-def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
+def relinearize(head):  # type: ignore[no-untyped-def]
     """
-    Linearize the worst waiting constraints again; the errors of the rest add up to `allowed`.
+    Linearize the worst waiting constraints again, until 0.4 of the budget remains.
 
     The nodes of the relinearized constraints are touched; the lists of the waiting are emptied.
     """
-    work_f, edge_i, observed_i = tb.work_f(head), tb.edge_i(head), tb.observed_i(head)
-    waiting = tb.waiting(head)
+    allowed = 0.4 * _budget(head)
+    work_f, waiting = tb.work_f(head), tb.waiting(head)
     clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
     work_i = tb.work_i(head)
     # sums of the errors by powers of two of their ratio to `allowed`, largest first
@@ -152,7 +123,7 @@ def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
     bins[:] = 0.0
     left, cut = 0.0, 0
     for n in range(head[tb.N_WAITING]):
-        error2 = _error2(head, waiting[n])
+        error2 = factors.parts(head, waiting[n])[0][tb.ERROR2]
         bins[_bin(error2 / allowed)] += error2
         left += error2
     turned = work_i[2 * head[tb.NODE_ROOM]:]
@@ -165,24 +136,15 @@ def _relinearize_worst(head, allowed):  # type: ignore[no-untyped-def]
         cut += 1
     for n in range(head[tb.N_WAITING]):
         entry = waiting[n]
-        worst = _bin(_error2(head, entry) / allowed) < cut
-        if entry >= 0:
-            transaction_log.log_constraint(head, entry)
-            edge_i[entry, tb.EDGE_WAITS] = 0
-            if worst:
-                head[tb.N_RELINEARIZED] += 1
-                factors.linearize(head, entry)
-                for side in range(3):
-                    if edge_i[entry, side] >= 0:
-                        _touch(head, edge_i[entry, side])
-        else:
-            k = -1 - entry
-            transaction_log.log_constraint(head, -1 - k)
-            observed_i[k, tb.OBS_WAITS] = 0
-            if worst:
-                head[tb.N_RELINEARIZED] += 1
-                factors.linearize(head, -1 - k)
-                _touch(head, observed_i[k, tb.OBS_NODE])
+        f, _, i, j, k = factors.parts(head, entry)
+        transaction_log.log_constraint(head, entry)
+        set_waits(head, entry, 0)
+        if _bin(f[tb.ERROR2] / allowed) < cut:
+            head[tb.N_RELINEARIZED] += 1
+            factors.linearize(head, entry)
+            for v in (i, j, k):
+                if v >= 0:
+                    _touch(head, v)
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
         if _bin(clique_f[c, tb.SLIP_ERROR2] / allowed) < cut:
@@ -238,9 +200,3 @@ def solve(head):  # type: ignore[no-untyped-def]
         forget_waiting(head)
         return True
     return False
-
-
-@kernel
-def relinearize(head):  # type: ignore[no-untyped-def]
-    """Linearize the worst waiting constraints again, until 0.4 of the budget remains."""
-    _relinearize_worst(head, 0.4 * _budget(head))

@@ -14,7 +14,13 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination.assembly import eliminate_clique, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
-from pose_graph_ros.core.elimination.symbolic import amalgamate, attach, newest_last, structure
+from pose_graph_ros.core.elimination.symbolic import (
+    in_postorder,
+    newest_last,
+    plant,
+    required_memory,
+    structure,
+)
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 
 # Return codes of the kernels of all modules here. UNFINISHED: what remains can wait for another
@@ -82,62 +88,26 @@ def mark(head):  # type: ignore[no-untyped-def]
 @kernel(allocates=True, inline='always')    # callees compile once
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     """Replace the marked cliques: their nodes are ordered and eliminated anew."""
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
     n_leaving = _leaving_first(head, affected)
     n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
-    n_cliques, offset, n_frontal, parent, nodes = minimum_degree(
-        len(affected), len(orphans), n_leaving, n_last, start, adjacency)
-    n_apart = 0     # cliques of nodes that are about to leave
-    while n_apart < n_cliques and nodes[offset[n_apart]] < n_leaving:
-        n_apart += 1
-    into, frontal = amalgamate(
-        n_cliques, n_frontal, offset, parent, n_apart, RELAXED_ZEROS, RELAXED_FRONTAL)
-    need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
-    for k in range(n_cliques):
-        if into[k] == k:
-            n_separator = offset[k + 1] - offset[k] - n_frontal[k]
-            need_f += pools.rounded(pools.n_values(frontal[k], n_separator))
-            need_i += pools.rounded(frontal[k] + n_separator)
-            largest = max(largest, work_size(frontal[k] + n_separator))
+    cliques = in_postorder(
+        affected, minimum_degree(
+            len(affected), len(orphans), n_leaving, n_last, start, adjacency),
+        n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, False)
+    need_f, need_i, largest = required_memory(cliques)
     if lacks_memory(head, head[tb.POOL_F_END] + need_f, head[tb.POOL_I_END] + need_i, largest):
         return MORE_MEMORY
     _push_drift_down(head, marked, orphans)
-    head[tb.LOOSE] = -1
     for k in range(len(marked)):
         transaction_log.drop_clique(head, marked[k])
-    # the rows of the new cliques; an amalgamated child's frontal nodes precede its parent's
-    clique = np.full(n_cliques, -1, np.int32)
-    filled = np.zeros(n_cliques, np.int32)
-    for k in range(n_cliques):
-        q = into[k]
-        n_separator = offset[q + 1] - offset[q] - n_frontal[q]
-        if clique[q] < 0:
-            clique[q] = transaction_log.take_clique(head, frontal[q], n_separator)
-        at = clique_i[clique[q], tb.NODES] + filled[q]
-        filled[q] += n_frontal[k]
-        for m in range(n_frontal[k]):
-            v = affected[nodes[offset[k] + m]]
-            pool_i[at + m] = v
-            transaction_log.log_node(head, v)
-            node_i[v, tb.CLIQUE] = clique[q]
-        if q == k:
-            at += n_frontal[k]
-            for m in range(n_separator):
-                pool_i[at + m] = affected[nodes[offset[k] + n_frontal[k] + m]]
-    for k in range(n_cliques):
-        if into[k] == k and parent[k] >= 0:
-            attach(head, clique[into[parent[k]]], clique[k])
-    for k in range(len(orphans)):
-        transaction_log.log_clique(head, orphans[k])
-        attach(head, clique[into[parent[n_cliques + k]]], orphans[k])
-    for k in range(n_cliques):
-        if into[k] == k:
-            bad = eliminate_clique(head, clique[k], True)
-            if bad >= 0:
-                head[tb.BAD_NODE] = bad
-                return BAD_PIVOT
-    _find_roots(head, clique)
+    rows = plant(head, cliques, orphans)
+    for k in range(len(rows)):
+        bad = eliminate_clique(head, rows[k], True)
+        if bad >= 0:
+            head[tb.BAD_NODE] = bad
+            return BAD_PIVOT
+    _find_roots(head, rows)
     return DONE
 
 
@@ -237,7 +207,7 @@ def _find_roots(head, cliques):  # type: ignore[no-untyped-def]
     clique_i, work_i = tb.clique_i(head), tb.work_i(head)
     n_roots = 0
     for k in range(len(cliques)):
-        if cliques[k] >= 0 and clique_i[cliques[k], tb.PARENT] < 0:
+        if clique_i[cliques[k], tb.PARENT] < 0:
             work_i[n_roots] = cliques[k]
             n_roots += 1
     head[tb.N_ROOTS] = n_roots

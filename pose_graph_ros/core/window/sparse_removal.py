@@ -32,16 +32,17 @@ import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
-from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.marginalization.marginalize import (
     as_observed,
+    columns_of,
     Cut,
     eliminate,
     equations,
     marginal,
     marginalize,
+    part_of,
     schur_complement,
 )
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
@@ -155,9 +156,12 @@ def _chain(first: int, ends: IntArray) -> list[int]:
 def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cut, ObservedNodes]:
     """Return a cut, and what it leaves on the state that stays."""
     chain = inside[np.isin(graph.edges.i[inside], nodes)]
-    part = _part(graph, nodes, np.append(chain, edge))
+    observed = graph.observed
+    part = part_of(
+        graph, np.sort(nodes), np.sort(np.append(chain, edge)),
+        np.isin(observed.node, nodes[:-1]) & (observed.weight > 0.0))
     order = np.argsort(np.argsort(nodes))
-    (x, y), last = _columns(order[[0, -1]]).reshape(2, 3), order[-2]
+    (x, y), last = columns_of(order[[0, -1]]).reshape(2, 3), order[-2]
     whole, own_b = equations(part)
     part.apply(GraphUpdate(weigh_edges={int(graph.edge_ids[edge]): 0.0}))
     H, b = equations(part)
@@ -181,19 +185,6 @@ def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cu
     return Cut(int(graph.edge_ids[edge]), int(nodes[0]), given * own[0], given * own[1]), rest
 
 
-def _part(graph: Graph, nodes: IntArray, edges: IntArray) -> Graph:
-    """Return a part of a graph, with the observations of all but the last of its nodes."""
-    ids, observed = np.sort(nodes), graph.observed
-    rows, edges = graph.node_rows(ids), np.sort(edges)
-    on_these = np.flatnonzero(np.isin(observed.node, nodes[:-1]) & (observed.weight > 0.0))
-    part = Graph()
-    part.fill(GraphRows(
-        graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], graph.edges.rows(edges),
-        observed.rows(on_these), ids, graph.edge_ids[edges], graph.observed_ids[on_these],
-        graph.next_ids, graph.dimension[rows]))
-    return part
-
-
 def _add_priors(
     graph: Graph, nodes: IntArray, order: IntArray, H: FloatArray, b: FloatArray,
 ) -> None:
@@ -205,10 +196,10 @@ def _add_priors(
         rows = graph.node_rows(prior.nodes)
         linear = model(prior, graph.poses[rows], graph.is_pose[rows])
         others = np.ones(len(prior.vector), dtype=bool)
-        others[_columns(of)] = False
+        others[columns_of(of)] = False
         U, u = schur_complement(linear.information, -linear.gradient, others)
         # what is left is in the order of the prior's nodes
-        columns = _columns(order[at[np.argsort(of)]])
+        columns = columns_of(order[at[np.argsort(of)]])
         H[np.ix_(columns, columns)] += U
         b[columns] += u
 
@@ -218,11 +209,11 @@ def _of_first(
 ) -> tuple[FloatArray, FloatArray]:
     """Return what a chain tells of its first node; its equations are changed."""
     if known >= 0:
-        at = _columns(np.array([known]))
+        at = columns_of(np.array([known]))
         H[at], H[:, at], b[at] = 0.0, 0.0, 0.0
     others = order[1:-1]
     eliminate(H, b, others, np.diagonal(H).copy())
-    at = _columns(order[:1])
+    at = columns_of(order[:1])
     return H[np.ix_(at, at)], b[at]
 
 
@@ -234,10 +225,6 @@ def _through(
     H[:3, :3] += own[0]
     b[:3] += own[1]
     return schur_complement(H, b, np.arange(6) < 3)
-
-
-def _columns(rows: IntArray) -> IntArray:
-    return np.asarray((3 * rows[:, None] + np.arange(3)).ravel())
 
 
 NONE: IntArray = np.empty(0, dtype=np.int64)
@@ -393,14 +380,3 @@ def _dense_group(near: dict[int, set[int]], first: int, size: int = 10) -> IntAr
         for other in near[node].difference(group):
             links[other] = links.get(other, 0) + 1
     return np.array(sorted(group), dtype=np.int64)
-
-
-def leaving(graph: Graph, update: GraphUpdate) -> Left:
-    """Return what leaves a graph with an update, constraints with weight 0 included."""
-    edges, observed = graph.edges, graph.observed
-    nodes = np.array(update.remove_nodes, dtype=np.int64)
-    gone = np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes)
-    return Left(
-        np.sort(nodes), np.union1d(graph.edge_ids[gone], list(update.drop_edges)).astype(np.int64),
-        np.union1d(graph.observed_ids[np.isin(observed.node, nodes)],
-                   list(update.drop_observed)).astype(np.int64))

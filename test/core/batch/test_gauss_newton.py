@@ -39,7 +39,7 @@ def planted(graph: Graph) -> symbolic.Cliques:
     memory.ensure('pool_f', need_f)
     memory.ensure('pool_i', need_i)
     memory.ensure('work_f', largest)
-    symbolic.plant(memory.head, cliques)
+    symbolic.plant_all(memory.head, cliques)
     return cliques
 
 

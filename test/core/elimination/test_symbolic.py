@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cliques of a whole graph are in postorder and cover it; loose parts are found."""
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
-from random_graphs import random_edges, random_observed, random_poses
-import scipy.sparse.csgraph
+from random_graphs import random_edges, random_poses
 
 from pose_graph_ros.core.elimination import symbolic
-from pose_graph_ros.core.elimination.symbolic import NEWEST_LAST, newest_last, structure
+from pose_graph_ros.core.elimination.symbolic import NEWEST_LAST, newest_last
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 seeds = st.integers(0, 2**32 - 1)
@@ -30,30 +29,6 @@ def test_the_newest_nodes_are_last_in_order_and_the_newest_pose_is_the_very_last
     assert n_last == min(NEWEST_LAST, len(chosen))
     expected = sorted(chosen - {newest}) + [newest] * has_newest
     assert affected[len(order) - n_last:].tolist() == expected[len(order) - n_last:]
-
-
-@given(seeds, st.integers(2, 20), st.integers(0, 40), st.data())
-@settings(max_examples=60)
-def test_before_any_clique_the_neighbours_are_those_of_the_edges(
-    seed: int, n: int, extra: int, data: st.DataObject,
-) -> None:
-    rng = np.random.default_rng(seed)
-    pairs = np.array([rng.choice(n, 2, replace=False) for _ in range(extra + 1)])
-    graph = Graph()
-    graph.apply(GraphUpdate(
-        hidden=random_poses(rng, n), edges=random_edges(rng, *pairs.T.tolist())))
-    graph.apply(GraphUpdate(remove_edges=(0,)))
-    affected = np.array(sorted(data.draw(st.sets(
-        st.integers(0, n - 1), min_size=1))), dtype=np.int32)
-    orphans, start, adjacency = structure(
-        graph.memory.head, *np.empty((2, 0), dtype=np.int32), affected)
-    assert len(orphans) == 0
-    used = {frozenset(pair) for pair in pairs[1:].tolist()}
-    for k, node in enumerate(affected.tolist()):
-        found = adjacency[start[k]:start[k + 1]].tolist()
-        assert len(set(found)) == len(found)    # each neighbour once
-        assert {int(affected[other]) for other in found} == {
-            other for other in affected.tolist() if {node, other} in used}
 
 
 @given(seeds, st.integers(1, 40), st.integers(0, 40))
@@ -102,26 +77,3 @@ def test_cliques_cover_the_graph_in_postorder(seed: int, n_nodes: int, extra: in
     for i, j in zip(graph.edges.i, graph.edges.j, strict=True):
         first = min(clique_of[i], clique_of[j])
         assert {i, j} <= set(lists[first])
-
-
-@given(seeds)
-def test_loose_parts_are_those_of_scipy(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    n = 15
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=random_poses(rng, n)))
-    i = rng.integers(0, n, 14)
-    j = (i + rng.integers(1, n, 14)) % n
-    graph.apply(GraphUpdate(
-        edges=random_edges(rng, i.tolist(), j.tolist()),
-        observed=random_observed(rng, rng.integers(0, n, 3).tolist()),
-        fix=[int(rng.integers(n))]))
-    graph.apply(GraphUpdate(remove_edges=[0, 3], remove_observed=[1]))
-    edges, observed = graph.edges, graph.observed
-    matrix = scipy.sparse.coo_array((edges.weight, (edges.i, edges.j)), shape=(n, n)).tocsr()
-    matrix.eliminate_zeros()
-    _, part = scipy.sparse.csgraph.connected_components(matrix, directed=False)
-    held = set(part[graph.fixed]) | set(part[observed.node[observed.weight > 0.0]])
-    loose = [node for node in range(n) if part[node] not in held]
-    expected = (loose[0] if len(loose) > 0 else -1, len(loose))
-    assert symbolic.loose_part(graph.memory.head) == expected

@@ -87,36 +87,6 @@ def test_a_drive_is_the_same_with_and_without_them(seed: int, steps: int) -> Non
     np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-9)
 
 
-@given(seeds, st.integers(2, 15))
-@settings(max_examples=20)
-def test_one_that_gets_a_weight_is_added_then(seed: int, steps: int) -> None:
-    twins = Twins(seed)
-    twins.drive(steps)
-    # the false ones as well
-    edges, observed = twins.idle_edges[-2:], twins.idle_observed[-1:]
-    late = (twins.full.graph.edges_at(np.array(edges)),
-            twins.full.graph.observed_at(np.array(observed)))
-    for table in late:
-        table.weight[:] = 0.5
-    results = (
-        twins.full.update(GraphUpdate(weigh_edges=dict.fromkeys(edges, 0.5),
-                                      weigh_observed=dict.fromkeys(observed, 0.5))),
-        twins.bare.update(GraphUpdate(edges=late[0], observed=late[1])))
-    assert results[0] == results[1]
-    twins.idle_edges, twins.idle_observed = twins.idle_edges[:-2], twins.idle_observed[:-1]
-    # where an update leaves errors within its budget, the order of sums may decide on a step more
-    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-6)
-    for smoother in (twins.full, twins.bare):
-        smoother.graph.set_poses(smoother.poses.copy())
-        smoother.update(GraphUpdate())
-    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-6)
-    n = twins.bare.graph.n_edges, twins.bare.graph.n_observed
-    twins.full.update(GraphUpdate(remove_edges=edges, remove_observed=observed))
-    twins.bare.update(GraphUpdate(
-        remove_edges=(n[0] - 2, n[0] - 1), remove_observed=(n[1] - 1,)))
-    np.testing.assert_allclose(twins.full.poses, twins.bare.poses, rtol=0.0, atol=1e-6)
-
-
 def test_adding_them_solves_nothing() -> None:
     twins = Twins(3)
     twins.drive(15)
@@ -125,7 +95,7 @@ def test_adding_them_solves_nothing() -> None:
     edges, observed = twins.here.edges([(0, 9), (4, 12)]), twins.here.observed([7, 7])
     edges.weight[:] = observed.weight[:] = 0.0
     result = twins.full.update(GraphUpdate(edges=edges, observed=observed))
-    assert result[2:] == (0, 0, 0, 0)
+    assert result[2:6] == (0, 0, 0, 0)
     np.testing.assert_array_equal(graph.memory['clique_i'], cliques)
     assert set(differences(before, state(graph))) == {
         'edge_f', 'edge_i', 'edge_id', 'observed_f', 'observed_i', 'observed_id', 'next'}

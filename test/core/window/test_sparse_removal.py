@@ -73,48 +73,6 @@ def test_nor_does_one_if_nodes_have_left_with_a_dense_prior_before(seed: int) ->
         assert np.min(np.linalg.eigvalsh(difference)) > -1e-5 * np.max(np.abs(after))
 
 
-def test_the_prior_of_a_bias_is_on_one_pose() -> None:
-    i = np.arange(4)
-    poses = np.column_stack((np.arange(5.0), np.zeros((5, 2))))
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, biases=np.zeros((1, 3)), fix=[0], edges=Edges.joined([
-        Edges(i, i + 1, se2.between(poses[:-1], poses[1:]), np.tile(np.eye(3), (4, 1, 1)), 0 * i),
-        Edges([2, 3], [5, 5], poses[2:4], np.tile(np.eye(3), (2, 1, 1)), [EdgeKind.BIAS] * 2,
-              bias=np.ones((2, 4)))]),
-        observed=ObservedNodes([5], mean=np.zeros((1, 3)), information=np.eye(3)[None], kind=[0])))
-    before = covariances(graph)
-    assert [prior.nodes.tolist() for prior in marginalize(graph, [1, 2]).priors] == [[0, 3, 5]]
-    IncrementalSmoother(EXACT, graph).update(sparse_marginalization(graph, np.array([1, 2])))
-    assert [len(prior.nodes) for prior in graph.priors] == [2]
-    assert 5 in graph.priors[0].nodes
-    assert graph.edges.kind.tolist().count(EdgeKind.PRIOR) == 1
-    after = covariances(graph)
-    difference = after - before[[0, 3, 4, 5]]
-    assert np.min(np.linalg.eigvalsh(difference)) > -1e-6
-    exact, sparse = (np.trace(each, axis1=1, axis2=2) for each in (before[[0, 3, 4, 5]], after))
-    assert np.all(sparse <= 1.2 * exact)
-
-
-def test_a_node_of_a_chain_becomes_an_edge_without_loss() -> None:
-    i = np.arange(5)
-    poses = np.column_stack((np.arange(6.0), np.zeros((6, 2))))
-    graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, fix=[0], edges=Edges(
-        i, i + 1, se2.between(poses[:-1], poses[1:]), np.tile(np.eye(3), (5, 1, 1)), 0 * i),
-        observed=ObservedNodes([4], mean=poses[[4]], information=np.eye(3)[None], kind=[0])))
-    before = covariances(graph)
-    update = sparse_removal(graph, np.array([2]))
-    smoother = IncrementalSmoother(EXACT, graph)
-    smoother.update(update)
-    np.testing.assert_allclose(covariances(graph), before[[0, 1, 3, 4, 5]], atol=1e-9)
-    # the edge that the node has left goes into the next one
-    update = sparse_removal(graph, np.array([1]))
-    smoother.update(update)
-    np.testing.assert_allclose(covariances(graph), before[[0, 3, 4, 5]], atol=1e-9)
-    assert graph.edges.kind.tolist() == [
-        EdgeKind.ODOMETRY, EdgeKind.ODOMETRY, EdgeKind.PRIOR]
-
-
 def test_fewer_edges_take_the_place_of_many() -> None:
     rng = np.random.default_rng(1)
     poses = np.column_stack((rng.uniform(0.0, 5.0, (8, 2)), rng.uniform(-3.0, 3.0, 8)))
