@@ -22,7 +22,8 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel, MATRICES, ROWS
+from pose_graph_ros.core.geometry.se2 import FloatArray
 
 # The weights of the barrier. The last one costs at most r mu / 2 of the divergence, and the last
 # scaling gives part of that back.
@@ -34,6 +35,11 @@ _START = 0.95
 _DESCENT = 0.1
 # Eigenvalues of the measurements' Gram matrix below this part of the largest one count as zero.
 _RANK = 1e-10
+
+_FAST = {'reassoc', 'contract', 'nsz'}
+
+# Upper triangle of a symmetric 3x3 matrix.
+_P, _Q = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 
 
 def nearest_below(rows: FloatArray) -> FloatArray:
@@ -56,10 +62,12 @@ def nearest_below(rows: FloatArray) -> FloatArray:
     # coordinates in which the measurements determine everything
     stacked = vectors[:, kept] * np.sqrt(values[kept])
     stacked[~used] = 0.0    # padding is known by that, and rounding is not
-    redundant = bool(np.count_nonzero(kept) < np.count_nonzero(used))
-    blocks = descend(stacked, _START * start, redundant)
+    redundant = np.count_nonzero(kept) < np.count_nonzero(used)
+    blocks = _START * start
+    descend(np.ascontiguousarray(stacked), blocks, int(redundant))
+    weighted = np.matmul(blocks, stacked.reshape(n, 3, -1)).reshape(3 * n, -1)
     # up to the border, and not beyond it by rounding
-    largest = float(np.linalg.eigvalsh(_information(stacked, blocks))[-1])
+    largest = float(np.linalg.eigvalsh(stacked.T @ weighted)[-1])
     return np.asarray(blocks / (largest * (1.0 + 1e-14)))
 
 
@@ -72,93 +80,207 @@ def divergence(rows: FloatArray, blocks: FloatArray) -> float:
     return 0.5 * float(np.trace(information) - log_det - len(information))
 
 
-def descend(stacked: FloatArray, blocks: FloatArray, redundant: bool) -> FloatArray:
+@kernel(signature=(ROWS, MATRICES, INTEGER), allocates=True)
+def descend(stacked, blocks, redundant):  # type: ignore[no-untyped-def]
     """
-    Return the blocks W at the minimum with the last barrier, given some with A < I.
+    Move blocks W with A < I, zero for padding, in place to the minimum with the last barrier.
 
-    The rows of J are stacked, (3 M, r); padding has zeros in all of them. Redundant rows need a
-    barrier that keeps W positive definite.
+    The rows of J are stacked, (3 M, r). Compiled, as NumPy takes 3 to 6 times as long: 14 ms
+    instead of 5 for 20 measurements. Redundant ones need a barrier that keeps W positive definite.
     """
+    n_rows = len(stacked)
+    # J A^-1 J^T and J (I - A)^-1 J^T
+    inside, gap = np.empty((n_rows, n_rows)), np.empty((n_rows, n_rows))
+    step, trial = np.zeros(blocks.shape), np.empty(blocks.shape)
     for mu in _BARRIERS:
-        value = _value(stacked, blocks, mu, redundant)
         for _ in range(_MAX_STEPS):
-            step, decrement = _newton(stacked, blocks, mu, redundant)
-            length = 1.0
+            A = _information(stacked, blocks)
+            _products(stacked, A, inside)
+            _products(stacked, _below_one(A), gap)
+            decrement = _newton(stacked, blocks, inside, gap, mu, redundant, step)
+            before, length = _value(stacked, blocks, mu, redundant), 1.0
             while length > 1e-9:
-                trial = blocks + length * step
-                reached = _value(stacked, trial, mu, redundant)
-                if reached <= value - _DESCENT * length * decrement:
-                    blocks, value = trial, reached
+                _add_scaled(blocks, length, step, trial)
+                if (_value(stacked, trial, mu, redundant)
+                        <= before - _DESCENT * length * decrement):
+                    _add_scaled(blocks, length, step, blocks)
                     break
                 length *= 0.5
             if decrement < mu:
                 break
-    return blocks
 
 
-def _information(stacked: FloatArray, blocks: FloatArray) -> FloatArray:
+@kernel
+def _add_scaled(blocks, length, step, out):  # type: ignore[no-untyped-def]
+    for m in range(len(blocks)):
+        for p in range(3):
+            for q in range(3):
+                out[m, p, q] = blocks[m, p, q] + length * step[m, p, q]
+
+
+@kernel(allocates=True)
+def _below_one(A):  # type: ignore[no-untyped-def]
+    """Return I - A; loops, as an expression of arrays takes seconds to compile."""
+    r = len(A)
+    out = np.empty((r, r))
+    for k in range(r):
+        for m in range(r):
+            out[k, m] = (1.0 if k == m else 0.0) - A[k, m]
+    return out
+
+
+@kernel(allocates=True, fastmath=_FAST)
+def _information(stacked, blocks):  # type: ignore[no-untyped-def]
     """Return A, shape (r, r)."""
-    weighted = np.matmul(blocks, stacked.reshape(len(blocks), 3, -1))
-    return np.asarray(stacked.T @ weighted.reshape(stacked.shape))
+    r = stacked.shape[1]
+    A, weighted = np.zeros((r, r)), np.empty(r)
+    for m in range(len(blocks)):
+        for p in range(3):
+            row = stacked[3 * m + p]
+            for k in range(r):
+                weighted[k] = (blocks[m, p, 0] * stacked[3 * m, k]
+                               + blocks[m, p, 1] * stacked[3 * m + 1, k]
+                               + blocks[m, p, 2] * stacked[3 * m + 2, k])
+            for k in range(r):
+                value = row[k]
+                for q in range(r):
+                    A[k, q] += value * weighted[q]
+    return A
 
 
-def _padded(stacked: FloatArray, blocks: FloatArray) -> FloatArray:
-    """Return blocks with ones on the diagonal of their padding."""
-    unused = ~np.any(stacked != 0.0, axis=1).reshape(-1, 3)
-    return np.asarray(blocks + unused[:, :, None] * np.eye(3))
+@kernel(fastmath=_FAST)
+def _factorize(A):  # type: ignore[no-untyped-def]
+    """Replace the lower triangle by L with `A = L L^T`; False if A is not positive definite."""
+    n = len(A)
+    for k in range(n):
+        for m in range(k + 1):
+            value = A[k, m]
+            for q in range(m):
+                value -= A[k, q] * A[m, q]
+            if m < k:
+                A[k, m] = value / A[m, m]
+            elif value > 0.0:
+                A[k, k] = math.sqrt(value)
+            else:
+                return False
+    return True
 
 
-def _value(stacked: FloatArray, blocks: FloatArray, mu: float, redundant: bool) -> float:
+@kernel
+def _log_det(L):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for k in range(len(L)):
+        total += math.log(L[k, k])
+    return 2.0 * total
+
+
+@kernel(allocates=True, fastmath=_FAST)
+def _products(stacked, A, out):  # type: ignore[no-untyped-def]
+    """Write `J A^-1 J^T`, shape (3 M, 3 M)."""
+    n_rows, r = stacked.shape
+    L, y = np.empty((r, r)), np.empty((n_rows, r))
+    for k in range(r):
+        for m in range(k + 1):
+            L[k, m] = A[k, m]
+    _factorize(L)
+    for m in range(n_rows):
+        for k in range(r):
+            value = stacked[m, k]
+            for q in range(k):
+                value -= L[k, q] * y[m, q]
+            y[m, k] = value / L[k, k]
+    for m in range(n_rows):
+        for n in range(m + 1):
+            value = 0.0
+            for k in range(r):
+                value += y[m, k] * y[n, k]
+            out[m, n] = out[n, m] = value
+
+
+@kernel(allocates=True)
+def _value(stacked, blocks, mu, redundant):  # type: ignore[no-untyped-def]
     """Return what is minimised; infinite where A or W are not inside."""
     A = _information(stacked, blocks)
-    try:
-        of_A, of_gap = (np.linalg.cholesky(each) for each in (A, np.eye(len(A)) - A))
-        of_W = np.linalg.cholesky(_padded(stacked, blocks)) if redundant else np.ones((1, 1, 1))
-    except np.linalg.LinAlgError:
-        return math.inf
-    inside, gap, each = (2.0 * np.sum(np.log(np.diagonal(L, axis1=-2, axis2=-1)))
-                         for L in (of_A, of_gap, of_W))
-    return float(np.trace(A) - inside - mu * (gap + each))
+    r = len(A)
+    other, total = _below_one(A), 0.0
+    for k in range(r):
+        total += A[k, k]
+    if not _factorize(A) or not _factorize(other):
+        return np.inf
+    total -= _log_det(A) + mu * _log_det(other)
+    if redundant != 0:
+        for m in range(len(blocks)):
+            W = _padded(blocks[m])
+            if not _factorize(W):
+                return np.inf
+            total -= mu * _log_det(W)
+    return total
 
 
-def _second(product: FloatArray) -> FloatArray:
-    """Return the second derivatives of `-log det` by all entries of the blocks, not scaled."""
-    p, q = _entries(len(product) // 3)
-    of_p, of_q = product.take(p, 0), product.take(q, 0)     # indexing takes ten times as long
-    crossed = of_p.take(q, 1)
-    return np.asarray(of_p.take(p, 1) * of_q.take(q, 1) + crossed * crossed.T)
+@kernel(allocates=True)
+def _padded(block):  # type: ignore[no-untyped-def]
+    """Return a block with ones on the diagonal of its padding."""
+    W = np.empty((3, 3))
+    for k in range(3):
+        for m in range(3):
+            W[k, m] = block[k, m]
+        if W[k, k] == 0.0:
+            W[k, k] = 1.0
+    return W
 
 
-def _entries(n: int) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the upper triangles of n blocks in a matrix with all of them."""
-    first, (row, column) = 3 * np.arange(n)[:, None], np.triu_indices(3)
-    return (first + row).ravel(), (first + column).ravel()
+@kernel
+def _second(product, i, j, k, m):  # type: ignore[no-untyped-def]
+    """Return the second derivative of `-log det` by two entries of the blocks, not scaled."""
+    return product[i, k] * product[j, m] + product[i, m] * product[j, k]
 
 
-def _newton(
-    stacked: FloatArray, blocks: FloatArray, mu: float, redundant: bool,
-) -> tuple[FloatArray, float]:
-    """Return Newton's step of all blocks, and its squared decrement."""
-    n, A = len(blocks), _information(stacked, blocks)
-    inside, gap = (stacked @ np.linalg.solve(each, stacked.T) for each in (A, np.eye(len(A)) - A))
-    of_blocks = np.zeros_like(inside)
-    if redundant:
-        at = np.arange(3 * n).reshape(n, 3)
-        of_blocks[at[:, :, None], at[:, None]] = np.linalg.inv(_padded(stacked, blocks))
-    p, q = _entries(n)
-    # an entry beside the diagonal is there twice
-    twice = np.where(p == q, 1.0, 2.0)
-    slope = (stacked @ stacked.T - inside + mu * (gap - of_blocks))[p, q] * twice
-    curvature = _second(inside) + mu * _second(gap)
-    if redundant:
-        curvature += mu * _second(of_blocks)
-    curvature *= 0.5 * twice[:, None] * twice
-    # padding has neither slope nor curvature
-    unused = np.flatnonzero(~np.any(stacked != 0.0, axis=1))
-    unused = np.flatnonzero(np.isin(p, unused) | np.isin(q, unused))
-    slope[unused], curvature[unused], curvature[:, unused] = 0.0, 0.0, 0.0
-    curvature[unused, unused] = 1.0
-    change = np.linalg.solve(curvature, slope)
-    step = np.empty((3 * n, 3))
-    step[p, q % 3] = step[q, p % 3] = -change
-    return step.reshape(n, 3, 3), float(slope @ change)
+@kernel(allocates=True, fastmath=_FAST)
+def _newton(stacked, blocks, inside, gap, mu, redundant, step):  # type: ignore[no-untyped-def]
+    """Write Newton's step of all blocks, and return its squared decrement."""
+    n, r = len(blocks), stacked.shape[1]
+    gradient, hessian = np.zeros(6 * n), np.zeros((6 * n, 6 * n))
+    inverse, unit = np.zeros((n, 3, 3)), np.zeros((3, 3))
+    for k in range(3):
+        unit[k, k] = 1.0
+    if redundant != 0:
+        for m in range(n):
+            _products(unit, _padded(blocks[m]), inverse[m])
+    for m in range(n):
+        for a in range(6):
+            p, q = 3 * m + _P[a], 3 * m + _Q[a]
+            at = 6 * m + a
+            # padding has neither slope nor curvature
+            if inside[p, p] == 0.0 or inside[q, q] == 0.0:
+                hessian[at, at] = 1.0
+                continue
+            slope = mu * gap[p, q] - inside[p, q] - mu * inverse[m, _P[a], _Q[a]]
+            for k in range(r):
+                slope += stacked[p, k] * stacked[q, k]
+            gradient[at] = slope if p == q else 2.0 * slope
+            for other in range(m + 1):
+                for b in range(6):
+                    s, t = 3 * other + _P[b], 3 * other + _Q[b]
+                    value = _second(inside, p, q, s, t) + mu * _second(gap, p, q, s, t)
+                    if other == m:
+                        value += mu * _second(inverse[m], _P[a], _Q[a], _P[b], _Q[b])
+                    if s == t:
+                        value *= 0.5
+                    if p != q:
+                        value *= 2.0
+                    hessian[at, 6 * other + b] = value
+    _factorize(hessian)
+    decrement = 0.0
+    for k in range(6 * n):
+        for q in range(k):
+            gradient[k] -= hessian[k, q] * gradient[q]
+        gradient[k] /= hessian[k, k]
+        decrement += gradient[k]**2
+    for k in range(6 * n - 1, -1, -1):
+        for q in range(k + 1, 6 * n):
+            gradient[k] -= hessian[q, k] * gradient[q]
+        gradient[k] /= hessian[k, k]
+    for m in range(n):
+        for a in range(6):
+            step[m, _P[a], _Q[a]] = step[m, _Q[a], _P[a]] = -gradient[6 * m + a]
+    return decrement
