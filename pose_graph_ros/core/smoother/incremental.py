@@ -23,7 +23,7 @@ from pose_graph_ros.core.geometry.se2 import (
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.graph_update import Left, NOTHING_LEFT
+from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.smoother import (
     chain,
     covariances,
@@ -51,7 +51,6 @@ class UpdateResult(NamedTuple):
     eliminated: int = 0     # nodes whose cliques were, summed over the iterations
     visited: int = 0    # cliques that were solved for, summed over the iterations
     iterations: int = 0     # back-substitutions
-    left: Left = NOTHING_LEFT   # what the update has taken out of the graph
 
 
 class Refinement(NamedTuple):
@@ -363,10 +362,9 @@ class IncrementalSmoother:
             reason = f'hidden node {node} is not determined'
             self.graph.rollback()
             return UpdateResult(Status.FAILED, reason)
-        left = self.graph.commit()
+        self.graph.commit()
         status = Status.CONVERGED if code == tree_update.DONE else Status.MAX_ITERATIONS
-        return UpdateResult(status, '', *head[
-            tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())._replace(left=left)
+        return UpdateResult(status, '', *head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1].tolist())
 
     def _make_room(self) -> None:
         """Let the pools and the work space grow to what a kernel needs."""

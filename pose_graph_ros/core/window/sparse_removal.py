@@ -33,6 +33,7 @@ import numpy as np
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.marginalization.marginalize import (
     as_observed,
@@ -380,3 +381,14 @@ def _dense_group(near: dict[int, set[int]], first: int, size: int = 10) -> IntAr
         for other in near[node].difference(group):
             links[other] = links.get(other, 0) + 1
     return np.array(sorted(group), dtype=np.int64)
+
+
+def leaving(graph: Graph, update: GraphUpdate) -> Left:
+    """Return what leaves a graph with an update, constraints with weight 0 included."""
+    edges, observed = graph.edges, graph.observed
+    nodes = np.array(update.remove_nodes, dtype=np.int64)
+    gone = np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes)
+    return Left(
+        np.sort(nodes), np.union1d(graph.edge_ids[gone], list(update.drop_edges)).astype(np.int64),
+        np.union1d(graph.observed_ids[np.isin(observed.node, nodes)],
+                   list(update.drop_observed)).astype(np.int64))

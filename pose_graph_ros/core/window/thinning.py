@@ -30,7 +30,7 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.window.sparse_removal import LIMITS, with_fewer_edges
+from pose_graph_ros.core.window.sparse_removal import leaving, LIMITS, with_fewer_edges
 
 
 class Segment(NamedTuple):
@@ -250,11 +250,12 @@ def removed(smoother: IncrementalSmoother, update: GraphUpdate | None) -> Left |
     """
     if update is None:
         return None
+    gone = leaving(smoother.graph, update)
     try:
         result = smoother.update(update)
     except GraphUpdateError:    # an approximation that rounding has made invalid
         return None
-    return None if result.status is Status.FAILED else result.left
+    return None if result.status is Status.FAILED else gone
 
 
 def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
