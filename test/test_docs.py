@@ -54,6 +54,15 @@ def test_files_that_are_named_exist(page: Path) -> None:
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_what_a_page_says_is_in_a_file_is_there(page: Path) -> None:
+    text = page.read_text(encoding='utf-8')
+    for name, module in re.findall(r'`([\w.]+)`\s(?:in\s|\()`([\w/]+\.py)`', text):
+        files = [place / module for place in (ROOT, PACKAGE, PACKAGE / 'core')]
+        found = next(file for file in files if file.is_file()).read_text(encoding='utf-8')
+        assert re.search(rf'\b{name.rpartition(".")[2]}\b', found), f'{page.name}: {name}'
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
     for link in re.findall(r'\]\(([^)#]+)(?:#[^)]*)?\)', page.read_text(encoding='utf-8')):
         if '://' not in link:

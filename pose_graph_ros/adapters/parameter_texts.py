@@ -21,7 +21,7 @@ _EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]'}
 def as_yaml() -> str:
     """Return the content of `config/pose_graph_full.yaml`: all parameters with their defaults."""
     lines = ['# All parameters with their defaults. In brackets: unit; range; when it can change.',
-             '# Generated from the tables in pose_graph_ros/adapters/parameters.py by the command',
+             '# Generated from the tables in pose_graph_ros/adapters/parameter_table.py by',
              '# `pose-graph parameters --yaml`. pose_graph.yaml has what most robots need.',
              '/**:', '  ros__parameters:']
     commented: set[str] = set()

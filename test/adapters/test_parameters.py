@@ -55,6 +55,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_the_full_yaml_file_is_made_from_the_table() -> None:
     assert (ROOT / 'config' / 'pose_graph_full.yaml').read_text(encoding='utf-8') == as_yaml()
+    (module,) = re.findall(r'tables in (\S+\.py)', as_yaml())
+    assert 'PARAMETERS: ' in (ROOT / module).read_text(encoding='utf-8')
 
 
 def flat(tree: Mapping[str, object], prefix: str = '') -> dict[str, object]:
