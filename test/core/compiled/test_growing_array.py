@@ -39,7 +39,6 @@ def test_it_grows_in_few_steps() -> None:
     np.testing.assert_array_equal(array.values[:, 0], np.arange(10_000))
 
 
-
 def test_rows_are_selected_and_others_follow() -> None:
     array = GrowingArray((2,), np.int64)
     array.append(np.arange(80).reshape(40, 2))

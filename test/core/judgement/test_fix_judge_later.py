@@ -111,28 +111,6 @@ def test_the_end_does_not_depend_on_the_order_of_arrival(seed: int) -> None:
         assert_allclose(path(other), path(backends[0]), atol=1e-9)
 
 
-def test_what_was_decided_for_the_estimate_of_errors_is_what_the_end_would_decide() -> None:
-    events, bad = drive(1, offset=True)
-    ended = []
-    for again in (False, True):
-        backend = PoseGraphBackend()
-        feed(backend, late(events, 1))
-        backend.finish()
-        while backend.update().new_constraints > 0:
-            pass
-        backend._tuner.decide()
-        fixes = backend._judge._fixes
-        assert fixes._decided is not None
-        if again:
-            fixes._decided = None
-        backend._judge.finish()
-        assert fixes._decided is None
-        assert_weights_are_as_decided(backend)
-        assert bad <= doubted(backend)
-        ended.append((everything(backend), fixes.states.totals(), backend.verdict_changes()))
-    assert ended[0] == ended[1]
-
-
 def test_a_decision_of_a_person_is_kept_at_the_end() -> None:
     events, bad = drive(1)
     backend = PoseGraphBackend(BackendConfig(measurements={'fix': POSITIONS}))
