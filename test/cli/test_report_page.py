@@ -4,7 +4,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-import itertools
 import json
 import os
 from pathlib import Path
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 from report_data import example
 
-import pose_graph_ros
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.report import render
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -26,7 +24,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
 WIDE, NARROW = 1400, 400
 HOSTILE = '</script><img src=x onerror="window.hacked=1"><!--\u2028{{data}}&amp;$&'
-CSS = (Path(pose_graph_ros.__file__).parent / 'cli' / 'page' / 'report.css').read_text('utf-8')
+
 
 # A hash of the pictures of the map.
 HASH = """() => {
@@ -411,62 +409,3 @@ def test_an_hour_of_driving_is_below_5_mb_and_can_be_panned(show) -> None:
     opened.page.mouse.up()
     assert opened.view()[0] != before[0]
     assert time.process_time() - began < 5.0
-
-
-# --- colours ------------------------------------------------------------------------------------
-
-def scheme(which: int) -> dict[str, np.ndarray]:
-    """Return name -> (R, G, B) in 0..1 of the light (0) or the dark scheme (1)."""
-    return {name: np.array([int(codes[which][k:k + 2], 16) for k in (0, 2, 4)]) / 255.0
-            for name, *codes in re.findall(r'--([\w-]+): light-dark\(#(\w{6}), #(\w{6})\);', CSS)}
-
-
-SCHEMES = {'light': scheme(0), 'dark': scheme(1)}
-MARKS = ('path', 'odometry', 'truth', 'believed', 'waiting', 'doubted', 'refused', 'held-out',
-         'spring', 'axis')
-
-
-def linear(colour: np.ndarray) -> np.ndarray:
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-
-
-def contrast(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the contrast ratio of WCAG 2.2."""
-    light = sorted(float(linear(colour) @ [0.2126, 0.7152, 0.0722]) for colour in (one, other))
-    return (light[1] + 0.05) / (light[0] + 0.05)
-
-
-@pytest.mark.parametrize('name', SCHEMES)
-def test_texts_and_marks_have_enough_contrast(name) -> None:
-    colours = SCHEMES[name]
-    assert len(colours) > 20
-    for ground, text in itertools.product(
-            ('page', 'surface', 'raised'),
-            ('ink', 'muted', 'accent', 'warning', 'notice', 'good')):
-        assert contrast(colours[ground], colours[text]) >= 4.5, (ground, text)
-    for mark in MARKS:
-        assert contrast(colours['surface'], colours[mark]) >= 3.0, mark
-
-
-# How colours look to people without cones for red and for green, in linear RGB (Viénot, Brettel
-# and Mollon: Digital video colourmaps for checking the legibility of displays by dichromats, 1999)
-DICHROMATS = {
-    'protanopia': [[0.11238, 0.88762, 0.0], [0.11238, 0.88762, 0.0], [0.00401, -0.00401, 1.0]],
-    'deuteranopia': [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1.0]]}
-
-
-def lab(rgb: np.ndarray) -> np.ndarray:
-    """Return CIELAB of linear RGB, for the white of sRGB."""
-    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    scaled = xyz @ np.clip(rgb, 0.0, 1.0) / (xyz @ np.ones(3))
-    f = np.where(scaled > 0.008856, np.cbrt(scaled), 7.787 * scaled + 16.0 / 116.0)
-    return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
-
-
-@pytest.mark.parametrize('name', SCHEMES)
-@pytest.mark.parametrize('eyes', DICHROMATS)
-def test_marks_differ_for_the_colour_blind(name, eyes) -> None:
-    seen = {mark: lab(np.array(DICHROMATS[eyes]) @ linear(SCHEMES[name][mark]))
-            for mark in MARKS if mark not in ('truth', 'axis')}
-    for one, other in itertools.combinations(seen, 2):
-        assert np.linalg.norm(seen[one] - seen[other]) > 15.0, (one, other)

@@ -10,7 +10,7 @@ from random_graphs import (
     random_graph,
 )
 from scipy.optimize import least_squares
-from slow_smoother import EXACT, world
+from slow_smoother import EXACT
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
@@ -154,35 +154,6 @@ def test_the_estimate_is_good_all_along_a_drive_with_default_settings() -> None:
 
 
 # --- batch, starts, files -----------------------------------------------------------------------
-
-@pytest.mark.parametrize('seed', range(6))
-def test_the_batch_optimum_is_that_of_scipy(seed: int) -> None:
-    here, graph = world(seed), Graph()
-    for update in (GraphUpdate(hidden=np.array(here.truth), fix=[0]), here.new_nodes(8),
-                   here.new_biases(3, 9)):
-        graph.apply(update)
-    edges, observed, free = graph.edges, graph.observed, ~graph.fixed
-    roots = []
-    for table in (edges, observed):
-        values, vectors = np.linalg.eigh(table.information)
-        roots.append(np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2))
-
-    def errors(x: FloatArray) -> FloatArray:
-        poses = graph_poses.copy()
-        poses[free] = x.reshape(-1, 3)
-        return np.concatenate([
-            np.einsum('mij,mj->mi', root, error).ravel() for root, error in zip(
-                roots, (error_functions.edge_errors(poses, edges),
-                        error_functions.observed_errors(poses, observed)), strict=True)])
-
-    graph_poses = graph.poses.copy()
-    other = least_squares(errors, graph_poses[free].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    result = optimizer.optimize(graph, THOROUGH)
-    assert result.status is Status.CONVERGED
-    assert result.chi2 == pytest.approx(2.0 * other.cost, rel=1e-9)
-    off = graph.poses[free] - other.x.reshape(-1, 3)
-    off[:, 2] = se2.wrap(off[:, 2])
-    np.testing.assert_allclose(off, 0.0, atol=1e-6)
 
 
 def test_a_file_has_no_biases_and_says_so(tmp_path: Path) -> None:
