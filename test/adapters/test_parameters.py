@@ -271,12 +271,6 @@ def test_a_change_is_refused_with_a_reason_whole(wanted: dict[str, object], said
     assert before == PRESENT
 
 
-@pytest.mark.parametrize('name', ['node_heartbeat', 'odom.robust_loss'])
-def test_what_has_become_of_a_parameter_is_said(name: str) -> None:
-    with pytest.raises(ConfigError, match=f'parameter {name} no longer exists: .*CHANGELOG'):
-        checked({name: 1.0})
-
-
 def some_value(parameter: Parameter) -> st.SearchStrategy[object]:
     """Draw a good value for it, more often than not."""
     low = -90.0 if parameter.smallest is None else parameter.smallest
