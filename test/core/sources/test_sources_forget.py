@@ -12,7 +12,9 @@ from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind,
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
+from pose_graph_ros.core.sources.error_likelihood import no_past
 from pose_graph_ros.core.sources.gauss_markov import Additions, GaussMarkovBias
+from pose_graph_ros.core.sources.settings import SOURCES
 
 
 class Chain:
@@ -144,3 +146,18 @@ def test_the_measured_path_goes_on_before_the_window(seed: int) -> None:
         first_motion = past.motion[0]
         np.testing.assert_allclose(
             se2.compose(first_motion, ends[0]), ends[1], atol=1e-9)
+
+
+def test_the_past_is_bounded() -> None:
+    path = no_past(0)
+    graph, stamps_ns, ids = drive(1, 12)
+    part = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids))
+    grown = part._replace(motion=np.zeros((len(ids) + 1, 3)),
+                          noise=np.tile(np.eye(3), (len(ids) + 1, 1, 1)),
+                          way=np.tile((1.0, 0.0, 1.0), (len(ids) + 1, 1)),
+                          lever=np.zeros((len(ids) + 1, 3)))
+    for k in range(600):
+        path = path.extended(stamps_ns + k * 100 * SECOND, grown, 0)
+        assert len(path.stamps_ns) <= 2 * SOURCES.kept_positions
+    assert np.all(np.diff(path.stamps_ns) > 0)
+    assert path.stamps_ns[-1] == stamps_ns[-1] + 599 * 100 * SECOND
