@@ -13,6 +13,7 @@ from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.several_sources import (
     choose_first,
     find_silence,
+    SecondaryEdges,
     Silence,
 )
 from pose_graph_ros.core.odometry.stream import OdometryStream
@@ -93,3 +94,39 @@ def test_samples_at_rest_that_were_left_out_end_no_silence() -> None:
     streams = {'wheel': wheel, 'visual': stream([95])}
     assert find_silence(
         streams, ['wheel', 'visual'], 70, ('wheel', 100), PATIENCE) == Silence(70, 95)
+
+
+SECOND = 1_000_000_000
+NODES = np.arange(1, 11) * SECOND
+# Of other nodes than the hidden ones there may be rows in between.
+ROWS = 2 * np.arange(10) + 1
+
+
+def filled(times: Iterable[float]) -> OdometryStream:
+    """Return settled samples at times [s] of a robot with 1 m/s and 0.1 rad/s."""
+    one = OdometryStream(OdometrySource())
+    for t in times:
+        one.add(OdometrySample(
+            round(t * 1e9), np.array([10.0 * np.sin(0.1 * t), 10.0 - 10.0 * np.cos(0.1 * t),
+                                      0.1 * t])))
+    one.settle_all(one.newest_ns)
+    return one
+
+
+def ends(edges: SecondaryEdges) -> list[tuple[int, int]]:
+    """Return the numbers of the hidden nodes that the edges connect."""
+    return [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for _, edge in edges.new]
+
+
+def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:
+    before = filled(np.arange(0.55, 4.5, 0.1))
+    after = OdometryStream(OdometrySource())
+    after.restore(before.saved(NODES[:4], (3, 4)))
+    for t in np.arange(4.6, 10.5, 0.1):      # 1 km away: this is no motion of the robot
+        after.add(OdometrySample(round(t * 1e9), np.array([1000.0 + t, 0.0, 0.0])))
+    after.settle_all(after.newest_ns)
+    assert NODES[3] < after.restarted_ns <= NODES[4]
+    edges = SecondaryEdges()
+    edges.progress['visual'] = 3, 4
+    edges.extend('visual', after, NODES, ROWS)
+    assert ends(edges) == [(k, k + 1) for k in range(4, 9)]
