@@ -18,7 +18,6 @@ from pose_graph_ros.adapters.parameter_table import Change, Parameter
 from pose_graph_ros.adapters.parameter_texts import (
     as_markdown,
     as_yaml,
-    constraints,
     sources_as_markdown,
 )
 from pose_graph_ros.adapters.parameters import (
@@ -202,15 +201,6 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
         Source('loop_closure', Kind.LOOP_CLOSURE, 'loop_closure'))
 
 
-@pytest.mark.parametrize(('name', 'text'), [
-    ('fix.robust_loss', 'one of: none, huber, cauchy, geman_mcclure, dcs, tukey, truncated'),
-    ('datum', '2 or 3 numbers, or unset; unit: deg, deg, rad; only while the node is not '
-              'configured'),
-    ('fix.sigma_floor', '2 numbers; unit: m, rad'), ('frequency', 'unit: Hz'), ('publish_tf', '')])
-def test_a_parameter_says_which_values_it_can_have(name: str, text: str) -> None:
-    assert constraints(next(each for each in all_parameters({}) if each.name == name)) == text
-
-
 # --- Names that are not known
 
 KNOWN = {parameter.name for parameter in all_parameters({})}
@@ -281,12 +271,6 @@ def test_a_change_is_refused_with_a_reason_whole(wanted: dict[str, object], said
         changed(PRESENT, {'path_period': 3.0, **wanted}, configured=True)
     assert '\n' not in str(caught.value)
     assert before == PRESENT
-
-
-@pytest.mark.parametrize('name', ['node_heartbeat', 'odom.robust_loss'])
-def test_what_has_become_of_a_parameter_is_said(name: str) -> None:
-    with pytest.raises(ConfigError, match=f'parameter {name} no longer exists: .*CHANGELOG'):
-        checked({name: 1.0})
 
 
 def some_value(parameter: Parameter) -> st.SearchStrategy[object]:

@@ -16,7 +16,7 @@ from pose_graph_ros.cli.drive import (
     place_truth,
     summary,
 )
-from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, thinned, VERMILION
+from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, VERMILION
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.verdicts import State
@@ -188,8 +188,3 @@ def test_the_paths_are_drawn_in_their_colours(turn, shape, tmp_path) -> None:
     for colour in (BLUE, GREEN, VERMILION):
         rgb = [int(colour[k:k + 2], 16) for k in (1, 3, 5)]
         assert np.sum(np.all(np.abs(pixels - rgb) < 3.0, axis=-1)) > 20, colour
-
-
-def test_of_very_many_points_only_some_are_drawn() -> None:
-    assert len(thinned(np.zeros((20_000, 2)))) == 20_000
-    assert 10_000 <= len(thinned(np.zeros((50_001, 2)))) <= 20_000

@@ -5,11 +5,10 @@
 import json
 import os
 from pathlib import Path
-import re
 import sys
 from typing import Any
 
-from circle_bag import circle, fixes, odometry, VARIANCES
+from circle_bag import circle, fixes, odometry
 import numpy as np
 import pytest
 from run_schema import problems
@@ -22,7 +21,6 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import replay
 from pose_graph_ros.cli.bag_messages import (
-    fix_messages,
     loop_closure_messages,
     Message,
     odometry_messages,
@@ -34,7 +32,6 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.verdicts import State
 
@@ -205,20 +202,6 @@ def test_a_bag_without_usable_odometry_is_one_line_of_error(tmp_path, capsys) ->
     assert capsys.readouterr().err == (
         f'error: {tmp_path}/bag: no usable odometry on /odom: not_finite 5\n')
     assert not (tmp_path / 'out').exists()
-
-
-def test_correlated_errors_are_reported(tmp_path, capsys) -> None:
-    # positions that wander by 2 m in half a minute, with sigmas of 0.3 m
-    path = circle(600)
-    wave = 2.0 * np.sin(path.stamps_ns * 1e-9 * 2.0 * np.pi / 120.0)
-    places = path.poses[:, :2] + np.column_stack((wave, np.roll(wave, 300)))
-    geodetic = TangentPlane(50.7, 7.1, 60.0).to_geodetic(places[::10], 60.0)
-    write_bag(tmp_path / 'bag', (
-        *odometry_messages('/odom', 'odom', path, VARIANCES),
-        *fix_messages('/gps/fix', path.stamps_ns[::10], geodetic, 0.3)))
-    assert run(tmp_path / 'bag', '-o', tmp_path, '-p', 'fix.correlation_time:=0.0') == 0
-    assert re.search(r'warning  fix: errors of \S+ m go on for \S+ s but are treated as '
-                     r'independent', capsys.readouterr().out)
 
 
 def test_the_exit_code_says_whether_the_optimisation_converged(tmp_path, monkeypatch) -> None:

@@ -104,7 +104,6 @@ def test_the_reason_is_said_where_there_is_none(text, because, tmp_path, capsys)
     assert f'not attempted, because {found["reason"]}' in capsys.readouterr().out
 
 
-
 @needs('graphs')
 @pytest.mark.parametrize(('name', 'chi2', 'bounded'), OPTIMA)
 def test_the_optimum_of_a_public_graph_is_reached_and_certified(

@@ -12,14 +12,13 @@ from random_graphs import dense_system, free_part, snapshot
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import gauss_newton, levenberg_marquardt, optimizer
-from pose_graph_ros.core.batch.optimizer import BatchResult, Status
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
     BackendConfig,
     MeasurementSource,
     OdometrySource,
     POSITIONS,
-    SolverConfig,
 )
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry import se2
@@ -40,8 +39,6 @@ from pose_graph_ros.core.sources import pipeline
 from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
-# The promise: the same measurements give the same path, whatever their order [m, rad].
-SAME_PATH = 1e-9
 # Odometry and map differ by a shift and by this angle.
 T_MAP_ODOM = np.array([40.0, -25.0, np.deg2rad(122.0)])
 
@@ -137,12 +134,6 @@ def path(backend: PoseGraphBackend) -> FloatArray:
     return estimate.path.poses
 
 
-def assert_same_path(backend: PoseGraphBackend, expected: FloatArray) -> None:
-    poses = path(backend)
-    np.testing.assert_allclose(poses[:, :2], expected[:, :2], atol=SAME_PATH)
-    np.testing.assert_allclose(se2.wrap(poses[:, 2] - expected[:, 2]), 0.0, atol=SAME_PATH)
-
-
 # Where the oracle is plain least squares, so are the settings.
 LEAST_SQUARES = {kind.__name__: MeasurementSource() for kind in (GlobalPose, Position)}
 ALL = in_order(DRIVE.odometry, DRIVE.global_poses, DRIVE.positions, DRIVE.closures)
@@ -161,18 +152,6 @@ def test_hidden_nodes_come_from_odometry_alone() -> None:
 
 
 # --- Order of arrival ------------------------------------------------------------------------
-
-@settings(max_examples=8)
-@given(st.data())
-def test_any_interleaving_of_the_topics_gives_the_same_path(data: st.DataObject) -> None:
-    sources: list[list[Event]] = [
-        list(DRIVE.odometry), list(DRIVE.global_poses), list(DRIVE.positions),
-        list(DRIVE.closures)]
-    whose = [k for k, source in enumerate(sources) for _ in source]
-    order = data.draw(st.permutations(whose))
-    iterators = [iter(source) for source in sources]
-    events = [next(iterators[k]) for k in order]
-    assert_same_path(run(events, data.draw(st.sampled_from((0, 11, 40)))), REFERENCE_PATH)
 
 
 def test_the_path_is_near_the_truth_and_exact_without_noise() -> None:
@@ -332,9 +311,6 @@ def test_positions_align_once_they_tell_the_angle_and_the_estimate_says_so() -> 
     assert not np.any(backend.graph.fixed)
 
 
-# --- Failing solvers -------------------------------------------------------------------------
-
-
 # --- Updates ---------------------------------------------------------------------------------
 
 def long_drive(backend: PoseGraphBackend, n: int, *, closures: bool) -> list[UpdateReport]:
@@ -434,43 +410,6 @@ def test_the_estimate_reaches_to_the_newest_odometry() -> None:
     assert exact.estimate().chi2 == pytest.approx(exact.graph.energies().chi2, rel=1e-9)
     # the cost of a loss is more than the energy with its weight
     assert REFERENCE.estimate().chi2 > REFERENCE.graph.energies().chi2
-
-
-def test_the_covariance_of_the_newest_node_is_the_block_of_the_dense_inverse() -> None:
-    # as many samples as end in a hidden node
-    backend = run(ALL)
-    last = int(np.searchsorted(
-        [sample.stamp_ns for sample in DRIVE.odometry], backend.node_stamps_ns[-1]))
-    events = [event for event in ALL if event.stamp_ns <= DRIVE.odometry[last].stamp_ns]
-    backend = run(events, config=BackendConfig(measurements=LEAST_SQUARES))
-    assert backend.estimate().path.stamps_ns[-1] == backend.node_stamps_ns[-1]
-    H, _ = free_part(backend.graph, *dense_system(backend.graph))
-    np.testing.assert_allclose(
-        backend.estimate().covariance, np.linalg.inv(H)[-3:, -3:], rtol=1e-6, atol=1e-12)
-
-
-def test_the_covariance_is_that_of_the_solved_system_where_steps_were_damped(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    evaluate, refused = gauss_newton.CompiledSystem.evaluate, []
-
-    def refusing(system: gauss_newton.CompiledSystem) -> tuple[float, float]:
-        refused.append(len(refused) == 0)
-        return (np.inf, 0.0) if refused[-1] else evaluate(system)
-
-    # the first step is refused, so that the two others are damped
-    monkeypatch.setattr(
-        levenberg_marquardt, 'TUNING', levenberg_marquardt.Tuning(first_damping=1.0))
-    monkeypatch.setattr(gauss_newton.CompiledSystem, 'evaluate', refusing)
-    backend = PoseGraphBackend(prompt(final_optimization=SolverConfig(max_iterations=2)))
-    for event in in_order(DRIVE.odometry[:10], DRIVE.global_poses[:1]):
-        feed(backend, event)
-    backend.optimize()
-    estimate = backend.estimate()
-    assert estimate.alignment is AlignmentState.ALIGNED
-    # no more certain than the one pose that holds everything
-    assert np.trace(estimate.covariance[:2, :2]) > 0.9 * np.trace(
-        DRIVE.global_poses[0].covariance[:2, :2])
 
 
 def test_too_many_waiting_measurements_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -621,28 +560,3 @@ def test_one_poor_position_does_not_delay_the_alignment() -> None:
         raise AssertionError('never aligned')
 
     assert updates(poor=True) <= updates(poor=False) + 20
-
-
-@pytest.mark.parametrize('fails', [False, True])
-def test_an_alignment_that_cannot_be_done_over_leaves_the_one_in_use(
-    fails: bool, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def solve(graph: Graph, config: SolverConfig) -> BatchResult:
-        if fails:
-            return BatchResult(Status.FAILED, 'on purpose', 0, 0.0)
-        return optimizer.optimize(graph, config)
-
-    backend = PoseGraphBackend(BackendConfig(odometry=PROMPT), solve=solve)
-    for event in in_order(DRIVE.odometry, DRIVE.positions):
-        feed(backend, event)
-    backend.update()
-    before = backend.graph.poses.copy()
-    # as if all had been seen the other way round
-    other = se2.compose(np.array([0.0, 0.0, np.pi]), before)
-    monkeypatch.setattr(backend._alignment, 'recheck', lambda *_: other)
-    backend.add_measurement(replace(DRIVE.positions[-1], stamp_ns=DRIVE.odometry[-2].stamp_ns),
-                            'again')
-    assert backend.update().status is not Status.FAILED
-    assert backend.counts['alignment', 'done_over'] == (not fails)
-    moved = np.max(np.abs((backend.graph.poses - before)[:, :2]))
-    assert moved < 1.0

@@ -17,7 +17,6 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import (
-    AnswerStatus,
     GlobalPose,
     LoopClosure,
     Measurement,
@@ -126,16 +125,3 @@ def test_a_graph_that_is_saved_between_two_primary_odometries_goes_on_as_without
     assert_same_value(restored.graph.edges, backend.graph.edges)
     np.testing.assert_allclose(
         restored.estimate().path.poses, backend.estimate().path.poses, atol=1e-9)
-
-
-def test_measurements_that_wait_are_left_out_and_may_be_sent_again() -> None:
-    backend = feed(PoseGraphBackend(CONFIG), EVENTS[:100])
-    end = EVENTS[99][1].stamp_ns
-    ahead = Position(end + 10 * SECOND, np.zeros(2), np.eye(2), np.zeros(2))
-    n_left_out = backend.saved().n_left_out
-    assert backend.add_measurement(ahead, 'fix').status is AnswerStatus.PENDING
-    assert backend.add_measurement(ahead, 'fix').reason == 'duplicate_stamp'
-    saved = backend.saved()
-    assert saved.n_left_out == n_left_out + 1
-    assert ahead.stamp_ns not in saved.sources['fix'].seen_ns
-    assert again(saved).add_measurement(ahead, 'fix').status is AnswerStatus.PENDING

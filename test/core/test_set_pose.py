@@ -12,7 +12,6 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, CovariancePolicy, MeasurementSource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import AnswerStatus, GlobalPose, OdometrySample, Position
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
 SIGMA = np.diag((0.25, 0.25, 0.07))
 
@@ -112,29 +111,3 @@ def test_a_pose_with_an_invalid_covariance_is_refused_and_changes_nothing() -> N
     assert len(backend.node_stamps_ns) == len(expected.node_stamps_ns)
     np.testing.assert_allclose(
         backend.estimate().path.poses, expected.estimate().path.poses, atol=1e-9)
-
-
-def test_a_pose_that_the_solver_makes_no_node_for_is_refused_and_may_be_set_again() -> None:
-    class Refusing(IncrementalSmoother):
-        refuses = False
-
-        def extend(self, *arguments: np.ndarray) -> UpdateResult:
-            if self.refuses:
-                return UpdateResult(Status.FAILED, 'refused', 0, 0, 0, 0)
-            return super().extend(*arguments)
-
-    smoother = Refusing()
-    backend = PoseGraphBackend(smoother=smoother)
-    drive(backend, 0, 100, np.array([5.0, 1.0, 0.0]))
-    backend.update()
-    backend.finish()
-    n, pose = len(backend.node_stamps_ns), np.array([300.0, -50.0, 2.5])
-    smoother.refuses = True
-    answer = backend.set_pose(GlobalPose(stamp(99), pose, SIGMA), 'set_pose')
-    assert (answer.status, answer.reason) == (AnswerStatus.REJECTED, 'failed')
-    assert len(backend.node_stamps_ns) == n
-    smoother.refuses = False
-    assert backend.set_pose(GlobalPose(stamp(99), pose, SIGMA), 'set_pose').reason == ''
-    assert len(backend.node_stamps_ns) == n + 1
-    backend.update()
-    np.testing.assert_allclose(backend.estimate().T_map_base, pose, atol=1e-3)

@@ -105,29 +105,6 @@ def test_an_update_that_fails_at_any_step_changes_nothing(
         backend.estimate().path.poses, whole.estimate().path.poses, atol=1e-6)
 
 
-def test_what_was_committed_survives_a_later_solve_that_fails(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    backend, updates = PoseGraphBackend(CONFIG), []
-    original = backend._smoother.update
-
-    def second_fails(update: GraphUpdate, **options: bool) -> UpdateResult:
-        updates.append(update)
-        return is_failed(update) if len(updates) == 2 else original(update, **options)
-
-    drive(backend, 0, 8)
-    with monkeypatch.context() as patch:
-        # the new weights of robust losses are solved for after the commit
-        patch.setattr(backend._smoother, 'update', second_fails)
-        patch.setattr(backend._reweighting, 'changes', lambda _: ({}, {0: 0.5}))
-        backend.update()
-    assert len(updates) == 2
-    bins = backend._factors.saved()['gnss'].bins
-    assert bins is not None
-    assert len(bins.numbers) == 8
-    assert len(bins.numbers) == np.sum(backend.graph.is_bias)
-
-
 def test_an_interrupt_is_rolled_back_and_goes_through(monkeypatch: pytest.MonkeyPatch) -> None:
     backend = PoseGraphBackend(CONFIG)
     drive(backend, 0, 8)

@@ -20,7 +20,6 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,
@@ -253,46 +252,3 @@ def test_a_closure_that_waits_holds_its_node_but_not_for_ever() -> None:
     assert max(held) >= 75
     assert max(held) <= 85
     assert held[-1] <= 45
-
-
-def test_what_stays_after_all_is_not_on_record_as_having_left() -> None:
-    events, _ = drive(600)
-    wrong = LoopClosure(stamp_of(590), np.array([9.0, 4.0, 2.0]), np.diag([0.01, 0.01, 4e-4]),
-                        reference_ns=stamp_of(100))
-    backend = run([*events[:-20], ('loop_closure', wrong), *events[-20:]], WindowConfig())
-    judge, graph = backend._judge, backend.graph
-    none = np.empty(0, dtype=np.int64)
-    assert backend.verdict_totals()['loop_closure'].counts[State.DOUBTED] == 1
-    assert len(judge.decide_leaving(graph.edge_ids, graph.observed_ids).unused) > 0
-    assert not any(each.left for each in backend.verdicts())
-    # the failed removal is followed by one of constraints that nobody judges
-    judge.forget(none, none, none, None)
-    assert not any(each.left for each in backend.verdicts())
-
-
-def test_what_leaves_without_being_judged_changes_nothing_that_was_decided() -> None:
-    backend = run(drive(600)[0], WINDOW)
-    none = np.empty(0, dtype=np.int64)
-    backend._judge.forget(none, none, none, None)
-    assert backend.optimize().status is not Status.FAILED
-    backend._judge.decide_leaving(none, backend.graph.observed_ids)
-
-
-def test_all_closures_that_wait_are_tested_before_they_leave() -> None:
-    events, truth = drive(500)
-    backend = run(events, WindowConfig())
-    rng, noise = np.random.default_rng(0), np.diag([0.01, 0.01, 4e-4])
-    for k in range(80):     # more than an update tests
-        pose = np.array((*rng.uniform(-9.0, 9.0, 2), rng.uniform(-3.0, 3.0)))
-        add(backend, ('loop_closure', LoopClosure(
-            stamp_of(410), pose, noise, reference_ns=stamp_of(100 + k))))
-    add(backend, ('loop_closure', LoopClosure(
-        stamp_of(411), se2.between(truth[161], truth[411]), noise, reference_ns=stamp_of(161))))
-    backend.update()
-    right = max(backend.verdicts(), key=lambda each: int(each.id.split('/')[1])
-                if each.source == 'loop_closure' else -1)
-    assert right.state is State.WAITING
-    decided = backend._judge.decide_leaving(
-        backend.graph.edge_ids, np.empty(0, dtype=np.int64)).unused
-    assert len(decided) == 80
-    assert right.id not in [each.id for each in decided]

@@ -58,7 +58,6 @@ def estimate(
         primary='odom', odometry=OdometrySource())
 
 
-
 class Outlet:
     """A publisher that keeps what it is given."""
 

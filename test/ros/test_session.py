@@ -5,14 +5,13 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-import re
 from types import SimpleNamespace as Space
 
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import fix_at, odometry_at, START
+from circle import odometry_at, START
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from harness import imu, LATCHED, odometry, PATIENCE, PREPARE_PATIENCE, stamp_ns
@@ -31,7 +30,6 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics
-from pose_graph_ros.ros.arrivals import EXPECTED
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
@@ -127,38 +125,6 @@ def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
     assert active.health() == (OK, 'Running.')
 
 
-def test_parameters_reach_input_outputs_and_engine(active: Robot) -> None:
-    session = active.session
-    active.drive(3.0)
-    configs = []
-    engine = session.worker._backend
-    configure = engine.configure
-    engine.configure = lambda config: (configs.append(config), configure(config))
-    active.configure(publish_tf=False, path_period=3.0, odom__maximum_speed=4.5,
-                     fix__robust_loss='tukey')
-    assert session.out.transforms is None
-    assert session._continuity['odom'].maximum_speed == 4.5
-    assert session._timers['views'].timer_period_ns == 500_000_000
-    active.wait(lambda: len(configs) > 0, 'the engine has them')
-    assert configs[0].measurements['fix'].rejection_threshold == 5.0
-    assert session.n_resets == 0
-    active.drive(4.0, 3.0)
-
-
-def test_odometry_that_starts_again_starts_a_new_graph_without_a_loss(active: Robot) -> None:
-    active.drive(6.0)
-    active.send('odom', *(odometry_at(0.1 * step) for step in range(10)))
-    active.send('fix', fix_at(0.2))
-    assert active.session.n_resets == 0
-    active.publishers['odom'].publish(odometry_at(1.0))
-    active.wait(lambda: active.session.n_resets == 1, 'a new graph is started')
-    assert active.session.reset_reason.endswith('the stamps of odom jumped back by 5.900 s')
-    assert active.session.input.received == {'odom': 11, 'fix': 1}
-    active.drive(3.0, 1.1)
-    assert active.session.worker.status.counts['odom', 'accepted'] == 31
-    assert active.session.worker.status.counts['fix', 'accepted'] == 5
-
-
 @pytest.mark.parametrize(('first', 'second'), [
     (odometry(START + 5.0, 500.0, 0.0, 0.0, speed=2.0),
      odometry(START + 5.1, 500.2, 0.0, 0.0, speed=2.0)),
@@ -243,26 +209,6 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
         level, text = diagnostics.health(seen)
         assert level == expected
         assert words in text
-
-
-def test_it_is_said_once_that_nothing_comes_in_any_more(
-    active: Robot, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
-) -> None:
-    active.configure(closing_silence=0.05)
-    active.drive(3.0, fixes=False)
-    with monkeypatch.context() as patch:
-        patch.setattr('pose_graph_ros.ros.arrivals.EXPECTED', replace(
-            EXPECTED, least_silence=0.3, medians=0.3, longest=0.3, quiet=0.3))
-        active.wait(lambda: active.health()[1].endswith('the graph has been optimised.'),
-                    'it is said')
-        level, text = active.health()
-        assert level == WARN
-        assert re.match(r'Nothing has been received for \d+ s', text)
-        active.session.publish_diagnostics()
-        assert capfd.readouterr().err.count('nothing has been received') == 1
-    active.send('odom', odometry_at(3.0))
-    active.session.publish_diagnostics()
-    assert active.health()[0] == OK
 
 
 def test_a_graph_that_was_loaded_waits_for_odometry(active: Robot) -> None:

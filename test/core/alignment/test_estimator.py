@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.alignment.consensus import positions_along, TimeCorrelation
+from pose_graph_ros.core.alignment.consensus import TimeCorrelation
 from pose_graph_ros.core.alignment.estimator import (
     find_alignment,
     GraphAlignment,
@@ -358,15 +358,3 @@ def test_an_angle_that_is_right_stays() -> None:
                 solved, some.odometry, some.observed.rows(slice(0, k)), turn.sigma) is None
         # drift that the graph has corrected is no reason either
         assert checked(some.truth, some.odometry, some.observed) is None
-
-
-def test_the_covariance_of_a_position_is_that_in_the_map() -> None:
-    information = np.linalg.inv(np.array([[4.0, 1.0], [1.0, 2.0]]))
-    table = observed_nodes(np.array([0, 0]), np.zeros((2, 2)), 1.0)
-    table.information[0, :2, :2] = information
-    # of a global pose it stands in the axes of that pose, here turned by 90 degrees
-    table.kind[1], table.mean[1, 2] = ObservedKind.GLOBAL_POSE, np.pi / 2.0
-    table.information[1] = np.diag([1.0, 0.25, 1.0])
-    root = positions_along(np.zeros((1, 3)), table, NOISE, lasting(np.zeros(2), 0.0)).root
-    covariances = sorted((root @ np.swapaxes(root, 1, 2)).round(9).tolist())
-    assert covariances == [[[4.0, 0.0], [0.0, 1.0]], [[4.0, 1.0], [1.0, 2.0]]]

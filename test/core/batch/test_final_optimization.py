@@ -238,6 +238,3 @@ def test_a_loss_that_takes_all_weight_away_fails_no_update(loss: Loss) -> None:
     assert backend.graph.observed.weight.tolist() == [
         pytest.approx(1.0, abs=1e-3), 0.0, *[pytest.approx(1.0, abs=1e-3)] * 8]
     np.testing.assert_allclose(backend.graph.poses[-1], [22.5, 0.0, 0.0], atol=1e-3)
-
-
-# --- Structure priors ------------------------------------------------------------------------

@@ -217,8 +217,6 @@ def test_a_failure_is_a_result_and_leaves_everything_as_it_was(
     assert snapshot(graph) == before
 
 
-# --- Parts -----------------------------------------------------------------------------------
-
 # --- From nothing ----------------------------------------------------------------------------
 
 @pytest.mark.parametrize('seed', range(10))

@@ -30,16 +30,6 @@ def test_a_growing_array_holds_what_a_list_would(
         np.testing.assert_array_equal(array.values, np.array(rows).reshape(-1, *row_shape))
 
 
-def test_it_grows_in_few_steps() -> None:
-    array, places = GrowingArray((2,), np.int64), set()
-    for k in range(10_000):
-        array.append_one((k, -k))
-        places.add(array.values.__array_interface__['data'][0])
-    assert len(places) < 20
-    np.testing.assert_array_equal(array.values[:, 0], np.arange(10_000))
-
-
-
 def test_rows_are_selected_and_others_follow() -> None:
     array = GrowingArray((2,), np.int64)
     array.append(np.arange(80).reshape(40, 2))

@@ -37,15 +37,6 @@ def test_positions_come_back_at_any_place(
 
 
 @pytest.mark.parametrize('place', PLACES)
-def test_the_datum_is_the_origin(place: tuple[float, float]) -> None:
-    plane = TangentPlane(*place, altitude=77.0)
-    np.testing.assert_allclose(plane.to_map(*place, 77.0), 0.0, atol=ROUND_TRIP)
-    latitude, _, altitude = plane.to_geodetic(np.zeros(2))
-    assert latitude == pytest.approx(place[0], abs=1e-9)
-    assert altitude == pytest.approx(77.0, abs=ROUND_TRIP)
-
-
-@pytest.mark.parametrize('place', PLACES)
 @pytest.mark.parametrize('distance', [1.0, 100.0, 1000.0])
 def test_directions_and_distances_are_those_of_geodesics(
     place: tuple[float, float], distance: float,

@@ -64,20 +64,6 @@ def test_after_any_edits_chi2_and_lists_are_those_of_the_rows(
         for node in range(graph.n_nodes)]
 
 
-def test_a_weight_of_zero_removes_a_constraint_and_another_brings_it_back() -> None:
-    graph = random_graph(8)
-    before, whole = snapshot(graph), graph.energies().chi2
-    graph.apply(GraphUpdate(remove_edges=range(graph.n_edges),
-                            remove_observed=range(graph.n_observed)))
-    assert graph.energies().chi2 == 0.0
-    scales = graph.memory['node_f'][:graph.n_nodes, [tb.SCALE_T, tb.SCALE_R]]
-    np.testing.assert_allclose(scales, 0.0, atol=1e-5)
-    graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(range(graph.n_edges), 1.0),
-                            weigh_observed=dict.fromkeys(range(graph.n_observed), 1.0)))
-    assert snapshot(graph) == before
-    assert graph.memory['scalars'][tb.CHI2] == pytest.approx(whole)
-
-
 # --- what leaves leaves no trace in the tables, and its id never comes back ---------------------
 
 def graph_of(seed: int) -> Graph:
@@ -198,15 +184,6 @@ def test_within_an_update_rows_stay_and_a_rollback_brings_all_back() -> None:
     assert left.nodes.tolist() == [0, 8]
     assert left.edges.tolist() == np.flatnonzero(
         np.isin(edges.i, [0, 8]) | np.isin(edges.j, [0, 8])).tolist()
-
-
-def test_a_graph_can_be_emptied_and_goes_on() -> None:
-    graph = random_graph(6, n_biases=2)
-    graph.apply(GraphUpdate(remove_nodes=range(9)))
-    assert (graph.n_nodes, graph.n_edges, graph.n_observed, graph.newest_pose) == (0, 0, 0, -1)
-    assert graph.node_rows([0, 8]).tolist() == [-1, -1]
-    graph.apply(GraphUpdate(hidden=np.zeros((1, 3))))
-    assert (graph.node_ids.tolist(), graph.newest_pose) == ([9], 9)
 
 
 def test_rows_are_filled_with_their_ids_which_must_ascend() -> None:

@@ -5,12 +5,10 @@
 from collections.abc import Callable
 from dataclasses import fields
 
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 from random_graphs import (
     random_edges,
-    random_edges_to_biases,
     random_graph,
     random_observed,
     random_poses,
@@ -20,16 +18,13 @@ from random_graphs import (
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import editing
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # A graph of seven nodes, 0 to 6, is edited here.
 N_NODES = 7
-seeds = st.integers(0, 2**32 - 1)
+
 
 ASYMMETRIC = np.eye(3) + np.array([[0.0, 0.1, 0.0], [0.0] * 3, [0.0] * 3])
-NEGATIVE = np.diag([1.0, 1.0, -0.1])
-NOT_FINITE = np.diag([1.0, np.inf, 1.0])
 
 
 def edge(
@@ -106,19 +101,6 @@ def test_of_a_bad_update_nothing_is_applied_and_it_says_why(name: str) -> None:
     assert snapshot(graph) == before
 
 
-def test_new_constraints_may_lead_to_the_new_hidden_nodes() -> None:
-    rng = np.random.default_rng(4)
-    graph = Graph()
-    graph.apply(GraphUpdate(
-        hidden=random_poses(rng, 3), edges=random_edges(rng, [0, 2], [1, 0]),
-        observed=random_observed(rng, [2]), fix=(1,)))
-    assert graph.n_nodes == 3
-    np.testing.assert_array_equal(graph.edges.i, [0, 2])
-    np.testing.assert_array_equal(graph.fixed, [False, True, False])
-    graph.apply(GraphUpdate(free=(1,), fix=(0,)))
-    np.testing.assert_array_equal(graph.fixed, [True, False, False])
-
-
 def strided(array: np.ndarray) -> np.ndarray:
     return np.repeat(array, 2, axis=0)[::2]
 
@@ -171,36 +153,12 @@ def test_writing_to_what_leaves_the_graph_does_not_change_it() -> None:
     assert snapshot(graph) == before
 
 
-def grow(graph: Graph, rng: np.random.Generator, n: int) -> None:
-    first = graph.n_nodes
-    before = [graph.newest_pose, *range(first, first + n - 1)]
-    graph.apply(GraphUpdate(
-        hidden=random_poses(rng, n), edges=Edges.joined([
-            random_edges(rng, before, list(range(first, first + n))),
-            random_edges_to_biases(rng, [first, first], [first + n, first + n])]),
-        biases=random_poses(rng, 1),
-        observed=random_observed(rng, list(range(first, first + n))), fix=(first,), free=(0,)))
-
-
 @pytest.mark.parametrize('make', [
     lambda: edge(i=[0.5]), lambda: edge(j=['1']), lambda: observed(node=[True]),
     lambda: edge(kind=[0.0])])
 def test_numbers_of_nodes_and_kinds_are_never_rounded(make: Callable[[], GraphUpdate]) -> None:
     with pytest.raises(GraphUpdateError, match='expected integers, got'):
         make()
-
-
-def test_poses_and_errors_are_found_by_id() -> None:
-    graph = random_graph(seed=3, n_biases=2)
-    assert np.array_equal(graph.poses_of([3, 1]), graph.poses[[3, 1]])
-    assert np.array_equal(graph.poses_of(4), graph.poses[4])
-    assert np.array_equal(graph.edge_errors(graph.edges_at([5, 2])),
-                          edge_errors(graph.poses, graph.edges)[[5, 2]])
-    assert np.array_equal(graph.observed_errors(graph.observed_at([1])),
-                          observed_errors(graph.poses, graph.observed)[[1]])
-    elsewhere = graph.poses + 0.5
-    assert np.array_equal(graph.edge_errors(graph.edges, elsewhere),
-                          edge_errors(elsewhere, graph.edges))
 
 
 def test_what_is_not_in_the_graph_is_refused_by_its_id() -> None:

@@ -58,23 +58,6 @@ class Counting(IncrementalSmoother):
         return super()._fall_back_to_batch()
 
 
-class LeftOver(Counting):
-    """One whose steps diverge, whatever is added, until the graph was solved as a copy."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.diverges, self.adopted = False, 0
-
-    def update(self, update: GraphUpdate, *, fall_back: bool = True) -> UpdateResult:
-        if self.diverges and not fall_back:
-            return UpdateResult(Status.FAILED, DIVERGED, 0, 0, 0, 0)
-        return super().update(update, fall_back=fall_back)
-
-    def adopt(self, trial: Trial) -> UpdateResult:
-        self.adopted, self.diverges = self.adopted + 1, False
-        return super().adopt(trial)
-
-
 class Stuck(Counting):
     """One whose steps diverge with any other weights, as those of a graph that is bent do."""
 
@@ -184,36 +167,6 @@ def test_what_comes_while_it_is_tried_is_kept() -> None:
     work(backend)
     assert states(backend) == {State.BELIEVED}
     assert (backend.graph.n_nodes, smoother.fallbacks) == (700, 0)
-    assert smoother.chi2() <= best_chi2(backend.graph) * (1.0 + 1e-6)
-
-
-def test_what_was_tried_from_other_poses_is_tried_again() -> None:
-    backend, smoother, poses = driven(600)
-    add_group(backend, poses, DIVERGING, 6)
-    backend.update()
-    for _ in range(4):
-        backend.refine()
-    backend.graph.set_poses(se2.compose(np.array([5.0, 0.0, 0.3]), backend.graph.poses))
-    smoother.update(GraphUpdate())
-    work(backend)
-    assert states(backend) == {State.BELIEVED}
-    assert smoother.fallbacks == 0
-
-
-def test_what_earlier_updates_have_left_over_is_solved_for_after_an_update() -> None:
-    smoother = LeftOver()
-    backend, _, poses = driven(600, smoother)
-    place = se2.between(poses[10], poses[-12]) + np.array([0.5, 0.3, 0.01])
-    smoother.diverges = True
-    add_group(backend, poses, place, 6)
-    before = smoother.graph.poses.copy()
-    report = backend.update()
-    assert (report.status, report.new_constraints) == (Status.MAX_ITERATIONS, 6)
-    np.testing.assert_array_equal(smoother.graph.poses, before)
-    assert np.all(smoother.graph.edges.weight[-6:] == 0.0)
-    work(backend)
-    assert states(backend) == {State.BELIEVED}
-    assert (smoother.fallbacks, smoother.adopted) == (0, 1)
     assert smoother.chi2() <= best_chi2(backend.graph) * (1.0 + 1e-6)
 
 

@@ -18,11 +18,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.judgement import closures as cl
-from pose_graph_ros.core.judgement.closure_trial import SetSearch
-from pose_graph_ros.core.judgement.closures import GATE
 from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
 from pose_graph_ros.core.judgement.verdicts import Decision, State
 from pose_graph_ros.core.measurements import (
@@ -131,14 +127,6 @@ def group(at: int, to: int, n: int, rng: np.random.Generator) -> list[LoopClosur
         + rng.normal(0.0, 0.2 * SIGMAS)) for k in range(n)]
 
 
-def test_a_group_of_false_closures_that_agree_is_doubted() -> None:
-    rng = np.random.default_rng(3)
-    false = group(60, 10, 10, rng)
-    backend = run([*true_ones(rng), *false])
-    assert all(not states(backend)[each.stamp_ns // SECOND - 1].in_graph for each in false)
-    assert error(backend) < 0.5
-
-
 def test_a_false_group_that_came_first_is_thrown_out_by_true_ones() -> None:
     rng = np.random.default_rng(4)
     # 20 sigmas are claimed for each metre: anything passes the first gate
@@ -151,39 +139,6 @@ def test_a_false_group_that_came_first_is_thrown_out_by_true_ones() -> None:
     run(true_ones(rng), begin=backend, first=66)
     assert all(not states(backend)[each.stamp_ns // SECOND - 1].in_graph for each in false)
     assert error(backend) < 0.5
-
-
-def test_a_closure_that_fits_outside_of_the_graph_only_does_not_keep_the_judge_busy_for_ever(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """So it was with a large sigma_scale, where the graph yields less than the gate allows."""
-    rng = np.random.default_rng(16)
-    backend = run(true_ones(rng), last=200)
-    judge = backend._judge._closures
-    monkeypatch.setattr(
-        cl, 'are_above', lambda graph, edges, limit: edges == judge.states.edge[7])
-    monkeypatch.setattr(
-        cl, 'residuals', lambda _, some: np.full(len(some.i), 2.0 * GATE))
-    rounds = 0
-    while judge.work():
-        rounds += 1
-        assert rounds < 100
-    assert not judge.states.in_graph[7]
-    # what comes next may have changed that
-    monkeypatch.undo()
-    run([true_one(121, 201, rng)], begin=backend, first=200, last=202)
-    assert judge.states.in_graph[7]
-
-
-def test_a_search_for_another_set_goes_on_while_closures_leave() -> None:
-    backend = run(true_ones(np.random.default_rng(3)), last=200)
-    judge = backend._judge._closures
-    edges = judge.states.edge.copy()
-    search = SetSearch(judge.states, judge._table)._trial(backend.graph, edges[:5])
-    next(search)
-    judge.forget(np.empty(0, dtype=np.int64), edges[1:3])
-    assert len(list(search)) > 4
-    assert judge.states.edge.tolist() == [edges[0], *edges[3:]]
 
 
 def wrong_ones(rng: np.random.Generator) -> list[LoopClosure]:
@@ -260,23 +215,6 @@ def test_a_saved_graph_goes_on_with_its_judgement(tmp_path: Path) -> None:
         each.optimize()
     assert states(backend) == states(other)
     assert np.allclose(backend.graph.poses, other.graph.poses, atol=1e-6)
-
-
-def test_an_update_that_fails_leaves_the_judgement_as_it_was(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rng = np.random.default_rng(9)
-    backend = run(true_ones(rng), last=120)
-    before = [(each.id, each.state) for each in backend.verdicts()]
-    backend.add_measurement(true_one(34, 114, rng), 'scan')
-    with monkeypatch.context() as patch:
-        failed = backend._smoother.update(GraphUpdate())._replace(
-            status=Status.FAILED, reason='on purpose')
-        patch.setattr(backend._smoother, 'update', lambda _: failed)
-        assert backend.update().status is Status.FAILED
-    assert [(each.id, each.state) for each in backend.verdicts()] == before
-    backend.optimize()     # takes what was set aside
-    assert len(backend.verdicts()) == len(before) + 1
 
 
 # --- pieces --------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-import pytest
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
@@ -155,19 +154,6 @@ def test_a_chain_has_the_relative_covariances_of_a_graph_without_loops(seed: int
     np.testing.assert_allclose(found.covariances, noise, rtol=1e-7, atol=1e-12)
     lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.array(drive.means)[:, :2].T))))
     np.testing.assert_allclose(chain.travel(rows), lengths)
-
-
-def test_nodes_outside_the_chain_agree_with_nothing() -> None:
-    smoother, chain = IncrementalSmoother(), OdometryChain()
-    chain.extend(smoother.graph)
-    smoother.update(GraphUpdate(hidden=np.zeros((2, 3)), fix=[0, 1]))
-    chain.extend(smoother.graph)
-    closures = Closures(np.array([0, 0]), np.array([0, 1]), np.zeros((2, 3)),
-                        np.tile(np.eye(3), (2, 1, 1)))
-    pairs = np.array([0, 0]), np.array([0, 1])
-    np.testing.assert_array_equal(squared_distances(chain, closures, *pairs), [0.0, np.inf])
-    with pytest.raises(KeyError, match='chained'):
-        chain.between(np.array([0]), np.array([1]))
 
 
 def test_a_long_drive_far_from_its_beginning_keeps_its_precision() -> None:

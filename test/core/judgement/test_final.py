@@ -22,7 +22,6 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement import final
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import Decision
 from pose_graph_ros.core.measurements import LoopClosure, Measurement, OdometrySample, Position
 
 SECOND = 1_000_000_000
@@ -136,53 +135,6 @@ def test_any_order_of_arrival_ends_with_the_same_set_and_the_same_path(
     off = path(backend) - path(expected)
     off[:, 2] = se2.wrap(off[:, 2])
     np.testing.assert_allclose(off, 0.0, atol=1e-9)
-
-
-def test_the_decisions_of_a_person_stay() -> None:
-    drive = DRIVES[0, False]
-    backend = PoseGraphBackend(CONFIG)
-    for event in sorted([*drive.odometry, *drive.measurements], key=lambda event: event.stamp_ns):
-        if isinstance(event, OdometrySample):
-            backend.add_odometry(event)
-        else:
-            backend.add_measurement(event, 'scan')
-        backend.update()
-    by_stamp = {verdict.stamp_ns: verdict.id for verdict in backend.verdicts()}
-    wrong, right = min(drive.wrong), min(set(by_stamp) - drive.wrong)
-    assert backend.decide(by_stamp[wrong], Decision.IN).reason == ''
-    assert backend.decide(by_stamp[right], Decision.OUT).reason == ''
-    backend.optimize()
-    assert wrong in believed(backend)
-    assert right not in believed(backend)
-    for stamp in (wrong, right):
-        backend.decide(by_stamp[stamp], Decision.AUTO)
-    backend.optimize()
-    assert believed(backend) == believed(reference(0, fixes=False))
-
-
-def test_nothing_is_decided_again_until_something_has_changed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    calls: list[int] = []
-    decide = final.decide
-    monkeypatch.setattr(final, 'decide', lambda *args, **rest: (
-        calls.append(1), decide(*args, **rest))[1])
-    drive = DRIVES[1, False]
-    backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
-    assert len(calls) == 1
-    before, poses = believed(backend), backend.graph.poses.copy()
-    backend.optimize()
-    assert len(calls) == 1
-    assert believed(backend) == before
-    np.testing.assert_allclose(backend.graph.poses, poses, atol=1e-9)
-    # it goes on from there
-    stamp = (N + 2) * SECOND
-    backend.add_odometry(OdometrySample(stamp, se2.compose(
-        drive.odometry[-1].pose, np.array([2.0, 0.0, 0.1]))))
-    backend.update()
-    backend.optimize()
-    assert len(calls) == 2
-    assert believed(backend) == before
 
 
 def test_in_a_very_large_graph_the_set_is_improved(monkeypatch: pytest.MonkeyPatch) -> None:

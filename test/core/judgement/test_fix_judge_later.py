@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from random_graphs import snapshot
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import BatchResult, Status
-from pose_graph_ros.core.config import BackendConfig, POSITIONS, SolverConfig
+from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import BackendConfig, POSITIONS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
@@ -111,28 +109,6 @@ def test_the_end_does_not_depend_on_the_order_of_arrival(seed: int) -> None:
         assert_allclose(path(other), path(backends[0]), atol=1e-9)
 
 
-def test_what_was_decided_for_the_estimate_of_errors_is_what_the_end_would_decide() -> None:
-    events, bad = drive(1, offset=True)
-    ended = []
-    for again in (False, True):
-        backend = PoseGraphBackend()
-        feed(backend, late(events, 1))
-        backend.finish()
-        while backend.update().new_constraints > 0:
-            pass
-        backend._tuner.decide()
-        fixes = backend._judge._fixes
-        assert fixes._decided is not None
-        if again:
-            fixes._decided = None
-        backend._judge.finish()
-        assert fixes._decided is None
-        assert_weights_are_as_decided(backend)
-        assert bad <= doubted(backend)
-        ended.append((everything(backend), fixes.states.totals(), backend.verdict_changes()))
-    assert ended[0] == ended[1]
-
-
 def test_a_decision_of_a_person_is_kept_at_the_end() -> None:
     events, bad = drive(1)
     backend = PoseGraphBackend(BackendConfig(measurements={'fix': POSITIONS}))
@@ -222,40 +198,3 @@ def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
         backend.update()
     assert n_turned >= 1
     assert {second * SECOND for second in range(1, 16)} <= doubted(backend)
-
-
-def test_a_final_optimisation_that_fails_undoes_what_was_decided_for_it() -> None:
-    broken = [True]
-
-    def solve(graph: Graph, config: SolverConfig) -> BatchResult:
-        if broken[0]:
-            return BatchResult(Status.FAILED, 'broken on purpose', 0, 1.0)
-        return optimizer.optimize(graph, config)
-
-    events, bad = drive(2, n=80)
-    config = BackendConfig(measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
-    backend = PoseGraphBackend(config, solve=solve)
-    feed(backend, late(events, 5, 400.0), 5)
-    backend.update()
-    # the judge decides otherwise at the end
-    believed = next(each.id for each in backend.verdicts() if each.state.in_graph)
-    record = backend._judge._fixes.states.records[int(believed.split('/')[1])]
-    record['believed'] = False
-    backend._smoother.update(GraphUpdate(weigh_observed={int(record['held']): 0.0}))
-    backend._reweighting.set_base_weight(int(record['held']), 0.0)
-    backend.verdict_changes()
-    backend.finish()
-    for _ in range(20):
-        backend.update()
-    before, poses = snapshot(backend.graph)[1:], backend.graph.poses.copy()
-    decided = everything(backend)
-    assert backend.optimize().status is Status.FAILED
-    assert snapshot(backend.graph)[1:] == before
-    assert_allclose(backend.graph.poses, poses, atol=1e-3)
-    assert everything(backend) == decided
-    assert backend.verdict_changes() == []
-    assert backend.update().status is not Status.FAILED
-    broken[0] = False
-    assert backend.optimize().status is Status.CONVERGED
-    assert [change.id for change in backend.verdict_changes()].count(believed) == 1
-    assert bad <= doubted(backend)

@@ -8,11 +8,11 @@ import pytest
 
 from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.error_functions import edge_errors, energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import final
-from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward
+from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -70,21 +70,6 @@ def test_a_gate_is_that_of_the_smoother() -> None:
         assert min(abs(ratio / factor - 1.0) for factor in BELIEF.lonely_factors) < 1e-5
 
 
-@pytest.mark.parametrize('weight', [1.0, 0.3])
-def test_gates_begin_with_those_of_odometry_alone(weight: float) -> None:
-    drive = laps(2, n_wrong=5)
-    odometry = np.flatnonzero(drive.graph.edges.kind == EdgeKind.ODOMETRY)
-    drive.graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(odometry.tolist(), weight) | {
-        int(odometry[20]): 0.1 * weight}))
-    problem = TruncatedProblem(drive.graph, drive.closures)
-    problem.solve(np.zeros(len(problem)))
-    gates = final._Gates(problem)
-    volume, covariances = gates.volume.copy(), gates._covariances.copy()
-    gates.passing(np.arange(len(problem)), 1e9, np.inf)
-    np.testing.assert_allclose(volume, gates.volume, rtol=1e-5)
-    np.testing.assert_allclose(covariances, gates._covariances, rtol=1e-4, atol=1e-7)
-
-
 def _jacobian(poses: np.ndarray, edge: Edges) -> np.ndarray:
     """Return the Jacobian of an edge's error by both ends, by differences, shape (3, 6)."""
     columns = []
@@ -112,21 +97,6 @@ def test_limits_fall_where_covariances_are_far_too_large() -> None:
 
 
 # --- Information for decisions ---------------------------------------------------------------
-
-def test_floors_raise_variances_and_leave_what_is_not_measured() -> None:
-    rng = np.random.default_rng(0)
-    root = rng.normal(0.0, 1.0, (20, 3, 3)) * 0.3
-    covariance = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(3)
-    edges = Edges(np.zeros(20, int), np.ones(20, int), np.zeros((20, 3)),
-                  np.linalg.inv(covariance), [1] * 20)
-    expected = covariance.copy()
-    diagonal = np.einsum('mii->mi', expected)
-    np.maximum(diagonal, FLOORS**2, out=diagonal)
-    softened = floored(edges)
-    np.testing.assert_allclose(np.linalg.inv(softened.information), expected, rtol=1e-6, atol=1e-9)
-    heading = Edges([0], [1], np.zeros((1, 3)), [np.diag([0.0, 0.0, 1e6])], [1])
-    np.testing.assert_allclose(
-        floored(heading).information[0], np.diag([0.0, 0.0, 400.0]), rtol=1e-3)
 
 
 def test_an_edge_that_is_turned_round_has_the_same_energy() -> None:

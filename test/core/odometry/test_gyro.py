@@ -104,15 +104,3 @@ def test_what_cannot_be_used_is_rejected(sample: YawRate, reason: str) -> None:
     answer = stream.add(sample)
     assert answer.status is AnswerStatus.REJECTED
     assert answer.reason == reason
-
-
-def test_a_saved_stream_continues_bit_for_bit() -> None:
-    given_ = samples(np.arange(0.0, 3.0, 0.01), np.sin(np.arange(300)), 1e-4)
-    whole = filled(given_)
-    first = filled(given_[:150])
-    second = GyroStream(QUIET)
-    second.restore(first.saved())
-    for sample in given_[150:]:
-        second.add(sample)
-    ends = EPOCH + 5_000_000, EPOCH + 2_700_000_000
-    assert second.integral(*ends).between(*ends) == whole.integral(*ends).between(*ends)

@@ -12,10 +12,10 @@ from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import propagated
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.measurements import Answer, LoopClosure, OdometrySample
+from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.node_table import ThinnedNodes
-from pose_graph_ros.core.sources.measurement_constraints import attach, attach_reference
+from pose_graph_ros.core.sources.measurement_constraints import attach
 
 SECOND = 1_000_000_000
 WINDOW = 6
@@ -116,24 +116,6 @@ def test_between_the_last_that_left_and_the_next_odometry_leads_backwards() -> N
     too_old = attach(nodes, before_ns - 1)
     assert isinstance(too_old, Answer)
     assert too_old.reason == 'before_window'
-
-
-def test_closures_to_what_has_left_are_refused_with_the_reason() -> None:
-    nodes, _ = empty_nodes()
-    for source, sample in arrivals([]):
-        nodes.add_sample(sample, source)
-    forget(nodes)
-
-    def reason(**reference: int) -> str:
-        found = attach_reference(nodes, LoopClosure(
-            int(nodes.stamps_ns[-1]), np.zeros(3), np.eye(3), **reference))
-        return found.reason if isinstance(found, Answer) else f'x{found.node}'
-
-    assert reason(reference_node=0) == 'before_window'
-    assert reason(reference_node=nodes.n_frozen) == f'x{nodes.n_frozen}'
-    assert reason(reference_node=len(nodes)) == 'unknown_node'
-    assert reason(reference_ns=int(nodes.stamps_ns[0])) == 'before_window'
-    assert reason(reference_ns=1) == 'before_odometry'
 
 
 @settings(max_examples=10, deadline=None)

@@ -7,7 +7,6 @@ from itertools import pairwise
 
 from hypothesis import given, strategies as st
 import numpy as np
-import pytest
 
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.measurements import OdometrySample
@@ -117,31 +116,6 @@ def filled(times: Iterable[float]) -> OdometryStream:
 def ends(edges: SecondaryEdges) -> list[tuple[int, int]]:
     """Return the numbers of the hidden nodes that the edges connect."""
     return [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for _, edge in edges.new]
-
-
-def test_the_edges_do_not_depend_on_how_often_they_are_extended() -> None:
-    times, edges = np.arange(0.55, 12.0, 0.1), SecondaryEdges()
-    edges.skip_to('visual', 0, reached=False)
-    growing = OdometryStream(OdometrySource())
-    for one in filled(times).timeline.stamps_ns.tolist():
-        growing.add(OdometrySample(one, np.array([one * 1e-9, 0.0, 0.0])))
-        growing.settle_all(one)
-        n_nodes = int(np.searchsorted(NODES, one)) + 1
-        edges.extend('visual', growing, NODES[:n_nodes], ROWS[:n_nodes])
-    assert ends(edges) == [(k, k + 1) for k in range(9)]
-    edges.extend('visual', growing, NODES, ROWS)
-    assert len(edges.new) == 9
-
-
-@pytest.mark.parametrize('reached', [True, False])
-def test_no_edge_spans_a_skip(*, reached: bool) -> None:
-    visual = filled(np.arange(0.55, 10.5, 0.1))
-    edges = SecondaryEdges()
-    edges.skip_to('visual', 0, reached=False)
-    edges.extend('visual', visual, NODES[:3], ROWS[:3])
-    edges.skip_to('visual', 5, reached=reached)
-    edges.extend('visual', visual, NODES, ROWS)
-    assert ends(edges) == [(0, 1), (1, 2), (5, 6), (6, 7), (7, 8), (8, 9)]
 
 
 def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:

@@ -200,14 +200,6 @@ def test_a_single_sample_that_is_off_leaves_no_trace_but_noise(rate: int) -> Non
     np.testing.assert_allclose(motion.increment, samples[-1].pose, atol=1e-6)
 
 
-@pytest.mark.parametrize('rate', RATES)
-@pytest.mark.parametrize('gap', [1.0, 3.0, 10.0])
-@pytest.mark.parametrize('speed', [0.0, 1.0, 30.0])
-def test_a_gap_is_no_jump(rate: int, gap: float, speed: float) -> None:
-    times = np.concatenate((np.arange(5 * rate) / rate, 5.0 + gap + np.arange(5 * rate) / rate))
-    assert jumps(drive(times, steady(speed), steady(0.3 if speed < 5.0 else 0.05))) == 0
-
-
 QUICK = {
     'full throttle': (lambda t: np.minimum(10.0 * t, 50.0), np.zeros_like),
     'full throttle after a while': (

@@ -41,13 +41,6 @@ class Given:
         return answers == {'used'} and not self.keeper.in_doubt
 
 
-def test_eight_bad_stamps_that_contradict_one_another_change_nothing() -> None:
-    one = Given()
-    bad = (-1000.0, -2000.0, -3000.0, -4000.0, -5000.0, 5000.0, 5001.0, 5002.0)
-    assert one.answers(*(NOW + each for each in bad)) == {'refused'}
-    assert one.goes_on()
-
-
 @given(st.lists(st.floats(-1e6, 1e6), max_size=30))
 def test_bad_stamps_among_good_ones_change_nothing(bad: list[float]) -> None:
     one = Given()

@@ -192,25 +192,3 @@ def test_thinning_changes_nothing_at_the_instants_that_matter_and_after(
                         thinned.motion(start, end), whole.motion(start, end), strict=True):
                     np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(thinned.poses[0], whole.poses[0])
-
-
-def test_thinning_does_not_take_what_is_left_out_for_rest() -> None:
-    # moves, rests for 9 s, moves on
-    x = [0.0, 1.0, *[2.0] * 91, 3.0, 4.0]
-    stamps = [EPOCH + k * SECOND // 10 for k in range(len(x))]
-    timeline = filled(stamps, np.column_stack((x, np.zeros((len(x), 2)))))
-    assert timeline.covers(stamps[50], closely=True)
-    thinned = OdometryTimeline()
-    thinned.restore(*timeline.thinned(np.array([stamps[0], stamps[92]]), stamps[93]),
-                    next_row(None, stamps[-1], (4.0, 0.0, 0.0)), resting=False)
-    assert thinned.covers(stamps[92])
-    assert thinned.covers(stamps[50])
-    assert not thinned.covers(stamps[50], closely=True)
-
-
-def test_at_rest_nothing_is_known_of_the_usual_noise() -> None:
-    timeline, row = OdometryTimeline(), None
-    for stamp_ns in (1, 2, 3):
-        row = next_row(row, stamp_ns, (1.0, 2.0, 0.5))
-        timeline.append(row)
-    np.testing.assert_array_equal(timeline.usual_variances(), 0.0)

@@ -258,21 +258,6 @@ def _laps_with_a_window(seed: int, n: int, *, per_lap: int, lag: int) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
-def test_a_position_alone_says_nothing_about_a_heading() -> None:
-    smoother = IncrementalSmoother(EXACT)
-    edge = Edges([0], [1], [[1.0, 0.0, 0.0]], [np.diag([100.0, 100.0, 0.0])], [EdgeKind.ODOMETRY])
-    smoother.update(GraphUpdate(
-        hidden=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=edge,
-        observed=ObservedNodes([0, 1, 1], None, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0] * 3],
-                               [np.eye(3), np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 4.0])],
-                               [0, 1, 2])))
-    update = marginalize(smoother.graph, [0])
-    assert len(update.edges) == len(update.priors) == 0
-    assert len(update.observed) == 1
-    # the heading of node 1 is not a part of the edge
-    assert update.observed.information[0, 2, 2] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_what_cannot_leave_is_refused() -> None:
     smoother, _ = at_rest(5)
     with pytest.raises(GraphUpdateError, match='no hidden node'):

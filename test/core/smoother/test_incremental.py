@@ -17,7 +17,6 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.smoother import step, tree_update
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 # Tolerance of poses after an exact step [m, rad].
@@ -288,35 +287,6 @@ def test_a_bad_update_leaves_no_trace(name: str, n: int) -> None:
                    GraphUpdate(remove_edges=[0], weigh_edges={1: 0.5}, fix=[1])):
         assert smoother.update(update)[:5] == spared.update(update)[:5]
         assert smoother.poses.tobytes() == spared.poses.tobytes()
-
-
-@pytest.mark.parametrize('raises', [False, True])
-def test_a_batch_fallback_that_fails_leaves_no_trace(
-    raises: bool, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The batch optimiser may find poses at which the elimination has a bad pivot after all."""
-    smoother, slow = street(60)
-    before, entered = state(smoother.graph), []
-
-    def failing(head: object, _: int, how: int) -> int:
-        entered.append(how)
-        if how != step.AFTER_BATCH:
-            return tree_update.DIVERGED
-        if raises:
-            raise MemoryError
-        return tree_update.BAD_PIVOT
-
-    update = GraphUpdate(edges=link(0, 50, slow.poses[50] + 0.1), weigh_edges={3: 0.5})
-    with monkeypatch.context() as patch:
-        patch.setattr(step, 'run', failing)
-        if raises:
-            with pytest.raises(MemoryError):
-                smoother.update(update)
-        else:
-            assert smoother.update(update).status is Status.FAILED
-    assert entered == [step.FIRST, step.AFTER_BATCH]
-    assert differences(before, state(smoother.graph)) == []
-    assert smoother.update(update).reason == ''
 
 
 def left_over() -> tuple[IncrementalSmoother, SlowGraph]:

@@ -5,7 +5,6 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from random_graphs import consistent_graph, random_edges, random_poses, snapshot
 from slow_smoother import differences, EXACT, SlowGraph, state, World, world
 
 from pose_graph_ros.core.batch import optimizer
@@ -15,7 +14,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
-from pose_graph_ros.core.smoother.trial import optimize_copy, Trial
+from pose_graph_ros.core.smoother.trial import Trial
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -160,28 +159,3 @@ def test_a_minimum_that_later_updates_would_diverge_at_is_not_adopted() -> None:
     assert status(trial) is Status.FAILED
     assert smoother.adopt(trial).status is Status.FAILED
     assert differences(before, state(smoother.graph)) == []
-
-
-def test_a_fallback_begins_at_the_poses_before_the_update_that_diverged() -> None:
-    graph, copies = consistent_graph(5, noise=0.1), [Graph(), Graph()]
-    assert optimize_copy(graph, copies[0])
-    graph.begin()
-    before = snapshot(graph)
-    for node in range(1, graph.n_nodes):    # a step that led astray
-        graph.apply(GraphUpdate(fix=(node,)))
-        graph.apply(GraphUpdate(free=(node,)))
-    graph.memory['node_f'][1:graph.n_nodes, :3] += 1e6
-    assert snapshot(graph) != before
-    assert optimize_copy(graph, copies[1])
-    assert snapshot(copies[1]) == snapshot(copies[0])
-    graph.rollback()
-    assert snapshot(graph) == before
-
-
-def test_a_fallback_tells_that_nothing_determines_the_graph() -> None:
-    graph, rng = consistent_graph(1), np.random.default_rng(0)
-    n = graph.n_nodes
-    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=random_edges(rng, [n], [n + 1])))
-    before = snapshot(graph)
-    assert not optimize_copy(graph, Graph())
-    assert snapshot(graph) == before

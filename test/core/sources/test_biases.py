@@ -4,32 +4,25 @@
 
 from pathlib import Path
 
-from hypothesis import given, settings, strategies as st
-import jacobians
 import numpy as np
 import pytest
 from random_graphs import (
-    random_edges_to_biases,
     random_graph,
-    random_poses,
 )
 from scipy.optimize import least_squares
-from slow_smoother import differences, EXACT, state, world
+from slow_smoother import EXACT
 
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import SmootherConfig, SolverConfig
+from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions, factors, tables as tb
+from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
-from pose_graph_ros.core.smoother import trial as trials
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-
-seeds = st.integers(0, 2**32 - 1)
 
 ODOMETRY = np.diag([400.0, 900.0, 2500.0])
 THOROUGH = SolverConfig(max_iterations=200, step_tolerance=1e-11)
@@ -50,52 +43,6 @@ def fix(node: int, bias: int, where: FloatArray, offset: FloatArray, sigmas: Flo
     weight = sigmas[0]**-2.0
     return Edges([node], [bias], [[*where, 0.0]], [np.diag([weight, weight, 0.0])],
                  [EdgeKind.BIAS], bias=[[*offset, sigmas[1], 0.0]])
-
-
-# --- the error ----------------------------------------------------------------------------------
-
-
-@given(seeds)
-@settings(max_examples=30)
-def test_energy_linearization_error_and_scale_are_those_of_the_formulas(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    graph = Graph()
-    i, j = rng.choice(3, 12), 3 + rng.choice(2, 12)
-    edges = random_edges_to_biases(rng, i, j)
-    edges.bias[::4, :2] = 0.0
-    biases = random_poses(rng, 2)
-    biases[:, 2] *= 0.5     # a factor times an angle jumps where the angle is wrapped
-    graph.apply(GraphUpdate(hidden=random_poses(rng, 3), biases=biases, edges=edges))
-    graph.apply(GraphUpdate(weigh_edges={0: 0.3, 1: 0.0}))
-    W, before = graph.edges.weighted_information, graph.poses.copy()
-    first = jacobians.linearize_edges(before, edges)
-    diagonals = np.einsum('mji,mjk,mki->mi', first.jacobian_i, W, first.jacobian_i)
-    expected = np.zeros((5, 3))
-    np.add.at(expected, i, diagonals)
-    np.add.at(expected, j, np.einsum('mji,mjk,mki->mi', first.jacobian_j, W, first.jacobian_j))
-    scale = graph.memory['node_f'][:5, [tb.SCALE_T, tb.SCALE_R]]
-    np.testing.assert_allclose(
-        scale[:, 0]**2, 0.5 * (expected[:, 0] + expected[:, 1]), atol=1e-9)
-    np.testing.assert_allclose(scale[3:, 1]**2, expected[3:, 2], atol=1e-9)
-    # move all nodes a little
-    moves = 0.2 * rng.normal(size=(5, 3))
-    rows = graph.memory['node_f'][:5]
-    rows[:, tb.DELTA:tb.DELTA + 3] = moves
-    rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(before + moves)
-    for e in range(12):
-        factors.check(graph.memory.head, e, factors.NO_TURN)
-    error = error_functions.edge_errors(graph.poses, edges)
-    linear = (first.error + np.einsum('mij,mj->mi', first.jacobian_i, moves[i])
-              + np.einsum('mij,mj->mi', first.jacobian_j, moves[j]))
-    rest = error - linear
-    rest[:, 2] = 0.0
-    energy = error_functions.energies(error, W)
-    turned = moves[i, 2]**2 * np.any(edges.bias[:, :2] != 0.0, axis=1) * energy
-    table, wrapped = graph.memory['edge_f'][:12], np.abs(error - linear)[:, 2] > 1.0
-    np.testing.assert_allclose(table[:, tb.ENERGY], energy, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(
-        table[~wrapped, tb.ERROR2], (error_functions.energies(rest, W) + turned)[~wrapped],
-        rtol=1e-9, atol=1e-9)
 
 
 # --- correlated noise ---------------------------------------------------------------------------
@@ -206,91 +153,7 @@ def test_the_estimate_is_good_all_along_a_drive_with_default_settings() -> None:
     assert np.max(off) < 5.0
 
 
-# --- rows of biases in the graph ----------------------------------------------------------------
-
-
-def with_biases(config: SmootherConfig = EXACT) -> IncrementalSmoother:
-    """Return a chain of 12 poses and a chain of 4 biases, which are the last nodes."""
-    smoother, bias = IncrementalSmoother(config), 12
-    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
-    for _ in range(11):
-        smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY)
-    sigmas = np.array([0.1, 1.0])
-    smoother.update(GraphUpdate(
-        biases=np.zeros((1, 3)), observed=prior(12),
-        edges=fix(2, 12, np.array([2.5, 1.0]), np.ones(2), sigmas)))
-    for node in (5, 8, 10):
-        bias = add_fix(
-            smoother, node, bias, 0.8, smoother.poses[node, :2] + 0.7, np.ones(2), 0.1, 1.0)
-    return smoother
-
-
-def test_an_update_with_an_undetermined_bias_is_rolled_back() -> None:
-    smoother = with_biases()
-    before = state(smoother.graph)
-    result = smoother.update(GraphUpdate(
-        hidden=np.zeros((1, 3)), biases=np.zeros((1, 3)), edges=Edges.joined([
-            Edges([11], [16], [[1.0, 0.0, 0.0]], [ODOMETRY], [EdgeKind.ODOMETRY]),
-            fix(16, 17, np.zeros(2), np.zeros(2), np.array([0.1, 1.0]))])))
-    # a position does not determine its angle
-    assert (result.status, result.reason) == (
-        Status.FAILED, 'hidden node 17 is not determined')
-    assert differences(before, state(smoother.graph)) == []
-    assert smoother.graph.newest_pose == 11
-
-
 # --- batch, starts, files -----------------------------------------------------------------------
-
-@pytest.mark.parametrize('seed', range(6))
-def test_the_batch_optimum_is_that_of_scipy(seed: int) -> None:
-    here, graph = world(seed), Graph()
-    for update in (GraphUpdate(hidden=np.array(here.truth), fix=[0]), here.new_nodes(8),
-                   here.new_biases(3, 9)):
-        graph.apply(update)
-    edges, observed, free = graph.edges, graph.observed, ~graph.fixed
-    roots = []
-    for table in (edges, observed):
-        values, vectors = np.linalg.eigh(table.information)
-        roots.append(np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2))
-
-    def errors(x: FloatArray) -> FloatArray:
-        poses = graph_poses.copy()
-        poses[free] = x.reshape(-1, 3)
-        return np.concatenate([
-            np.einsum('mij,mj->mi', root, error).ravel() for root, error in zip(
-                roots, (error_functions.edge_errors(poses, edges),
-                        error_functions.observed_errors(poses, observed)), strict=True)])
-
-    graph_poses = graph.poses.copy()
-    other = least_squares(errors, graph_poses[free].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    result = optimizer.optimize(graph, THOROUGH)
-    assert result.status is Status.CONVERGED
-    assert result.chi2 == pytest.approx(2.0 * other.cost, rel=1e-9)
-    off = graph.poses[free] - other.x.reshape(-1, 3)
-    off[:, 2] = se2.wrap(off[:, 2])
-    np.testing.assert_allclose(off, 0.0, atol=1e-6)
-
-
-def test_a_closure_that_contradicts_all_is_solved_for_on_a_copy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    smoother, copied = with_biases(SmootherConfig()), []
-    optimize_copy = trials.optimize_copy
-
-    def watched(graph: Graph, copy: Graph) -> bool:
-        copied.append(copy)
-        return optimize_copy(graph, copy)
-
-    monkeypatch.setattr(trials, 'optimize_copy', watched)
-    smoother.update(GraphUpdate(edges=Edges(
-        [2], [10], [[0.0, 0.0, 3.0]], ODOMETRY[None], [EdgeKind.LOOP_CLOSURE])))
-    assert len(copied) == 1
-    other = Graph()
-    other.fill(smoother.graph.rows()._replace(poses=smoother.poses))
-    assert optimizer.optimize(other, THOROUGH).status is Status.CONVERGED
-    assert smoother.chi2() == pytest.approx(other.energies().chi2, rel=1e-3)
-    assert smoother.extend(np.array([1.0, 0.0, 0.1]), ODOMETRY).status is Status.CONVERGED
-    assert smoother.graph.newest_pose == 16
 
 
 def test_a_file_has_no_biases_and_says_so(tmp_path: Path) -> None:

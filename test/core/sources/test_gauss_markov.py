@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Correlated errors: the estimate is that of the full covariance, in any order of arrival."""
 
-import itertools
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -74,36 +73,6 @@ def transitions(stamps: list[float]) -> set[tuple[object, ...]]:
                           sizes.observed + len(additions.observed))
     return ({(rows.get(i, 'pose'), rows[j], *rest) for i, j, *rest in edges.values()}
             | {('prior', rows[node]) for node in priors.values()})
-
-
-def test_the_order_of_arrival_does_not_change_the_transitions_of_states() -> None:
-    stamps = [3.0, 4.0, 7.0, 20.0, 21.0]
-    expected = transitions(stamps)
-    assert len(expected) == 5 + 4 + 1
-    for order in itertools.permutations(stamps):
-        assert transitions(list(order)) == expected
-
-
-def test_the_additions_of_a_failed_update_are_rolled_back() -> None:
-    def add(chain: GaussMarkovBias, seconds: float) -> Additions:
-        additions = Additions(NextIds(10, 20, 30))
-        chain.add(round(seconds * SECOND), observed(seconds), NO_NOISE, additions)
-        return additions
-
-    chains = [GaussMarkovBias(ERRORS) for _ in range(2)]
-    for chain in chains:
-        for seconds in (3.0, 9.0):
-            chain.begin()
-            add(chain, seconds)
-    chains[0].begin()
-    for seconds in (1.0, 5.0, 5.2, 30.0):
-        add(chains[0], seconds)
-    chains[0].rollback()
-    for seconds in (5.0, 2.0, 40.0, 5.5):
-        got, expected = (add(chain, seconds) for chain in chains)
-        assert got.remove_edges == expected.remove_edges
-        assert got.remove_observed == expected.remove_observed
-        assert len(got.biases) == len(expected.biases)
 
 
 STIFF = OdometrySource(

@@ -5,7 +5,6 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from test_gauss_markov import ERRORS, NO_NOISE, observed, SECOND, TAU
-from test_waiting import closure, heading
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
@@ -15,7 +14,6 @@ from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
 from pose_graph_ros.core.sources.error_likelihood import no_past
 from pose_graph_ros.core.sources.gauss_markov import Additions, GaussMarkovBias
-from pose_graph_ros.core.sources.pipeline import SeenStamps
 from pose_graph_ros.core.sources.settings import SOURCES
 
 
@@ -163,14 +161,3 @@ def test_the_past_is_bounded() -> None:
         assert len(path.stamps_ns) <= 2 * SOURCES.kept_positions
     assert np.all(np.diff(path.stamps_ns) > 0)
     assert path.stamps_ns[-1] == stamps_ns[-1] + 599 * 100 * SECOND
-
-
-def test_stamps_before_the_window_are_forgotten() -> None:
-    seen = SeenStamps()
-    for stamp in (5, 1, 9):
-        seen.add('a', heading(stamp))
-        seen.add('scan', closure(stamp, reference_ns=stamp - 1))
-    seen.forget(5)
-    assert [seen.has('a', heading(stamp)) for stamp in (1, 5, 9)] == [False, True, True]
-    assert [seen.has('scan', closure(stamp, reference_ns=stamp - 1))
-            for stamp in (1, 5, 9)] == [False, True, True]

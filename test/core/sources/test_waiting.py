@@ -3,7 +3,6 @@
 """Waiting measurements and stamps seen so far, compared with plain lists and sets."""
 
 
-
 from hypothesis import given, strategies as st
 import numpy as np
 

@@ -61,7 +61,7 @@ def test_closures_that_are_honest_are_not_found_wrong_and_those_that_claim_a_thi
 ) -> None:
     for claim, name in ((1.0, 'honest'), (1.0 / 3.0, 'third')):
         bag, run = tmp_path / name, tmp_path / f'{name}_run'
-        assert main(['simulate', str(bag), '--world', world, '--duration', '900', '--seed', '3',
+        assert main(['simulate', str(bag), '--world', world, '--duration', '500', '--seed', '3',
                      '--claimed-sigma', f'/{CLOSURES}:{claim}']) == 0
         assert main(['replay', str(bag), '-o', str(run), '--odom', '/odom']) == 0
         data = read_document(run / 'run.json')
