@@ -191,16 +191,23 @@ def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
 
 def loose_nodes(graph: Graph) -> IntArray:
     """Return ids of nodes in parts without a fixed or observed node or an anchored prior."""
-    edges, observed, priors = graph.edges, graph.observed, graph.priors
-    edges = edges.rows(edges.weight > 0.0)
-    third = edges.k >= 0
-    starts = edges.i, edges.i[third], *(prior.nodes[:-1] for prior in priors)
-    ends = edges.j, edges.k[third], *(prior.nodes[1:] for prior in priors)
-    i, j = (graph.node_rows(np.concatenate(each)) for each in (starts, ends))
-    part = components(i, j, graph.n_nodes)
-    held = np.concatenate((graph.node_ids[graph.fixed], observed.node[observed.weight > 0.0],
-                           *(prior.nodes[:1] for prior in priors if prior.anchored)))
-    return graph.node_ids[~np.isin(part, part[graph.node_rows(held)])]
+    # from the tables, as `graph.edges` would copy all means and informations
+    memory, head = graph.memory, graph.memory.head
+    rows, numbers = (memory[name][:head[tb.N_EDGES]] for name in ('edge_i', 'edge_f'))
+    ends = rows[numbers[:, tb.WEIGHT] > 0.0, tb.END_I:tb.END_K + 1]
+    with_third = ends[ends[:, tb.END_K] >= 0]
+    rows, numbers = (memory[name][:head[tb.N_OBSERVED]] for name in ('observed_i', 'observed_f'))
+    held = [np.flatnonzero(graph.fixed), rows[numbers[:, tb.WEIGHT] > 0.0, tb.OBS_NODE]]
+    i = [ends[:, tb.END_I], with_third[:, tb.END_I]]
+    j = [ends[:, tb.END_J], with_third[:, tb.END_K]]
+    for prior in graph.priors if head[tb.N_PRIORS] > 0 else ():
+        nodes = graph.node_rows(prior.nodes)
+        i.append(nodes[:-1])
+        j.append(nodes[1:])
+        if prior.anchored:
+            held.append(nodes[:1])
+    part = components(np.concatenate(i), np.concatenate(j), graph.n_nodes)
+    return graph.node_ids[~np.isin(part, part[np.concatenate(held)])]
 
 
 def chi2_of(graph: Graph) -> float:
