@@ -47,7 +47,6 @@ Rows6 = Annotated[FloatArray, Column(float, (6,))]
 Rows7 = Annotated[FloatArray, Column(float, (7,))]
 Rows8 = Annotated[FloatArray, Column(float, (8,))]
 Pairs = Annotated[IntArray, Column(int, (2,))]
-Triples = Annotated[IntArray, Column(int, (3,))]
 Matrix = tuple[Pose, Pose, Pose]
 
 

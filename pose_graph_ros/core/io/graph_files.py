@@ -47,7 +47,7 @@ from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.saved_columns import Flags, Integers, Numbers, Rows3, Rows4, Rows6
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 5
+VERSION = 6
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'

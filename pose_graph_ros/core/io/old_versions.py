@@ -5,8 +5,12 @@ Saved graphs of older versions.
 
 Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements. In
 version 3 the ids of hidden nodes are `rows`. In version 4 loop closures may have doubted odometry.
+Up to version 5 closures and fixes have columns of their own in judgements.
 """
 
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import count
 from typing import Any
 
 LOSSES = ('none', 'huber', 'cauchy')
@@ -18,31 +22,58 @@ NUMBERED = {
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
 _NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
-_EMPTY: dict[str, dict[str, Any]] = {
-    'closures': {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
-        'sources', 'scales', 'rows', 'source', 'stamps_ns', 'since_ns', 'distance')}},
-    'fixes': {'decision': _NO_NAMES, **{name: [] for name in (
-        'sources', 'rows', 'edges', 'source', 'stamps_ns', 'believed', 'since_ns', 'observed',
-        'distance', 'loosened', 'weights')}},
-    'odometry': {}}
+_NOTHING: dict[str, Any] = {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
+    'sources', 'scales', 'left', 'held', 'edge', 'observed', 'source', 'number', 'stamps_ns',
+    'since_ns', 'distance')}}
+_NOT_JUDGED: dict[str, Any] = {
+    'closures': _NOTHING, 'fixes': _NOTHING, 'loosened': [], 'weights': [], 'odometry_left': {}}
 
 
 def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
-    """Return the members of a file of an older version as those of version 5."""
+    """Return the members of a file of an older version as those of version 6."""
     for member, name in NUMBERED if version < 2 else ():
         column = {'names': list(NUMBERED[member, name]), 'of': members[member][name]}
         members[member] = {**members[member], name: column}
     if version < 3:
-        members = {'judgement': _EMPTY, 'verdicts': {}, **members}
+        members = {'judgement': _NOT_JUDGED, 'verdicts': {}, **members}
         for name in ('waiting', 'set_aside'):
             members[name] = {'stamps_ns': [[-1, -1]] * len(members[name]['sources']),
                              **members[name]}
     if version < 4:
         nodes = members['nodes']
         members['nodes'] = {'ids' if name == 'rows' else name: nodes[name] for name in nodes}
-    if version < 5:
-        # odometry that closures had doubted keeps the weight that it has in the file
-        odometry = members['judgement']['odometry']
-        kept = {name: odometry[name] for name in odometry.keys() & {'left_sources', 'left'}}
-        members['judgement'] = {**members['judgement'], 'odometry': kept}
+    if 3 <= version < 6:
+        members['judgement'] = _judgement(**members['judgement'])
     return members
+
+
+def _judgement(
+    closures: dict[str, Any], fixes: dict[str, Any], odometry: dict[str, Any],
+) -> dict[str, Any]:
+    # odometry that closures had doubted keeps the weight that it has in the file
+    n = len(closures['rows'])
+    return {
+        'closures': {
+            **_common(closures, [[n - used - doubted, used, 0, doubted]
+                                 for n, used, doubted in closures.get('left', [])]),
+            'scales': closures['scales'], 'edge': [True] * n, 'observed': [-1] * n,
+            'stamps_ns': closures['stamps_ns'], 'state': closures['state']},
+        'fixes': {
+            **_common(fixes, [[0, n - unused, 0, unused] for n, unused in fixes.get('left', [])]),
+            'scales': [1.0] * len(fixes['sources']), 'edge': fixes['edges'],
+            'observed': fixes['observed'],
+            'stamps_ns': [[stamp, -1] for stamp in fixes['stamps_ns']],
+            'state': {'names': ['doubted', 'believed'], 'of': fixes['believed']}},
+        'loosened': fixes['loosened'], 'weights': fixes['weights'],
+        'odometry_left': dict(zip(
+            odometry.get('left_sources', ()), odometry.get('left', ()), strict=True))}
+
+
+def _common(old: dict[str, Any], left: list[list[int]]) -> dict[str, Any]:
+    """Return the columns that closures and fixes had in common."""
+    # without numbers they are counted from 0 in each source
+    counted = defaultdict[int, Iterator[int]](count)
+    return {
+        **{name: old[name] for name in ('sources', 'source', 'since_ns', 'decision', 'distance')},
+        'held': old['rows'], 'left': left or [[0] * 4] * len(old['sources']),
+        'number': old.get('numbers') or [next(counted[source]) for source in old['source']]}

@@ -16,18 +16,11 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement.closure_states import (
-    ClosureStates,
-    DOUBTED,
-    NEVER,
-    OUT,
-    STATES,
-    USED,
-)
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, NEVER
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial, Found
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.judgement.verdicts import DOUBTED, OUT, State, STATES, USED
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
 
@@ -158,7 +151,7 @@ class Beliefs:
     def set_base_weights(self, numbers: IntArray) -> None:
         """Tell robust losses the weights of closures, which the graph has already."""
         for number, weight in zip(numbers.tolist(), self.weights(numbers).tolist(), strict=True):
-            self._reweighting.set_base_weight(int(self._states.edge[number]), weight, edge=True)
+            self._reweighting.set_base_weight(int(self._states.held[number]), weight, edge=True)
 
     def apply(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
         """Tell whether states and weights were changed; if not, they may be tried later."""
@@ -196,7 +189,7 @@ class Beliefs:
         self._states.state[numbers] = [STATES.index(changes[k]) for k in numbers.tolist()]
         weights = self.weights(numbers).tolist()
         self._states.state[numbers] = before
-        return dict(zip(self._states.edge[numbers].tolist(), weights, strict=True))
+        return dict(zip(self._states.held[numbers].tolist(), weights, strict=True))
 
     def _keep(self, changes: Mapping[int, State]) -> None:
         """Change states, of which the graph has the weights already."""

@@ -18,28 +18,25 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import closures, final
 from pose_graph_ros.core.judgement.beliefs import BeliefRule, Beliefs, Retests, ScaleLeft
-from pose_graph_ros.core.judgement.closure_states import (
-    AUTO,
-    ClosureReports,
-    ClosureStates,
-    DECISIONS,
-    DOUBTED,
-    SavedClosures,
-    STATES,
-    WAITING,
-)
+from pose_graph_ros.core.judgement.closure_states import ClosureReports, ClosureStates
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial, SetSearch
 from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
+from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.verdicts import (
+    AUTO,
     Decision,
-    MOST_OTHERS,
+    DECISIONS,
+    DOUBTED,
     SourceVerdicts,
     State,
+    STATES,
+    USED,
     Verdict,
+    WAITING,
 )
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -69,7 +66,8 @@ class ClosureJudge:
         self._beliefs.now_ns, self._n_staged = now_ns, n
         self._chain.extend(self._smoother.graph)
         self._table.append(claims(edges))
-        self._states.append(new, now_ns)
+        for one in new:
+            self._states.append(one, now_ns, WAITING)
         self._scales.add_sources()
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
@@ -98,7 +96,7 @@ class ClosureJudge:
     def rollback(self) -> None:
         self.reports.forget()
         self._table.drop(self._n_staged)
-        self._states.drop(self._n_staged)
+        self._states.truncate(len(self._states) - self._n_staged)
         self._n_staged = 0
 
     def commit(self) -> None:
@@ -106,7 +104,7 @@ class ClosureJudge:
         if begin < len(self._states):
             self._retests.begin_turns()
         for number in range(begin, len(self._states)):
-            self._states.announce(number, -1, self._beliefs.now_ns)
+            self._states.announce(number, NEW, self._beliefs.now_ns)
         for source in np.unique(self._states.source[begin:]).tolist():
             self._table.forget(self._states.forget(source).tolist())
         if np.any(self._states.in_graph[begin:]):
@@ -120,7 +118,7 @@ class ClosureJudge:
         total, distance = spread + some.noise, np.empty(n)
         closures.distances(errors, total, distance)
         self._table.spread[numbers] = spread
-        self._states.distance[numbers] = distance
+        self._states.distance[numbers] = np.sqrt(distance)
         self._retests.tested(numbers, self._beliefs.round)
         passes = distance < GATE
         for number, state in zip(
@@ -183,7 +181,7 @@ class ClosureJudge:
         """Take those of some closures out of the graph that do not fit; tell if there was any."""
         # the smoother knows the energies; raised covariances make the residuals only smaller
         inside = inside[closures.are_above(
-            self._smoother.graph, self._states.edge[inside], 0.5 * GATE)]
+            self._smoother.graph, self._states.held[inside], 0.5 * GATE)]
         fit = closures.residuals(self._smoother.graph, self._table.rows(inside))
         bad = inside[fit > GATE]
         if not self._change(dict.fromkeys(bad.tolist(), State.DOUBTED)):
@@ -274,10 +272,10 @@ class ClosureJudge:
         present = *graph.next_ids, self._beliefs.round
         if len(judged) == 0 or present == self._final:
             return
-        forced = states.edge[states.in_graph & ~states.judged]
+        forced = states.held[states.in_graph & ~states.judged]
         inside = states.in_graph
         choice = final.decide(
-            graph, self._reweighting, states.edge[judged], forced, inside[judged])
+            graph, self._reweighting, states.held[judged], forced, inside[judged])
         if choice is None:
             return
         inside[judged] = choice.believed
@@ -309,21 +307,21 @@ class ClosureJudge:
             self._beliefs.try_set(self._search.found)
         return more
 
-    def saved(self) -> SavedClosures:
+    def saved(self) -> SavedVerdicts:
         return self._states.saved(self._beliefs.scales)
 
-    def restore(self, saved: SavedClosures, now_ns: int) -> None:
+    def restore(self, saved: SavedVerdicts, now_ns: int) -> None:
         self._beliefs.now_ns = now_ns
         self._chain.extend(self._smoother.graph)
-        self._table.append(claims(self._smoother.graph.edges_at(saved.rows)))
+        self._table.append(claims(self._smoother.graph.edges_at(saved.held)))
         self._states.restore(saved)
         self._scales.set_state(saved.scales.tolist(), [0] * len(saved.scales))
-        used = saved.left[:, 1].tolist() or [0] * len(saved.scales)
-        self._beliefs.scales_left[:] = map(ScaleLeft, used, saved.scales.tolist())
+        self._beliefs.scales_left[:] = map(
+            ScaleLeft, np.sum(saved.left[:, USED], axis=1).tolist(), saved.scales.tolist())
         self._scales.add_sources()
 
     def totals(self) -> dict[str, SourceVerdicts]:
-        return self.reports.totals(self._beliefs.scales)
+        return self._states.totals(self._beliefs.scales)
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """

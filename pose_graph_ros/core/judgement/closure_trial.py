@@ -253,7 +253,7 @@ class SetSearch:
                 return False
             self._next = max(len(against) + BELIEF.more_corroborated,
                              math.ceil(1.5 * len(against)))
-            self._parts = self._trial(graph, self._states.edge[against[-BELIEF.most_seeds:]])
+            self._parts = self._trial(graph, self._states.held[against[-BELIEF.most_seeds:]])
             self._began = now
         try:
             next(self._parts)
@@ -268,10 +268,10 @@ class SetSearch:
             for number in states.numbers(np.array([edge])).tolist():
                 if states.judged[number]:
                     other = self._table.support(number, ~states.in_graph & states.judged).clique
-                    clique = states.edge[other] if len(other) > len(clique) else clique
+                    clique = states.held[other] if len(other) > len(clique) else clique
             yield
         known = np.flatnonzero(~states.forgotten)
-        edges = states.edge[known]
+        edges = states.held[known]
         clique = np.flatnonzero(np.isin(edges, clique))
         some = self._table.rows(known)
         closures = Edges(some.i, some.j, some.mean, np.linalg.inv(some.noise),
@@ -283,5 +283,5 @@ class SetSearch:
             return None
         # edges are in the order of their addition
         inside = np.zeros(len(states), dtype=bool)
-        inside[states.numbers(edges)] = found.inside[np.isin(edges, states.edge)]
+        inside[states.numbers(edges)] = found.inside[np.isin(edges, states.held)]
         return Found(inside, found.nodes, found.poses)

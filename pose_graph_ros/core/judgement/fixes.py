@@ -18,7 +18,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import fix_states as fs
+from pose_graph_ros.core.judgement.fix_states import FixStates, LONE
+from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.run_set import decision_cost, RunSet, Turn
 from pose_graph_ros.core.judgement.runs import odometry_between
@@ -30,7 +31,14 @@ from pose_graph_ros.core.judgement.tracks import (
     observations,
     Track,
 )
-from pose_graph_ros.core.judgement.verdicts import Decision, MOST_OTHERS, State, Verdict
+from pose_graph_ros.core.judgement.verdicts import (
+    AUTO,
+    BELIEVED,
+    Decision,
+    DECISIONS,
+    DOUBTED,
+    Verdict,
+)
 from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,
@@ -42,18 +50,13 @@ from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 
-class _Before(NamedTuple):
-    """The state before an update, but for the records, of which there were `size`."""
-
-    size: int
-    runs: RunSet
-    loosened: dict[int, float]
-
-
 class _Decided(NamedTuple):
+    """What is decided on all measurements in the map, at some time."""
+
     run: IntArray
-    believed: IntArray  # of each record, both of shape (M,)
+    state: IntArray  # of each record, both of shape (M,)
     runs: RunSet
+    # weights of odometry edges by id; replaced, never changed, so that it is not copied
     loosened: dict[int, float]
 
 
@@ -62,12 +65,11 @@ class FixJudge:
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
     ) -> None:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
-        self.states = self._states = fs.FixStates()
+        self.states = self._states = FixStates()
         self._runs = RunSet()
-        # weights of odometry edges by id; replaced, never changed, so that it is not copied
         self._loosened: dict[int, float] = {}
-        self._restore: _Before | None = None
-        self._decided: _Decided | None = None
+        self._before: _Decided | None = None  # during an update, what was decided before it
+        self._final: _Decided | None = None  # what `final_weights` has found
         # stamp [ns] of the newest believed measurement that has left, and where the robot was
         self._cut: tuple[int, Track] | None = None
         # newest stamp of odometry, and the record that is judged again, -1 for a new one
@@ -90,28 +92,22 @@ class FixJudge:
                   is Robust.JUDGED]
         if len(judged) == 0:
             return change
-        self._begin()
-        self._now_ns = now_ns
+        self._now_ns, before = now_ns, self._begin()
         graph = self._smoother.graph
         solved = not graph.has_touched
         self._runs.chain.extend(graph)
-        first, loosened = len(self._states), self._loosened
         is_edge = np.array([one.is_edge for one in judged])
         numbers, begin = np.array([one.number for one in judged]), graph.next_ids
         seen = _both(change.edges.rows(numbers[is_edge] - begin.edge),
                      change.observed.rows(numbers[~is_edge] - begin.observed), is_edge)
         for one, each in zip(judged, seen, strict=True):
             self._judge(one.stamp_ns, each, one, solved=solved)
-        for number in range(first, len(self._states)):
-            if not self._states.believed[number]:
-                self._states.announce(number, None)
-        return self._with_weights(change, first, loosened)
+        return self._with_weights(change, before)
 
-    def _with_weights(
-        self, change: GraphUpdate, first: int, loosened: Mapping[int, float],
-    ) -> GraphUpdate:
+    def _with_weights(self, change: GraphUpdate, before: _Decided) -> GraphUpdate:
         """Return an update with the weights of new records and of those that have changed."""
-        edges, observed = self._states.weights(first, self._reweighting)
+        edges, observed = self._states.weights(before.state, self._reweighting)
+        loosened = before.loosened
         for edge in () if loosened is self._loosened else {*loosened, *self._loosened}:
             if loosened.get(edge) != self._loosened.get(edge):
                 edges[edge] = self._loosened.get(edge, 1.0)
@@ -122,37 +118,43 @@ class FixJudge:
     def chain(self) -> OdometryChain:
         return self._runs.chain
 
-    def _begin(self) -> None:
-        self._restore, self._decided = self._copy(), None
+    def _begin(self) -> _Decided:
+        self._before, self._final = self._decided(), None
+        return self._before
 
-    def _copy(self) -> _Before:
-        return _Before(len(self._states), self._runs.copy(), self._loosened)
+    def _decided(self) -> _Decided:
+        return _Decided(self._states.run.copy(), self._states.state.copy(), self._runs.copy(),
+                        self._loosened)
+
+    def _decide(self, decided: _Decided) -> None:
+        """Make it what is decided; what has come since is taken away."""
+        self._states.truncate(len(decided.run))
+        self._states.run[:], self._states.state[:] = decided.run, decided.state
+        self._runs, self._loosened = decided.runs, decided.loosened
 
     def commit(self) -> None:
-        if self._restore is None:
+        if self._before is None:
             return
-        self._states.set_base_weights(self._restore.size, self._reweighting)
-        for number, before in self._states.changed.items():
-            if before != bool(self._states.records['believed'][number]):
-                self._states.announce(number, State.BELIEVED if before else State.DOUBTED)
-        self._states.forget()
-        self._restore = None
+        before, states = self._before.state, self._states
+        states.set_base_weights(before, self._reweighting)
+        for number in states.changed(before).tolist():
+            states.announce(number, int(before[number]), self._now_ns)
+        for number in range(len(before), len(states)):
+            states.announce(number, NEW, self._now_ns)
+        self._before = None
 
     def rollback(self) -> None:
-        if self._restore is not None:
-            self._states.undo(self._restore.size)
-            self._set(self._restore)
-
-    def _set(self, before: _Before) -> None:
-        self._runs, self._loosened, self._restore = before.runs, before.loosened, None
+        if self._before is not None:
+            self._decide(self._before)
+            self._before = None
 
     def state(self) -> Callable[[], None]:
         """Return what brings the present state back, as long as no measurement is added."""
-        before, records_back = self._copy(), self._states.snapshot()
+        before, records_back = self._decided(), self._states.snapshot()
 
         def bring_back() -> None:
+            self._decide(before)
             records_back()
-            self._set(before)
         return bring_back
 
     def _judge(self, stamp_ns: int, seen: Observation | None, one: NewConstraint | None, *,
@@ -161,20 +163,18 @@ class FixJudge:
         if seen is None:
             return      # a heading alone
         states = self._states
-        source = (states.sources[states.records['source'][self._again]]
+        source = (states.sources[states.source[self._again]]
                   if one is None else one.source)
         begun = not np.any(self._smoother.graph.fixed)
         given = self._runs.judge(
             stamp_ns, seen, source, self._of_graph(seen.node, solved=solved),
             solved=solved, begun=begun)
         if one is not None:
-            states.append(one, run=given.run, believed=given.believed,
-                          distance=math.sqrt(given.d2), now_ns=self._now_ns)
+            states.append(one, self._now_ns, BELIEVED if given.believed else DOUBTED,
+                          math.sqrt(given.d2), run=given.run)
         else:
-            states.records['run'][self._again] = given.run
-            if bool(states.records['believed'][self._again]) != given.believed:
-                states.believe(
-                    np.array((self._again,)), believed=given.believed, now_ns=self._now_ns)
+            states.run[self._again] = given.run
+            states.believe(np.array((self._again,)), believed=given.believed)
         if given.turn is not None:
             self._apply(given.turn)
 
@@ -187,34 +187,29 @@ class FixJudge:
 
     def _apply(self, turn: Turn) -> None:
         """Believe and doubt the members of runs, and the odometry between them."""
-        records = self._states.records
+        states = self._states
         for number, rest, stamp_ns in turn.cuts:
-            after = np.flatnonzero((records['run'] == number)
-                                   & (records['stamp_ns'] >= stamp_ns))
-            self._states.keep(after)
-            self._states.believe(after, believed=False, now_ns=self._now_ns)
-            records['run'][after] = rest
+            after = np.flatnonzero(
+                (states.run == number) & (states.stamps_ns[:, 0] >= stamp_ns))
+            states.believe(after, believed=False)
+            states.run[after] = rest
         for number, believed in turn.runs:
-            self._states.believe(np.flatnonzero(records['run'] == number),
-                                 believed=believed, now_ns=self._now_ns)
+            states.believe(np.flatnonzero(states.run == number), believed=believed)
         self._loosened = {
             edge: 1.0 / scale for begin, end, scale in turn.jumps
             for edge in odometry_between(self._smoother.graph, begin, end).tolist()}
 
     def finish(self) -> None:
         """Judge all again by odometry alone, unless `final_weights` has just decided it."""
-        loosened, states, decided = self._loosened, self._states, self._decided
+        final = self._final
         if not self._can_judge_all():
             return
-        self._begin()
-        states.keep(np.arange(len(states)))
-        if decided is None:
+        before = self._begin()
+        if final is None:
             self._judge_all()
         else:
-            self._use(decided)
-        states.changed = {number: before for number, before in sorted(states.changed.items())
-                          if before != bool(states.records['believed'][number])}
-        change = self._with_weights(GraphUpdate(), len(states), loosened)
+            self._decide(final)
+        change = self._with_weights(GraphUpdate(), before)
         if (len(change.weigh_edges) + len(change.weigh_observed) > 0
                 and self._smoother.update(change).reason != ''):
             self.rollback()
@@ -223,64 +218,54 @@ class FixJudge:
 
     def final_weights(self) -> tuple[FloatArray, FloatArray]:
         """Return the weights that `finish` would give, by row."""
-        graph, records = self._smoother.graph, self._states.records
+        graph, states = self._smoother.graph, self._states
         weights = graph.weights
         if not self._can_judge_all():
             return weights
         self._begin()
-        self._states.keep(np.arange(len(self._states)))
         self._judge_all()
-        for kind, table, row_of in ((1, weights[0], graph.edge_rows),
-                                    (0, weights[1], graph.observed_rows)):
-            some = records[records['edge'] == kind]
-            table[row_of(some['held'])] = some['believed']
-        decided = self._decision()
+        for some, table, row_of in ((states.edge, weights[0], graph.edge_rows),
+                                    (~states.edge, weights[1], graph.observed_rows)):
+            table[row_of(states.held[some])] = states.believed[some]
+        final = self._decided()
         self.rollback()
-        self._decided = decided
+        self._final = final
         return weights
-
-    def _decision(self) -> _Decided:
-        records = self._states.records
-        return _Decided(records['run'].copy(), records['believed'].copy(),
-                        self._runs, self._loosened)
-
-    def _use(self, decided: _Decided) -> None:
-        self._runs, self._loosened = decided.runs, decided.loosened
-        self._states.records['run'] = decided.run
-        for believed in (False, True):
-            self._states.believe(np.flatnonzero(decided.believed == believed), believed=believed,
-                                 now_ns=self._now_ns)
 
     def _can_judge_all(self) -> bool:
         return 0 < len(self._states) <= BELIEF.most_again and not self._smoother.graph.has_touched
 
     def _judge_all(self) -> None:
         """Judge all again, with the errors that they state; the cheaper decision is kept."""
-        graph, states, present = self._smoother.graph, self._states, self._decision()
+        graph, states, present = self._smoother.graph, self._states, self._decided()
         self._runs, self._loosened = self._runs.empty(), {}
         self._runs.chain.extend(graph)
         if self._cut is not None:
             self._runs.begin_with(*self._cut)
-        states.records['run'] = fs.LONE
+        states.run[:] = LONE
         order = states.by_stamp()
-        held, observed, stamps_ns = (
-            states.records[name][order] for name in ('held', 'observed', 'stamp_ns'))
-        is_edge = observed < 0
-        seen = _both(graph.edges_at(held[is_edge]), graph.observed_at(observed[~is_edge]), is_edge)
+        stamps_ns, seen = states.stamps_ns[order, 0], self._seen(order)
         for self._again, stamp_ns, one in zip(
                 order.tolist(), stamps_ns.tolist(), seen, strict=True):
             self._judge(stamp_ns, one, None)
         self._again = -1
-        if np.array_equal(present.believed, states.records['believed']):
+        if np.array_equal(present.state, states.state):
             return
         begin = None if self._cut is None else self._cut[1]
         now, before = (decision_cost(
             ((stamp_ns, one, run, believed) for stamp_ns, one, run, believed in zip(
                 stamps_ns.tolist(), seen, decided.run[order].tolist(),
-                (decided.believed[order] != 0).tolist(), strict=True) if one is not None),
-            begin, self._runs.chain) for decided in (self._decision(), present))
+                (decided.state[order] == BELIEVED).tolist(), strict=True) if one is not None),
+            begin, self._runs.chain) for decided in (self._decided(), present))
         if before < now:
-            self._use(present)
+            self._decide(present)
+
+    def _seen(self, numbers: IntArray) -> list[Observation | None]:
+        """Return the observations of some records, as they were added."""
+        graph, observed = self._smoother.graph, self._states.observed[numbers]
+        is_edge = observed < 0
+        return _both(graph.edges_at(self._states.held[numbers[is_edge]]),
+                     graph.observed_at(observed[~is_edge]), is_edge)
 
     def decide_leaving(
         self, edges: IntArray, observed: IntArray,
@@ -290,18 +275,16 @@ class FixJudge:
         self._runs.chain.extend(graph)
         leaving = states.leaving(edges, observed)
         unused = np.flatnonzero(leaving & ~states.believed)
-        return (fs.verdicts_on(states, graph, unused[-MOST_OTHERS:]),
+        return (states.verdicts(graph, unused[-MOST_OTHERS:]),
                 self._after(np.flatnonzero(leaving & states.believed)))
 
     def _after(self, numbers: IntArray) -> tuple[int, Track] | None:
         """Return where the robot was after some believed measurements, by what was before."""
         graph, chain, cut = self._smoother.graph, self._runs.chain, self._cut
-        records = self._states.records[numbers]
-        records = records[np.argsort(records['stamp_ns'], kind='stable')]
-        is_edge = records['observed'] < 0
-        seen = _both(graph.edges_at(records['held'][is_edge]),
-                     graph.observed_at(records['observed'][~is_edge]), is_edge)
-        for stamp_ns, one in zip(records['stamp_ns'].tolist(), seen, strict=True):
+        stamps_ns = self._states.stamps_ns[numbers, 0]
+        order = np.argsort(stamps_ns, kind='stable')
+        for stamp_ns, one in zip(
+                stamps_ns[order].tolist(), self._seen(numbers[order]), strict=True):
             if one is None or (cut is not None and one.node < cut[1].node):
                 continue
             track = Track(one.node, graph.poses_of(one.node),
@@ -315,8 +298,10 @@ class FixJudge:
         self, nodes: IntArray, edges: IntArray, observed: IntArray,
         last: tuple[int, Track] | None,
     ) -> None:
-        self._states.leave(self._states.leaving(edges, observed))
-        self._cut, self._decided = last or self._cut, None
+        leaving = self._states.leaving(edges, observed)
+        if np.any(leaving):
+            self._states.select(np.flatnonzero(~leaving))
+        self._cut, self._final = last or self._cut, None
         if self._cut is not None:
             self._cut = self._cut[0], self._cut[1].carried(self._runs.chain, nodes)
         self._runs.forget(nodes)
@@ -330,32 +315,27 @@ class FixJudge:
         number = self._states.find(name)
         if number < 0:
             return unknown(name, has_left=self._states.has_left(name))
-        record = self._states.records[number]
+        states = self._states
         believed = decision is Decision.IN or (
-            decision is Decision.AUTO and self._runs.believes(int(record['run'])))
-        self._begin()
-        self._states.keep(np.array((number,)))
-        record['decision'] = fs.AUTO
-        self._states.believe(np.array((number,)), believed=believed, now_ns=self._now_ns)
-        change = self._with_weights(GraphUpdate(), len(self._states), self._loosened)
-        if len(self._states.changed) > 0:
-            result = self._smoother.update(change)
+            decision is Decision.AUTO and self._runs.believes(int(states.run[number])))
+        before, decided = self._begin(), int(states.decision[number])
+        states.decision[number] = AUTO
+        states.believe(np.array((number,)), believed=believed)
+        if len(states.changed(before.state)) > 0:
+            result = self._smoother.update(self._with_weights(GraphUpdate(), before))
             if result.reason != '':
                 self.rollback()
+                states.decision[number] = decided
                 return rejected('failed', 'the solver failed with it')
         self.commit()
-        self._states.records['decision'][number] = fs.DECISIONS.index(decision)
-        verdict, = fs.verdicts_on(
-            self._states, self._smoother.graph, np.array((number,)))
+        states.decision[number] = DECISIONS.index(decision)
+        verdict, = states.verdicts(self._smoother.graph, np.array((number,)))
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
 
-    def saved(self) -> fs.SavedFixes:
-        return self._states.saved(self._loosened)
-
-    def restore(self, saved: fs.SavedFixes, now_ns: int) -> None:
+    def restore(self, saved: SavedVerdicts, loosened: Mapping[int, float], now_ns: int) -> None:
         self._now_ns = now_ns
         self._states.restore(saved)
-        self._loosened = dict(zip(saved.loosened.tolist(), saved.weights.tolist(), strict=True))
+        self._loosened = dict(loosened)
 
 
 def _both(edges: Edges, observed: ObservedNodes, is_edge: BoolArray) -> list[Observation | None]:

@@ -23,33 +23,34 @@ from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import fix_states as fs
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
-from pose_graph_ros.core.judgement.closure_states import SavedClosures
-from pose_graph_ros.core.judgement.fix_states import SavedFixes
 from pose_graph_ros.core.judgement.fixes import FixJudge
-from pose_graph_ros.core.judgement.odometry_states import OdometryStates, SavedOdometry
+from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, SavedVerdicts
+from pose_graph_ros.core.judgement.odometry_states import OdometryStates
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
     Decision,
-    MOST_OTHERS,
     SourceVerdicts,
     Verdict,
 )
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
+from pose_graph_ros.core.saved_columns import Integers, Numbers
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.sources.source_constraints import Held, NewConstraint
 
 
 @dataclass(frozen=True, slots=True)
 class SavedJudgement:
-    closures: SavedClosures
-    fixes: SavedFixes
-    odometry: SavedOdometry
+    closures: SavedVerdicts
+    fixes: SavedVerdicts
+    loosened: Integers  # ids of odometry edges that are believed less than claimed
+    weights: Numbers  # their weights
+    # number of odometry edges of some sources that have left the graph doubted
+    odometry_left: Mapping[str, int]
 
 
 class Leaving(NamedTuple):
@@ -203,20 +204,20 @@ class Judge:
         return self._closures.work()
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
-        """Return the verdicts that are listed, see `verdicts.listed`, and on what left unused."""
-        graph = self._smoother.graph
-        return [*self._closures.reports.verdicts(graph, most_believed),
-                *self._odometry.verdicts(graph, self._believed_after),
-                *fs.verdicts(self._fixes.states, graph, most_believed), *self._left]
+        """Return the verdicts that are listed, see `Judgements`, and on what left unused."""
+        graph, closures, fixes = self._smoother.graph, self._closures, self._fixes.states
+        return [*closures.reports.of(graph, closures.states.listed(most_believed).tolist()),
+                *self._odometry.verdicts(graph, fixes.believed_after),
+                *fixes.verdicts(graph, fixes.listed(most_believed)), *self._left]
 
     def closures(self) -> tuple[IntArray, IntArray]:
         """Return the edges of judged loop closures, and stamps of their ends [ns], (L, 2)."""
-        return self._closures.states.edge, self._closures.states.stamps_ns
+        return self._closures.states.held, self._closures.states.stamps_ns
 
     def drawn_rows(self) -> DrawnRows:
         """Return the rows of constraints that are drawn in another way than believed ones."""
         graph, (unused, is_edge) = self._smoother.graph, self._fixes.states.unused
-        weak, waiting, doubted = self._closures.reports.drawn_ids()
+        weak, waiting, doubted = self._closures.states.drawn_ids()
         doubted = np.append(doubted, self._odometry.doubted_edges).astype(np.int64)
         weak, waiting, doubted, edges = (graph.edge_rows(each).tolist() for each in (
             weak, waiting, doubted, unused[is_edge]))
@@ -246,7 +247,8 @@ class Judge:
         closures = self._closures.decide_leaving(edges)
         fixes, last = self._fixes.decide_leaving(edges, observed)
         unused = [*closures, *fixes,
-                  *self._odometry.decide_leaving(graph, edges, self._believed_after)]
+                  *self._odometry.decide_leaving(
+                      graph, edges, self._fixes.states.believed_after)]
         return Leaving([replace(each, left=True, since_ns=self._nodes.newest_ns)
                         for each in unused], last)
 
@@ -259,17 +261,18 @@ class Judge:
         if leaving is not None:
             self._left.extend(leaving.unused)
 
-    def _believed_after(self, stamp_ns: int) -> tuple[str, ...]:
-        return fs.believed_after(self._fixes.states, stamp_ns)
-
     def saved(self) -> SavedJudgement:
+        loosened = self._fixes.loosened
         return SavedJudgement(
-            self._closures.saved(), self._fixes.saved(), self._odometry.saved())
+            self._closures.saved(), self._fixes.states.saved(),
+            np.array([*loosened], dtype=np.int64), np.array([*loosened.values()]),
+            dict(self._odometry.left))
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
         self._closures.restore(saved.closures, now_ns)
-        self._fixes.restore(saved.fixes, now_ns)
-        self._odometry.restore(saved.odometry)
+        self._fixes.restore(saved.fixes, dict(zip(
+            saved.loosened.tolist(), saved.weights.tolist(), strict=True)), now_ns)
+        self._odometry.left.update(saved.odometry_left)
         self._odometry.keep_gaps(self._fixes.loosened, self._smoother.graph, now_ns)
         self._odometry.take_changes()   # which were told before
 

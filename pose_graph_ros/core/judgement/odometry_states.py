@@ -9,8 +9,9 @@ Where fixes and global poses win against odometry, it is believed less over a ga
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,23 +29,13 @@ from pose_graph_ros.core.judgement.verdicts import (
     Verdict,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.saved_columns import Integers
 
 
-@dataclass(frozen=True, slots=True)
-class SavedOdometry:
-    """Saved counts of doubted odometry; which is doubted now follows from the saved fixes."""
+class Doubt(NamedTuple):
+    """Odometry is wrong somewhere along some edges; which of them it is cannot be told."""
 
-    left_sources: tuple[str, ...] = ()
-    # number of edges of each of these sources that have left the graph doubted
-    left: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-
-@dataclass(frozen=True, slots=True)
-class Doubt:
     edges: tuple[int, ...]  # ids of those that are believed less
-    ends: tuple[int, int]  # nodes between which odometry is wrong; which edge it is cannot be told
-    since_ns: int
+    verdict: Verdict  # on all of them, but for what changes with the estimate
 
 
 class OdometryStates:
@@ -54,7 +45,7 @@ class OdometryStates:
         self._loosened: Mapping[int, float] = {}
         self._changes: list[Change] = []
         # number of edges of each source that have left the graph doubted
-        self._left = Counter[str]()
+        self.left = Counter[str]()
 
     def decide_leaving(
         self, graph: Graph, edges: IntArray, fixes: Callable[[int], tuple[str, ...]],
@@ -68,7 +59,7 @@ class OdometryStates:
     def forget(self, graph: Graph, edges: IntArray, loosened: Mapping[int, float]) -> None:
         gone, self._loosened = {*edges.tolist()}, loosened
         for doubt in self._gaps.values():
-            self._left[self._source(doubt.ends[1])] += len(gone.intersection(doubt.edges))
+            self.left[doubt.verdict.source] += len(gone.intersection(doubt.edges))
         self._gaps = self._found_gaps(graph, self._nodes.newest_ns)
 
     def keep_gaps(self, loosened: Mapping[int, float], graph: Graph, now_ns: int) -> None:
@@ -77,11 +68,17 @@ class OdometryStates:
             return
         before, self._loosened = self._gaps, loosened
         self._gaps = self._found_gaps(graph, now_ns)
-        self._note(before, self._gaps, graph)
+        for edge in sorted(before.keys() ^ self._gaps.keys()):
+            verdict = {**before, **self._gaps}[edge].verdict
+            states = State.BELIEVED, State.DOUBTED
+            self._changes.append(Change(
+                verdict.id, verdict.kind, verdict.source, verdict.stamp_ns,
+                *(states[::-1] if edge in before else states)))
 
     def _found_gaps(self, graph: Graph, now_ns: int) -> dict[int, Doubt]:
         """Return the stretches of odometry that is believed much less, by their first edges."""
-        since_ns = {edge: doubt.since_ns for doubt in self._gaps.values() for edge in doubt.edges}
+        since_ns = {edge: doubt.verdict.since_ns
+                    for doubt in self._gaps.values() for edge in doubt.edges}
         ids = np.array(sorted(edge for edge, factor in self._loosened.items()
                               if factor < BELIEF.much_less), dtype=np.int64)
         edges = graph.edges_at(ids)
@@ -89,21 +86,18 @@ class OdometryStates:
         gaps = {}
         for part in np.split(np.arange(len(ids)), cuts) if len(ids) > 0 else ():
             first = int(ids[part[0]])
-            gaps[first] = Doubt(
-                tuple(ids[part].tolist()), (int(edges.i[part[0]]), int(edges.j[part[-1]])),
-                since_ns.get(first, now_ns))
+            # edges are counted along the path
+            begin, number, end = np.searchsorted(
+                self._nodes.ids, (edges.i[part[0]], edges.j[part[0]], edges.j[part[-1]])).tolist()
+            reference_ns, stamp_ns = self._nodes.stamps_ns[[begin, end]].tolist()
+            source = self._nodes.primary_at(stamp_ns)
+            gaps[first] = Doubt(tuple(ids[part].tolist()), Verdict(
+                id=f'{source}/{number - 1}', kind=Judged.ODOMETRY, source=source,
+                stamp_ns=stamp_ns, reference_ns=reference_ns, state=State.DOUBTED,
+                since_ns=since_ns.get(first, now_ns), decision=Decision.AUTO,
+                residual=np.full(3, np.nan), distance=np.nan, supported_by=(),
+                contradicted_by=(), edge=True, number=first))
         return gaps
-
-    def _note(
-        self, before: Mapping[int, Doubt], after: Mapping[int, Doubt], graph: Graph,
-    ) -> None:
-        for edge in sorted(before.keys() ^ after.keys()):
-            states = State.BELIEVED, State.DOUBTED
-            old, new = states[::-1] if edge in before else states
-            end = (before.get(edge) or after[edge]).ends[1]
-            self._changes.append(Change(
-                self.name(graph, edge), Judged.ODOMETRY, self._source(end), self._stamp_ns(end),
-                old, new))
 
     def take_changes(self) -> list[Change]:
         changes, self._changes = self._changes, []
@@ -119,35 +113,18 @@ class OdometryStates:
             self._changes = list(changes)
         return bring_back
 
-    def name(self, graph: Graph, edge: int) -> str:
-        """Return the name of an edge: edges are counted along the path."""
-        end = int(graph.edges_at(np.array([edge])).j[0])
-        return f'{self._source(end)}/{np.searchsorted(self._nodes.ids, end) - 1}'
-
-    def _stamp_ns(self, node: int) -> int:
-        return int(self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, node)])
-
-    def _source(self, node: int) -> str:
-        return self._nodes.primary_at(self._stamp_ns(node))
-
     def verdicts(
         self, graph: Graph, fixes: Callable[[int], tuple[str, ...]],
     ) -> list[Verdict]:
         verdicts = []
-        for edge, doubt in self._gaps.items():
+        for doubt in self._gaps.values():
             edges = graph.edges_at(np.array(doubt.edges))
             begin, end = graph.poses_of((edges.i[0], edges.j[-1]))
-            measured = reduce(se2.compose, edges.mean)
-            distance = np.sqrt(np.sum(energies(
-                graph.edge_errors(edges), edges.information)))
-            verdicts.append(Verdict(
-                id=self.name(graph, edge), kind=Judged.ODOMETRY,
-                source=self._source(doubt.ends[1]), stamp_ns=self._stamp_ns(doubt.ends[1]),
-                reference_ns=self._stamp_ns(doubt.ends[0]), state=State.DOUBTED,
-                since_ns=doubt.since_ns, decision=Decision.AUTO,
-                residual=se2.between(measured, se2.between(begin, end)),
-                distance=float(distance), supported_by=(), edge=True, number=edge,
-                contradicted_by=fixes(self._stamp_ns(doubt.ends[1]))))
+            chi2 = np.sum(energies(graph.edge_errors(edges), edges.information))
+            verdicts.append(replace(
+                doubt.verdict, distance=float(np.sqrt(chi2)), residual=se2.between(
+                    reduce(se2.compose, edges.mean), se2.between(begin, end)),
+                contradicted_by=fixes(doubt.verdict.stamp_ns)))
         return verdicts
 
     @property
@@ -157,16 +134,9 @@ class OdometryStates:
     def totals(self) -> dict[str, SourceVerdicts]:
         counts = Counter[str]()
         for doubt in self._gaps.values():
-            counts[self._source(doubt.ends[1])] += len(doubt.edges)
+            counts[doubt.verdict.source] += len(doubt.edges)
         n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
         return {source: SourceVerdicts(
             {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]}, 1.0,
-            doubting=False, n_left=n_left, n_left_unused=self._left[source])
-            for source in (counts | self._left)}
-
-    def saved(self) -> SavedOdometry:
-        return SavedOdometry(
-            tuple(self._left), np.array([*self._left.values()], dtype=np.int64))
-
-    def restore(self, saved: SavedOdometry) -> None:
-        self._left.update(dict(zip(saved.left_sources, saved.left.tolist(), strict=True)))
+            doubting=False, n_left=n_left, n_left_unused=self.left[source])
+            for source in (counts | self.left)}

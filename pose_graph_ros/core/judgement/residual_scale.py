@@ -36,10 +36,11 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.beliefs import Beliefs, ScaleLeft
-from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
+from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE, squared_distances
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
+from pose_graph_ros.core.judgement.verdicts import STATES
 from pose_graph_ros.core.smoother.covariances import innovations
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -255,16 +256,16 @@ class ScaleLearner:
     def _shown(self, source: int, numbers: IntArray, most: int) -> float:
         states, graph = self._states, self._smoother.graph
         some, group = self._sample(numbers, most)
-        edges, inside = graph.edges_at(states.edge[some]), self._of(source)
+        edges, inside = graph.edges_at(states.held[some]), self._of(source)
         return together(max(
             residual_scale(*self._smoother.edge_innovations(edges), edges.information, group,
                            self._beliefs.scales[source]),
-            agreement_scale(self._table, some, inside, graph.edges_at(states.edge[inside]))),
+            agreement_scale(self._table, some, inside, graph.edges_at(states.held[inside]))),
             float(len(some)), self._beliefs.scales_left[source])
 
     def _sample(self, numbers: IntArray, most: int) -> tuple[IntArray, IntArray]:
         """Return at most so many closures, from all along the path, and the group of each."""
-        group = places(self._table, self._smoother.graph.edges_at(self._states.edge[numbers]))
+        group = places(self._table, self._smoother.graph.edges_at(self._states.held[numbers]))
         n_groups = int(group.max()) + 1
         n_chosen = min(max(n_groups * most // len(numbers), 1), n_groups)
         chosen = np.linspace(0, n_groups - 1, n_chosen).astype(np.int64)

@@ -10,6 +10,7 @@ from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
     MOST_NAMED,
+    ODOMETRY,
     SourceVerdicts,
     State,
     Verdict,
@@ -17,8 +18,6 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.measurements import Answer, rejected
 
 NANOSECONDS = 1_000_000_000
-# what stands for the path without a constraint among those that contradict it
-ODOMETRY = 'odometry'
 PLAUSIBLE = 3.37  # distance up to which a pose may be right: 99 % of right ones are nearer [sigma]
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
 PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',

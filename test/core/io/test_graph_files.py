@@ -198,10 +198,10 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
     assert_same_value(read_graph(side), small_graph())  # the layout of the text does not matter
 
     def renew(members: dict[str, Any]) -> None:
-        members['version'], members['created_by'] = 6, 'pose_graph_ros 9.9'
+        members['version'], members['created_by'] = 7, 'pose_graph_ros 9.9'
 
     rewrite(side, renew)
-    with pytest.raises(FileFormatError, match=r'version 1 to 5, .*version 6, .*9\.9'):
+    with pytest.raises(FileFormatError, match=r'version 1 to 6, .*version 7, .*9\.9'):
         read_graph(side)
 
 
@@ -219,14 +219,28 @@ def test_a_file_of_version_1_is_read() -> None:
     assert backend.estimate().chi2 == pytest.approx(27.1463, abs=1e-3)
 
 
+def old_columns(new: dict[str, Any]) -> dict[str, Any]:
+    return {'rows': new['held']} | {name: new[name] for name in (
+        'sources', 'source', 'stamps_ns', 'state', 'since_ns', 'decision', 'distance')}
+
+
 def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_path: Path) -> None:
     _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
 
     def as_version_4(members: dict[str, Any]) -> None:
         members['version'] = 4
         members['graph']['edge_weight'][0] = 0.01
-        members['judgement']['odometry'] |= {
-            'rows': [0], 'ends': [[0, 1]], 'weights': [0.01], 'since_ns': [5], 'final': [0]}
+        new = members['judgement']
+        members['judgement'] = {
+            'closures': old_columns(new['closures']) | {'scales': new['closures']['scales']},
+            'fixes': old_columns(new['fixes']) | {
+                'edges': new['fixes']['edge'], 'observed': new['fixes']['observed'],
+                'stamps_ns': [stamp for stamp, _ in new['fixes']['stamps_ns']],
+                'believed': [new['fixes']['state']['names'][k] == 'believed'
+                             for k in new['fixes']['state']['of']],
+                'loosened': new['loosened'], 'weights': new['weights']},
+            'odometry': {
+                'rows': [0], 'ends': [[0, 1]], 'weights': [0.01], 'since_ns': [5], 'final': [0]}}
 
     rewrite(side, as_version_4)
     saved = read_graph(side)

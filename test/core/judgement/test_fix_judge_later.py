@@ -167,7 +167,7 @@ class Flaky(IncrementalSmoother):
 
 def everything(backend: PoseGraphBackend) -> list[object]:
     judge = backend._judge._fixes
-    return [judge.states.records.tolist(), judge._loosened,
+    return [judge.states.records.tobytes(), judge._loosened,
             [base.tolist() for base in backend._reweighting.base_weights()],
             [(run.number, run.n, run.seconds, run.believed) for run in judge._runs]]
 
@@ -190,7 +190,7 @@ def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
         smoother.broken = True
         change = backend._factors.build(backend._pipeline.queue, backend.graph)
         backend._judge.before(backend._factors.new, change, 0)
-        n_turned += judge.states.records[:n].tolist() != before[0]
+        n_turned += judge.states.records[:n].tobytes() != before[0]
         backend._judge.rollback()
         backend._factors.rollback()
         assert everything(backend) == before

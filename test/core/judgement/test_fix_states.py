@@ -6,31 +6,34 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 
 from pose_graph_ros.core.judgement.fix_states import FixStates
+from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED
 from pose_graph_ros.core.measurements import Position
 from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_what_an_update_changes_can_be_undone_and_all_can_be_saved(seed: int) -> None:
+def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
     rng, states = np.random.default_rng(seed), FixStates()
     for _ in range(20):
         size, before, totals = len(states), states.records.copy(), states.totals()
         for k in range(size, size + int(rng.integers(5))):
             source = ('fix', 'other', 'third')[rng.integers(3)]
-            states.append(NewConstraint(False, k, source, k, Position), run=-1,
-                          believed=bool(rng.integers(2)), distance=0.5, now_ns=0)
-        for _ in range(2):
-            some = np.flatnonzero(rng.random(len(states)) < rng.random())
-            states.believe(some, believed=bool(rng.integers(2)), now_ns=1)
+            states.append(NewConstraint(False, k, source, k, Position), 0,
+                          (BELIEVED, DOUBTED)[rng.integers(2)], 0.5)
         if rng.random() < 0.4:
-            states.undo(size)
+            states.truncate(size)
             np.testing.assert_array_equal(states.records, before)
             assert {name: states.totals()[name] for name in totals} == totals
-        else:
-            states.forget()
+        some = np.flatnonzero(rng.random(len(states)) < rng.random())
+        states.believe(some, believed=bool(rng.integers(2)))
+        if rng.random() < 0.2:
+            states.select(np.flatnonzero(rng.random(len(states)) < 0.8))
     again = FixStates()
-    again.restore(states.saved({}))
-    assert np.all(states.records['run'] == -1)
+    again.restore(states.saved())
+    assert np.all(states.run == -1)
     np.testing.assert_array_equal(again.records, states.records)
     assert again.totals() == states.totals()
+    for each in (states, again):
+        each.append(NewConstraint(False, 0, 'fix', 0, Position), 0, BELIEVED)
+    assert again.name(len(again) - 1) == states.name(len(states) - 1)

@@ -8,13 +8,13 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from test_consistency import Drive
 
-from pose_graph_ros.core.judgement.closure_states import ClosureStates, STATES
+from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft, together
 from pose_graph_ros.core.judgement.run_set import best_runs, without_old
 from pose_graph_ros.core.judgement.runs import Run, Transition
 from pose_graph_ros.core.judgement.tracks import Track
-from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED, State, WAITING
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
@@ -91,19 +91,21 @@ def test_the_best_runs_stay_the_best_when_old_ones_are_forgotten(seed: int) -> N
 
 
 def added(states: ClosureStates, edges: range) -> None:
-    states.append([NewConstraint(True, edge, 'scan', edge * SECOND, LoopClosure, 0)
-                   for edge in edges], 0)
+    for edge in edges:
+        states.append(
+            NewConstraint(True, edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
 
 
 def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
     states = ClosureStates()
     added(states, range(10, 20))
-    believed, doubted = STATES.index(State.BELIEVED), STATES.index(State.DOUBTED)
-    states.state[:] = [believed, doubted] * 5
+    states.state[:] = [BELIEVED, DOUBTED] * 5
     assert states.numbers(np.array([10, 11, 12, 99])).tolist() == [0, 1, 2]
     states.select(np.arange(3, 10))
     assert len(states) == 7
-    assert states.n_left(0) == (3, 1)
+    assert states.totals()['scan'][-2:] == (3, 1)
+    assert states.totals()['scan'].counts == {
+        State.WAITING: 0, State.BELIEVED: 3, State.WEAKLY_BELIEVED: 0, State.DOUBTED: 4}
     assert states.record(0) == (5, 5)
     assert np.count_nonzero(states.in_graph) == 3
     assert (states.find('scan/1'), states.has_left('scan/1')) == (-1, True)
@@ -115,7 +117,7 @@ def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
         added(each, range(30, 31))
         assert each.name(7) == 'scan/10'
         assert each.record(0) == (5, 5)
-        assert each.n_left(0) == (3, 1)
+        assert each.totals()['scan'][-2:] == (3, 1)
         assert each.has_left('scan/2')
 
 

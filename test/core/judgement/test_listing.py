@@ -3,9 +3,12 @@
 """What is listed is bounded."""
 
 from hypothesis import given, strategies as st
-import numpy as np
 
-from pose_graph_ros.core.judgement.verdicts import listed, MOST_OTHERS
+from pose_graph_ros.core.judgement.fix_states import FixStates
+from pose_graph_ros.core.judgement.judgements import MOST_OTHERS
+from pose_graph_ros.core.judgement.verdicts import AUTO, BELIEVED, DOUBTED, OUT
+from pose_graph_ros.core.measurements import Position
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 constraints = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()), max_size=40)
 
@@ -14,13 +17,14 @@ constraints = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()
 def test_the_newest_of_each_source_are_listed(
     constraints: list[tuple[int, bool, bool]], most: int,
 ) -> None:
-    source, believed, decided = np.array(constraints, dtype=int).reshape(-1, 3).T
-    found = listed(source, believed > 0, decided > 0, most)
-    expected = []
+    states, expected = FixStates(), []
     for number, (own, good, by_person) in enumerate(constraints):
+        states.append(NewConstraint(False, number, f'fix{own}', number, Position), 0,
+                      BELIEVED if good else DOUBTED)
+        states.decision[number] = OUT if by_person else AUTO
         later = sum(each[0] == own and each[1] == good and not each[2]
                     for each in constraints[number + 1:])
         if by_person or later < (most if good else MOST_OTHERS):
             expected.append(number)
-    assert found.tolist() == expected
-    assert listed(source, believed > 0, decided > 0, None).tolist() == list(range(len(source)))
+    assert states.listed(most).tolist() == expected
+    assert states.listed(None).tolist() == list(range(len(constraints)))

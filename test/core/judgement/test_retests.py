@@ -7,6 +7,7 @@ import numpy as np
 from pose_graph_ros.core.judgement.beliefs import Retests
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.settings import BELIEF
+from pose_graph_ros.core.judgement.verdicts import WAITING
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
@@ -14,7 +15,8 @@ EACH = np.arange(3)
 
 
 def append(states: ClosureStates, n: int) -> None:
-    states.append([NewConstraint(True, k, 'scan', k, LoopClosure, 0) for k in range(n)], 0)
+    for k in range(n):
+        states.append(NewConstraint(True, k, 'scan', k, LoopClosure, 0), 0, WAITING)
 
 
 def retests() -> tuple[Retests, ClosureStates]:
@@ -32,5 +34,5 @@ def test_those_that_take_turns_wait_for_another_closure() -> None:
     append(states, 1)
     them.begin_turns()
     np.testing.assert_array_equal(them.due(0, 100), [True] * 4)
-    states.drop(1)
+    states.truncate(len(EACH))
     assert len(them.due(0, 100)) == 3

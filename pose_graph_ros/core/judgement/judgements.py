@@ -1,0 +1,272 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The table of judged constraints: what is decided on each, and changes that are to be announced.
+
+Loop closures have one, positions and poses in the map another.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.judgement.settings import BELIEF
+from pose_graph_ros.core.judgement.verdicts import (
+    AUTO,
+    BELIEVED,
+    Change,
+    Decision,
+    DECISIONS,
+    Judged,
+    MOST_NAMED,
+    SourceVerdicts,
+    State,
+    STATES,
+    USED,
+    Verdict,
+)
+from pose_graph_ros.core.saved_columns import (
+    Choices,
+    Column as SavedColumn,
+    Flags,
+    Integers,
+    Numbers,
+    Pairs,
+)
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
+
+# State of a constraint before it came.
+NEW = -1
+# Of each source, the newest of those that are not simply believed.
+MOST_OTHERS = 500
+COLUMNS: list[Any] = [
+    ('held', np.int64),  # id of what holds it, an edge or an observed node
+    ('edge', np.bool_),  # whether that is an edge
+    ('observed', np.int64),  # id of the observed node that it was added as; -1 for an edge
+    ('source', np.int64),  # index of its source
+    ('number', np.int64),  # in its name
+    ('stamps_ns', np.int64, (2,)),  # of the measurement, and of the other end of a loop closure
+    ('state', np.int64),  # index of its state
+    ('since_ns', np.int64),  # newest odometry when it came, or its use began or ended
+    ('decision', np.int64),  # index of what a person has decided
+    # Mahalanobis distance when it was judged, of a closure the last time; nan before [sigma]
+    ('distance', np.float64)]
+Records = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class SavedVerdicts:
+    """The columns of a table, and its sources."""
+
+    sources: tuple[str, ...]
+    scales: Numbers  # of each source, the factor on its sigmas
+    # of each source, how many have left the graph, by their states then
+    left: Annotated[IntArray, SavedColumn(int, (len(State),))]
+    held: Integers
+    edge: Flags
+    observed: Integers
+    source: Integers
+    number: Integers
+    stamps_ns: Pairs
+    state: Annotated[IntArray, Choices(State)]
+    since_ns: Integers
+    decision: Annotated[IntArray, Choices(Decision)]
+    distance: Numbers  # -1 if it was not judged
+
+
+class Column:
+    """A column of the records of `Judgements`, writeable, by its name."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, owner: 'Judgements', kind: type) -> npt.NDArray[Any]:
+        return np.asarray(owner.records[self._name])
+
+
+class Judgements:
+    held, edge, observed, source, number = Column(), Column(), Column(), Column(), Column()
+    stamps_ns, state, since_ns = Column(), Column(), Column()
+    decision, distance = Column(), Column()
+
+    def __init__(self, kind: Judged, **more: int) -> None:
+        """Make an empty table; more columns, with the values of new constraints, are not saved."""
+        self.sources: list[str] = []
+        self._kind, self._more = kind, more
+        self._records = GrowingArray((), np.dtype(
+            [*COLUMNS, *((name, type(default)) for name, default in more.items())]))
+        # of each source, how many have left the graph, by their states then, and the next number
+        self._left: list[IntArray] = []
+        self._next: list[int] = []
+        self._changes: deque[Change] = deque(maxlen=BELIEF.most_changes)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    @property
+    def records(self) -> Records:
+        """All records, writeable, shape (M,)."""
+        return self._records.values
+
+    @property
+    def in_graph(self) -> BoolArray:
+        return np.asarray(USED[self.state])
+
+    def index_of(self, source: str) -> int:
+        """Return the index of a source, which may be new."""
+        if source not in self.sources:
+            self.sources.append(source)
+            self._left.append(np.zeros(len(STATES), dtype=np.int64))
+            self._next.append(0)
+        return self.sources.index(source)
+
+    def append(
+        self, one: NewConstraint, now_ns: int, state: int, distance: float = np.nan, **more: int,
+    ) -> None:
+        source = self.index_of(one.source)
+        held = (one.held_by, True) if one.held_by >= 0 else (one.number, one.is_edge)
+        self._records.append_one(np.array((
+            *held, -1 if one.is_edge else one.number, source, self._next[source],
+            (one.stamp_ns, one.reference_ns), state, now_ns, AUTO, distance,
+            *{**self._more, **more}.values()), dtype=self.records.dtype))
+        self._next[source] += 1
+
+    def truncate(self, size: int) -> None:
+        """Remove the newest, so that some are left: they were not added."""
+        for source in self.source[size:].tolist():
+            self._next[source] -= 1
+        self._records.truncate(size)
+
+    def select(self, kept: IntArray) -> None:
+        """Keep some; all others have left the graph, and are only counted."""
+        gone = np.ones(len(self), dtype=bool)
+        gone[kept] = False
+        for source, state in self.records[gone][['source', 'state']].tolist():
+            self._left[source][state] += 1
+        self._records.select(kept)
+
+    def counts(self, source: int) -> IntArray:
+        """Return how many of a source are or were in each state, by its index."""
+        return self._counts(source) + self._left[source]
+
+    def _counts(self, source: int) -> IntArray:
+        return np.bincount(self.state[self.source == source], minlength=len(STATES))
+
+    def name(self, row: int) -> str:
+        record = self.records[row]
+        return f'{self.sources[record["source"]]}/{record["number"]}'
+
+    def find(self, name: str) -> int:
+        """Return the row of the constraint with a name, -1 if there is none in the graph."""
+        source, _, text = name.rpartition('/')
+        if source not in self.sources or not text.isdecimal():
+            return -1
+        found = np.flatnonzero(
+            (self.source == self.sources.index(source)) & (self.number == int(text)))
+        return int(found[0]) if len(found) > 0 else -1
+
+    def has_left(self, name: str) -> bool:
+        """Return whether the constraint with a name was in the graph, and is no more."""
+        source, _, text = name.rpartition('/')
+        return (source in self.sources and text.isdecimal() and self.find(name) < 0
+                and int(text) < self._next[self.sources.index(source)])
+
+    def announce(self, row: int, before: int, now_ns: int) -> None:
+        """Note that the state of a constraint is another one than before."""
+        record = self.records[row]
+        new = STATES[record['state']]
+        if before == record['state']:
+            return
+        # one that has waited is as little used if it is doubted
+        if before == NEW or new.in_graph != STATES[before].in_graph:
+            record['since_ns'] = now_ns
+        if before != NEW or not new.in_graph:
+            self._changes.append(Change(
+                self.name(row), self._kind, self.sources[record['source']],
+                int(record['stamps_ns'][0]), None if before == NEW else STATES[before], new))
+
+    def take_changes(self) -> list[Change]:
+        """Return the changes since the last call."""
+        changes = list(self._changes)
+        self._changes.clear()
+        return changes
+
+    def snapshot(self) -> Callable[[], None]:
+        """Return what brings the present records and changes back, as long as none is added."""
+        records, changes = self.records.copy(), list(self._changes)
+
+        def bring_back() -> None:
+            self.records[:] = records
+            self._changes.clear()
+            self._changes.extend(changes)
+        return bring_back
+
+    def verdict(
+        self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
+        contradicted_by: Sequence[str],
+    ) -> Verdict:
+        record = self.records[row]
+        stamp, reference = record['stamps_ns'].tolist()
+        return Verdict(
+            id=self.name(row), kind=self._kind, source=self.sources[record['source']],
+            stamp_ns=stamp, reference_ns=reference if self._kind is Judged.LOOP_CLOSURE else None,
+            state=STATES[record['state']], since_ns=int(record['since_ns']),
+            decision=DECISIONS[record['decision']], residual=residual,
+            distance=float(record['distance']),
+            supported_by=tuple(self.name(other) for other in supported_by[:MOST_NAMED]),
+            contradicted_by=tuple(contradicted_by[:MOST_NAMED]), edge=bool(record['edge']),
+            number=int(record['held']))
+
+    def listed(self, most_believed: int | None) -> IntArray:
+        """Return which are listed: all that a person has decided on, and the newest of sources."""
+        if most_believed is None:
+            return np.arange(len(self))
+        believed, decided = self.state == BELIEVED, self.decision != AUTO
+        chosen = decided.copy()
+        for source in range(len(self.sources)):
+            for most, those in ((most_believed, believed), (MOST_OTHERS, ~believed)):
+                rows = np.flatnonzero((self.source == source) & those & ~decided)
+                chosen[rows[max(len(rows) - most, 0):]] = True
+        return np.flatnonzero(chosen)
+
+    def totals(self, scales: Sequence[float] | None = None) -> dict[str, SourceVerdicts]:
+        totals = {}
+        for index, source in enumerate(self.sources):
+            left, newest = self._left[index], self.state[self.source == index][-BELIEF.newest:]
+            totals[source] = SourceVerdicts(
+                dict(zip(STATES, self._counts(index).tolist(), strict=True)),
+                1.0 if scales is None else scales[index],
+                # wrong closures among right ones are what place recognition is like
+                doubting=(self._kind is not Judged.LOOP_CLOSURE and len(newest) > 0
+                          and not bool(np.any(USED[newest]))),
+                n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~USED])))
+        return totals
+
+    def saved(self, scales: Sequence[float] | None = None) -> SavedVerdicts:
+        columns = {column[0]: self.records[column[0]].copy() for column in COLUMNS}
+        columns['distance'] = np.nan_to_num(columns['distance'], nan=-1.0)
+        return SavedVerdicts(
+            tuple(self.sources),
+            np.ones(len(self.sources)) if scales is None else np.array(scales, dtype=np.float64),
+            np.array(self._left, dtype=np.int64).reshape(-1, len(STATES)), **columns)
+
+    def restore(self, saved: SavedVerdicts) -> None:
+        """Fill the empty table with saved columns."""
+        for source in saved.sources:
+            self.index_of(source)
+        records = np.zeros(len(saved.held), dtype=self.records.dtype)
+        for column in COLUMNS:
+            records[column[0]] = getattr(saved, column[0])
+        for name, default in self._more.items():
+            records[name] = default
+        records['distance'][records['distance'] < 0.0] = np.nan
+        self._records.append(records)
+        for index, left in enumerate(saved.left):
+            self._left[index] = left.copy()
+            self._next[index] = int(np.sum(self.counts(index)))
