@@ -87,9 +87,11 @@ class Problem:
             self._held = self.plain.hold_parts()
             return self._held
         from pose_graph_ros.core.batch.optimizer import loose_nodes  # noqa: PLC0415
+        from pose_graph_ros.core.elimination.symbolic import analyse  # noqa: PLC0415
 
         graph, held = self.engine, []
-        while len(loose := loose_nodes(graph)) > 0:
+        cliques = analyse(graph.memory.head).cliques
+        while len(loose := loose_nodes(graph, cliques)) > 0:
             held.append(int(loose[0]))
             graph.apply(GraphUpdate(fix=held[-1:]))
         return held

@@ -16,11 +16,17 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import FLAG, kernel, NUMBER, ROWS
-from pose_graph_ros.core.elimination.assembly import eliminate_clique
+from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
+from pose_graph_ros.core.elimination.assembly import (
+    eliminate_clique,
+    HEADINGS,
+    LINEARIZED,
+    POSITIONS,
+)
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
+from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import Poses
+from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
 
@@ -41,18 +47,19 @@ def linearize(head):  # type: ignore[no-untyped-def]
             factors.linearize(head, entry)
 
 
-@kernel(signature=(tb.HEAD, NUMBER))
-def eliminate(head, damping):  # type: ignore[no-untyped-def]
+@kernel(signature=(tb.HEAD, NUMBER, INTEGER))
+def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    Return False if a node is not determined, which is `BAD_NODE` of the head.
+    `terms` says what constraints add; see `assembly`. Return False if a node is not determined,
+    which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)
     scalars[tb.DAMPING] = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
-        bad = eliminate_clique(head, c, False)
+        bad = eliminate_clique(head, c, terms)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             break
@@ -109,13 +116,15 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
         for k in range(n_frontal):
             v = nodes[k]
             f = node_f[v]
-            fixed = node_i[v, tb.FIXED] != 0
+            if node_i[v, tb.FIXED] != 0:    # known, and zero but in a linear start
+                for m in range(3):
+                    right[v, m] = f[tb.DELTA + m]
+                continue
             for m in range(3):
-                right[v, m] = 0.0 if fixed else x[3 * k + m]
+                right[v, m] = x[3 * k + m]
                 f[tb.DELTA + m] += right[v, m]
                 largest = _larger(largest, right[v, m])
-            if not fixed:
-                _update_pose(f)
+            _update_pose(f)
     return largest
 
 
@@ -242,7 +251,7 @@ class CompiledSystem:
         if chord:
             return float(step(self._head, self._right, True))
         linearize(self._head)
-        if not eliminate(self._head, damping):
+        if not eliminate(self._head, damping, LINEARIZED):
             return math.inf
         return float(step(self._head, np.zeros_like(self._right), False))
 
@@ -251,3 +260,29 @@ class CompiledSystem:
 
     def settle(self) -> None:
         settle(self._head)
+
+
+class CompiledChordal:
+    """The `ChordalSystem` of `linear_starts` for a graph in tables; changes its poses."""
+
+    def __init__(self, memory: tb.Memory) -> None:
+        n, self._head = memory.head[tb.N_NODES], memory.head
+        self._rows, self._fixed = memory['node_f'][:n], memory['node_i'][:n, tb.FIXED] != 0
+
+    def headings(self, known: ComplexArray) -> ComplexArray:
+        return self._solved(HEADINGS, known)
+
+    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
+        self._rows[~self._fixed, tb.POSE + 2] = np.angle(u[:-1])[~self._fixed]
+        return self._solved(POSITIONS, known)
+
+    def _solved(self, terms: int, known: ComplexArray) -> ComplexArray:
+        rows, fixed = self._rows, self._fixed
+        # the unknowns are the solutions of the nodes
+        rows[:, tb.REF:] = rows[:, tb.DELTA:tb.CHECKED_TURN + 1] = 0.0
+        rows[fixed, tb.DELTA] = known.real[:-1][fixed]
+        rows[fixed, tb.DELTA + 1] = known.imag[:-1][fixed]
+        if not eliminate(self._head, 0.0, terms):
+            raise LinearSolveError('chordal start: singular')
+        step(self._head, np.zeros((len(rows), 3)), False)
+        return np.append(rows[:, tb.DELTA] + 1j * rows[:, tb.DELTA + 1], known[-1])

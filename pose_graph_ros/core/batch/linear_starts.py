@@ -14,7 +14,8 @@ condition |u| = 1 both equations are linear.
   from odometry.
 - `joint` solves for both together, which needs no measured heading.
 
-Nothing in here is compiled.
+Nothing in here is compiled. `gauss_newton.CompiledChordal` solves the systems of `chordal` over
+the cliques of a graph.
 """
 
 from collections.abc import Callable, Iterator
@@ -169,33 +170,61 @@ class NodeSystem:
         return solve
 
 
-def chordal(graph: Constrained, system: NodeSystem | None = None) -> Poses:
+class ChordalSystem(Protocol):
+    """
+    A graph for `chordal`: solves for its headings, and for its positions.
+
+    Both, and what is known of fixed nodes, are complex numbers, the last one that of the map.
+    """
+
+    def headings(self, known: ComplexArray) -> ComplexArray:
+        """Return u at the minimum."""
+
+    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
+        """Return t at the minimum for headings u with |u| = 1."""
+
+
+class SparseChordal:
+    """The `ChordalSystem` that is not compiled; `nodes` is that of the edges."""
+
+    def __init__(self, graph: Constrained, nodes: NodeSystem | None = None) -> None:
+        self._terms = terms = Terms.joined(*Terms.of_both(
+            graph.edges_by_row, graph.observed_by_row, len(graph.poses))).informative()
+        self._nodes = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
+
+    def headings(self, known: ComplexArray) -> ComplexArray:
+        root = np.sqrt(self._terms.kappa)[:, None, None]
+        return self._nodes.solver(
+            (-root * self._terms.turn[:, None, None], root + 0j),
+            np.zeros((len(root), 1), complex), known[:, None])()[:, 0]
+
+    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
+        terms, root = self._terms, np.sqrt(self._terms.tau)[:, None]
+        right = root * (u[terms.i] * terms.arm_i - u[terms.j] * terms.arm_j)[:, None]
+        return self._nodes.solver(
+            (-root[:, None], root[:, None]), right, known[:, None])()[:, 0]
+
+
+def chordal(graph: Constrained, system: ChordalSystem | None = None) -> Poses:
     """
     Return initial poses from the constraints and the poses of fixed nodes: headings come first.
 
-    `system` is that of the edges, if there is one already. Raises LinearSolveError if headings or
-    positions are not determined, for example if only positions are observed, or if the graph has
-    priors or nodes that are no poses.
+    Raises LinearSolveError if headings or positions are not determined, for example if only
+    positions are observed, or if the graph has priors or nodes that are no poses.
     """
     if np.any(graph.node_kind != NodeKind.POSE):
         raise LinearSolveError('chordal start: a bias or a landmark has no heading')
     if graph.n_priors > 0:
         raise LinearSolveError('chordal start: a prior has no term for a heading alone')
-    terms = Terms.joined(*Terms.of_both(
-        graph.edges_by_row, graph.observed_by_row, len(graph.poses))).informative()
-    system = NodeSystem(terms.i, terms.j, ~graph.fixed) if system is None else system
-    root_t, root_u = np.sqrt((terms.tau, terms.kappa))[:, :, None, None]
+    system = system or SparseChordal(graph)
     t, u = _known(graph.poses)
-    u = system.solver((-root_u * terms.turn[:, None, None], root_u + 0j),
-                      np.zeros((len(root_u), 1), complex), u)()
+    u = system.headings(u)
     length = np.abs(u)
     # what remains of u where measured headings cancel often leads to another minimum
     if np.any(length < 1e-6):
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
     u /= length
-    right = root_t[:, 0] * (u[terms.i] * terms.arm_i[:, None] - u[terms.j] * terms.arm_j[:, None])
-    t = system.solver((-root_t, root_t), right, t)()
-    return _poses(graph, t[:, 0], u[:, 0])
+    return _poses(graph, system.positions(u, t), u)
 
 
 def joint(graph: 'Graph', *, unit: bool = False) -> Poses:
@@ -224,7 +253,7 @@ def joint(graph: 'Graph', *, unit: bool = False) -> Poses:
     by_j[:, 0, 0], by_j[:, 0, 1] = root_t, root_t * terms.arm_j
     by_i[:, 1, 1], by_j[:, 1, 1] = -root_u * terms.turn, root_u
     right = np.zeros((len(root_t), 2), complex)
-    known = np.concatenate(_known(graph.poses), axis=1)
+    known = np.stack(_known(graph.poses), axis=1)
     turns = is_pose[system.free]
     own, towards = np.zeros((len(turns), 2, 2)), np.zeros((len(turns), 2), complex)
     own[~turns, 1, 1] = 1.0   # holds the headings that landmarks do not have
@@ -250,9 +279,8 @@ def joint(graph: 'Graph', *, unit: bool = False) -> Poses:
 
 
 def _known(poses: Poses) -> tuple[ComplexArray, ComplexArray]:
-    """Return t and u of poses, and behind them of the map, shape (n + 1, 1)."""
-    return (np.append(complex_of(poses), 0.0)[:, None],
-            np.append(np.exp(1j * poses[:, 2]), 1.0)[:, None])
+    """Return t and u of poses, and behind them of the map, shape (n + 1,)."""
+    return np.append(complex_of(poses), 0.0), np.append(np.exp(1j * poses[:, 2]), 1.0)
 
 
 def _poses(graph: Constrained, t: ComplexArray, u: ComplexArray) -> Poses:

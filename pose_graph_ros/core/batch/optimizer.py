@@ -30,7 +30,6 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.sparse import components
 
 __all__ = [
     'SAME_MINIMUM',
@@ -47,6 +46,7 @@ __all__ = [
     'optimize',
     'optimize_from_linear_start',
     'optimize_from_two_starts',
+    'plant',
     'to_the_end',
 ]
 
@@ -69,12 +69,11 @@ def in_parts(graph: Graph, config: SolverConfig) -> Optimization:
     """
     Return the result of `optimize`, after a pause at each iteration.
     """
-    chi2, answer = _check_before(graph)
+    chi2, answer = _prepare(graph)
     if answer is not None:
         return answer
     poses = graph.poses.copy()
-    return _finished(graph, poses, chi2, (
-        yield from _minimize(graph, config, _analysed(graph), chi2)))
+    return _finished(graph, poses, chi2, (yield from _minimize(graph, config, chi2)))
 
 
 def optimize_from_linear_start(
@@ -96,10 +95,10 @@ def from_linear_start(
     above that of the present poses, which should be the last of them. The lowest minimum is kept,
     and the result says from which start it is. Failures are treated as in `optimize`.
     """
-    chi2, answer = _check_before(graph)
+    chi2, answer = _prepare(graph)
     if answer is not None:
         return answer
-    poses, cliques = graph.poses.copy(), _analysed(graph)
+    poses = graph.poses.copy()
     few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
     yield
     best, best_poses = _failed('', chi2), poses
@@ -112,7 +111,7 @@ def from_linear_start(
             continue
         yield
         result = replace(
-            (yield from _minimize(graph, few, cliques, chi2_of(graph))), start=start)
+            (yield from _minimize(graph, few, chi2_of(graph))), start=start)
         better = result.status is not Status.FAILED and (
             best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM))
         trusted = result.status is Status.CONVERGED and result.chi2 <= chi2
@@ -127,7 +126,7 @@ def from_linear_start(
             return _finished(graph, poses, chi2, result)
         gauss_newton.put_poses(graph.memory, best_poses)
         rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
-        result = yield from _minimize(graph, rest, cliques, best.chi2)
+        result = yield from _minimize(graph, rest, best.chi2)
         result = replace(result, start=best.start, iterations=best.iterations + result.iterations)
     return _finished(graph, poses, chi2, result)
 
@@ -166,7 +165,7 @@ def _is_observed(graph: Graph) -> bool:
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     if start is Start.CHORDAL:
-        return linear_starts.chordal(graph)
+        return linear_starts.chordal(graph, gauss_newton.CompiledChordal(graph.memory))
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT and not _is_observed(graph):
@@ -174,40 +173,49 @@ def _start(graph: Graph, start: Start) -> FloatArray:
     return linear_starts.joint(graph, unit=start is Start.UNIT)
 
 
-def _check_before(graph: Graph) -> tuple[float, BatchResult | None]:
-    """Return chi2, and a result if there is nothing to optimise or the poses are undetermined."""
+def _prepare(graph: Graph) -> tuple[float, BatchResult | None]:
+    """
+    Return chi2 after storing the cliques of the whole graph.
+
+    Instead there is a result if there is nothing to optimise or poses are not determined.
+    """
     chi2 = chi2_of(graph)
     if not np.isfinite(chi2):
         return chi2, _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
         return chi2, BatchResult(Status.CONVERGED, '', 0, chi2)
-    loose = loose_nodes(graph)
+    analysis = symbolic.analyse(graph.memory.head)
+    loose = loose_nodes(graph, analysis.cliques)
     if len(loose) > 0:
         return chi2, _failed(
             f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
             f'and no observed node: their poses are not determined', chi2)
+    plant(graph, analysis)
     return chi2, None
 
 
-def loose_nodes(graph: Graph) -> IntArray:
+def plant(graph: Graph, analysis: symbolic.Analysis) -> None:
+    """Store the cliques of a whole graph, without values, in place of its present ones."""
+    memory = graph.memory
+    keep_f, keep_i = (
+        memory.head[tb.POOL_F_END:tb.POOL_I_END + 1] if memory.head[tb.N_PRIORS] > 0 else (0, 0))
+    memory.ensure('pool_f', max(analysis.need_f, int(keep_f)), keep=int(keep_f))
+    memory.ensure('pool_i', max(analysis.need_i, int(keep_i)), keep=int(keep_i))
+    memory.ensure('work_f', analysis.largest)
+    symbolic.plant_all(memory.head, analysis.cliques)
+
+
+def loose_nodes(graph: Graph, cliques: symbolic.Cliques) -> IntArray:
     """Return ids of nodes in parts without a fixed or observed node or an anchored prior."""
-    # from the tables, as `graph.edges` would copy all means and informations
-    memory, head = graph.memory, graph.memory.head
-    rows, numbers = (memory[name][:head[tb.N_EDGES]] for name in ('edge_i', 'edge_f'))
-    ends = rows[numbers[:, tb.WEIGHT] > 0.0, tb.END_I:tb.END_K + 1]
-    with_third = ends[ends[:, tb.END_K] >= 0]
-    rows, numbers = (memory[name][:head[tb.N_OBSERVED]] for name in ('observed_i', 'observed_f'))
-    held = [np.flatnonzero(graph.fixed), rows[numbers[:, tb.WEIGHT] > 0.0, tb.OBS_NODE]]
-    i = [ends[:, tb.END_I], with_third[:, tb.END_I]]
-    j = [ends[:, tb.END_J], with_third[:, tb.END_K]]
-    for prior in graph.priors if head[tb.N_PRIORS] > 0 else ():
-        nodes = graph.node_rows(prior.nodes)
-        i.append(nodes[:-1])
-        j.append(nodes[1:])
-        if prior.anchored:
-            held.append(nodes[:1])
-    part = components(np.concatenate(i), np.concatenate(j), graph.n_nodes)
-    return graph.node_ids[~np.isin(part, part[np.concatenate(held)])]
+    part = symbolic.trees(cliques, graph.n_nodes)
+    held = np.zeros(len(cliques.n_frontal), dtype=bool)
+    held[part[graph.fixed]] = True
+    memory, n_observed = graph.memory, graph.memory.head[tb.N_OBSERVED]
+    used = memory['observed_f'][:n_observed, tb.WEIGHT] > 0.0
+    held[part[memory['observed_i'][:n_observed, tb.OBS_NODE][used]]] = True
+    for prior in graph.priors if graph.n_priors > 0 else ():
+        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
+    return graph.node_ids[~held[part]]
 
 
 def chi2_of(graph: Graph) -> float:
@@ -215,27 +223,11 @@ def chi2_of(graph: Graph) -> float:
     return float(gauss_newton.evaluate(graph.memory.head, np.empty((graph.n_nodes, 3)))[0])
 
 
-def _analysed(graph: Graph) -> symbolic.Cliques:
-    """Return the cliques of the whole graph, with memory allocated for them."""
-    memory = graph.memory
-    analysis = symbolic.analyse(memory.head)
-    keep_f, keep_i = (
-        memory.head[tb.POOL_F_END:tb.POOL_I_END + 1] if memory.head[tb.N_PRIORS] > 0 else (0, 0))
-    memory.ensure('pool_f', max(analysis.need_f, int(keep_f)), keep=int(keep_f))
-    memory.ensure('pool_i', max(analysis.need_i, int(keep_i)), keep=int(keep_i))
-    memory.ensure('work_f', analysis.largest)
-    return analysis.cliques
-
-
-def _minimize(
-    graph: Graph, config: SolverConfig, cliques: symbolic.Cliques, chi2: float,
-) -> Optimization:
+def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
     """Optimise from the present poses; the poses after a failure have no meaning."""
-    head = graph.memory.head
-    symbolic.plant_all(head, cliques)
     result = yield from minimize(gauss_newton.CompiledSystem(graph.memory), chi2, config)
     if result.status is Status.FAILED:
-        node = graph.node_ids[head[tb.BAD_NODE]]
+        node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
     return result
 

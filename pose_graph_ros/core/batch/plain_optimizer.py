@@ -22,7 +22,7 @@ from pose_graph_ros.core.batch.levenberg_marquardt import (
     to_the_end,
     TRUSTED_ITERATIONS,
 )
-from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem
+from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, SparseChordal
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
@@ -149,7 +149,7 @@ class PlainOptimizer:
                 first = chi2 = self.evaluate()[0]
                 if start is Start.CHORDAL and first < np.inf:
                     steps = min(steps, TRUSTED_ITERATIONS)
-                    graph.poses = chordal(graph, self._nodes)
+                    graph.poses = chordal(graph, SparseChordal(graph, self._nodes))
                     chi2 = self.evaluate()[0]
                 if chi2 < np.inf:
                     result = to_the_end(minimize(

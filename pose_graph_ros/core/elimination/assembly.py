@@ -22,28 +22,30 @@ from pose_graph_ros.core.graph.pools import row_start, triangle_size
 # add in their weakest direction, and, because of rounding, of all that they add.
 LEAST_WEAK_PIVOT = 1e-9
 LEAST_STIFF_PIVOT = 1e-15
+# What constraints add to the equations: their linearization, the same after they were logged and
+# linearized at the present estimate, as the frame in which they were may have turned since, or
+# the equations of headings or of positions of a linear start.
+LINEARIZED, RELINEARIZED, HEADINGS, POSITIONS = range(4)
 
 
 @kernel
-def eliminate_clique(head, c, relinearize):  # type: ignore[no-untyped-def]
+def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
     """
     Return a node with a bad pivot, or -1, after the elimination of a clique.
 
     Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
     a pivot is small, it is judged again by the weakest direction of the constraints of its node.
-    If asked to relinearize, the constraints are logged and linearized at the present estimate
-    before they are added: the frame in which they were linearized may have turned since.
     """
     by_weakest = False
     while True:     # one call, as the compiler then inlines it
-        bad = _eliminate(head, c, relinearize, by_weakest)
+        bad = _eliminate(head, c, terms, by_weakest)
         if bad < 0 or by_weakest:
             return bad
         by_weakest = True
 
 
 @kernel
-def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def]
+def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
     """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
     node_f = tb.node_f(head)
     pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
@@ -80,7 +82,11 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
                 if (min(at_i, at_j) < 0 or (ends[tb.END_K] >= 0 and at_k < 0)
                         or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
                     continue
-            if relinearize:
+            if terms > RELINEARIZED:
+                normal_equations.add_complex(
+                    head, entry, terms == HEADINGS, at_i, at_j, front, ld)
+                continue
+            if terms == RELINEARIZED:
                 transaction_log.log_constraint(head, entry)
                 factors.linearize(head, entry)
             if entry >= 0:
@@ -91,6 +97,8 @@ def _eliminate(head, c, relinearize, by_weakest):  # type: ignore[no-untyped-def
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
         least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
         least[3 * k + 2] = LEAST_PIVOT * scale_r
+        if terms > RELINEARIZED:
+            least[3 * k:3 * k + 3] = 0.0
         if by_weakest:
             _lower_bounds(head, v, least[3 * k:3 * k + 3])
         damping = scalars[tb.DAMPING]

@@ -306,6 +306,18 @@ def required_memory(cliques):  # type: ignore[no-untyped-def]
     return need_f, need_i, largest
 
 
+@kernel(signature=(CLIQUES, INTEGER), allocates=True)
+def trees(cliques, n_nodes):  # type: ignore[no-untyped-def]
+    """Return the root of the tree of cliques, a part of the graph, that each node is in."""
+    first, n_frontal, parent, nodes = cliques
+    root, of_node = np.empty(len(n_frontal), np.int32), np.empty(n_nodes, np.int32)
+    for k in range(len(n_frontal) - 1, -1, -1):
+        root[k] = root[parent[k]] if parent[k] >= 0 else k
+        for m in range(first[k], first[k] + n_frontal[k]):
+            of_node[nodes[m]] = root[k]
+    return of_node
+
+
 @kernel(allocates=True)
 def _postorder(n_cliques, into, parent):  # type: ignore[no-untyped-def]
     """Return the merged cliques, children before parents, each subtree contiguous."""

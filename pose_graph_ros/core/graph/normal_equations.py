@@ -7,6 +7,8 @@ Symbols are those of `factors`. With G = (0, 0, f_th) the column of a third node
 blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 """
 
+import math
+
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import (
@@ -141,6 +143,51 @@ def add(head, entry, a, b, k, front, ld):  # type: ignore[no-untyped-def]
         _add(f, ODOMETRY, node_f[i], node_f[j], a, b, -1, front, ld)
     else:
         _add(f, kind, node_f[i], node_f[j], a, b, k, front, ld)
+
+
+@kernel
+def add_complex(head, entry, headings, a, b, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add an equation of a linear start to a front, as `add` does: of headings, or of positions.
+
+    It is `v_j - f v_i = s`, or `v_i = s` where a node is observed, of complex numbers: v is u or t
+    of `batch.linear_starts`. The third unknown of each node is 0.
+    """
+    node_f, (f, _, i, _, _) = tb.node_f(head), parts(head, entry)
+    kappa = weight = f[tb.WEIGHT] * f[tb.INFO + 5]
+    fx, fy, sx, sy = 1.0, 0.0, 0.0, 0.0
+    if headings:
+        if b >= 0:
+            fx, fy = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+        else:
+            th = f[tb.MEAN + 2] - f[tb.OFFSET + 2]
+            sx, sy = math.cos(th), math.sin(th)
+    else:
+        weight = 0.5 * f[tb.WEIGHT] * (f[tb.INFO] + f[tb.INFO + 3])
+        c, s = math.cos(node_f[i, tb.POSE + 2]), math.sin(node_f[i, tb.POSE + 2])
+        arm = tb.MEAN if b >= 0 else tb.OFFSET
+        sx, sy = c * f[arm] - s * f[arm + 1], s * f[arm] + c * f[arm + 1]
+        if b < 0:
+            sx, sy = f[tb.MEAN] - sx, f[tb.MEAN + 1] - sy
+    for at in (a, b):
+        if at >= 0:
+            front[at * (ld + 1)] += weight
+            front[(at + 1) * (ld + 1)] += weight
+            front[(at + 2) * (ld + 1)] += kappa
+    last, right = b if b >= 0 else a, ld - 1
+    front[last * ld + right] += weight * sx
+    front[(last + 1) * ld + right] += weight * sy
+    if b < 0:
+        return
+    front[a * ld + right] -= weight * (fx * sx + fy * sy)
+    front[(a + 1) * ld + right] -= weight * (fx * sy - fy * sx)
+    if a > b:
+        a, b, fy = b, a, -fy
+    r = a * ld + b      # block ij is that of -weight conj(f)
+    front[r] -= weight * fx
+    front[r + 1] -= weight * fy
+    front[r + ld] += weight * fy
+    front[r + ld + 1] -= weight * fx
 
 
 @kernel(forceinline=True)

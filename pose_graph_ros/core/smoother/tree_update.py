@@ -12,7 +12,7 @@ keep all their values, including their update matrices.
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.elimination.assembly import eliminate_clique, work_size
+from pose_graph_ros.core.elimination.assembly import eliminate_clique, RELINEARIZED, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.elimination.symbolic import (
     in_postorder,
@@ -103,7 +103,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
         transaction_log.drop_clique(head, marked[k])
     rows = plant(head, cliques, orphans)
     for k in range(len(rows)):
-        bad = eliminate_clique(head, rows[k], True)
+        bad = eliminate_clique(head, rows[k], RELINEARIZED)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             return BAD_PIVOT
@@ -186,7 +186,7 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
         if interruptible and head[tb.INTERRUPT] != 0:
             return INTERRUPTED
         transaction_log.renew_values(head, c)
-        bad = eliminate_clique(head, c, True)
+        bad = eliminate_clique(head, c, RELINEARIZED)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             return BAD_PIVOT

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from random_graphs import dense_system, free_part, random_graph
 
-from pose_graph_ros.core.batch import gauss_newton
+from pose_graph_ros.core.batch import gauss_newton, optimizer
 from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.elimination.assembly import LINEARIZED
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -32,22 +33,11 @@ def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
     return graph
 
 
-def planted(graph: Graph) -> symbolic.Cliques:
-    """Store the cliques of the whole graph in its tables."""
-    memory = graph.memory
-    cliques, need_f, need_i, largest = symbolic.analyse(memory.head)
-    memory.ensure('pool_f', need_f)
-    memory.ensure('pool_i', need_i)
-    memory.ensure('work_f', largest)
-    symbolic.plant_all(memory.head, cliques)
-    return cliques
-
-
 def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     """Make a step; return the solution of the free nodes, in the order of H."""
     head = graph.memory.head
     gauss_newton.linearize(head)
-    assert gauss_newton.eliminate(head, damping)
+    assert gauss_newton.eliminate(head, damping, LINEARIZED)
     length = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
     step = graph.memory['node_f'][:graph.n_nodes, tb.DELTA:tb.DELTA + 3]
     assert length == np.max(np.abs(step))
@@ -64,7 +54,7 @@ def test_a_step_is_that_of_dense_matrices(seed: int, damping: float) -> None:
     rows = graph.memory['node_f'][:graph.n_nodes][~graph.fixed]
     scale = rows[:, [tb.SCALE_T, tb.SCALE_T, tb.SCALE_R]].ravel()**2
     expected = -np.linalg.solve(H + damping * np.diag(scale), b)
-    planted(graph)
+    optimizer.plant(graph, symbolic.analyse(graph.memory.head))
     for _ in range(2):  # again over the same cliques
         poses = graph.poses.copy()
         np.testing.assert_allclose(
@@ -79,7 +69,7 @@ def test_a_chord_step_has_the_old_matrix_and_the_new_gradient(seed: int) -> None
     graph = weighted_graph(seed)
     H, _ = free_part(graph, *dense_system(graph))
     assume(np.linalg.cond(H) < 1e12)
-    planted(graph)
+    optimizer.plant(graph, symbolic.analyse(graph.memory.head))
     full_step(graph)
     head, right = graph.memory.head, np.empty((graph.n_nodes, 3))
     for _ in range(2):
