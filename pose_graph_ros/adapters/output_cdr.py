@@ -37,14 +37,20 @@ _UNKNOWN_TWIST = bytes(48) + (UNKNOWN_VARIANCE * np.eye(6)).tobytes()
 
 
 @functools.cache
-def _names(at: int, frame_id: str, child_frame_id: str = '') -> bytes:
-    """Serialise one or two frame ids at an offset [bytes], padded for a double to follow."""
+def _names(at: int, *frames: str) -> bytes:
+    """Serialise frame ids at an offset [bytes], padded for a double to follow."""
     data = b''
-    for text in (frame_id, child_frame_id) if child_frame_id else (frame_id,):
+    for text in frames:
         data += bytes(-(at + len(data)) % 4)
         name = text.encode() + b'\0'
         data += _LENGTH.pack(len(name)) + name
     return data + bytes(-(at + len(data)) % 8)
+
+
+def _head(stamp_ns: int, *frames: str, count: bytes = b'') -> bytes:
+    """Serialise what comes before the numbers of a message: a header, after a count of items."""
+    return b''.join((CDR, count, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
+                     _names(8 + len(count), *frames)))
 
 
 def odometry_cdr(
@@ -57,15 +63,14 @@ def odometry_cdr(
     # a finite sum is the quick way to tell
     finite = math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))
     return b''.join((
-        CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame, base_frame),
+        _head(stamp_ns, map_frame, base_frame),
         _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
         _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
     """Return a serialised geometry_msgs/PoseWithCovarianceStamped in the map."""
-    return b''.join((CDR, _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)), _names(8, map_frame),
-                     _pose_with_covariance_cdr(prediction, PLANAR_VARIANCE)))
+    return _head(stamp_ns, map_frame) + _pose_with_covariance_cdr(prediction, PLANAR_VARIANCE)
 
 
 def _pose_with_covariance_cdr(prediction: Prediction, unknown: float) -> bytes:
@@ -91,9 +96,8 @@ def transform_cdr(
     stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
 ) -> bytes:
     """Return a serialised tf2_msgs/TFMessage with the transform from map to odom."""
-    return b''.join((CDR, _LENGTH.pack(1), _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)),
-                     _names(12, map_frame, odom_frame),
-                     _POSE.pack(*_position_and_quaternion(T_map_odom))))
+    return _head(stamp_ns, map_frame, odom_frame, count=_LENGTH.pack(1)) + _POSE.pack(
+        *_position_and_quaternion(T_map_odom))
 
 
 def path_cdr(path: Trajectory, stamp_ns: StampNs, frame_id: str) -> bytes:

@@ -22,6 +22,7 @@ from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.fixes import datum_of
 from pose_graph_ros.adapters.parameter_table import (
     Change,
+    OF_SOURCES,
     Parameter,
     PARAMETERS,
     SOURCE_PARAMETERS,
@@ -37,16 +38,6 @@ from pose_graph_ros.adapters.sources import (
 from pose_graph_ros.core.exceptions import ConfigError
 
 LIKENESS = 0.7  # from which on one name may be meant by another, as difflib measures it
-# Parameters of version 0.1.0 that are gone, without the name of a source.
-REMOVED = frozenset((
-    'graph_period', 'clock_jump_threshold', 'minimum_node_interval', 'moving_node_interval',
-    'node_heartbeat', 'odometry_patience', 'transform_slew_linear', 'transform_slew_angular',
-    'thinning.angle', 'thinning.poses', 'thinning.newest', 'alignment.sigma_heading',
-    'alignment.minimum_baseline', 'alignment.baseline_in_sigmas', 'reorder_window',
-    'rejection_threshold', 'covariance_policy', 'sigma_ceiling', 'default_sigma',
-    'minimum_period', 'correlation_model', 'white_share'))
-REMOVED_OF_SOME = ('sigma_floor', 'sigma_scale', 'robust_loss')  # other kinds of sources have them
-OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
 FRAMES = ('map_frame', 'odom_frame', 'base_link_frame')
 NOTHING = (None, 'null', 'None')
 """What is not set, as rcl and `ros2 param load` read what `ros2 param dump` has written."""
@@ -112,29 +103,22 @@ def checked(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def unknown(name: str, known: Collection[str]) -> ConfigError:
     """Return the error for a parameter that is not known, with what to do about it."""
-    own = name.rpartition('.')[2]
-    if name in REMOVED or (name != own and own in {*REMOVED, *REMOVED_OF_SOME}):
-        return ConfigError(
-            f'parameter {name} no longer exists: remove it, CHANGELOG.rst says what is instead')
-    hint = explanation(name, known)
-    return ConfigError(f'parameter {name} is not known' + (hint and f': {hint}'))
+    hint = explanation(name, known) or 'CHANGELOG.rst has those that are gone'
+    return ConfigError(f'parameter {name} is not known: {hint}')
 
 
 def explanation(name: str, known: Collection[str]) -> str:
     """Return what may be wrong with a name that is not known; empty if no other is like it."""
     source, _, own = name.rpartition('.')
     if source == '' or own not in OF_SOURCES:
-        return _question(get_close_matches(name, known, 1, LIKENESS))
-    if f'{source}.type' in known:
+        nearest, said = get_close_matches(name, known, 1, LIKENESS), []
+    elif f'{source}.type' in known:
         return f'a source of the type of {source} has none'
-    others = [each.removesuffix(f'.{own}') for each in known if each.endswith(f'.{own}')]
-    question = _question(
-        [f'{other}.{own}' for other in get_close_matches(source, others, 1, LIKENESS)])
-    return f'{source} is not in sources' + (question and f'; {question}')
-
-
-def _question(nearest: list[str]) -> str:
-    return '' if len(nearest) == 0 else f'did you mean {nearest[0]}?'
+    else:
+        others = [each.removesuffix(f'.{own}') for each in known if each.endswith(f'.{own}')]
+        said = [f'{source} is not in sources']
+        nearest = [f'{other}.{own}' for other in get_close_matches(source, others, 1, LIKENESS)]
+    return '; '.join((*said, *(f'did you mean {each}?' for each in nearest)))
 
 
 def is_own(name: str, known: Collection[str]) -> bool:
@@ -145,7 +129,7 @@ def is_own(name: str, known: Collection[str]) -> bool:
     are for others, unless they resemble one of its own.
     """
     group, dot, _ = name.partition('.')
-    return (dot == '' or name in REMOVED or any(each.startswith(f'{group}.') for each in known)
+    return (dot == '' or any(each.startswith(f'{group}.') for each in known)
             or explanation(name, known) != '')
 
 

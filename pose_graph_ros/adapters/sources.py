@@ -19,20 +19,23 @@ _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 class Kind(Enum):
-    """Kind of a source; the value of its parameter `type`."""
+    """Kind of a source; the value of its parameter `type`, and the type of its messages."""
 
-    ODOMETRY = 'odometry'
-    GLOBAL_POSE = 'global_pose'
-    FIX = 'fix'
-    IMU = 'imu'
-    LOOP_CLOSURE = 'loop_closure'
-    TWIST = 'twist'
-    GYRO = 'gyro'
+    ODOMETRY = 'odometry', 'nav_msgs/msg/Odometry'
+    GLOBAL_POSE = 'global_pose', _POSE
+    FIX = 'fix', 'sensor_msgs/msg/NavSatFix'
+    IMU = 'imu', 'sensor_msgs/msg/Imu'
+    LOOP_CLOSURE = 'loop_closure', _POSE
+    TWIST = 'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped'
+    GYRO = 'gyro', 'sensor_msgs/msg/Imu'
 
-    @property
-    def message_type(self) -> str:
-        """Type of the messages."""
-        return MESSAGE_TYPES[self]
+    message_type: str
+
+    def __new__(cls, name: str, message_type: str = '') -> 'Kind':
+        """Make a member whose value is its name alone."""
+        kind = object.__new__(cls)
+        kind._value_, kind.message_type = name, message_type
+        return kind
 
     @property
     def is_odometry(self) -> bool:
@@ -40,11 +43,6 @@ class Kind(Enum):
         return self in ODOMETRY_KINDS
 
 
-MESSAGE_TYPES = {
-    Kind.ODOMETRY: 'nav_msgs/msg/Odometry', Kind.GLOBAL_POSE: _POSE,
-    Kind.FIX: 'sensor_msgs/msg/NavSatFix', Kind.IMU: 'sensor_msgs/msg/Imu',
-    Kind.LOOP_CLOSURE: _POSE, Kind.TWIST: 'geometry_msgs/msg/TwistWithCovarianceStamped',
-    Kind.GYRO: 'sensor_msgs/msg/Imu'}
 IN_MAP = (Kind.FIX, Kind.GLOBAL_POSE)
 """Kinds of sources of positions in the map."""
 ODOMETRY_KINDS = (Kind.ODOMETRY, Kind.TWIST)
@@ -62,9 +60,9 @@ DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
 OUTPUTS = {
     'path': ('path', 'nav_msgs/msg/Path', 'corrected path'),
     'pose': ('pose', _POSE, 'newest pose'),
-    'filtered_odometry': ('odometry/filtered', MESSAGE_TYPES[Kind.ODOMETRY],
+    'filtered_odometry': ('odometry/filtered', Kind.ODOMETRY.message_type,
                           'newest pose and twist'),
-    'filtered_fix': ('gps/filtered', MESSAGE_TYPES[Kind.FIX], 'newest pose on the Earth'),
+    'filtered_fix': ('gps/filtered', Kind.FIX.message_type, 'newest pose on the Earth'),
     'graph': ('graph', 'visualization_msgs/msg/MarkerArray', 'markers of the graph'),
     'verdicts': ('~/verdicts', 'diagnostic_msgs/msg/DiagnosticArray', 'verdicts'),
     'diagnostics': ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'diagnostics')}

@@ -16,6 +16,7 @@ from contextlib import contextmanager, ExitStack
 from dataclasses import replace
 import fcntl
 from importlib.util import find_spec
+import json
 import os
 from pathlib import Path
 import random
@@ -188,12 +189,14 @@ def _run(
     node_command = [sys.executable, '-m', 'pose_graph_ros.ros.main',
                     *shared.ros_arguments(options),
                     # the player reads from the diagnostics which messages the node has processed
-                    '-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5']
+                    '-p', 'diagnostics_period:=0.05', '-p', 'path_period:=0.5',
+                    # in quotes, as it is read as YAML
+                    '-p', f'graph_file:={json.dumps(str((options.out / GRAPH).resolve()))}']
     if find_spec('tf2_msgs') is None:  # make demo does not build it for the simulated drive
         node_command += ['-p', 'publish_tf:=false']
     player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
               str((options.out / RECORDED).resolve()), '--rate', str(options.rate),
-              '--hold-out', str(inputs.hold_out), '--graph', str((options.out / GRAPH).resolve())]
+              '--hold-out', str(inputs.hold_out)]
     for name, topic in inputs.topics.items():
         player += ['--input', name, inputs.kinds[name].value, values[f'{name}.topic'], topic]
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \

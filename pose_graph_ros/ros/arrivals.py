@@ -145,7 +145,7 @@ class Delays:
             way = 'ahead of' if late_ns < 0 else 'behind'
             waits = ', for which its measurements wait' if may_be_late else ''
             self.wrong[source] = (
-                f'The stamps of {source} are {abs(delay.seconds):.1f} s {way} those of {odometry}'
+                f'the stamps of {source} are {abs(delay.seconds):.1f} s {way} those of {odometry}'
                 f'{waits}: mend the clock of its driver (GPS time is 18 s ahead of UTC), or set '
                 f'{source}.time_offset')
 

@@ -1,8 +1,8 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Values and summary of the node's status in /diagnostics; imports only messages of ROS."""
+"""The values of /diagnostics by their keys."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 import math
 import os
@@ -10,14 +10,8 @@ from pathlib import Path
 import time
 from typing import TYPE_CHECKING
 
-from diagnostic_msgs.msg import DiagnosticStatus
-
-from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.core.alignment.monitor import AlignmentState
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
-from pose_graph_ros.core.odometry.turns import CONTRADICTORY, MOST_BIAS
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.ros.worker import Worker
@@ -150,120 +144,3 @@ def _fits(session: 'Session') -> dict[str, object]:
                 + (f'; treated as white: set {name}.correlation_time'
                    if report.wrongly_white else ''))
     return found
-
-
-def health(session: 'Session') -> tuple[bytes, str]:
-    """Return the level of the diagnostics and a sentence with the state and what to do."""
-    return next(_concerns(session))
-
-
-def _concerns(session: 'Session') -> Iterator[tuple[bytes, str]]:
-    """Yield level and sentence of all that applies to the node, the most urgent first."""
-    error, warn, good = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
-    worker = session.worker
-    estimate, report = worker.estimate, worker.status.report
-    if not worker.alive:
-        yield error, 'The worker thread has ended: restart the node.'
-    if report is not None and report.status is Status.FAILED:
-        names = ', '.join(worker.status.set_aside) or 'the newest measurements'
-        yield error, (f'The solver failed with {names}: set aside until ~/optimize; the estimate '
-                      'is without them. See the log for the reason.')
-    if not session.active:
-        yield good, 'Inactive: activate the node (ros2 lifecycle set).'
-    if session.input.paused:
-        yield warn, 'Paused: call ~/pause with false to resume.'
-    if not worker.prepared:
-        waiting = f'{session.input.posted} measurements wait until then.'
-        yield warn, (f'Compiling kernels, as at every first start: {waiting}'
-                     if session.compiling else f'Loading compiled kernels: {waiting}')
-    yield from _missing_input(session)
-    if estimate is None:
-        return
-    transforms, silent = session.out.transforms, session.input.silent
-    if transforms is not None and transforms.other != '':
-        yield warn, _said(transforms.other)
-    if len(silent) > 0:
-        yield warn, (f'{" and ".join(silent)} {"is" if len(silent) == 1 else "are"} silent '
-                     'while other sources are not: check the drivers.')
-    yield from ((warn, _said(text)) for text in (
-        *session.doubts, *session.input.delays.wrong.values()))
-    if estimate.alignment is AlignmentState.UNALIGNED:
-        yield warn, ('Unaligned: the angle between odometry and map is not known yet. Drive some '
-                     'metres while fixes come in.')
-    yield from ((warn, text) for _, text in disagreements(session))
-    yield from _doubts(session)
-    if estimate.alignment is AlignmentState.LOCAL:
-        yield good, ('Running without measurements in the map: its frame is that of the first '
-                     'odometry.')
-    yield good, 'Running.'
-
-
-def _missing_input(session: 'Session') -> Iterator[tuple[bytes, str]]:
-    """Yield what is to be said if odometry, or all messages of a source, do not get in."""
-    warn, estimate = DiagnosticStatus.WARN, session.worker.estimate
-    odometry, quiet, refused = session.odometry_topics, session.input.quiet, session.input.refused
-    if estimate is None or (session.is_loaded and not any(
-            session.worker.status.counts[name, 'accepted'] > 0 for name in odometry)):
-        why = '; '.join(refused[name] for name in odometry if name in refused)
-        if why == '':
-            why = f'check {" or ".join(odometry.values())}'
-        state = 'No odometry yet' if estimate is None else (
-            f'A graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
-        yield warn, f'{state}: {why}.'
-    if quiet > 0.0:
-        final = session.final
-        ended = (final is not None and final.done() and not final.cancelled()
-                 and final.exception() is None and final.result().status is Status.CONVERGED)
-        yield warn, (f'Nothing has been received for {quiet:.0f} s: the drivers have stopped, or '
-                     'a bag has ended'
-                     + ('; the graph has been optimised.' if ended else '.'))
-    if len(refused) > 0:
-        yield warn, _said('; '.join(refused.values()))
-
-
-def _said(text: str) -> str:
-    """Return a text as a sentence."""
-    return f'{text[0].upper()}{text[1:]}.'
-
-
-def _doubts(session: 'Session') -> Iterator[tuple[bytes, str]]:
-    """Yield what is to be said of a node that works, but with wrong settings or errors."""
-    warn, status = DiagnosticStatus.WARN, session.worker.status
-    doubted = [name for name, each in status.verdicts.items() if each.doubting]
-    if len(doubted) > 0:
-        yield warn, (f'The newest measurements of {" and ".join(doubted)} are doubted and not '
-                     'used, as they contradict the others: see ~/verdicts.')
-    for name, fit in status.sources.items():
-        if fit.wrongly_white:
-            yield warn, (f'The errors of {name} are correlated in time but treated as white, so '
-                         f'the covariances are too small: set {name}.correlation_time to about '
-                         f'{short(fit.errors.tau)} s.')
-    errors = sum(count for (_, reason), count in status.counts.items()
-                 if reason == 'internal_error')
-    if errors > 0:
-        yield warn, f'Running, but {errors} internal errors are in the log: please report them.'
-
-
-def disagreements(session: 'Session') -> Iterator[tuple[str, str]]:
-    """Yield who disagrees with others, by a key, and what is probably wrong with them."""
-    status, estimate = session.worker.status, session.worker.estimate
-    found = session.searches.contradiction
-    if found is not None:
-        yield f'{found.source}.contradiction', _said(found.text)
-    for name, source in session.input.reader.sources.items():
-        if source.kind is not Kind.GYRO or estimate is None:
-            continue
-        counts, bias = status.counts, status.biases.get(name, 0.0)
-        used, most = counts[name, 'rotations'], MOST_BIAS * session.values[f'{name}.sigma_bias']
-        if used == 0 and counts[name, 'accepted'] >= 20 <= estimate.n_hidden:
-            yield f'{name}.rotations', (
-                f'No message of {name} could be used: either their stamps are not in the time of '
-                f'odometry, or they are farther apart than {name}.maximum_gap.')
-        difference = status.differences.get(name)
-        if difference is not None and difference.sigmas > CONTRADICTORY and difference.reason:
-            yield f'{name}.odometry_difference', (
-                f'Of {name} and odometry one is wrong: {difference.reason}.')
-        elif abs(bias) > most:
-            yield f'{name}.bias', (
-                f'The bias of {name} is {short(bias)} rad/s, more than five times its sigma_bias: '
-                'check its mounting and its unit, rad/s.')

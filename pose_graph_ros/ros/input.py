@@ -10,6 +10,7 @@ that are still in the queues are recognised.
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+import logging
 import math
 import time
 from typing import Any, NamedTuple
@@ -29,7 +30,9 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
-from pose_graph_ros.ros.arrivals import Delays, Liveness, Refusals
+from pose_graph_ros.ros.arrivals import Delays, INTENDED, Liveness, Refusals
+
+logger = logging.getLogger(__name__)
 
 PAUSED = rejected('paused', 'call ~/pause with false to resume')
 BEFORE_JUMP = rejected('before_clock_jump', 'a message from before the clock was set back')
@@ -130,11 +133,10 @@ class TimeJumps:
 class Input:
     """Counts all messages, holds them back while time may have jumped back, and reads them."""
 
-    def __init__(self, values: Mapping[str, Any], warn: Callable[[str], None]) -> None:
+    def __init__(self, values: Mapping[str, Any]) -> None:
         self.reader = MessageReader(values)
         self.time_jumps = TimeJumps(self.reader.keeper)
-        self._warn = warn
-        self._warned: set[tuple[str, str]] = set()
+        self._told: set[tuple[str, str]] = set()
         self._odometry_at = 0.0
         self.paused = False  # whether all measurements are rejected
         # frame_id and child_frame_id of the newest message by source
@@ -182,8 +184,6 @@ class Input:
             self.delays.receive(
                 source, measurement.stamp_ns, self.reader.keeper.clock,
                 may_be_late=not isinstance(measurement, OdometrySample | YawRate))
-            if source in self.delays.wrong:
-                self.warn_once(source, 'delay', self.delays.wrong[source])
         return decision
 
     def release_overdue(self) -> list[ReceivedMessage]:
@@ -225,37 +225,35 @@ class Input:
         active: bool,
     ) -> None:
         """
-        Find the sources that are silent or refused, and log each silence once.
+        Find the sources that are silent or refused, and log each reason once.
 
         The engine has counted measurements by source and 'accepted' or a reason, and kept the
         details of the newest refusals.
         """
-        now, silent, quiet = time.monotonic(), self.silent, self.quiet
+        now = time.monotonic()
         self.silent = self.liveness.silent(now) if active else []
         self.quiet = self.liveness.quiet(now) if active else 0.0
-        if self.quiet > 0.0 and quiet == 0.0:
-            self._warn(f'nothing has been received for {self.quiet:.0f} s')
-        for name in sorted(set(self.silent) - set(silent)):
-            self._warn(f'{name} is silent while other sources are not')
+        for (source, reason), detail in details.items():
+            self._tell_refusal(source, reason, detail)
         self.refused = self._refusals.update(
             self.received, counts + self.rejected, {**details, **self._details}, now)
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used; log the first for each source and reason."""
         self.count(source, answer)
-        self.warn_once(source, answer.reason, f'{source}: {answer.reason}: {answer.detail} '
-                                              '(logged once, counted in diagnostics)')
+        self._tell_refusal(source, answer.reason, answer.detail)
+
+    def _tell_refusal(self, source: str, reason: str, detail: str) -> None:
+        if (source, reason) not in self._told:
+            self._told.add((source, reason))
+            logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
+                       '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
 
     def count(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used."""
         self.rejected[source, answer.reason] += 1
         self._details[source, answer.reason] = answer.detail
 
-    def warn_once(self, about: str, what: str, sentence: str) -> None:
-        """Log a sentence, once for each source and reason, or parameter and value."""
-        if (about, what) not in self._warned:
-            self._warned.add((about, what))
-            self._warn(sentence)
 
 
 # A step in the stamps by more than this may be a mistake: it is treated as a jump [ns].
@@ -281,32 +279,25 @@ class PoseContinuity:
 
     def covers(self, estimate: Estimate | None, sample: OdometrySample) -> bool:
         """Tell whether an estimate can be propagated to the newest sample."""
-        if sample.stamp_ns > self._stamp_ns:
-            self._add(sample)
-        elif sample.stamp_ns < self._stamp_ns - FAR_NS:
-            # the stamp before was wrong: it lay in the future
-            self._begin(sample)
-            self._jump_ns = 0
+        elapsed_ns = sample.stamp_ns - self._stamp_ns
+        # far behind, the stamp before was wrong: it lay in the future
+        if elapsed_ns > 0 or elapsed_ns < -FAR_NS:
+            self._add(sample, elapsed_ns)
         return estimate is not None and estimate.stamp_ns >= self._jump_ns
 
-    def _begin(self, sample: OdometrySample) -> None:
+    def _add(self, sample: OdometrySample, elapsed_ns: int) -> None:
         x, y, theta = sample.pose.tolist()
-        self._stamp_ns, self._pose = sample.stamp_ns, (x, y, theta)
-        self._window = SpeedWindow(self._window.speeds, sample.stamp_ns, self._pose)
-
-    def _add(self, sample: OdometrySample) -> None:
-        x, y, theta = sample.pose.tolist()
-        elapsed_ns, pose = sample.stamp_ns - self._stamp_ns, (x, y, theta)
-        motion = between_one(self._pose, pose)
+        motion = between_one(self._pose, (x, y, theta))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
-        if self._stamp_ns == 0:
-            jumped = self._resumes
+        begins = self._stamp_ns == 0 or elapsed_ns < 0
+        if begins:
+            jumped = self._stamp_ns == 0 and self._resumes
         else:
             jumped = elapsed_ns > FAR_NS or is_jump(
                 self._window.speeds, step, elapsed_ns * 1e-9, sample.speed, self.maximum_speed)
-        if jumped or self._stamp_ns == 0:
-            self._begin(sample)
+        self._stamp_ns, self._pose = sample.stamp_ns, (x, y, theta)
+        if begins or jumped:
+            self._window = SpeedWindow(self._window.speeds, sample.stamp_ns, self._pose)
             self._jump_ns = sample.stamp_ns if jumped else 0
         else:
-            self._stamp_ns, self._pose = sample.stamp_ns, pose
-            self._window = self._window.moved(sample.stamp_ns, pose, step)
+            self._window = self._window.moved(sample.stamp_ns, self._pose, step)

@@ -7,9 +7,10 @@ So it reaches /rosout with the node's name, at the level that was asked for. Wha
 an error with each message, is left out and counted.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
 import logging
+import math
 import re
 import time
 import traceback
@@ -26,19 +27,15 @@ ANSWER = {'is_answer': True}
 PACKAGE = __name__.partition('.')[0]
 
 
-@dataclass(slots=True)
-class _Logged:
-    at: float  # time of the message [s]
-    left_out: int = 0  # how many like it came since
-
-
 class NodeLog(logging.Handler):
     """Passes records to the logger of a node, from its creation until it is closed."""
 
     def __init__(self, logger: Any) -> None:
         super().__init__()
         self._logger = logger
-        self._logged: dict[tuple[object, ...], _Logged] = {}
+        # of messages that are like one another, when one was logged [s], and how many came since
+        self._logged: dict[tuple[object, ...], float] = {}
+        self._left_out: Counter[tuple[object, ...]] = Counter()
         logging.getLogger().addHandler(self)
         # the node's logger has a level of its own
         logging.getLogger(PACKAGE).setLevel(logging.DEBUG)
@@ -66,14 +63,15 @@ class NodeLog(logging.Handler):
         key = getattr(record, 'way', None) or (
             record.levelno, record.pathname, record.lineno, NUMBER.sub('', record.getMessage()),
             _raised_at(record))
-        now, before = time.monotonic(), self._logged.get(key)
-        if before is not None and now - before.at < REPEAT_PERIOD:
-            before.left_out += 1
+        now = time.monotonic()
+        if now - self._logged.get(key, -math.inf) < REPEAT_PERIOD:
+            self._left_out[key] += 1
             return -1
         if len(self._logged) > 1000:    # texts may come from messages, so without an end
             self._logged.clear()
-        self._logged[key] = _Logged(now)
-        return 0 if before is None else before.left_out
+            self._left_out.clear()
+        self._logged[key] = now
+        return self._left_out.pop(key, 0)
 
     def _log(self, level: int, text: str) -> None:
         # a line for each level: rclpy lets no line of code change its level

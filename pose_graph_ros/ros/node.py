@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Sequence
 import logging
-import traceback
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -52,14 +51,12 @@ class PoseGraphNode(LifecycleNode):
         super().__init__(
             'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
         self._log = NodeLog(self.get_logger())
-        self.failure = ''  # why the last transition or change of parameters failed
+        self.failure = ''  # why the last transition failed
         self._session: Session | None = None
         self._offered: Services | None = None
         self._given = self._declared()  # the node's own parameters that have a value
         self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
         self._warn_of_unknown()
-        self.add_on_set_parameters_callback(self._on_set_parameters)
-        self.add_post_set_parameters_callback(self._on_parameters_set)
 
     def destroy_node(self) -> None:
         """Destroy the node; what is logged from now on goes elsewhere."""
@@ -71,11 +68,11 @@ class PoseGraphNode(LifecycleNode):
     def begin(self, arguments: Sequence[str]) -> None:
         """Tell of parameter files in the arguments that are for others; start by `autostart`."""
         for sentence in without_effect(arguments, self.get_fully_qualified_name()):
-            self.get_logger().warning(sentence)
+            logger.warning('%s', sentence)
         if self.get_parameter('autostart').value:
             self.start()
         else:
-            self.get_logger().info('autostart is false: waiting for the transition configure')
+            logger.info('autostart is false: waiting for the transition configure')
 
     def start(self) -> None:
         """Configure and activate; raises `ConfigError` with the reason if a transition fails."""
@@ -111,14 +108,14 @@ class PoseGraphNode(LifecycleNode):
         except ConfigError as error:
             self.failure = str(error)
             if self.executor is not None:   # else `start` raises it
-                self.get_logger().error(f'no transition: {error}')
+                logger.error('no transition: %s', error)
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.failure = f'{type(error).__name__}: {error}'
-            self.get_logger().error(f'a transition failed:\n{traceback.format_exc()}')
+            logger.exception('a transition failed')
             return TransitionCallbackReturn.ERROR
         if done != '':
-            self.get_logger().info(done)
+            logger.info('%s', done)
         return TransitionCallbackReturn.SUCCESS
 
     @property
@@ -185,7 +182,7 @@ class PoseGraphNode(LifecycleNode):
             if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
                     is_own(name, self._own)) and (
                     name not in usual or not is_same(plain(value), usual[name])):
-                self.get_logger().warning(str(unknown(name, self._own)))
+                logger.warning('%s', unknown(name, self._own))
 
     def set_parameters_atomically(
         self, parameter_list: list[RosParameter],
@@ -200,54 +197,45 @@ class PoseGraphNode(LifecycleNode):
         for parameter in parameter_list:
             name = parameter.name
             if not self.has_parameter(name):
-                return SetParametersResult(successful=False, reason=str(unknown(name, self._own)))
+                return _refused(unknown(name, self._own))
             value = self._plain(name, parameter.value)
             refused_by_rclpy = value == [] or self.describe_parameter(name).read_only
-            if refused_by_rclpy and is_same(
+            if not refused_by_rclpy or not is_same(
                     value, self._plain(name, self.get_parameter(name).value)):
-                continue
-            # without a value rclpy would undeclare it
-            changes.append(parameter if value != [] else RosParameter(
-                name, RosParameter.Type.DOUBLE_ARRAY, []))
+                # without a value rclpy would undeclare it
+                changes.append(parameter if value != [] else RosParameter(
+                    name, RosParameter.Type.DOUBLE_ARRAY, []))
+        own = {each.name: each.value for each in changes if each.name in self._own}
         if len(changes) == 0:
             return SetParametersResult(successful=True)
-        self.failure = ''
+        try:
+            given = changed(self._given, own, configured=self._session is not None)
+        except ConfigError as error:
+            return _refused(error)
         result = super().set_parameters_atomically(changes)
-        return result if self.failure == '' else SetParametersResult(
-            successful=False, reason=self.failure)
+        if result.successful and len(own) > 0:
+            self._given = given
+            try:
+                if self._session is not None:
+                    self._session.configure(given)
+            except Exception as error:
+                # raised from here, the client would get no answer
+                logger.exception('a change of parameters failed')
+                return _refused(f'failed: {type(error).__name__}: {error}')
+        return result
+
+    def set_parameters(self, parameter_list: list[RosParameter]) -> list[SetParametersResult]:
+        """Set several parameters, each for itself."""
+        return [self.set_parameters_atomically([each]) for each in parameter_list]
 
     def _plain(self, name: str, value: Any) -> Any:
         """Return a value of a parameter with its arrays as lists, also where it is unset."""
         can_be_unset = name in self._own and self._own[name].default == []
         return [] if can_be_unset and value in NOTHING else plain(value)
 
-    def _on_set_parameters(self, parameters: list[RosParameter]) -> SetParametersResult:
-        """Return whether all of some changes can be made now, and why not."""
-        try:
-            # rclpy declares dozens of its own, of qualities of service, at each start
-            if any(parameter.name in self._own for parameter in parameters):
-                self._changed(parameters)
-        except ConfigError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
 
-    def _on_parameters_set(self, parameters: list[RosParameter]) -> None:
-        """Apply changes that were found to be possible."""
-        # rclpy calls this for every declaration as well
-        if any(parameter.name in self._own for parameter in parameters):
-            self._given = self._changed(parameters)
-            if self._session is not None:
-                try:
-                    self._session.configure(checked(self._given))
-                except Exception as error:
-                    # raised from here, the client would get no answer
-                    self.failure = f'failed: {type(error).__name__}: {error}'
-                    logger.exception('a change of parameters failed')
-
-    def _changed(self, parameters: list[RosParameter]) -> dict[str, Any]:
-        wanted = {parameter.name: parameter.value for parameter in parameters
-                  if parameter.name in self._own}
-        return changed(self._given, wanted, configured=self._session is not None)
+def _refused(reason: object) -> SetParametersResult:
+    return SetParametersResult(successful=False, reason=str(reason))
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -4,7 +4,8 @@
 Play a bag to the node over DDS, from a separate process, and record the node's outputs.
 
 No message is lost: the writers are reliable, and the node's queues hold all messages that it has
-not processed yet, by its own count. At the end it is asked for the final optimisation and path.
+not processed yet, by its own count. At the end it is asked for the final optimisation and path,
+and to save its graph.
 """
 
 import argparse
@@ -15,16 +16,13 @@ from functools import partial
 from pathlib import Path
 import sys
 import time
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
-from rcl_interfaces.srv import SetParameters
 import rclpy
 from rclpy.client import Client
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
@@ -42,7 +40,8 @@ from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, OUTPUTS
 from pose_graph_ros.ros.transforms import message_class, TF_TYPE, TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
-VERDICTS = f'{NODE_NAME}/verdicts'
+RECORDED, KEPT = ('pose', 'filtered_odometry', 'diagnostics'), ('path', 'verdicts')
+"""Outputs that are recorded, and those of which only the newest message is."""
 # Profiles are reliable if they do not say otherwise.
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
@@ -82,31 +81,34 @@ class Player(Node):
             for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
             TFMessage, STATIC_FRAMES[0], STATIC)
+        # topic, type, time of arrival [ns] and bytes of the node's messages
         self._recorded: list[tuple[str, str, int, bytes]] = []
-        """Topic, type, time of arrival [ns] and bytes of the node's messages."""
-        self._newest: dict[str, tuple[str, str, int, bytes]] = {}
-        """The same of the newest message on a latched topic, by its name."""
+        self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        types = {topic: name for topic, name, _ in OUTPUTS.values()}
-        types |= {VERDICTS: types['~/verdicts']} | ({} if TFMessage is None else {'/tf': TF_TYPE})
-        for topic, keep in (
-                ('pose', self._recorded.append), ('odometry/filtered', self._recorded.append),
-                ('/tf', self._recorded.append), ('/diagnostics', self._diagnose),
-                ('path', partial(self._newest.__setitem__, 'path')),
-                (VERDICTS, partial(self._newest.__setitem__, VERDICTS))):
-            if topic in types:
-                named = self.resolve_topic_name(topic), types[topic]
-                self.create_subscription(
-                    message_class(types[topic]), topic,
-                    lambda raw, keep=keep, named=named: keep((*named, time.time_ns(), raw)),
-                    LATCHED if topic in {'path', VERDICTS} else RELIABLE, raw=True)
-        self._optimize = self.create_client(Trigger, f'{NODE_NAME}/optimize')
+        outputs = {name: OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
+        if TFMessage is not None:
+            outputs['tf'] = '/tf', TF_TYPE
+        for name, (relative, type_name) in outputs.items():
+            topic = self.resolve_topic_name(relative.replace('~', NODE_NAME))
+            self.create_subscription(
+                message_class(type_name), topic, partial(self._record, name, topic, type_name),
+                LATCHED if name in KEPT else RELIABLE, raw=True)
+        self._optimize, self._save = (
+            self.create_client(Trigger, f'{NODE_NAME}/{name}')
+            for name in ('optimize', 'save_graph'))
 
-    def _diagnose(self, received: tuple[str, str, int, bytes]) -> None:
-        for status in deserialize_message(received[-1], DiagnosticArray).status:
-            if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME:
-                self.diagnostics = {value.key: value.value for value in status.values}
-                self._recorded.append(received)
+    def _record(self, output: str, topic: str, type_name: str, raw: bytes) -> None:
+        received = topic, type_name, time.time_ns(), raw
+        if output in KEPT:
+            self._newest[output] = received
+            return
+        if output == 'diagnostics':
+            own = [status for status in deserialize_message(raw, DiagnosticArray).status
+                   if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME]
+            if len(own) == 0:
+                return
+            self.diagnostics = {value.key: value.value for value in own[0].values}
+        self._recorded.append(received)
 
     @property
     def n_poses(self) -> int:
@@ -136,20 +138,20 @@ class Player(Node):
         """
         self._spin_until(
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
-            and len(self.diagnostics) > 0 and self._optimize.service_is_ready(), PATIENCE.appear,
+            and len(self.diagnostics) > 0 and self._optimize.service_is_ready()
+            and self._save.service_is_ready(), PATIENCE.appear,
             'the node does not subscribe')
         self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PATIENCE.prepare,
                         'the node is still compiling')
-        if self._static is not None:
-            with open_bag(bag) as reader:
-                for frames in read_static_frames(reader):
-                    self._static.publish(frames.raw)
-        # the other side of a match may learn of it a little later
-        settled = time.monotonic() + 0.5
-        self._spin_until(lambda: time.monotonic() > settled, 2.0, '')
         sent = self.processed
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
+            if self._static is not None:
+                for frames in read_static_frames(reader):
+                    self._static.publish(frames.raw)
+            # the other side of a match may learn of it a little later
+            settled = time.monotonic() + 0.5
+            self._spin_until(lambda: time.monotonic() > settled, 2.0, '')
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
             start = first_ns = None
             progress = tqdm(total=total, disable=None, unit=' messages')     # on a terminal
@@ -190,7 +192,7 @@ class Player(Node):
     def request_final_optimization(self) -> tuple[bool, str]:
         """Call ~/optimize, and wait for the path after it; return success and message."""
         asked_ns = time.time_ns()
-        response = self._call(self._optimize, Trigger.Request(), 'the optimisation')
+        response = self._call(self._optimize, 'the optimisation')
         answered_ns = time.time_ns()
 
         def is_last() -> bool:
@@ -201,20 +203,14 @@ class Player(Node):
         self._spin_until(is_last, PATIENCE.answer, 'no path came after the optimisation')
         return bool(response.success), str(response.message)
 
-    def save_graph(self, path: Path) -> None:
-        """Have the node save its graph to a file, whatever its parameter graph_file is."""
-        parameters = self.create_client(SetParameters, f'{NODE_NAME}/set_parameters')
-        save = self.create_client(Trigger, f'{NODE_NAME}/save_graph')
-        self._spin_until(lambda: parameters.service_is_ready() and save.service_is_ready(),
-                         PATIENCE.appear, 'the node does not offer to save its graph')
-        self._call(parameters, SetParameters.Request(parameters=[
-            Parameter('graph_file', value=str(path)).to_parameter_msg()]), 'setting graph_file')
-        answer = self._call(save, Trigger.Request(), 'saving the graph')
+    def save_graph(self) -> None:
+        """Have the node save its graph."""
+        answer = self._call(self._save, 'saving the graph')
         if not answer.success:
             raise PlayError(f'~/save_graph: {answer.message}')
 
-    def _call(self, service: Client, request: Any, what: str) -> Any:
-        asked = service.call_async(request)
+    def _call(self, service: Client, what: str) -> Trigger.Response:
+        asked = service.call_async(Trigger.Request())
         self._spin_until(asked.done, PATIENCE.answer, f'no answer to {what}')
         return asked.result()
 
@@ -235,7 +231,6 @@ def main(args: list[str] | None = None) -> int:
                         metavar=('SOURCE', 'TYPE', 'NODE_TOPIC', 'BAG_TOPIC'))
     parser.add_argument('--hold-out', type=int, default=0)
     parser.add_argument('--rate', type=float, default=20.0)
-    parser.add_argument('--graph', type=Path, help='file that the node saves its graph to')
     options = parser.parse_args(args)
     inputs = Inputs({source: topic for source, _, _, topic in options.input},
                     {source: Kind(kind) for source, kind, _, _ in options.input},
@@ -245,8 +240,7 @@ def main(args: list[str] | None = None) -> int:
         player = Player(inputs, {source: topic for source, _, topic, _ in options.input})
         published = player.play(options.bag, options.rate)
         success, answer = player.request_final_optimization()
-        if options.graph is not None:
-            player.save_graph(options.graph)
+        player.save_graph()
         player.write(options.out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '

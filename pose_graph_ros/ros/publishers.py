@@ -56,7 +56,6 @@ from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
 from pose_graph_ros.ros.transforms import (
     message_class,
-    Slew,
     TF_QOS,
     TF_TYPE,
     TFMessage,
@@ -108,9 +107,7 @@ class View:
 class Publishers:
     """The outputs of the node."""
 
-    def __init__(
-        self, node: Node, values: Mapping[str, Any], on_other: Callable[[str], None],
-    ) -> None:
+    def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node = node
         self.map_frame = frame(values['map_frame'])
         self.odom_frame = frame(values['odom_frame'])
@@ -124,12 +121,9 @@ class Publishers:
         self.path, self.markers, self.verdicts = (View(self._publishers[name]) for name in LATCHED)
         # None if `publish_tf` is false or tf2_msgs is not installed
         self.transforms: TransformPublisher | None = None
-        self._on_other = on_other
         self._map_topics = [node.resolve_topic_name(source.topic)
                             for source in source_list(values) if source.kind in IN_MAP]
         self._awaits_map = False    # whether there ever was a publisher on one of these
-        self._slew = Slew()
-        self._aligned = False
         self._newest_ns = 0
         self.graph = 0  # number of the present graph: how many were started after the first
         # shared by the two threads
@@ -150,8 +144,7 @@ class Publishers:
         elif values['publish_tf'] and self.transforms is None:
             self.transforms = TransformPublisher(
                 self._node, self._publisher(TF_TYPE, TOPIC, TF_QOS), self.map_frame,
-                self.odom_frame, self._on_other)
-            self._slew.forget()
+                self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
@@ -172,12 +165,7 @@ class Publishers:
         self._newest_ns = stamp
         if (self.transforms is not None
                 and frame(odometry.header.frame_id) in ('', self.odom_frame)):
-            if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
-                # the map frame itself has moved, which is no correction of the pose
-                self._aligned = not self._aligned
-                self._slew.forget()
-            self.transforms.publish(stamp + self._tf_offset_ns, self._slew.limited(
-                stamp, estimate.T_map_odom, sample.pose, *self._slew_limits))
+            self.transforms.publish(estimate, sample, self._tf_offset_ns, self._slew_limits)
         wanted = [publisher for publisher in (self._pose, self._odometry, self._fix)
                   if publisher.get_subscription_count() > 0]
         if len(wanted) == 0:
@@ -211,7 +199,8 @@ class Publishers:
 
     def jump(self) -> None:
         """Let the next transform be published without limits: the robot was put elsewhere."""
-        self._slew.forget()
+        if self.transforms is not None:
+            self.transforms.slew.forget()
 
     def publish_views(
         self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
@@ -248,8 +237,7 @@ class Publishers:
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""
-        self._newest_ns, self._aligned = 0, False
-        self._slew.forget()
+        self._newest_ns = 0
         if self.transforms is not None:
             self.transforms.forget()
         with self._lock:

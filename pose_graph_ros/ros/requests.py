@@ -7,7 +7,6 @@ Imports no rclpy.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 import logging
 from pathlib import Path
 from typing import Any
@@ -89,22 +88,14 @@ class SetPoseInput:
         self._waiting = None
 
 
-def read_decision(message: Message) -> tuple[str, Decision] | Answer:
-    """Return the id of a constraint and what is decided on it; else why it cannot be read."""
-    name, text = str(message.key).strip(), str(message.value).strip().lower()
-    try:
-        return name, Decision(text)
-    except ValueError:
-        choices = ', '.join(decision.value for decision in Decision)
-        return rejected('unknown_decision', f'expected one of {choices} as the value for the key '
-                                            f'{name!r}, got {text!r}')
-
-
 def decide(message: Message, worker: Worker) -> None:
     """Hand a decision to the engine, which answers in the log; an update follows at once."""
     def act(backend: PoseGraphBackend) -> None:
-        read = read_decision(message)
-        answer = read if isinstance(read, Answer) else backend.decide(*read)
+        name, text = str(message.key).strip(), str(message.value).strip().lower()
+        choices = [decision.value for decision in Decision]
+        answer = backend.decide(name, Decision(text)) if text in choices else rejected(
+            'unknown_decision', f'expected one of {", ".join(choices)} as the value for the key '
+            f'{name!r}, got {text!r}')
         refused = answer.status is AnswerStatus.REJECTED
         backend.counts[JUDGE, answer.reason if refused else 'accepted'] += 1
         _tell(answer, 'nothing is decided', answer.detail or f'{message.key}: {message.value}')
@@ -133,24 +124,6 @@ def _tell(answer: Answer, refused: str, done: str) -> None:
 
 # --- the file of the graph
 
-@dataclass(frozen=True, slots=True)
-class InitialGraph:
-    """A saved graph that was found to be whole, and to be of the site of the robot."""
-
-    path: Path
-    datum: MapOrigin | None
-
-    def read(self, config: BackendConfig) -> PoseGraphBackend | None:
-        """Return an engine that continues it; None, which is logged, if that fails after all."""
-        try:
-            saved, backend = restored(self.path, config)
-        except Exception:
-            logger.exception('%s could not be loaded: a new graph is started', self.path)
-            return None
-        logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), self.path)
-        return backend
-
-
 def graph_path(values: Mapping[str, Any]) -> Path:
     """Return the file that graph_file names; raises `ConfigError` if it names none."""
     name = values['graph_file']
@@ -163,9 +136,9 @@ def graph_path(values: Mapping[str, Any]) -> Path:
         raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
 
 
-def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
+def initial_graph(values: Mapping[str, Any]) -> tuple[Path, MapOrigin | None] | None:
     """
-    Return the graph that a node starts with; None before one was saved, which is said.
+    Return file and datum of the graph that a node starts with; None before one was saved.
 
     Only the checksums and the datum are read, as whoever configures the node waits for it.
     """
@@ -184,7 +157,18 @@ def initial_graph(values: Mapping[str, Any]) -> InitialGraph | None:
         refusal = datum_refusal(datum, plane.origin)
         if refusal is not None:
             raise ConfigError(f'parameter load_graph_on_start: {path}: {refusal}')
-    return InitialGraph(path, datum)
+    return path, datum
+
+
+def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
+    """Return an engine that continues a saved graph; None, which is logged, if that fails."""
+    try:
+        saved, backend = restored(path, config)
+    except Exception:
+        logger.exception('%s could not be loaded: a new graph is started', path)
+        return None
+    logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), path)
+    return backend
 
 
 def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:

@@ -71,7 +71,7 @@ class Services:
         """
         self._closed = True
         if self._saving:
-            self._node.get_logger().warning('the graph is still being saved')
+            logger.warning('the graph is still being saved')
         for service in self._quick:
             self._node.destroy_service(service)
         self._spinner.stop()

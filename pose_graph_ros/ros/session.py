@@ -38,18 +38,13 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
-from pose_graph_ros.ros.log import ANSWER
+from pose_graph_ros.ros.log import ANSWER, NUMBER
 from pose_graph_ros.ros.publishers import Publishers
-from pose_graph_ros.ros.requests import (
-    decide,
-    initial_graph,
-    InitialGraph,
-    set_pose,
-    SetPoseInput,
-)
+from pose_graph_ros.ros.requests import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.topics import CLOSURE_QOS, doubts, INPUTS, JUDGE_TOPIC, SENSOR_QOS
+from pose_graph_ros.ros.topics import CLOSURE_QOS, INPUTS, JUDGE_TOPIC, SENSOR_QOS
 from pose_graph_ros.ros.transforms import message_class, STATIC_TOPIC
 from pose_graph_ros.ros.worker import Worker
 
@@ -66,29 +61,35 @@ class Session:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
         initial = initial_graph(values)
-        self.input = Input(values, node.get_logger().warning)
-        self.out = Publishers(node, values, node.get_logger().warning)
+        self.input, self.out = Input(values), Publishers(node, values)
         self._set_pose_input = SetPoseInput(
             self.out.map_frame, self.out.odom_frame, self.out.base_frame)
-        self.active = self._closed = False
+        self.active = False
         self.n_resets, self.reset_reason = 0, ''
+        self._told: dict[str, str] = {}  # what is logged and not over, by its text without numbers
         self.activated_at = math.inf  # by a monotonic clock [s]
-        self.doubts: list[str] = []  # what around the node is probably not as it was meant
         self.compiling = False  # whether kernels are compiled, which a start from the cache is not
         self._subscriptions: list[Subscription] = []
         self._timers: dict[str, Timer] = {}
         self._jump_handle: JumpHandle | None = None
         # a clock that is set back, or a bag that starts again, must not stall a timer
-        self.steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._clear(resumes=initial is not None)
-        self._start_worker(PoseGraphBackend(self._config), initial=initial)
-        if initial is not None:
-            if initial.datum is not None:
-                self.input.reader.datum.keep(initial.datum)
-            self.worker.request_update()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        path, datum = initial or (None, None)
+
+        def prepare(stopped: Callable[[], bool]) -> PoseGraphBackend | None:
+            self._warm_up(stopped)
+            return None if path is None or stopped() else continued(path, self._config)
+
+        self._begin(PoseGraphBackend(self._config), prepare, resumes=path is not None)
+        if datum is not None:
+            self.input.reader.datum.keep(datum)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
 
-    def _clear(self, *, resumes: bool = False) -> None:
+    def _begin(
+        self, backend: PoseGraphBackend, prepare: Callable[[Callable[[], bool]], Any], *,
+        resumes: bool,
+    ) -> None:
+        """Start the thread that owns a graph, which may resume a drive."""
         self._continuity = {
             name: PoseContinuity(source.maximum_speed, resumes=resumes)
             for name, source in self._config.odometry.items()}
@@ -96,24 +97,12 @@ class Session:
         self.final: Future[UpdateReport] | None = None  # optimisation at the end of the stream
         # of this graph, so that the answer of an earlier worker is nobody's
         self.searches = diagnostics.Searches()
-
-    def _start_worker(
-        self, backend: PoseGraphBackend, *, prepared: bool = False,
-        initial: InitialGraph | None = None,
-    ) -> None:
-        """Start the thread that owns a graph."""
         graph = self.out.graph
-
-        def prepare(stopped: Callable[[], bool]) -> None:
-            self._warm_up(stopped)
-            if initial is not None and not stopped() and (
-                    saved := initial.read(self._config)) is not None:
-                worker.adopt(saved)
-
         self.worker = worker = Worker(
-            backend, lambda backend: self.out.publish_views(worker, graph, backend),
-            None if prepared else prepare)
+            backend, lambda backend: self.out.publish_views(worker, graph, backend), prepare)
         self.worker.start()
+        if resumes:
+            self.worker.request_update()
 
     def _warm_up(self, stopped: Callable[[], bool]) -> None:
         """Compile or load all kernels before the first measurement; for the worker's thread."""
@@ -123,13 +112,12 @@ class Session:
 
         if not is_cached():
             self.compiling = True
-            self.node.get_logger().info(
-                'compiling kernels, up to a minute and only at the first start; measurements wait '
-                'until then, none is lost')
+            logger.info('compiling kernels, up to a minute and only at the first start; '
+                        'measurements wait until then, none is lost')
         seconds = warm_up(stopped)
         if not stopped():   # else another worker may be compiling by now
             self.compiling = False
-            self.node.get_logger().info(f'kernels ready after {seconds:.1f} s')
+            logger.info('kernels ready after %.1f s', seconds)
 
     # ---- transitions of the node
 
@@ -152,8 +140,8 @@ class Session:
         self._watch_time()
         self.input.liveness.resume(time.monotonic())
         self.active, self.activated_at = True, time.monotonic()
-        topics = ', '.join(self.node.resolve_topic_name(source.topic) for source in sources)
-        self.node.get_logger().info(f'ready, listening to {topics}')
+        logger.info('ready, listening to %s', ', '.join(
+            self.node.resolve_topic_name(source.topic) for source in sources))
 
     def deactivate(self) -> None:
         """Destroy the subscriptions and stop the timers; keep the graph."""
@@ -171,12 +159,10 @@ class Session:
         """Stop the worker; destroy subscriptions, timers and publishers."""
         if self.active:
             self.deactivate()
-        self._closed = True
-        for timer in self._timers.values():
-            self.node.destroy_timer(timer)
+        self.node.destroy_timer(self._timers.pop('diagnostics'))
         if not self.worker.stop(STOP_TIMEOUT):
-            self.node.get_logger().warning(
-                f'stopping in the middle of {"a compilation" if self.compiling else "a solve"}')
+            logger.warning('stopping in the middle of %s',
+                           'a compilation' if self.compiling else 'a solve')
         self.out.close()
 
     def configure(self, values: Mapping[str, Any]) -> None:
@@ -203,9 +189,8 @@ class Session:
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
         timer, period_ns = self._timers.get(name), round(period * NANOSECONDS)
         if timer is None:
-            is_due = (lambda: not self._closed) if name == 'diagnostics' else (lambda: self.active)
             self._timers[name] = self.node.create_timer(
-                period, guarded(tick, is_due), clock=self.steady)
+                period, guarded(tick, lambda: name in self._timers), clock=self._steady)
         elif timer.timer_period_ns != period_ns:
             # not a new one: the executor knows it before the one that it replaces is gone
             timer.timer_period_ns = period_ns
@@ -226,11 +211,9 @@ class Session:
     def _use(self, received: ReceivedMessage) -> None:
         """Post the measurement of a message; publish the pose at once for odometry."""
         self.input.post(received, self.worker.post)
-        if received.refusal is None and isinstance(received.measurement, OdometrySample):
-            self._publish_prediction(received.source, received.measurement, received.message)
-
-    def _publish_prediction(self, name: str, sample: OdometrySample, message: Message) -> None:
-        """Publish the newest estimate, propagated to a message of the primary odometry."""
+        name, message, sample, refusal = received
+        if refusal is not None or not isinstance(sample, OdometrySample):
+            return
         estimate = self.worker.estimate
         covers = self._continuity[name].covers(estimate, sample)
         if estimate is None or estimate.primary != name:
@@ -299,18 +282,16 @@ class Session:
         self._replace(backend, f'the graph in {name} was loaded', resumes=True)
         if saved.datum is not None:
             self.input.reader.datum.keep(saved.datum)
-        self.worker.request_update()
 
     def _replace(self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False) -> None:
-        self.node.get_logger().warning(reason)
+        logger.warning('%s', reason, extra=ANSWER)
         prepared = self.worker.prepared
         self.worker.stop(0.0)  # the result of a running solve is discarded
         self.out.start_new_graph()
         self.input.start_new_graph(self.values)
         self._set_pose_input.forget()
-        self._clear(resumes=resumes)
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
-        self._start_worker(backend, prepared=prepared)
+        self._begin(backend, (lambda _: None) if prepared else self._warm_up, resumes=resumes)
 
     # ---- timers
 
@@ -358,13 +339,14 @@ class Session:
         self.input.watch(status.counts, status.refusals, active=self.active)
         if self.out.transforms is not None and self.active:
             self.out.transforms.check_for_others()
-        found = list(doubts(self)) if self.active else []
-        for about, what, sentence in found:
-            self.input.warn_once(about, what, sentence)
-        self.doubts = [sentence for *_, sentence in found]
         self.searches.update(self.worker)
-        for key, text in diagnostics.disagreements(self):
-            self.input.warn_once(key, 'disagreement', text)
         # in this order: the sentence is then at least as new as the values beside it
-        values = diagnostics.values(self)
-        self.out.publish_diagnostics(*diagnostics.health(self), values)
+        values, found = diagnostics.values(self), [*concerns(self)]
+        self.out.publish_diagnostics(found[0].level, found[0].sentence, values)
+        if self.active:
+            present = {NUMBER.sub('', each.text): each.text for each in found if each.logged}
+            for key in present.keys() - self._told.keys():
+                logger.warning('%s', present[key])
+            for key in self._told.keys() - present.keys():
+                logger.info('over: %s', self._told[key])
+            self._told = present

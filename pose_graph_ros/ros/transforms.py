@@ -3,7 +3,6 @@
 """The transform from map to odom: its speed, its stamps, and others that publish it."""
 
 from collections import Counter, deque
-from collections.abc import Callable
 from importlib import import_module
 import math
 import time
@@ -18,8 +17,11 @@ from rclpy.subscription import Subscription
 
 from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, stamp_ns
+from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.ros.spinning import guarded
 
 
@@ -57,19 +59,28 @@ class TransformPublisher:
 
     def __init__(
         self, node: Node, publisher: Publisher, map_frame: str, odom_frame: str,
-        on_other: Callable[[str], None],
     ) -> None:
-        self._node, self._publisher, self._on_other = node, publisher, on_other
+        self._node, self._publisher = node, publisher
         self._map_frame, self._odom_frame = map_frame, odom_frame
-        self._newest_ns = 0
+        self._newest_ns, self._aligned, self.slew = 0, False, Slew()
         # its newest, to recognise them
         self._own: deque[tuple[int, float, float]] = deque(maxlen=2000)
         self._subscription: Subscription | None = None
         self._since = -float('inf')
         self.other = ''  # warning about another publisher of the transform; empty if there is none
 
-    def publish(self, at_ns: int, T_map_odom: FloatArray) -> None:
-        """Publish the transform, unless its stamp is not newer than the last one."""
+    def publish(
+        self, estimate: Estimate, sample: OdometrySample, offset_ns: int,
+        limits: tuple[float, float],
+    ) -> None:
+        """Publish the transform at odometry, unless its stamp is not newer than the last one."""
+        if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
+            # the map frame itself has moved, which is no correction of the pose
+            self._aligned = not self._aligned
+            self.slew.forget()
+        T_map_odom = self.slew.limited(
+            sample.stamp_ns, estimate.T_map_odom, sample.pose, *limits)
+        at_ns = sample.stamp_ns + offset_ns
         if at_ns <= self._newest_ns:
             return
         self._newest_ns = at_ns
@@ -78,8 +89,8 @@ class TransformPublisher:
             at_ns, T_map_odom, self._map_frame, self._odom_frame))
 
     def forget(self) -> None:
-        """Let the next transform have any stamp."""
-        self._newest_ns = 0
+        """Let the next transform have any stamp, and be without limits."""
+        self._newest_ns, self._aligned, self.slew = 0, False, Slew()
 
     def check_for_others(self) -> None:
         """Listen to /tf for a while if other nodes publish there; to be called periodically."""
@@ -122,7 +133,6 @@ class TransformPublisher:
                 'the two to false; if it is that of another robot, give each a namespace and its '
                 'own tf, with remap_tf:=true of the launch file or -r /tf:=tf '
                 '-r /tf_static:=tf_static')
-            self._on_other(self.other)
             return
 
 

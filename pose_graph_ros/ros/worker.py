@@ -21,10 +21,9 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
-from pose_graph_ros.core.measurements import AnswerStatus, Measurement, OdometrySample
+from pose_graph_ros.core.measurements import Measurement, OdometrySample
 from pose_graph_ros.core.odometry.turns import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.ros.arrivals import INTENDED
 from pose_graph_ros.ros.log import verdict_lines
 
 logger = logging.getLogger(__name__)
@@ -66,13 +65,13 @@ class Worker:
     """
     Runs a backend in a thread of its own; a new graph gets a new worker.
 
-    The thread calls `prepare` before its first work, with a function that tells whether to end,
-    and `on_estimate` after each new estimate.
+    The thread calls `prepare` before its first work, with a function that tells whether to end;
+    it may return another backend to run. `on_estimate` is called after each new estimate.
     """
 
     def __init__(
         self, backend: PoseGraphBackend, on_estimate: Callable[[PoseGraphBackend], None],
-        prepare: Callable[[Callable[[], bool]], None] | None = None,
+        prepare: Callable[[Callable[[], bool]], PoseGraphBackend | None] = lambda _: None,
     ) -> None:
         self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
         self.prepared = False  # whether the preparation has ended
@@ -84,9 +83,7 @@ class Worker:
         self._condition = threading.Condition()
         self._revision = backend.revision
         self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
-        self._warned: set[tuple[str, str]] = set()
-        self._jumps = _numbers_of_jumps(backend)
-        self._doubted: set[str] = set()  # sources whose newest measurements are doubted
+        self._jumps: Counter[str] = Counter()  # of odometries, that were told
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
         self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
@@ -94,10 +91,6 @@ class Worker:
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
-
-    def adopt(self, backend: PoseGraphBackend) -> None:
-        """Run another backend; only for `prepare`, as nothing has been added yet."""
-        self._backend, self._jumps = backend, _numbers_of_jumps(backend)
 
     @property
     def alive(self) -> bool:
@@ -148,8 +141,7 @@ class Worker:
 
     def _run(self) -> None:
         try:
-            if self._prepare is not None:
-                self._prepare(lambda: self._stopping)
+            self._backend = self._prepare(lambda: self._stopping) or self._backend
         except Exception:
             # kernels are then compiled when they are first needed
             logger.exception('the preparation of the worker failed')
@@ -244,23 +236,14 @@ class Worker:
 
     def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
         try:
-            answer = (self._backend.add_odometry(measurement, source)
-                      if isinstance(measurement, OdometrySample)
-                      else self._backend.add_measurement(measurement, source))
-            if answer.status is AnswerStatus.REJECTED:
-                self._warn_once(source, answer.reason, answer.detail)
+            if isinstance(measurement, OdometrySample):
+                self._backend.add_odometry(measurement, source)
+            else:
+                self._backend.add_measurement(measurement, source)
         except Exception as error:
-            self._warned.add((source, 'internal_error'))
             self._backend.counts[source, 'internal_error'] += 1
             self._backend.refusals[source, 'internal_error'] = f'{type(error).__name__}: {error}'
             logger.exception('a measurement of %s could not be added', source)
-
-    def _warn_once(self, source: str, reason: str, detail: str) -> None:
-        """Log why a measurement is rejected, the first time for each source and reason."""
-        if (source, reason) not in self._warned:
-            self._warned.add((source, reason))
-            logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
-                       '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
 
     def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
         start = time.monotonic()
@@ -287,20 +270,12 @@ class Worker:
         It keeps the report of the last update if there is no new one.
         """
         status, backend = self.status, self._backend
-        for (source, reason), detail in backend.refusals.items():
-            self._warn_once(source, reason, detail)  # also those that had to wait for odometry
         for source, stream in backend.odometry.items():
-            if stream.n_jumps > self._jumps.get(source, 0):
+            if stream.n_jumps > self._jumps[source]:
                 logger.warning('%s jumped %s: its motion there is not used', source, stream.jump)
             self._jumps[source] = stream.n_jumps
         changes, verdicts = backend.verdict_changes(), backend.verdict_totals()
         doubted = {source for source, each in verdicts.items() if each.doubting}
-        for source in sorted(doubted - self._doubted):
-            logger.warning('%s: its newest measurements are doubted; the path goes on without '
-                           'them', source)
-        for source in sorted(self._doubted - doubted):
-            logger.info('%s: its newest measurements are believed again', source)
-        self._doubted = doubted
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
         self.status = WorkerStatus(
@@ -315,7 +290,3 @@ class Worker:
             differences=backend.gyro_differences(),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
         return len(changes)
-
-
-def _numbers_of_jumps(backend: PoseGraphBackend) -> dict[str, int]:
-    return {source: stream.n_jumps for source, stream in backend.odometry.items()}

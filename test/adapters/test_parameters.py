@@ -222,7 +222,7 @@ def test_the_nearest_name_is_offered(name: str, said: str) -> None:
 @pytest.mark.parametrize(('name', 'own'), [
     ('gain', True), ('odom.gain', True), ('odm.topic', True), ('planner.gain', False),
     ('local_costmap.robot.radius', False), ('window.gain', True),
-    ('alignment.sigma_heading', True), ('alignment.gain', False)])
+    ('alignment.gain', False)])
 def test_groups_that_the_node_does_not_have_are_for_other_nodes(name: str, own: bool) -> None:
     assert is_own(name, KNOWN) is own
 

@@ -40,14 +40,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.core.geometry import se2
 
-WITHOUT = '''
-import sys
-sys.modules['rclpy.experimental'] = sys.modules['tf2_msgs'] = None
-from pose_graph_ros.ros.main import main
-sys.exit(main())
-'''
-"""The node with an rclpy that has no EventsExecutor, and without tf2_msgs."""
-
 
 def test_every_message_of_a_drive_is_sound(client: Client) -> None:
     rosout: list[Log] = []
@@ -151,34 +143,6 @@ def test_poses_and_closures_are_heard_and_services_answer(client: Client) -> Non
     assert math.hypot(newest.x - expected[0], newest.y - expected[1]) < 1.0
 
 
-def test_a_graph_is_saved_and_another_node_goes_on_with_it(tmp_path: Path) -> None:
-    """The other node loads the file at its start, and receives the rest of the drive."""
-    (tmp_path / 'b').mkdir()
-    file = tmp_path / 'maps' / 'yard.g2o'
-    arguments = ('-p', f'graph_file:={file}', '-p', 'load_graph_on_start:=true')
-    with NodeProcess(tmp_path, arguments) as node, \
-            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
-        assert 'yard.g2o yet: starting with an empty one' in node.stderr()
-        drive(client, 20.0)
-        answer = client.trigger('save_graph')
-        assert answer.success, answer.message
-        assert {path.suffix for path in file.parent.iterdir()} == {'.g2o', '.json', '.tum'}
-        nodes = answer.message.split()[0]
-        assert client.trigger('reset').success
-        assert client.trigger('load_graph').success
-        client.wait_values({'hidden_nodes': nodes})
-        assert node.signal_and_wait(signal.SIGINT) == 0
-    with NodeProcess(tmp_path / 'b', arguments) as node, \
-            Client(int(node.env['ROS_DOMAIN_ID'])) as client:
-        client.wait_values({'hidden_nodes': nodes, 'alignment': 'aligned'})
-        assert 'refused' in client.trigger('set_datum').message
-        drive(client, 40.0, begin=20.0)
-        assert client.optimize().success
-        assert path_error(client) < 1e-3
-        assert stamp_ns(client.paths[-1].poses[0]) == round(START * 1e9)
-        assert 'odom.jump' not in client.values
-
-
 @pytest.mark.parametrize(
     'node', [('-p', 'use_sim_time:=true', '-p', 'datum:=[48.1, 11.6]')], indirect=True)
 def test_loops_of_a_bag_with_its_clock(node: NodeProcess, client: Client) -> None:
@@ -220,27 +184,10 @@ def test_a_signal_that_any_thread_gets_ends_the_node_without_a_traceback(
     assert 'Traceback' not in node.stderr()
 
 
-def test_it_runs_without_the_executor_of_events_and_without_tf2_msgs(tmp_path: Path) -> None:
-    with NodeProcess(tmp_path, program=('-c', WITHOUT)) as node:
-        with Client(int(node.env['ROS_DOMAIN_ID'])) as client:
-            drive(client, 10.0)
-            assert client.optimize().success
-            assert path_error(client) < 1e-2
-            assert client.transforms == []
-            assert client.set_parameter('publish_tf', value=False) == (True, '')
-            assert client.trigger('reset').success
-        assert node.signal_and_wait(signal.SIGINT) == 0
-        assert node.stderr().count('tf2_msgs is not installed') == 1
-        assert 'Traceback' not in node.stderr()
-
-
 BAD = (
-    ('-p map_frame:=3', 'map_frame'), ('-p sources:=[odom,wheels]', 'wheels.type'),
-    ('-p odom.topic:=/odometry/filtered',
-     '-p outputs.filtered_odometry:=/pose_graph/filtered_odometry with'),
+    ('-p map_frame:=3', 'map_frame'),
     ('-p qos_overrides./odom.subscription.reliability:=bestefort', 'best_effort'),
-    ('-p load_graph_on_start:=true', 'parameter graph_file: expected the name of a file'),
-    ('-p frequency', ''), ('--params-file /no/such.yaml', ''))
+    ('--params-file /no/such.yaml', ''))
 
 
 def test_a_bad_argument_is_one_sentence_and_no_traceback(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The managed node in the test's own process: its lifecycle, parameters and services."""
 
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+import json
+import math
 from pathlib import Path
 import threading
 from types import ModuleType
@@ -13,18 +16,25 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
-from circle import odometry_at, PLANE
-from harness import PATIENCE, PREPARE_PATIENCE
+from circle import fix_at, odometry_at, PLANE
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from harness import PATIENCE, PREPARE_PATIENCE, RELIABLE, TFMessage, transform
 from local_node import Driver, LocalNode
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.parameter import Parameter
+from rclpy.parameter import get_parameter_value, Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from pose_graph_ros.adapters.parameter_table import Change
+from pose_graph_ros.adapters.parameter_texts import constraints
+from pose_graph_ros.adapters.parameters import all_parameters, checked
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, requests, services
+from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED
 from pose_graph_ros.ros.session import Session
@@ -102,20 +112,142 @@ def test_what_fails_is_answered_and_a_transition_leaves_the_node_unconfigured(
 
 @pytest.mark.parametrize('managed', [
     {'sources': ['odom', 'rear'], 'rear.type': 'fix', 'rear.topic': 'rear/fix', 'datum': [48, 11],
-     'wheels.type': 'odometry', 'other_node.gain': 1.0}], indirect=True)
+     'wheels.type': 'odometry', 'other_node.gain': 1.0, 'frequncy': 3.0}], indirect=True)
 def test_parameters_may_be_whole_numbers_and_unknown_ones_are_warned_of(
-    managed: Managed, capfd: pytest.CaptureFixture[str],
+    managed: Managed, caplog: pytest.LogCaptureFixture,
 ) -> None:
     node = managed.local.node
-    node._warn_of_unknown()
-    log = capfd.readouterr().err
+    log = '\n'.join(record.getMessage() for record in caplog.get_records('setup'))
     assert 'parameter wheels.type is not known: wheels is not in sources' in log
+    assert 'frequncy is not known: did you mean frequency?' in log
     assert 'other_node' not in log
     node.start()
     assert managed.session.input.reader.sources['rear'].topic == 'rear/fix'
     plane = managed.session.input.reader.datum.plane
     assert (plane.latitude, plane.longitude) == (48.0, 11.0)
     assert not node.has_parameter('fix.topic')
+
+
+@pytest.mark.parametrize('managed', [{'diagnostics_period': 30.0}], indirect=True)
+def test_parameters_are_described_changed_and_refused(managed: Managed) -> None:
+    node, own = managed.local.node, {each.name: each for each in all_parameters({})}
+    managed.start()
+    for descriptor in node.describe_parameters(list(own)):
+        parameter = own[descriptor.name]
+        assert parameter.description in descriptor.description
+        assert descriptor.read_only == (parameter.change is Change.START)
+        assert descriptor.additional_constraints == constraints(parameter)
+    for name, value, expected in (
+            ('map_frame', 'world', 'configured'), ('sources', ['odom'], 'read at the start'),
+            ('fix.robust_loss', 'l1', 'none, huber, cauchy'),
+            ('frequency', -1.0, 'expected a number in [0.01, 100], got -1.0'),
+            ('frequency', 'often', 'expected a number'), ('fix.lever_arm', [1.0], '2 numbers'),
+            ('fix.covariance_scal', 1.0, 'did you mean fix.covariance_scale?')):
+        successful, reason = managed.set(name, value)
+        assert not successful, name
+        assert expected in reason, (name, reason)
+    result = node.set_parameters_atomically([
+        Parameter('path_period', value=0.2), Parameter('map_frame', value='world')])
+    assert not result.successful
+    assert node.get_parameter('path_period').value == 1.0
+    diagnostics = managed.local.subscribe(DiagnosticArray, '/diagnostics')
+    assert managed.set('diagnostics_period', 0.02) == (True, '')
+    managed.wait(lambda: len(diagnostics) > 5, 'they hurry')
+
+
+def test_what_was_dumped_can_be_loaded_and_given_as_a_file(
+    managed: Managed, tmp_path: Path, capfd: pytest.CaptureFixture[str],
+) -> None:
+    node = managed.local.node
+    managed.start()
+    assert managed.set('minimum_travel_distance', 4) == (True, '')
+    names = node.list_parameters([], 0).names
+
+    def values() -> dict[str, object]:
+        return {name: list(value) if isinstance(value, array) else value
+                for name in names for value in [node.get_parameter(name).value]}
+
+    def load(texts: Mapping[str, str]) -> set[str]:
+        """Set parameters as `ros2 param load` does; return those that were refused."""
+        results = node.set_parameters([Parameter.from_parameter_msg(
+            ParameterMessage(name=name, value=get_parameter_value(text)))
+            for name, text in texts.items()])
+        return {name for name, result in zip(texts, results, strict=True)
+                if not result.successful}
+
+    dumped = values()
+    assert dumped['datum'] is dumped['fix.covariance_override'] is None
+    assert dumped['qos_overrides./odom.subscription.depth'] == 1000
+    texts = {name: str(value) for name, value in dumped.items()}
+    assert load(texts) == set()
+    assert values() == dumped
+    for _ in range(2):  # what is unset there is unset again, and can be set again
+        assert managed.set('fix.covariance_override', [2.0]) == (True, '')
+        assert load(texts) == set()
+        assert values()['fix.covariance_override'] == []
+    assert load({**texts, 'autostart': 'False', 'sources': '[odom]'}) == {'autostart', 'sources'}
+
+    file = tmp_path / 'dumped.yaml'
+    file.write_text(json.dumps({'/pose_graph': {'ros__parameters': {
+        name: dumped[name] for name in checked({})}}}))
+    capfd.readouterr()
+    other = PoseGraphNode(context=managed.local.context,
+                          cli_args=['--ros-args', '--params-file', str(file)])
+    other.start()
+    assert other.get_parameter('minimum_travel_distance').value == 4.0
+    assert other._configured.input.reader.datum.plane is None
+    other.close()
+    other.destroy_node()
+    assert 'is not known' not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize('managed', [
+    {'sources': ['odom', 'global_pose', 'fix', 'rear'], 'rear.type': 'fix',
+     'rear.topic': '/gnss'}], indirect=True)
+def test_mistakes_around_the_node_are_logged_when_they_begin_and_end(
+    managed: Managed, capfd: pytest.CaptureFixture[str],
+) -> None:
+    client, logged = managed.local.client, []
+    poses = client.create_publisher(PoseWithCovarianceStamped, 'pose', RELIABLE)
+    other = None if TFMessage is None else client.create_publisher(TFMessage, '/tf', RELIABLE)
+    managed.start()
+    managed.session.activated_at = -math.inf    # all drivers have had the time to start
+    said = [
+        '/pose is published by /client as well: give one of them another topic',
+        'rear listens to /gnss for sensor_msgs/msg/NavSatFix, but nobody publishes it; there is '
+        '/gps/fix',
+        "odom has the child_frame_id 'base_footprint', but the parameter base_link_frame is",
+        'fix has no frame_id: its antenna is taken to be in base_link: set fix.lever_arm',
+        *(['another node publishes map -> odom on /tf'] if other else [])]
+    lone = fix_at(0.1)
+    lone.header.frame_id = ''
+    managed.send('fix', lone)
+    step = 0
+
+    def all_is_said() -> bool:
+        nonlocal step
+        step += 1
+        message = odometry_at(step / 20.0)
+        message.child_frame_id = 'base_footprint'
+        managed.publishers['odom'].publish(message)
+        if other is not None:   # others are no conflict
+            other.publish(TFMessage(transforms=[
+                transform('odom', 'base_link', seconds=float(step)),
+                transform('map', 'odom', seconds=float(step))]))
+        logged.extend(capfd.readouterr().err.splitlines())
+        return all(any(words in line for line in logged) for words in said)
+
+    managed.wait(all_is_said, 'all is said')
+    assert next(concerns(managed.session)).level == DiagnosticStatus.WARN
+    client.destroy_publisher(poses)
+
+    def is_over() -> bool:
+        logged.extend(capfd.readouterr().err.splitlines())
+        return f'over: {said[0]}' in logged[-1]
+    managed.wait(is_over, 'its end is said')
+    for words in said:
+        (line,) = [line for line in logged if words in line and 'over: ' not in line]
+        assert '[WARN]' in line
 
 
 def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> None:
@@ -137,17 +269,20 @@ def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> 
 
 def test_a_node_starts_with_a_graph(
     managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     node = managed.local.node
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+    assert managed.set('load_graph_on_start', True) == (True, '')
     managed.start()
+    assert 'map.g2o yet: starting with an empty one' in capfd.readouterr().err
     managed.drive(8.0)
     before = managed.session.worker.estimate
-    managed.set('graph_file', str(tmp_path / 'map.g2o'))
     assert managed.call('save_graph').success
-    assert not managed.set('load_graph_on_start', True)[0], 'while it is configured'
+    assert {path.suffix for path in tmp_path.glob('map.*')} == {'.g2o', '.json', '.tum'}
+    assert not managed.set('load_graph_on_start', False)[0], 'while it is configured'
 
     assert node.trigger_deactivate() is node.trigger_cleanup() is SUCCESS
-    assert managed.set('load_graph_on_start', True) == (True, '')
     (tmp_path / 'no.g2o').touch()   # without the .json beside it
     # as Path.home does not know everyone
     for wrong in ('', str(tmp_path), str(tmp_path / 'no.g2o'), '~nobody_of_this_name/map.g2o'):

@@ -36,6 +36,7 @@ from pose_graph_ros.core.judgement.verdicts import (
     Verdict,
 )
 from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.ros import publishers
 from pose_graph_ros.ros.publishers import Publishers, thinned, verdicts_message
 from pose_graph_ros.ros.worker import WorkerStatus
 
@@ -77,6 +78,7 @@ class Outlets(dict[str, Outlet]):
     """What the outputs need of a node; and who else publishes."""
 
     others: tuple[str, ...] = ()
+    warnings: tuple[str, ...] | list[str] = ()
 
     def create_publisher(self, kind: type, topic: str, *_: object, **__: object) -> Outlet:
         return self.setdefault(topic, Outlet(kind, topic))
@@ -90,13 +92,16 @@ class Outlets(dict[str, Outlet]):
     def count_publishers(self, topic: str) -> int:
         return self.others.count(topic)
 
+    def get_logger(self) -> Any:
+        return Space(warning=lambda text, **_: self.warnings.append(text))
+
 
 class Given:
     """The outputs of a node."""
 
     def __init__(self, **values: object) -> None:
         self.node, self.values, self.datum = Outlets(), values, Datum()
-        self.out = Publishers(self.node, checked(values), lambda _: None)
+        self.out = Publishers(self.node, checked(values))
 
     def configure(self, **values: object) -> None:
         self.values |= values
@@ -180,6 +185,19 @@ def test_a_correction_is_slow_unless_the_map_or_the_robot_was_put_elsewhere(even
                          for each in (second, first)))
     assert math.hypot(*step[:2]) == pytest.approx(0.5)
     assert step[2] == pytest.approx(0.1)
+
+
+def test_without_tf2_msgs_all_but_the_transform_is_published(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(publishers, 'TFMessage', None)
+    monkeypatch.setattr(Outlets, 'warnings', [])
+    given = Given()
+    given.publish(1.0)
+    assert given.stamps('pose') == [1.0]
+    assert '/tf' not in given.node
+    assert 'tf2_msgs is not installed' in given.node.warnings[0]
+    given.configure(publish_tf=False)
 
 
 def test_the_fix_needs_a_datum_and_a_measurement_in_the_map() -> None:

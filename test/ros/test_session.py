@@ -14,7 +14,16 @@ pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 from circle import odometry_at, START
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from harness import imu, LATCHED, odometry, PATIENCE, PREPARE_PATIENCE, stamp_ns
+from harness import (
+    imu,
+    LATCHED,
+    odometry,
+    PATIENCE,
+    PREPARE_PATIENCE,
+    stamp_ns,
+    TFMessage,
+    transform,
+)
 from local_node import Driver, LocalNode
 from nav_msgs.msg import Odometry, Path as PathMessage
 import numpy as np
@@ -30,6 +39,7 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
 from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
@@ -41,6 +51,12 @@ PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0}
 def _compiled() -> None:
     """Compile the kernels, which may take half a minute, outside of the tests."""
     warm_up(lambda: False)
+
+
+def health(session: object) -> tuple[bytes, str]:
+    """Return the level of the diagnostics and their message."""
+    first = next(concerns(session))
+    return first.level, first.sentence
 
 
 class Robot(Driver):
@@ -67,7 +83,7 @@ class Robot(Driver):
         return {key: str(value) for key, value in diagnostics.values(self.session).items()}
 
     def health(self) -> tuple[bytes, str]:
-        return diagnostics.health(self.session)
+        return health(self.session)
 
 
 @pytest.fixture
@@ -144,6 +160,16 @@ def test_no_pose_is_published_over_a_jump_or_a_gap_before_an_update(
     assert active.session.n_resets == 0
 
 
+@pytest.mark.skipif(TFMessage is None, reason='tf2_msgs is not built: no /tf_static')
+def test_static_frames_say_where_an_antenna_is(active: Robot) -> None:
+    frames = active.local.client.create_publisher(TFMessage, '/tf_static', LATCHED)
+    frames.publish(TFMessage(transforms=[transform('base_link', 'gps', (0.75, -0.25, 1.0))]))
+    known = active.session.input.reader.frames
+    active.wait(lambda: known.transform('gps', 'base_link') is not None, 'it comes')
+    active.drive(1.0)
+    assert active.values()['fix.lever_arm'] == '[0.750, -0.250] from tf_static'
+
+
 @pytest.mark.parametrize('robot', [{'closing_silence': 0.05}], indirect=True)
 def test_the_graph_is_optimised_once_when_the_stream_ends(active: Robot) -> None:
     finals = []
@@ -171,9 +197,10 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
-                     delays=Space(wrong={}), reader=Space(sources={}))
+                     delays=Space(wrong={}), reader=Space(sources={}), received={})
     seen = Space(worker=worker, active=True, input=received, odometry_topics={}, final=None,
-                 is_loaded=False, compiling=False, doubts=[],
+                 is_loaded=False, compiling=False, values=session.values,
+                 node=Space(count_publishers=lambda _: 0),
                  searches=Space(contradiction=None),
                  out=Space(transforms=Space(other='')))
 
@@ -191,8 +218,8 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
                 worker.estimate, alignment=AlignmentState.UNALIGNED)}, WARN, 'Unaligned'),
             (received.delays, {'wrong': {'fix': 'The stamps of fix are 18.0 s ahead'}}, WARN,
              'The stamps of fix are 18.0 s ahead.'),
-            (received, {'silent': ['fix']}, WARN, 'fix is silent'),
-            (received, {'silent': ['fix', 'imu']}, WARN, 'fix and imu are silent'),
+            (received, {'silent': ['fix']}, WARN, 'Nothing comes from fix, while'),
+            (received, {'silent': ['fix', 'imu']}, WARN, 'from fix and imu, while'),
             (seen.out.transforms, {'other': 'another node publishes map -> odom'}, WARN,
              'Another node publishes map -> odom.'),
             (received, {'refused': {'fix': 'the newest 7 messages of fix were refused'}}, WARN,
@@ -206,7 +233,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
              ERROR, 'solver failed'),
             (worker, {'alive': False}, ERROR, 'restart')):
         vars(owner).update(changes() if callable(changes) else changes)
-        level, text = diagnostics.health(seen)
+        level, text = health(seen)
         assert level == expected
         assert words in text
 
