@@ -90,7 +90,11 @@ class PoseGraphBackend:
         self.counts = self._pipeline.counts  # of answers by source and 'accepted' or the reason
         self.refusals = self._pipeline.refusals  # details of the newest ones by source and reason
         self._quarantine, self._alignment = Queue(), AlignmentMonitor(self._config)
-        self._forgetting = Forgetting(self._smoother, self._tuner, self.parts())
+        self.parts = Parts(  # what it is made of, for tools
+            self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
+            self._pipeline, self._quarantine, self._judge, self._smoother)
+        self._transaction = partial(Transaction, self.parts)
+        self._forgetting = Forgetting(self._tuner, self.parts)
         self._settled, self._chi2 = True, 0.0
         self._waits = False  # whether the queue waits until the graph is solved
 
@@ -324,9 +328,6 @@ class PoseGraphBackend:
         """Let the running or the next `refine` end early, without effect; any thread may call."""
         self._smoother.interrupt()
 
-    def _transaction(self) -> Transaction:
-        return Transaction(self.graph, self._nodes, self._alignment, self._factors, self._judge)
-
     def _evaluate(self) -> None:
         """Update chi2 and the covariance of the newest node."""
         # the only part of an update that is linear in the graph: 0.03 ms per 1000 nodes
@@ -397,32 +398,26 @@ class PoseGraphBackend:
         if self.graph.n_nodes == 0:
             return None
         return newest_estimate.estimate(
-            self.parts(), self._smoother, self._config.odometry_source(self._nodes.primary),
+            self.parts, self._config.odometry_source(self._nodes.primary),
             self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
         """Return those at the path of the present estimate; see `newest_estimate`."""
-        return newest_estimate.path_covariances(
-            self.parts(), self._smoother.covariances(), estimate)
+        return newest_estimate.path_covariances(self.parts, estimate)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `parts.capture`."""
         self._tuner.finish_change()
-        return capture(self.parts(), self._newest_node_covariance, self._chi2, datum)
+        return capture(self.parts, self._newest_node_covariance, self._chi2, datum)
 
     @classmethod
     def restored(cls, config: BackendConfig | None, saved: SavedGraph) -> Self:
         """Return a back end that continues a saved graph; see `parts.restore`."""
         backend = cls(config)
-        restore(backend.parts(), saved)
+        restore(backend.parts, saved)
         backend._tuner.restored(knows_errors=len(saved.nodes.errors) > 0)
         backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
         # the next update eliminates all nodes
         backend._settled, backend._chi2 = False, saved.chi2
         return backend
-
-    def parts(self) -> Parts:
-        """Return what it is made of, for tools."""
-        return Parts(self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
-                     self._pipeline, self._quarantine, self._judge, self._smoother)

@@ -26,7 +26,6 @@ from pose_graph_ros.core.judgement.judge import Leaving
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.window.sparse_removal import (
     cut_chains,
     LIMITS,
@@ -90,8 +89,8 @@ def _beyond(config: WindowConfig, table: NodeTable, factor: float) -> int:
 class Thinner:
     """Keeps the graph at the size of the area."""
 
-    def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
-        self._smoother, self._tuner, self._parts = smoother, tuner, parts
+    def __init__(self, tuner: ErrorTuner, parts: Parts) -> None:
+        self._tuner, self._parts = tuner, parts
         self._thinning = Thinning()
         self._work: Iterator[None] = iter(())
         self._n_made = 0
@@ -112,7 +111,7 @@ class Thinner:
 
     def _steps(self, config: ThinningConfig) -> Iterator[None]:
         """Yield after each change of the graph; others may have changed it before the next."""
-        parts, smoother = self._parts, self._smoother
+        parts, smoother = self._parts, self._parts.smoother
         # a fixed node that is frozen stays in the graph, but stands for no others
         first = int(parts.nodes.ids[parts.nodes.n_frozen])
         places = self._thinning.places(
@@ -159,7 +158,8 @@ class Thinner:
         graph = self._parts.graph
         there = (graph.node_rows(places.nodes) >= 0) & (graph.node_rows(places.anchors) >= 0)
         free = there & ~np.isin(places.nodes, list(self._held()))
-        return certain(self._smoother, Crowd(places.nodes[free], places.anchors[free]), config)
+        crowd = Crowd(places.nodes[free], places.anchors[free])
+        return certain(self._parts.smoother, crowd, config)
 
     def _measurements_leave(self, segment: Segment, group: Places) -> bool:
         """
@@ -180,7 +180,7 @@ class Thinner:
 
     def _leave(self, group: Places, update: GraphUpdate | None, decided: Leaving) -> bool:
         """Let nodes leave with an update; tell whether they did."""
-        gone = removed(self._smoother, update)
+        gone = removed(self._parts.smoother, update)
         if gone is None:
             self._tuner.stay()
             return False
@@ -209,9 +209,9 @@ def forget(
 class Forgetting:
     """Keeps the graph within its window."""
 
-    def __init__(self, smoother: IncrementalSmoother, tuner: ErrorTuner, parts: Parts) -> None:
-        self._smoother, self._tuner, self._parts = smoother, tuner, parts
-        self._thinner = Thinner(smoother, tuner, parts)
+    def __init__(self, tuner: ErrorTuner, parts: Parts) -> None:
+        self._tuner, self._parts = tuner, parts
+        self._thinner = Thinner(tuner, parts)
         # pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
         # was frozen before the graph was aligned with the map; else None
         self._joint: FloatArray | None = None
@@ -259,7 +259,7 @@ class Forgetting:
             dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
         decided = parts.judge.decide_leaving(*graph.constraints_on(leaving))
-        self._smoother.linearize(leaving)
+        self._parts.smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         anchors = self._other_anchors(first)
         gone = self._gone(leaving, prior)
@@ -279,11 +279,11 @@ class Forgetting:
     def _gone(self, leaving: IntArray, prior: WindowPrior) -> Left | None:
         """Return what has left with nodes; None, and they all stay, if the solver has failed."""
         gone = None if prior is WindowPrior.DENSE else removed(
-            self._smoother, sparse_marginalization(self._parts.graph, leaving))
+            self._parts.smoother, sparse_marginalization(self._parts.graph, leaving))
         if gone is not None:
             return gone
         try:
-            return self._smoother.forget(leaving)
+            return self._parts.smoother.forget(leaving)
         except GraphUpdateError:
             self._parts.pipeline.counts['solver', 'failed'] += 1
             self._rest = len(self._parts.nodes) + LIMITS.rest
@@ -305,7 +305,7 @@ class Forgetting:
         nearest = np.array([np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T)) for end in ends])
         ids, anchors = table.ids[leave], table.ids[kept[nearest]]
         return Places(ids, anchors, se2.between(starts[nearest], ends),
-                      relative_noise(self._smoother, anchors, ids))
+                      relative_noise(self._parts.smoother, anchors, ids))
 
     def _follow_alignment(self) -> None:
         """

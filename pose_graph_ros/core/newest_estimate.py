@@ -36,15 +36,15 @@ from pose_graph_ros.core.sources.measurement_constraints import absolute_constra
 
 
 def estimate(
-    parts: Parts, smoother: IncrementalSmoother, source: OdometrySource,
-    newest_covariance: FloatArray, chi2: float, *, with_path: bool,
+    parts: Parts, source: OdometrySource, newest_covariance: FloatArray, chi2: float, *,
+    with_path: bool,
 ) -> Estimate:
     """Return the present estimate; there must be a hidden node."""
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
     state, sigma = parts.alignment.state, parts.alignment.sigma
     node = Corrected(graph.poses_of(nodes.ids[-1]), newest_covariance)
     if state is AlignmentState.ALIGNED:
-        node = corrected(parts, smoother, node)
+        node = corrected(parts, node)
     motion, motion_noise, odometry = nodes.newest()
     motion, motion_noise = _turned(parts, motion, motion_noise)
     newest = se2.compose(node.pose, motion)
@@ -74,15 +74,14 @@ def estimate(
             nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))
 
 
-def path_covariances(parts: Parts, covariances: FloatArray, of: Estimate) -> FloatArray:
+def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     """
     Return the covariances at the poses of the path of the present estimate, in map axes.
 
     They are NaN where they are unknown: at nodes that have left the graph by its window, and at
-    all but the newest pose while the angle between odometry and map is unknown. Those of all nodes
-    in the graph are given by row.
+    all but the newest pose while the angle between odometry and map is unknown.
     """
-    nodes, thinned = parts.nodes, parts.nodes.thinned
+    nodes, thinned, covariances = parts.nodes, parts.nodes.thinned, parts.smoother.covariances()
     rows = parts.graph.node_rows(nodes.ids)
     found = np.full((len(of.path), 3, 3), np.nan)
     inside = np.flatnonzero(rows >= 0)
@@ -129,7 +128,7 @@ class _Passed(NamedTuple):
     is_gated: bool
 
 
-def corrected(parts: Parts, smoother: IncrementalSmoother, node: Corrected) -> Corrected:
+def corrected(parts: Parts, node: Corrected) -> Corrected:
     """Return the newest node of an aligned graph with what odometry has passed."""
     if parts.graph.has_touched:
         return node     # an update has failed
@@ -137,7 +136,7 @@ def corrected(parts: Parts, smoother: IncrementalSmoother, node: Corrected) -> C
     if len(passed) == 0:
         return node
     ids = [int(parts.nodes.ids[-1]), *sorted({int(each.edge.j[0]) for each in passed} - {-1})]
-    state, joint = parts.graph.poses_of(ids), _joint(smoother, ids)
+    state, joint = parts.graph.poses_of(ids), _joint(parts.smoother, ids)
     for edge, is_gated in passed:
         error, jacobian, noise = _linearized(edge, state, ids)
         spread = jacobian @ joint @ jacobian.T + noise

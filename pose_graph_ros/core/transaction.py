@@ -13,17 +13,13 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
-from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.judgement.judge import Judge
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother.incremental import UpdateResult
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_constraints import Queue
 
@@ -38,13 +34,9 @@ class Transaction:
     bit.
     """
 
-    def __init__(
-        self, graph: Graph, nodes: HiddenNodes, alignment: AlignmentMonitor,
-        factors: FactorBuilder, judge: Judge,
-    ) -> None:
-        self._graph, self._nodes, self._alignment = graph, nodes, alignment
-        self._factors, self._judge = factors, judge
-        self._before = alignment.state, alignment.sigma
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._before = parts.alignment.state, parts.alignment.sigma
         self._poses: tuple[FloatArray, FloatArray] | None = None
         self.queue = Queue()  # the new constraints
         self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)  # result of the solver
@@ -52,10 +44,11 @@ class Transaction:
 
     def move_graph(self, T_map_graph: FloatArray) -> None:
         """Move all nodes, frozen ones too, by a rigid motion, shape (3,) [m, m, rad]."""
-        poses = self._graph.poses.copy()
-        self._poses = poses, self._nodes.frozen.copy()
-        self._graph.set_poses(se2.compose(T_map_graph, poses))
-        self._nodes.move_frozen(T_map_graph)
+        graph, nodes = self._parts.graph, self._parts.nodes
+        poses = graph.poses.copy()
+        self._poses = poses, nodes.frozen.copy()
+        graph.set_poses(se2.compose(T_map_graph, poses))
+        nodes.move_frozen(T_map_graph)
 
     @property
     def moved_back(self) -> bool:
@@ -77,13 +70,14 @@ class Transaction:
     ) -> bool:
         if error is None:
             return False
-        self._factors.rollback()
-        self._judge.rollback()
+        parts = self._parts
+        parts.factors.rollback()
+        parts.judge.rollback()
         if self._poses is not None:
             poses, frozen = self._poses
-            self._graph.set_poses(poses)
-            self._nodes.set_frozen(frozen)
-        self._alignment.state, self._alignment.sigma = self._before
+            parts.graph.set_poses(poses)
+            parts.nodes.set_frozen(frozen)
+        parts.alignment.state, parts.alignment.sigma = self._before
         self.failure = str(error)
         if not isinstance(error, LinearSolveError):
             self.failure = f'{type(error).__name__}: {error}'

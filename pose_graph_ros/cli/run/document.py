@@ -57,7 +57,7 @@ def document(run: Run) -> dict[str, Any]:
     frame = places.Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
     covariances = run.backend.path_covariances(run.estimate)
     errors = places.errors(drive, covariances, frame)
-    analysis = variance_components.analyse(run.backend.parts())
+    analysis = variance_components.analyse(run.backend.parts)
     in_use = {source: each.in_use for source, each in run.backend.reports().items()}
     analyses = analyse(analysis, run.kinds, in_use)
     lines, at_ns = places.lines(drive, frame)

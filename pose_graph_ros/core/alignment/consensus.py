@@ -169,7 +169,8 @@ class Consensus:
     scale: float  # ratio of lengths in the map to lengths by odometry
     count: int  # number of inliers
     inlier_fraction: float  # number of inliers over the number of positions
-    cost: float  # minus twice the log likelihood of all positions, truncated for outliers
+    # whether the mirror image of odometry fits better, as with a left-handed frame
+    is_mirrored: bool
 
 
 def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
@@ -179,6 +180,8 @@ def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
     n = int(np.count_nonzero(inlier))
     if n < 2:
         return None
+    mirrored, cost_of_mirrored = _inliers(
+        positions.odometry.conj(), positions.observed, variance)
     chosen, weight = positions.rows(inlier), 1.0 / variance[inlier]
     p_mean = np.average(chosen.odometry, weights=weight)
     q_mean = np.average(chosen.observed, weights=weight)
@@ -196,7 +199,9 @@ def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
         sigma_heading=float(np.sqrt(inflation * variance_heading)),
         node=int(chosen.node[best]), walk=float(chosen.walk[best]), baseline=chosen.baseline,
         sigma_position=float(np.sqrt(inflation / np.mean(1.0 / chosen.variance))),
-        scale=abs(z), count=n, inlier_fraction=n / len(inlier), cost=cost)
+        scale=abs(z), count=n, inlier_fraction=n / len(inlier), is_mirrored=bool(
+            cost_of_mirrored < cost - TUNED.truncation
+            and np.mean(mirrored) >= TUNED.least_agreement))
 
 
 def _drift(positions: Positions, noise: OdometryNoise) -> FloatArray:
@@ -208,17 +213,14 @@ def _drift(positions: Positions, noise: OdometryNoise) -> FloatArray:
     return np.asarray(walk * far**2 / 6.0 + 0.5 * slip * along)
 
 
-def mirrored(positions: Positions, found: Consensus, noise: OdometryNoise) -> bool:
-    """Tell whether the mirror image of odometry fits better, as with a left-handed frame."""
-    variance = positions.variance + _drift(positions, noise)
-    inlier, cost = _inliers(positions.odometry.conj(), positions.observed, variance)
-    return cost < found.cost - TUNED.truncation and bool(np.mean(inlier) >= TUNED.least_agreement)
-
-
 def _inliers(
     p: ComplexArray, q: ComplexArray, variance: FloatArray,
 ) -> tuple[BoolArray, float]:
-    """Return which positions are inliers of the best motion, shape (K,), and its cost."""
+    """
+    Return which positions are inliers of the best motion, shape (K,), and its cost.
+
+    That is minus twice the log likelihood of all positions, truncated for outliers.
+    """
     # near the origin, as products of large coordinates would lose digits
     p, q = p - np.median(p.real) - 1j * np.median(p.imag), q - q[0]
     anchors = np.unique(np.linspace(0, len(p) - 1, TUNED.anchors).round().astype(np.int64))

@@ -16,7 +16,6 @@ import numpy as np
 from pose_graph_ros.core.alignment.consensus import (
     Consensus,
     consensus,
-    mirrored,
     Positions,
     positions_along,
     TimeCorrelation,
@@ -25,7 +24,7 @@ from pose_graph_ros.core.alignment.consensus import (
 from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
-from pose_graph_ros.core.geometry.se2 import FloatArray, Poses, PoseVector
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, Poses, PoseVector
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import observed_errors
 from pose_graph_ros.core.quantities import Radians
@@ -47,18 +46,36 @@ def find_alignment(
     """
     Return the rigid motion that takes a graph into the map, if it is known well enough.
 
-    It is found from positions and global poses on its hidden nodes, at least one, in any order.
+    It is found from what was observed on its hidden nodes, in any order; at least one of these is
+    a position or a global pose.
     """
-    sigma = np.full(len(observed), np.inf)
-    full = observed.kind == ObservedKind.GLOBAL_POSE
+    placed = observed.kind != ObservedKind.HEADING
+    by_heading = _by_heading(poses, observed, placed)
+    stamps, times = correlation
+    by_positions = _from_positions(
+        positions_along(poses, observed.rows(placed), noise,
+                        TimeCorrelation(stamps[placed], times[placed])), policy, noise)
+    better = by_positions.T_map_graph is None or by_heading.sigma < by_positions.sigma
+    return by_heading if better and by_heading.sigma <= TUNED.aligning_sigma else by_positions
+
+
+def _by_heading(
+    poses: FloatArray, observed: ObservedNodes, placed: BoolArray,
+) -> GraphAlignment:
+    """Return the alignment by the most certain heading, at its position or at those of others."""
+    sigma, full = np.full(len(observed), np.inf), observed.kind == ObservedKind.GLOBAL_POSE
     sigma[full] = np.sqrt(np.linalg.inv(observed.information[full])[:, 2, 2])
+    sigma[~placed] = observed.information[~placed, 2, 2]**-0.5
     best = int(np.argmin(sigma))
-    if sigma[best] <= TUNED.aligning_sigma:
-        predicted = se2.compose(poses[observed.node[best]], observed.offset[best])
-        return GraphAlignment(se2.compose(observed.mean[best], se2.inverse(predicted)),
-                              float(sigma[best]), int(observed.node[best]))
-    positions = positions_along(poses, observed, noise, correlation)
-    return _from_positions(positions, policy, noise)
+    predicted = se2.compose(poses[observed.node], observed.offset)
+    theta = float(se2.wrap(observed.mean[best, 2] - predicted[best, 2]))
+    used = np.array([best]) if full[best] else np.flatnonzero(placed)
+    weight = np.trace(observed.information[used, :2, :2], axis1=1, axis2=2)
+    shift = np.average(
+        observed.mean[used, :2] - predicted[used, :2] @ se2.rotation(theta).T, axis=0,
+        weights=weight)
+    return GraphAlignment(
+        np.array((*shift, theta)), float(sigma[best]), int(observed.node[best]))
 
 
 def recheck(
@@ -93,7 +110,7 @@ def _certain(found: Consensus, policy: AlignmentPolicy) -> bool:
         sigmas *= 2.0
     # with a scale far from 1, odometry or positions do not follow the robot (spinning wheels, a
     # frozen receiver), and the angle is meaningless
-    return (found.sigma_heading <= policy.sigma_heading
+    return (not found.is_mirrored and found.sigma_heading <= policy.sigma_heading
             and found.baseline >= policy.minimum_baseline
             and found.baseline >= sigmas * found.sigma_position
             and 1.0 / TUNED.largest_scale <= found.scale <= TUNED.largest_scale
@@ -113,20 +130,20 @@ def _from_positions(
         found = [consensus(stretch, noise) if len(stretch.node) >= least else None
                  for stretch in stretches]
         sparse = sparse and all(len(stretch.node) < least for stretch in stretches)
-        if shortening == 1.0 and _left_handed(stretches, found, noise):
+        left_handed = [item.is_mirrored for item in found if item is not None]
+        # the shorter ones may be too straight to show it
+        if (shortening == 1.0 and any(left_handed)
+                and np.mean(left_handed) >= TUNED.least_agreement):
             return GraphAlignment(None, np.inf)
         sigma = min([sigma, *(item.sigma_heading for item in found if item is not None)])
-        best = _supported(stretches, found, policy, noise, least)
+        best = _supported(stretches, found, policy, least)
         if best is not None:
-            return GraphAlignment(best.T_map_odom, best.sigma_heading, best.node)
+            return best
     if sparse:
         # every stretch of the long drive has too few positions
-        stretches = [positions.thinned()]
-        found = [consensus(stretches[0], noise)]
-        best = _supported(stretches, found, policy, noise, 3)
-        if best is not None:
-            return GraphAlignment(best.T_map_odom, best.sigma_heading, best.node)
-    return GraphAlignment(None, sigma)
+        whole = positions.thinned()
+        best = _supported([whole], [consensus(whole, noise)], policy, 3)
+    return best or GraphAlignment(None, sigma)
 
 
 def _stretches(positions: Positions, shortening: float) -> list[Positions]:
@@ -143,24 +160,14 @@ def _stretches(positions: Positions, shortening: float) -> list[Positions]:
     return [positions.rows(number == k).thinned() for k in used]
 
 
-def _left_handed(
-    stretches: list[Positions], found: list[Consensus | None], noise: OdometryNoise,
-) -> bool:
-    """Tell whether most stretches with a fit are mirrored; short ones may be too straight."""
-    left = [mirrored(stretch, item, noise)
-            for stretch, item in zip(stretches, found, strict=True) if item is not None]
-    return any(left) and sum(left) >= TUNED.least_agreement * len(left)
-
-
 def _supported(
     stretches: list[Positions], found: list[Consensus | None], policy: AlignmentPolicy,
-    noise: OdometryNoise, least: int,
-) -> Consensus | None:
+    least: int,
+) -> GraphAlignment | None:
     """Return the newest certain fit that enough stretches agree with, up to odometry's drift."""
     candidates, n_relevant = [], 0
     for stretch, item in zip(stretches, found, strict=True):
-        if (item is not None and _certain(item, policy)
-                and not mirrored(stretch, item, noise)):
+        if item is not None and _certain(item, policy):
             candidates.append(item)
             n_relevant += 1
         else:
@@ -184,7 +191,8 @@ def _supported(
         return None
     # the newest, as receivers converge over time, unless it is much less certain
     good = supported & (variance <= TUNED.comparable_sigma**2 * np.min(variance[supported]))
-    return candidates[int(np.argmax(good))]
+    best = candidates[int(np.argmax(good))]
+    return GraphAlignment(best.T_map_odom, best.sigma_heading, best.node)
 
 
 def guess(

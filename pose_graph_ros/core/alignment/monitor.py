@@ -12,7 +12,6 @@ import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
 from pose_graph_ros.core.alignment.consensus import TimeCorrelation, TUNED
-from pose_graph_ros.core.alignment.estimator import GraphAlignment
 from pose_graph_ros.core.config import BackendConfig, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -91,22 +90,11 @@ class AlignmentMonitor:
         It has the shape (3,), and is None if the graph is aligned already, or the angle is not
         known well enough.
         """
-        if self.state is AlignmentState.ALIGNED or len(waiting) == 0:
+        if self.state is AlignmentState.ALIGNED or len(placed(waiting)) == 0:
             return None
-        positions = placed(waiting)
-        if len(positions) == 0:
-            return None
-        poses = nodes.recent_poses(graph)
         found = estimator.find_alignment(
-            poses, _numbered(nodes, _table(positions)), self._config.alignment,
-            _noise(nodes),
-            self._correlation([_evidence_of(each) for each in positions]))
-        headings = [each for each in waiting if each.observed.kind[0] == ObservedKind.HEADING]
-        if len(headings) > 0:
-            by_heading = _by_heading(poses, *(
-                _numbered(nodes, _table(some)) for some in (headings, positions)))
-            if by_heading.sigma < min(found.sigma, TUNED.aligning_sigma):
-                found = by_heading
+            nodes.recent_poses(graph), _numbered(nodes, _table(waiting)), self._config.alignment,
+            _noise(nodes), self._correlation([_evidence_of(each) for each in waiting]))
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
                       else AlignmentState.ALIGNED)
         self.sigma = found.sigma
@@ -222,19 +210,3 @@ def _evidence_of(attached: AttachedMeasurement) -> Evidence:
 
 def _table(measurements: Sequence[AttachedMeasurement | Evidence]) -> ObservedNodes:
     return ObservedNodes.joined([each.observed for each in measurements])
-
-
-def _by_heading(
-    poses: FloatArray, headings: ObservedNodes, positions: ObservedNodes,
-) -> GraphAlignment:
-    """Return the alignment with the most certain heading as angle and positions for the shift."""
-    best = int(np.argmax(headings.information[:, 2, 2]))
-    node = int(headings.node[best])
-    theta = float(se2.wrap(
-        headings.mean[best, 2] - poses[node, 2] - headings.offset[best, 2]))
-    weight = np.trace(positions.information[:, :2, :2], axis1=1, axis2=2)
-    predicted = se2.compose(poses[positions.node], positions.offset)[:, :2]
-    shift = np.average(
-        positions.mean[:, :2] - predicted @ se2.rotation(theta).T, axis=0, weights=weight)
-    return GraphAlignment(np.array((*shift, theta)),
-                          float(1.0 / np.sqrt(headings.information[best, 2, 2])), node)

@@ -16,7 +16,6 @@ is defined.
 """
 
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 import functools
 from pathlib import Path
 from types import MappingProxyType
@@ -75,9 +74,8 @@ def kernel(
             if signature is not None:
                 _signatures[name] = signature
                 _compile_at_first_call(compiled, signature)
-        with suppress(RuntimeError):    # no folder for the cache; kernel_cache has logged why
-            # as njit(cache=True) does, with our own class of cache
-            compiled._cache = KernelCache(compiled)  # noqa: SLF001
+        # as njit(cache=True) does, with our own class of cache
+        compiled._cache = KernelCache(compiled)  # noqa: SLF001
     return compiled
 
 
@@ -135,24 +133,23 @@ def compile_kernels(names: Iterable[str] | None = None) -> None:
 
 def is_cached(*names: str) -> bool:
     """
-    Tell whether kernels have valid code in the cache: all `declared` ones, or some of them.
+    Tell whether declared kernels have valid code in the cache: all of them, or some.
 
     This takes about a millisecond per kernel, and neither loads nor compiles code.
     """
-    caches = [_registered[name]._cache for name in names or _signatures]  # noqa: SLF001
-    return all(isinstance(cache, KernelCache) and cache.holds_code() for cache in caches)
+    return all(_registered[name]._cache.holds_code(_signatures[name])  # noqa: SLF001
+               for name in names or _signatures)
 
 
 def can_be_kept() -> bool:
     """Tell whether all kernels imported so far have a writeable folder for their code."""
-    caches = [dispatcher._cache for dispatcher in _registered.values()]  # noqa: SLF001
-    return all(isinstance(cache, KernelCache) and cache.is_writable for cache in caches)
+    return all(each._cache.is_writable for each in _registered.values())  # noqa: SLF001
 
 
 def cache_folders() -> set[Path]:
     """Return the folders that the code of all kernels imported so far is kept in."""
-    caches = [dispatcher._cache for dispatcher in _registered.values()]  # noqa: SLF001
-    return {Path(cache.cache_path) for cache in caches if isinstance(cache, KernelCache)}
+    paths = {each._cache.cache_path for each in _registered.values()}  # noqa: SLF001
+    return {Path(path) for path in paths if path != ''}
 
 
 def processor() -> str:

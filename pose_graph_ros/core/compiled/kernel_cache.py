@@ -7,14 +7,14 @@ Numba's own cache has four faults on a robot. It raises at import where it finds
 folder (a package that belongs to root, a service without a home directory). It raises at a call if
 a power failure has truncated a file. It does not detect that a function which the kernel calls has
 changed. Two processes that compile different signatures at once can store the code of one under
-the name of the other. The cache in this module uses Numba's files with these differences:
+the name of the other. So each signature of a kernel has a file of its own here, named by it:
 
 - The folder is the first writeable one of: `NUMBA_CACHE_DIR` if it is set, `__pycache__` beside
   the source, `pose_graph_ros` in the user's cache. Code is also loaded from those before it, such
   as the `__pycache__` that root has filled when it made a robot's image. If there is none, a
   warning is logged and every start compiles again.
-- Each entry contains a fingerprint of everything that its code was made from, and a check sum. It
-  is used only if both are correct.
+- Each file begins with a fingerprint of everything that its code was made from, and a check sum.
+  It is used only if both are correct.
 - A cache that cannot be read or written costs time, but never raises an exception.
 
 Only the dispatchers of our kernels are changed. Numba's settings and the environment belong to the
@@ -29,18 +29,17 @@ import logging
 import os
 from pathlib import Path
 import pickle
+import sys
 import tempfile
 from types import CodeType, FunctionType, ModuleType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 from pose_graph_ros.core.compiled.numba_internals import (
-    CompileResultCacheImpl,
+    CompileResult,
     Dispatcher,
-    FunctionCache,
-    IndexDataCacheFile,
     rtsys,
     serialize,
     sigutils,
@@ -49,7 +48,7 @@ from pose_graph_ros.core.compiled.numba_internals import (
 logger = logging.getLogger(__name__)
 
 OWNER = 'pose_graph_ros'
-# Settings of Numba that change the generated code, but are not part of Numba's key in the cache.
+# Settings of Numba that change the generated code.
 SETTINGS = ('OPT', 'LOOP_VECTORIZE', 'SLP_VECTORIZE', 'BOUNDSCHECK', 'DEBUGINFO_DEFAULT')
 
 
@@ -177,124 +176,90 @@ def _globals(function: FunctionType, names: set[str], ours: set[str]) -> Iterato
             yield space[name]
 
 
-# --- Numba's cache with this folder and fingerprint ---------------------------------------------
+# --- the files ----------------------------------------------------------------------------------
 
-class _Locator:
-    """Location of the cached code of a function, with the interface of Numba's locators."""
-
-    def __init__(self, source: Path, folder: Path) -> None:
-        self._py_file = str(source)     # for Numba's warnings
-        self._folder = folder
-        # constant: the fingerprint detects changes, also those in other files
-        self._stamp = hashlib.sha256(OWNER.encode()).digest()
-
-    @classmethod
-    def from_function(cls, _: FunctionType, py_file: str) -> '_Locator | None':
-        source = Path(py_file).absolute()
-        if not source.is_file():
-            _warn_once(f'compiled kernels of {py_file} cannot be kept: it is no file')
-            return None
-        own, others = find_folders(source.parent)
-        folder = own or next(iter(others), None)
-        return None if folder is None else cls(source, folder)
-
-    def ensure_cache_path(self) -> None:
-        _make_writable(self._folder)
-
-    def get_cache_path(self) -> str:
-        return str(self._folder)
-
-    def get_source_stamp(self) -> bytes:
-        return self._stamp
-
-    def get_disambiguator(self) -> str:
-        """Return a suffix for the function's name instead of its line number, which may change."""
-        return OWNER
-
-
-class _Contents(CompileResultCacheImpl):  # type: ignore[misc]  # Numba is untyped
-    """Conversion of compiled code to a cache entry (fingerprint, check sum, code) and back."""
-
-    _locator_classes: ClassVar = [_Locator]
-    dispatcher: Dispatcher
-
-    def reduce(self, result: Any) -> tuple[bytes, bytes, bytes]:
-        code = serialize.dumps(super().reduce(result))
-        return fingerprint(self.dispatcher), hashlib.sha256(code).digest(), code
-
-    def rebuild(self, target_context: Any, kept: tuple[bytes, bytes, bytes]) -> Any:
-        made_from, check_sum, code = kept
-        if made_from != fingerprint(self.dispatcher):
-            return None
-        if check_sum != hashlib.sha256(code).digest():
-            raise ValueError('the check sum is wrong')
-        return super().rebuild(target_context, pickle.loads(code))
-
-
-class KernelCache(FunctionCache):  # type: ignore[misc]
-    """The cache of one kernel; RuntimeError if no folder is writeable."""
-
-    _impl_class = _Contents
+class KernelCache:
+    """The cache of one kernel, which its dispatcher calls instead of one of Numba's."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
-        super().__init__(dispatcher.py_func)
-        self._impl.dispatcher = dispatcher
         self._dispatcher = dispatcher
-        source = Path(dispatcher.py_func.__code__.co_filename).absolute().parent
-        folders = find_folders(source)
-        self.is_writable = folders.own is not None
-        # its own files first
-        self._files = [self._cache_file, *(
-            IndexDataCacheFile(
-                str(folder), self._impl.filename_base, self._impl.locator.get_source_stamp())
-            for folder in folders.others if str(folder) != self.cache_path)]
+        source = Path(dispatcher.py_func.__code__.co_filename).absolute()
+        self._own, others = find_folders(source.parent)
+        self._name = f'{source.stem}.{dispatcher.py_func.__qualname__}'.replace('<locals>.', '')
+        # its own folder first
+        self._folders = others if self._own is None else (self._own, *others)
+
+    @property
+    def cache_path(self) -> str:
+        """Folder of its code; empty without one."""
+        return str(next(iter(self._folders), ''))
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether its code can be kept."""
+        return self._own is not None
+
+    def holds_code(self, signature: Any) -> bool:
+        """Tell whether there is valid code for a signature; it is not loaded."""
+        return any(self._code(path) is not None for path in self._files(signature))
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the cached code for a signature; None if there is no valid entry."""
+        """Return the code for a signature; None if there is none that is valid."""
         # Numba refreshes the context, which imports all that can be compiled (0.5 s) and does
         # this, which is all that machine code needs. The compiler refreshes the context itself.
         rtsys.initialize(target_context)
-        key = self._index_key(signature, target_context.codegen())
-        wanted, _ = sigutils.normalize_signature(signature)
-        for file in self._files:
+        for path in self._files(signature):
+            code = self._code(path)
             try:
-                kept = file.load(key)
-                found = None if kept is None else self._impl.rebuild(target_context, kept)
-                if found is not None and tuple(found.signature.args) == tuple(wanted):
-                    return found
+                if code is not None:
+                    return CompileResult._rebuild(  # noqa: SLF001
+                        target_context, *pickle.loads(code))
             except Exception as error:
-                _warn('read', file._cache_path, error)  # noqa: SLF001
-                if file is self._cache_file:
-                    self._forget()
+                _warn('read', path.parent, error)
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Store the code for a signature; log a warning if that fails."""
+        # with dynamic globals the code contains addresses of this process
+        if self._own is None or result.library.has_dynamic_globals:
+            return
+        path = next(self._files(signature))
         try:
-            super().save_overload(signature, result)
+            code = serialize.dumps(result._reduce())  # noqa: SLF001
+            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+                file.write(self._fingerprint + hashlib.sha256(code).digest() + code)
+            os.replace(file.name, path)
         except Exception as error:
-            _warn('written', self.cache_path, error)
+            _warn('written', path.parent, error)
 
-    def holds_code(self) -> bool:
-        """Tell whether the cache has a valid entry for at least one signature."""
-        return any(map(self._holds_code, self._files))
+    def _files(self, signature: Any) -> Iterator[Path]:
+        """Yield the places of the code for a signature."""
+        arguments, _ = sigutils.normalize_signature(signature)
+        processor = self._dispatcher.targetctx.codegen().magic_tuple()
+        key = repr((str(arguments), processor, sys.implementation.cache_tag)).encode()
+        name = f'{self._name}-{hashlib.sha256(key).hexdigest()[:16]}.nbc'
+        return (folder / name for folder in self._folders)
 
-    def _holds_code(self, file: IndexDataCacheFile) -> bool:
-        # Numba has no public method that checks an entry without loading its code
+    @functools.cached_property
+    def _fingerprint(self) -> bytes:
+        return fingerprint(self._dispatcher)
+
+    def _code(self, path: Path) -> bytes | None:
+        """Return the code in a file; None if it is not valid."""
         try:
-            names = file._load_index().values()  # noqa: SLF001
-            kept = [file._load_data(name) for name in names]  # noqa: SLF001
-            current = fingerprint(self._dispatcher)
-            return any(made_from == current for made_from, _, _ in kept)
-        except Exception:
-            return False
-
-    def _forget(self) -> None:
-        """Replace the index by an empty one, so that the next start does not fail on it again."""
-        try:
-            self.flush()
+            kept = path.read_bytes()
+        except FileNotFoundError:
+            return None
         except OSError as error:
-            _warn('emptied', self.cache_path, error)
+            _warn('read', path.parent, error)
+            return None
+        made_from, check_sum, code = kept[:32], kept[32:64], kept[64:]
+        if made_from != self._fingerprint:
+            return None
+        if check_sum != hashlib.sha256(code).digest():
+            _warn('read', path.parent, ValueError('the check sum is wrong'))
+            return None
+        return code
 
 
 @functools.cache
@@ -302,6 +267,6 @@ def _warn_once(text: str) -> None:
     logger.warning('%s', text)
 
 
-def _warn(what: str, folder: str, error: Exception) -> None:
+def _warn(what: str, folder: Path, error: Exception) -> None:
     _warn_once(f'the compiled kernels in {folder} could not be {what}: '
                f'{type(error).__name__}: {error}; they are compiled again')

@@ -14,10 +14,10 @@ take a newer one, run all tests with it, and raise the bound here, in setup.py a
   `entry_point`, so that the first call compiles for the declared signature alone.
 - The options `_nrt` and `no_cfunc_wrapper` of `njit`: kernels that own no array count no
   references, and no wrapper for C is compiled.
-- `FunctionCache`, `CompileResultCacheImpl` and `IndexDataCacheFile` write and read the files of
-  the cache (`_index_key`, `_impl`, `_cache_file`, `_load_index`, `_load_data`), in our folders and
-  with our checks; `serialize` and `sigutils` belong to them. `rtsys`, which kernels that allocate
-  arrays run on, has to be initialized before their code is loaded.
+- `CompileResult` makes of compiled code what can be pickled by `serialize` (`_reduce`), unless its
+  `library` has dynamic globals, and code of that (`_rebuild`); `sigutils` gives the types in a
+  signature. `rtsys`, which kernels that allocate arrays run on, has to be initialized before
+  their code is loaded.
 - `ir` makes vectors of numbers, `populate_array` an array over the memory of the tables.
 """
 
@@ -44,14 +44,12 @@ check_version(numba.__version__)
 
 # ruff: noqa: E402  another version may lack them
 from numba.core import serialize, sigutils
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.cgutils import ir
+from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.runtime import rtsys
 
-__all__ = [
-    'CompileResultCacheImpl', 'Dispatcher', 'FunctionCache', 'IndexDataCacheFile', 'ir', 'rtsys',
-    'serialize', 'sigutils']
+__all__ = ['CompileResult', 'Dispatcher', 'ir', 'rtsys', 'serialize', 'sigutils']
 
 
 def populate_array(*arguments: Any) -> None:

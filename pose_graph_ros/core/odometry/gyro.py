@@ -16,7 +16,7 @@ import numpy as np
 from pose_graph_ros.core.config import GyroSource, RateNoise
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_defect, stamp_of
+from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.saved_columns import Integers, Rows2
 
@@ -77,8 +77,6 @@ class GyroStream(ReorderBuffer[YawRate]):
 
     def add(self, sample: YawRate) -> Answer:
         """Add a sample; return whether it is accepted, or the reason for its rejection."""
-        if (defect := stamp_defect(sample.stamp_ns)) is not None:
-            return defect
         if not abs(sample.rate) <= LARGEST_RATE:
             return rejected('too_large' if abs(sample.rate) > LARGEST_RATE else 'not_finite',
                             f'yaw rate {sample.rate} rad/s')

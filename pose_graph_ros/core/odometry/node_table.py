@@ -4,7 +4,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -55,12 +54,11 @@ THINNED = np.dtype([('anchor', np.int32), ('relative', np.float32, 3), ('noise',
 
 class ThinnedNodes:
     """
-    Nodes by number, each with its place relative to another one, its anchor.
+    Nodes by number, each with its place relative to another one in the graph, its anchor.
 
     The poses of these nodes move with the graph, and what concerns them later is attached to their
     anchors. If an anchor leaves as well, the nodes that were attached to it are passed on to its
-    own anchor once all places are asked for, so that it costs the same to add a node however many
-    have left. A node takes 40 bytes.
+    own anchor. A node takes 40 bytes.
     """
 
     def __init__(self) -> None:
@@ -74,7 +72,7 @@ class ThinnedNodes:
     def add(
         self, numbers: IntArray, anchors: IntArray, relative: Poses, noise: Covariances,
     ) -> None:
-        """Add nodes."""
+        """Add nodes; none of the anchors is among these, or has left before."""
         if len(numbers) == 0:
             return
         rows = numbers - self._first
@@ -86,46 +84,29 @@ class ThinnedNodes:
         table['anchor'][rows], table['relative'][rows] = anchors, relative
         table['noise'][rows] = _upper(noise)
         self._size += len(rows)
+        passed = np.flatnonzero(np.isin(table['anchor'], numbers))
+        own, before = table[passed], table[table['anchor'][passed] - self._first]
+        mean = own['relative'].astype(np.float64)
+        table['noise'][passed] = _upper(
+            passed_on(mean, _full(before['noise']), _full(own['noise'])))
+        table['relative'][passed] = se2.compose(before['relative'].astype(np.float64), mean)
+        table['anchor'][passed] = before['anchor']
 
     def place(self, number: int) -> Place | None:
         """Return the place of a node; None if it is not among these."""
-        anchor = self._anchor(number)
-        if anchor < 0:
-            return None
-        mean, noise = self._stored(number)
-        while (further := self._anchor(anchor)) >= 0:
-            before, noise_before = self._stored(anchor)
-            noise = passed_on(mean, noise_before, noise)
-            mean, anchor = se2.compose(before, mean), further
-        return Place(anchor, mean, noise)
-
-    def _anchor(self, number: int) -> int:
         row = number - self._first
-        return int(self._rows.values['anchor'][row]) if 0 <= row < len(self._rows) else -1
-
-    def _stored(self, number: int) -> tuple[PoseVector, Covariance]:
-        row = self._rows.values[number - self._first]
-        return row['relative'].astype(np.float64), _full(row['noise'][None])[0]
+        if not 0 <= row < len(self._rows) or self._rows.values['anchor'][row] < 0:
+            return None
+        anchor, mean, noise = self._rows.values[row]
+        return Place(int(anchor), mean.astype(np.float64), _full(noise[None])[0])
 
     def places(self) -> ThinnedPlaces:
-        """Return the places of all nodes, relative to nodes that are in the graph."""
-        anchors, relative, noise = (
-            self._rows.values[name] for name in ('anchor', 'relative', 'noise'))
-        rows = np.flatnonzero(anchors >= 0)
-        passed = rows
-        while len(passed) > 0:
-            by = anchors[passed] - self._first
-            further = np.zeros(len(passed), dtype=bool)
-            inside = by < len(anchors)
-            further[inside] = anchors[by[inside]] >= 0
-            passed, by = passed[further], by[further]
-            mean = relative[passed].astype(np.float64)
-            noise[passed] = _upper(passed_on(mean, _full(noise[by]), _full(noise[passed])))
-            relative[passed] = se2.compose(relative[by].astype(np.float64), mean)
-            anchors[passed] = anchors[by]
-        return ThinnedPlaces(
-            rows + self._first, anchors[rows].astype(np.int64),
-            relative[rows].astype(np.float64), noise[rows].astype(np.float64))
+        """Return the places of all nodes."""
+        rows = np.flatnonzero(self._rows.values['anchor'] >= 0)
+        table = self._rows.values[rows]
+        return ThinnedPlaces(rows + self._first, table['anchor'].astype(np.int64),
+                             table['relative'].astype(np.float64),
+                             table['noise'].astype(np.float64))
 
     def drop_before(self, number: int) -> None:
         """
@@ -133,7 +114,6 @@ class ThinnedNodes:
 
         The anchors of the others must not be before it.
         """
-        self.places()
         n = min(number - self._first, len(self._rows))
         self._size -= int(np.count_nonzero(self._rows.values['anchor'][:n] >= 0))
         self._rows.drop_first(n)
@@ -219,7 +199,7 @@ class NodeTable:
         self._ids = GrowingArray((), np.int64)
         self._frozen = GrowingArray((3,), np.float64)
         self._odometry = GrowingArray((3,), np.float64)
-        self._travelled = GrowingArray((), np.float64)
+        self._travelled = 0.0  # path length up to the first node that is not frozen [m]
         self.thinned = ThinnedNodes()
 
     def __len__(self) -> int:
@@ -258,24 +238,20 @@ class NodeTable:
     @property
     def travelled(self) -> FloatArray:
         """Path lengths up to the nodes after the frozen ones [m]."""
-        return self._travelled.read_only
+        steps = np.diff(self.odometry[:, :2], axis=0)
+        return np.cumsum(np.append(self._travelled, np.hypot(steps[:, 0], steps[:, 1])))
 
     def append(self, stamp_ns: int, node: int, odometry: PoseVector) -> None:
         """Append a node."""
-        travelled = 0.0
-        if len(self._odometry) > 0:
-            step = odometry - self._odometry.values[-1]
-            travelled = float(self._travelled.values[-1]) + math.hypot(step[0], step[1])
         self._stamps.append_one(stamp_ns)
         self._ids.append_one(node)
         self._odometry.append_one(odometry)
-        self._travelled.append_one(travelled)
 
     def freeze(self, poses: Poses) -> None:
         """Freeze the oldest nodes in the graph at the given poses."""
+        self._travelled = float(self.travelled[len(poses)])
         self._frozen.append(poses)
         self._odometry.drop_first(len(poses))
-        self._travelled.drop_first(len(poses))
         self.thinned.drop_before(self.n_frozen)
 
     def placed(self, present: Poses) -> Poses:
@@ -320,7 +296,5 @@ class NodeTable:
         self._ids.append(saved.ids)
         self._odometry.append(saved.odometry)
         self._frozen.append(saved.frozen)
-        steps = np.diff(saved.odometry[:, :2], axis=0)
-        lengths = [math.hypot(x, y) for x, y in steps.tolist()]
-        self._travelled.append(np.cumsum([saved.travelled, *lengths]))
+        self._travelled = saved.travelled
         self.thinned.restore(saved.thinned, self.n_frozen)

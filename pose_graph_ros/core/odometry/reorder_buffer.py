@@ -52,6 +52,9 @@ class ReorderBuffer(Generic[Sample]):
     def _insert(self, sample: Sample) -> Answer | int:
         """Return the index of a sample that was added, or why it was not."""
         samples, stamp_ns, at = self._waiting, sample.stamp_ns, len(self._waiting)
+        if not 0 < stamp_ns <= LARGEST_STAMP:
+            return rejected('zero_stamp' if stamp_ns <= 0 else 'no_stamp',
+                            f'expected a stamp above 0, got {stamp_ns} ns')
         if stamp_ns <= self.settled_ns:
             return rejected(
                 'duplicate_stamp' if self._was_settled(stamp_ns) else 'out_of_order',
@@ -71,14 +74,6 @@ class ReorderBuffer(Generic[Sample]):
             del samples[kept:]
             self._n_behind = 0
         return at
-
-
-def stamp_defect(stamp_ns: StampNs) -> Answer | None:
-    """Return why a stamp is not valid; None if it is."""
-    if 0 < stamp_ns <= LARGEST_STAMP:
-        return None
-    return rejected('zero_stamp' if stamp_ns <= 0 else 'no_stamp',
-                    f'expected a stamp above 0, got {stamp_ns} ns')
 
 
 def stamp_of(sample: Stamped) -> StampNs:

@@ -26,7 +26,6 @@ from pose_graph_ros.core.measurements import (
     LARGEST_COORDINATE,
     OdometrySample,
     rejected,
-    value_defect,
 )
 from pose_graph_ros.core.odometry.jumps import (
     is_jump,
@@ -45,12 +44,13 @@ from pose_graph_ros.core.odometry.motion import (
     step_variance,
     Variances,
 )
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_defect, stamp_of
+from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
 from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Flags, Integers, Rows3, Rows7, Rows8
 
 NO_TWIST: Pose = (0.0, 0.0, 0.0)
+LARGEST_SPEED = 1e4  # of a twist [m/s, rad/s]; a larger one is a faulty number
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,17 +171,13 @@ class OdometryStream(ReorderBuffer[_Sample]):
 
     def add(self, sample: OdometrySample) -> Answer:
         """Add a sample; return whether it is accepted, or the reason for its rejection."""
-        if (defect := stamp_defect(sample.stamp_ns)) is not None:
-            return defect
         x, y, theta = sample.pose.tolist()
-        if not (abs(x) <= LARGEST_COORDINATE and abs(y) <= LARGEST_COORDINATE
-                and abs(theta) <= LARGEST_COORDINATE):
-            return rejected(value_defect(sample.pose) or '', f'odometry pose {[x, y, theta]}')
-        twist = sample.twist or NO_TWIST
-        if not all(abs(value) <= 1e4 for value in twist):
-            return rejected('too_large' if all(map(math.isfinite, twist)) else 'not_finite',
-                            f'twist {twist}')
-        variance = sample.twist_variance
+        twist, variance = sample.twist or NO_TWIST, sample.twist_variance
+        for what, numbers, largest in (('odometry pose', (x, y, theta), LARGEST_COORDINATE),
+                                       ('twist', twist, LARGEST_SPEED)):
+            if not all(abs(number) <= largest for number in numbers):
+                return rejected('too_large' if all(map(math.isfinite, numbers)) else 'not_finite',
+                                f'{what} {numbers}')
         at = self._insert(_Sample(
             sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,
             None if variance is None else tuple(variance.tolist()), twist))

@@ -8,9 +8,10 @@ rotation by the gyroscope minus that by odometry is, over the time t between two
 
     d = b t + tau (w_1 - w_0) + k a
 
-with b the bias, tau how much its stamps are early, w the rates at both nodes, a the rotation and
-k the error of the scale. These three are fitted to the newest rotations by least squares, with the
-noise that both claim.
+with b the bias, tau how much its stamps are early, w the rates at both nodes, a the rotation by
+odometry and 1 + k how much the gyroscope turns for each turn of odometry: 0 if it is dead, -1 if
+it is upside down. These three are fitted to the newest rotations by least squares, with the noise
+that both claim.
 """
 
 from collections import Counter
@@ -51,8 +52,6 @@ class Agreement:
     def __init__(self) -> None:
         self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
         self._squares = self._n = self._turned = 0.0
-        # products of time and rotation by odometry with that rotation and the gyroscope's
-        self._shares = np.zeros((2, 2))
 
     def add(
         self, difference: float, seconds: float, change: float, angle: float, variance: float,
@@ -62,7 +61,8 @@ class Agreement:
 
         `variance` is that of the difference, `change` how much the rate changes meanwhile [rad/s].
         """
-        row, fade = np.array((seconds, change, angle)), 1.0 - 1.0 / 1000.0  # the fit forgets
+        by_odometry, fade = angle - difference, 1.0 - 1.0 / 1000.0  # the fit forgets
+        row = np.array((seconds, change, by_odometry))
         left = difference
         if self._n >= LEAST:
             left -= float(row @ self._fit()[0])
@@ -72,9 +72,6 @@ class Agreement:
         self._right = fade * self._right + weight * difference * row
         self._squares = fade * self._squares + weight * difference * difference
         self._n = fade * self._n + 1.0
-        by_odometry = angle - difference
-        self._shares = fade * self._shares + weight * np.outer(
-            (seconds, by_odometry), (by_odometry, angle))
         self._turned = fade * self._turned + max(abs(angle), abs(by_odometry))
 
     def _fit(self) -> tuple[FloatArray, FloatArray]:
@@ -82,12 +79,6 @@ class Agreement:
         # weak priors: 0.1 rad/s, 10 s, 10
         covariance = np.linalg.inv(self._normal + np.diag((1e2, 1e-2, 1e-2)))
         return np.asarray(covariance @ self._right), np.asarray(covariance, dtype=np.float64)
-
-    def _share(self) -> float:
-        """Return how much the gyroscope turns per rotation by odometry, but for its bias."""
-        (time_by, time_angle), (by_by, by_angle) = self._shares.tolist()
-        per_time = time_by / float(self._normal[0, 0])
-        return (by_angle - per_time * time_angle) / max(by_by - per_time * time_by, 1e-300)
 
     def difference(self) -> Difference | None:
         """Return the difference by now; None as long as too little is known."""
@@ -98,22 +89,21 @@ class Agreement:
         found, covariance = self._fit()
         rest = max((self._squares - float(found @ self._right)) / self._n, 1.0)
         shown = np.abs(found) > 5.0 * np.sqrt(rest * np.diagonal(covariance))
-        _, early, scale = found.tolist()
-        reason = ''
+        early, turns, reason = float(found[1]), 1.0 + float(found[2]), ''
         if sigmas < 0.1:
             reason = 'odometry seems to contain it already, so that it counts twice'
         elif sigmas < CONTRADICTORY:
             pass
-        elif self._share() < 0.3 and not (shown[2] and scale > 1.0):
+        elif turns < -0.3:
+            reason = 'it turns the other way: check its mounting'
+        elif turns < 0.3:
             reason = ('it does not turn with odometry: its z axis is not up (see mounting and '
                       '/tf_static), or it is dead')
-        elif shown[2] and scale > 1.0:
-            reason = 'it turns the other way: check its mounting'
         elif shown[1] and abs(early) > 0.05:
             reason = (f'its stamps seem to be {abs(early):.2f} s '
                       f'{"early" if early > 0.0 else "late"}: see time_offset')
-        elif shown[2] and abs(scale) > 0.05 and scale < 1.0:
-            reason = f'odometry turns {1.0 - scale:.2f} times as much'
+        elif shown[2] and abs(1.0 / turns - 1.0) > 0.05:
+            reason = f'odometry turns {1.0 / turns:.2f} times as much'
         return Difference(sigmas, reason)
 
 

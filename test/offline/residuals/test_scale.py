@@ -92,7 +92,7 @@ def test_whiteness_tells_the_correlation_time_of_correlated_errors_alone() -> No
 
 def analysed(settings: dict[str, float], **drive: float) -> Analysis:
     measurements = HonestDrive(2, **drive).measurements()  # type: ignore[arg-type]
-    return analyse(run_measurements(measurements, checked(settings))[0].parts())
+    return analyse(run_measurements(measurements, checked(settings))[0].parts)
 
 
 @pytest.mark.parametrize(('wrong', 'ratio'), [('times', 3.0), ('odometry_times', 3.0)])
