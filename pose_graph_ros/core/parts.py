@@ -123,7 +123,8 @@ def _restore(parts: Parts, saved: SavedGraph) -> None:
         parts.factors.restore(name, source)
     parts.factors.n_bias_edges = int(np.sum(saved.rows.edges.kind == EdgeKind.BIAS))
     for name, gyro in saved.gyros.items():
-        parts.pipeline.queue.turns += parts.pipeline.gyros.restore(name, gyro)
+        parts.pipeline.gyros.restore(name, gyro)
+        parts.pipeline.queue.turns += gyro.waiting
     for name, bias in saved.gyro_biases.items():
         parts.factors.gyro_bias(name).restore(bias)
     parts.reweighting.restore(saved.edge_losses, saved.observed_losses)

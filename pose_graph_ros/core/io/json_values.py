@@ -32,6 +32,8 @@ def encoded(value: Any, kind: Any = None) -> Any:
         names = {number: name for name, number in choices.numbers.items()}
         used, which = np.unique(value, return_inverse=True)
         return {'names': [names[number] for number in used.tolist()], 'of': which.tolist()}
+    if isinstance(value, tuple):
+        return [encoded(each) for each in value]
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 

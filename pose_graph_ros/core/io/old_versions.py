@@ -5,7 +5,8 @@ Saved graphs of older versions.
 
 Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements. In
 version 3 the ids of hidden nodes are `rows`. In version 4 loop closures may have doubted odometry.
-Up to version 5 closures and fixes have columns of their own in judgements.
+Up to version 5 closures and fixes have columns of their own in judgements, and samples that wait
+are columns as well.
 """
 
 from collections import defaultdict
@@ -21,6 +22,8 @@ NUMBERED = {
     ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
+TURN = ('source', 'i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate',
+        'rest_variance')
 _NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
 _NOTHING: dict[str, Any] = {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
     'sources', 'scales', 'left', 'held', 'edge', 'observed', 'source', 'number', 'stamps_ns',
@@ -42,9 +45,42 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
     if version < 4:
         nodes = members['nodes']
         members['nodes'] = {'ids' if name == 'rows' else name: nodes[name] for name in nodes}
+    for stream in members['nodes']['streams'].values() if version < 6 else ():
+        _list_samples(stream)
+    for name, gyro in members.get('gyros', {}).items() if version < 6 else ():
+        rates = gyro['rates']
+        gyro['rates'] = [
+            {'stamp_ns': stamp_ns, 'rate': rate, 'variance': variance}
+            for stamp_ns, (rate, variance) in zip(
+                rates['stamps_ns'], rates['rates'], strict=True)]
+        gyro['waiting'] = [
+            dict(zip(TURN, (name, *ends, stamp_ns, *numbers), strict=True))
+            for stamp_ns, ends, numbers in zip(
+                gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
     if 3 <= version < 6:
         members['judgement'] = _judgement(**members['judgement'])
     return members
+
+
+def _list_samples(stream: dict[str, Any]) -> None:
+    """Make one value of the state of odometry at its newest sample, and of each that waits."""
+    twists = stream.pop('waiting_twists', ())
+    stream['waiting'] = [
+        {'stamp_ns': stamp_ns, 'pose': row[:3], 'speed': row[3], 'variance': row[4:]}
+        for stamp_ns, row in zip(stream.pop('waiting_ns'), stream['waiting'], strict=True)]
+    for sample, twist in zip(stream['waiting'], twists, strict=len(twists) > 0):
+        sample['twist'] = twist
+    if stream['last'] is None:
+        return
+    last, (x, y, theta, distance, turn, *variance) = stream['last'], stream['samples'][-1]
+    rate = last.pop('rate') or [0.0, 0.0, 0.0, 1e30, 1e30, 1e30, 1e30]
+    last['window'] = {
+        'speeds': {'velocity': rate[:3], 'recent': rate[3:5], 'greatest': rate[5:]},
+        'since_ns': last.pop('since_ns'), 'since': last.pop('since'), 'path': last.pop('way')}
+    last['row'] = {
+        'stamp_ns': stream['stamps_ns'][-1], 'pose': [x, y, theta], 'distance': distance,
+        'turn': turn, 'variance': variance,
+        **{name: last.pop(name) for name in ('counted', 'counted_ns', 'held')}}
 
 
 def _judgement(

@@ -8,7 +8,8 @@ rate is w + b + n: w the true one, b the bias, which is estimated in the graph, 
 """
 
 import bisect
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,21 +19,12 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
 from pose_graph_ros.core.quantities import StampNs
-from pose_graph_ros.core.saved_columns import Integers, Rows2
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
 LARGEST_RATE = 1000.0
 # Change of the rate that the polygon must allow for [rad/s^2]: an acceleration that is not uniform
 # during a step h leaves an error of h^2 / 12 times its change.
 UNIFORM_WITHIN = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class SavedRates:
-    """Saved samples of a gyroscope from the last node on that was reached."""
-
-    stamps_ns: Integers  # shape (S,) [ns]
-    rates: Rows2  # rate and its variance, shape (S, 2) [rad/s, rad^2/s^2]
 
 
 class Rotation(NamedTuple):
@@ -128,19 +120,17 @@ class GyroStream(ReorderBuffer[YawRate]):
         stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
         if len(stamps_ns) < 2 or np.max(np.diff(stamps_ns)) > self._gap_ns:
             return None
-        return RateIntegral(stamps_ns, _rates(samples), self._source)
+        rates = np.array([(each.rate, each.variance) for each in samples])
+        return RateIntegral(stamps_ns, rates, self._source)
 
-    def saved(self) -> SavedRates:
+    def saved(self) -> tuple[YawRate, ...]:
         """Return the samples that are still here."""
-        every = self._settled + self._waiting
-        return SavedRates(np.array([each.stamp_ns for each in every], dtype=np.int64),
-                          _rates(every))
+        return (*self._settled, *self._waiting)
 
-    def restore(self, saved: SavedRates) -> None:
+    def restore(self, saved: Sequence[YawRate]) -> None:
         """Fill this empty stream with saved samples."""
-        self._waiting = [YawRate(stamp_ns, *rate) for stamp_ns, rate in zip(
-            saved.stamps_ns.tolist(), saved.rates.tolist(), strict=True)]
-        if self._waiting:
+        self._waiting = [*saved]
+        if len(saved) > 0:
             self.settle(self._waiting[-1].stamp_ns - self._window_ns)
 
 
@@ -148,11 +138,6 @@ def _around(samples: list[YawRate], start_ns: StampNs, end_ns: StampNs) -> tuple
     """Return the range of samples that cover a time; it may begin at -1 or end too late."""
     return (bisect.bisect_right(samples, start_ns, key=stamp_of) - 1,
             bisect.bisect_left(samples, end_ns, key=stamp_of) + 1)
-
-
-def _rates(samples: list[YawRate]) -> FloatArray:
-    """Return rates and their variances, shape (S, 2)."""
-    return np.array([(each.rate, each.variance) for each in samples]).reshape(-1, 2)
 
 
 class RateIntegral:

@@ -35,13 +35,13 @@ class Speeds(NamedTuple):
     """How fast the robot moves by odometry, in [m/s] and [rad/s]."""
 
     velocity: Pose  # in the robot's frame, with the yaw rate
-    # greatest recent speed and yaw rate; infinite before the first are known
-    recent: tuple[float, float]
-    # greatest speed and yaw rate so far; infinite before the first are known
-    greatest: tuple[float, float]
+    recent: tuple[float, float]  # greatest recent speed and yaw rate
+    greatest: tuple[float, float]  # greatest speed and yaw rate so far
 
 
-UNKNOWN = Speeds((0.0, 0.0, 0.0), (math.inf, math.inf), (math.inf, math.inf))
+# Beyond all limits, but finite: a saved state contains it.
+_ANY = (1e30, 1e30)
+UNKNOWN = Speeds((0.0, 0.0, 0.0), _ANY, _ANY)
 
 
 class SpeedWindow(NamedTuple):
@@ -62,7 +62,7 @@ class SpeedWindow(NamedTuple):
         speed = path[0] / time, path[1] / time
         x, y, theta = between_one(self.since, pose)
         velocity = x / time, y / time, theta / time
-        if self.speeds is UNKNOWN:
+        if self.speeds == UNKNOWN:
             speeds = Speeds(velocity, speed, speed)
         else:
             decay, (_, recent, greatest) = math.exp(-time / MEMORY_TIME), self.speeds

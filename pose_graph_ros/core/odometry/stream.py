@@ -4,7 +4,7 @@
 
 import bisect
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -47,29 +47,33 @@ from pose_graph_ros.core.odometry.motion import (
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
 from pose_graph_ros.core.quantities import StampsNs
-from pose_graph_ros.core.saved_columns import Flags, Integers, Rows3, Rows7, Rows8
+from pose_graph_ros.core.saved_columns import Flags, Integers, Rows8
 
 NO_TWIST: Pose = (0.0, 0.0, 0.0)
 LARGEST_SPEED = 1e4  # of a twist [m/s, rad/s]; a larger one is a faulty number
 
 
-@dataclass(frozen=True, slots=True)
-class SavedInstant:
-    """Saved state of a source at its newest settled sample, see `Row` and `SpeedWindow`."""
+class Received(NamedTuple):
+    """An odometry sample as received."""
+
+    stamp_ns: int
+    pose: Pose
+    speed: float  # by the twist; 0 if it is unknown
+    variance: Variances | None  # of the twist; 0 where it is unknown
+    twist: Pose = NO_TWIST  # (v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated
+
+
+class Instant(NamedTuple):
+    """The state of a source at a sample."""
 
     raw: Pose  # pose as received [m, m, rad]
+    row: Row  # the sample in a frame without jumps, with its sums
     # pose of the odometry frame in the frame without jumps; None before the first jump
     offset: Pose | None
-    counted: Pose
-    counted_ns: int
-    held: Pose
-    # velocity, recent and greatest speeds; None before they are known
-    rate: tuple[float, float, float, float, float, float, float] | None
-    since_ns: int
-    since: Pose
-    way: tuple[float, float]  # path length [m] and sum of absolute turns [rad] since then
+    window: SpeedWindow  # speeds of the robot by this odometry
     jumped: bool  # whether odometry jumped to this sample
-    twist: Pose = NO_TWIST  # as `_Sample.twist`
+    restarted: bool = False  # whether odometry restarted at this sample, after a graph was loaded
+    twist: Pose = NO_TWIST  # as `Received.twist`
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,42 +84,15 @@ class SavedStream:
     samples: Rows8  # their rows, as returned by `OdometryTimeline.thinned`, shape (T, 8)
     dense: Flags  # as `OdometryTimeline.dense`, shape (T,)
     resting: bool  # as `OdometryTimeline.resting`
-    last: SavedInstant | None
-    waiting_ns: Integers  # stamps of samples that are not settled, shape (W,) [ns]
-    # as received: pose, speed, variances of the twist (zero where unknown), shape (W, 7)
-    waiting: Rows7
+    last: Instant | None  # at the newest settled sample
+    waiting: tuple[Received, ...]  # samples that are not settled
     restarted_ns: int  # as `OdometryStream.restarted_ns`
     # newest node that the samples cover, where the next secondary edge begins; -1 for none
     tied: int
     next_to_tie: int  # next node to check for a secondary edge
-    # twists of samples that are not settled, shape (W, 3); empty if they are not integrated
-    waiting_twists: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
 
 
-class _Sample(NamedTuple):
-    """An odometry sample as received."""
-
-    stamp_ns: int
-    pose: Pose
-    speed: float
-    variance: Variances | None
-    twist: Pose = NO_TWIST  # (v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated
-
-
-class _Instant(NamedTuple):
-    """The state of a source at a sample."""
-
-    raw: Pose  # pose as received [m, m, rad]
-    row: Row  # the sample in a frame without jumps, with its sums
-    # pose of the odometry frame in the frame without jumps; None before the first jump
-    offset: Pose | None
-    window: SpeedWindow  # speeds of the robot by this odometry
-    jumped: bool  # whether odometry jumped to this sample
-    restarted: bool = False  # whether odometry restarted at this sample, after a graph was loaded
-    twist: Pose = NO_TWIST  # as `_Sample.twist`
-
-
-class OdometryStream(ReorderBuffer[_Sample]):
+class OdometryStream(ReorderBuffer[Received]):
     """
     The samples of one source of odometry.
 
@@ -129,8 +106,8 @@ class OdometryStream(ReorderBuffer[_Sample]):
         self.timeline = OdometryTimeline()  # settled samples, in a frame without jumps
         self.n_jumps = 0  # number of jumps among the settled samples
         self.jump = ''  # when and how far odometry jumped last, in words
-        self._ahead: list[_Instant] = []  # states at the first samples that wait
-        self._last: _Instant | None = None  # state at the newest settled sample
+        self._ahead: list[Instant] = []  # states at the first samples that wait
+        self._last: Instant | None = None  # state at the newest settled sample
         # stamp of the newest sample of a graph that was loaded; -1 if none was [ns]
         self.saved_ns = -1
         # stamp at which odometry restarted after a graph was loaded; -1 if it did not [ns]
@@ -178,9 +155,11 @@ class OdometryStream(ReorderBuffer[_Sample]):
             if not all(abs(number) <= largest for number in numbers):
                 return rejected('too_large' if all(map(math.isfinite, numbers)) else 'not_finite',
                                 f'{what} {numbers}')
-        at = self._insert(_Sample(
-            sample.stamp_ns, (x, y, wrap_one(theta)), sample.speed,
-            None if variance is None else tuple(variance.tolist()), twist))
+        at = self._insert(Received(
+            sample.stamp_ns, (x, y, wrap_one(theta)),
+            sample.speed if math.isfinite(sample.speed) else 0.0,
+            None if variance is None else tuple(
+                np.nan_to_num(variance, posinf=0.0, neginf=0.0).tolist()), twist))
         if isinstance(at, Answer):
             return at
         del self._ahead[at:], self._ahead[len(self._waiting):]
@@ -241,28 +220,17 @@ class OdometryStream(ReorderBuffer[_Sample]):
         stamps, rows, dense = self.timeline.thinned(
             # and those of the last minute, for measurements that come late
             nodes_ns, min(int(nodes_ns[-1]), self.settled_ns - 60_000_000_000))
-        waiting = np.array([(*sample.pose, sample.speed, *(sample.variance or NOTHING))
-                            for sample in self._waiting]).reshape(-1, 7)
-        waiting[~np.isfinite(waiting)] = 0.0    # stands for unknown, too
-        return SavedStream(
-            stamps, rows, dense, self.timeline.resting,
-            None if self._last is None else _saved_instant(self._last),
-            np.array([sample.stamp_ns for sample in self._waiting], dtype=np.int64), waiting,
-            self.restarted_ns, *tied, waiting_twists=np.array(
-                [sample.twist for sample in self._waiting]).reshape(-1, 3))
+        return SavedStream(stamps, rows, dense, self.timeline.resting, self._last,
+                           tuple(self._waiting), self.restarted_ns, *tied)
 
     def restore(self, saved: SavedStream) -> None:
         """Set the state of this empty stream to a saved one."""
         if saved.last is not None:
-            self._last = _restored_instant(saved, saved.last)
+            self._last = saved.last
             self.timeline.restore(
-                saved.stamps_ns, saved.samples, saved.dense, self._last.row,
+                saved.stamps_ns, saved.samples, saved.dense, saved.last.row,
                 resting=saved.resting)
-        twists = saved.waiting_twists.tolist() or [NO_TWIST] * len(saved.waiting)
-        for stamp_ns, (x, y, theta, speed, *variance), twist in zip(
-                saved.waiting_ns.tolist(), saved.waiting.tolist(), twists, strict=True):
-            self._waiting.append(
-                _Sample(stamp_ns, (x, y, theta), speed, tuple(variance), tuple(twist)))
+        self._waiting += saved.waiting
         self.restarted_ns = saved.restarted_ns
         self.saved_ns = self.newest_ns
 
@@ -322,11 +290,11 @@ class OdometryStream(ReorderBuffer[_Sample]):
             self._ahead.append(self._next_instant(
                 self._ahead[-1] if self._ahead else self._last, sample))
 
-    def _next_instant(self, before: _Instant | None, sample: _Sample) -> _Instant:
+    def _next_instant(self, before: Instant | None, sample: Received) -> Instant:
         """Return the state at a sample from the state at the sample before."""
         stamp_ns, raw, twist = sample.stamp_ns, sample.pose, sample.twist
         if before is None:
-            return _Instant(raw, next_row(None, stamp_ns, raw), None,
+            return Instant(raw, next_row(None, stamp_ns, raw), None,
                             SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
         integrates = self._source.integrate is Integrate.TWIST
@@ -347,7 +315,7 @@ class OdometryStream(ReorderBuffer[_Sample]):
         variance = (step_variance(self._source, sample.variance, step, elapsed)
                     if self._source.noise_from is NoiseFrom.TWIST else NOTHING)
         row = next_row(before.row, stamp_ns, pose, variance)
-        return _Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
+        return Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
                         jumped=False, twist=twist)
 
 
@@ -357,56 +325,31 @@ def _integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
     return exp_one((x, y, theta))
 
 
-def _after_jump(before: _Instant, sample: _Sample, elapsed: float) -> _Instant:
+def _after_jump(before: Instant, sample: Received, elapsed: float) -> Instant:
     """Return the state at a sample to which odometry has jumped."""
     time = min(elapsed, MEMORY_TIME)
     speeds = before.window.speeds
     x, y, theta = speeds.velocity
     pose = compose_one(before.row.pose, (x * time, y * time, wrap_one(theta * time)))
-    way, turn = (rate * elapsed if math.isfinite(rate) else 0.0 for rate in speeds.recent)
+    way, turn = (0.0 if speeds == UNKNOWN else rate * elapsed for rate in speeds.recent)
     position, heading = (JUMP_SIGMA[0] + way)**2, (JUMP_SIGMA[1] + turn)**2
     return _elsewhere(before, sample, pose, (position, position, heading), speeds)
 
 
 def _elsewhere(
-    before: _Instant, sample: _Sample, pose: Pose, variance: Variances, speeds: Speeds = UNKNOWN,
+    before: Instant, sample: Received, pose: Pose, variance: Variances, speeds: Speeds = UNKNOWN,
     *, restarted: bool = False,
-) -> _Instant:
+) -> Instant:
     """Return the state at a sample from which on odometry has another origin."""
     row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
     offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
-    return _Instant(sample.pose, row, offset, SpeedWindow(speeds, sample.stamp_ns, pose),
+    return Instant(sample.pose, row, offset, SpeedWindow(speeds, sample.stamp_ns, pose),
                     jumped=True, restarted=restarted, twist=sample.twist)
 
 
-def _described(before: _Instant, after: _Instant) -> str:
+def _described(before: Instant, after: Instant) -> str:
     """Return when and how far odometry jumped between two samples."""
     x, y, turn = between_one(before.raw, after.raw)
     begin_ns, end_ns = before.row.stamp_ns, after.row.stamp_ns
     return (f'by {math.hypot(x, y):.2f} m and {math.degrees(turn):.1f} degrees within '
             f'{(end_ns - begin_ns) * 1e-9:.3f} s at {end_ns * 1e-9:.3f} s')
-
-
-def _saved_instant(last: _Instant) -> SavedInstant:
-    speeds, since_ns, since, path = last.window
-    rate = None if speeds is UNKNOWN else (
-        *speeds.velocity, *speeds.recent, *speeds.greatest)
-    return SavedInstant(
-        last.raw, last.offset, last.row.counted, last.row.counted_ns, last.row.held, rate,
-        since_ns, since, path, last.jumped, last.twist)
-
-
-def _restored_instant(saved: SavedStream, last: SavedInstant) -> _Instant:
-    x, y, theta, distance, turn, *variance = saved.samples[-1].tolist()
-    row = Row(int(saved.stamps_ns[-1]), (x, y, theta), distance, turn, _nothing(tuple(variance)),
-              last.counted, last.counted_ns, _nothing(last.held))
-    speeds = UNKNOWN if last.rate is None else Speeds(
-        last.rate[:3], last.rate[3:5], last.rate[5:])
-    return _Instant(last.raw, row, last.offset,
-                    SpeedWindow(speeds, last.since_ns, last.since, last.way), last.jumped,
-                    twist=last.twist)
-
-
-def _nothing(variance: Variances) -> Variances:
-    """Return `NOTHING` itself for a variance of zero, as `next_row` compares by identity."""
-    return variance if any(variance) else NOTHING

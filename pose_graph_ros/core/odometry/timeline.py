@@ -56,17 +56,14 @@ def next_row(
     _, _, distance, turn, total, counted, counted_ns, held = before
     step = math.hypot(pose[0] - counted[0], pose[1] - counted[1])
     bend = abs(wrap_one(pose[2] - counted[2]))
-    if variance is not NOTHING:
-        held = held[0] + variance[0], held[1] + variance[1], held[2] + variance[2]
+    held = held[0] + variance[0], held[1] + variance[1], held[2] + variance[2]
     if step >= JITTER_DISTANCE or bend >= JITTER_HEADING:
         distance, turn, counted, counted_ns = distance + step, turn + bend, pose, stamp_ns
-        if held is not NOTHING:
-            total = total[0] + held[0], total[1] + held[1], total[2] + held[2]
-            held = NOTHING
-    elif held is not NOTHING and stamp_ns - counted_ns > STANDING_NS:
+        total = total[0] + held[0], total[1] + held[1], total[2] + held[2]
+        held = NOTHING
+    elif any(held) and stamp_ns - counted_ns > STANDING_NS:
         held, counted_ns = NOTHING, stamp_ns
-    if loose is not NOTHING:
-        total = total[0] + loose[0], total[1] + loose[1], total[2] + loose[2]
+    total = total[0] + loose[0], total[1] + loose[1], total[2] + loose[2]
     return Row(stamp_ns, pose, distance, turn, total, counted, counted_ns, held)
 
 

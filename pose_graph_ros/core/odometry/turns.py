@@ -26,10 +26,9 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, YawRate
-from pose_graph_ros.core.odometry.gyro import GyroStream, RateIntegral, Rotation, SavedRates
+from pose_graph_ros.core.odometry.gyro import GyroStream, RateIntegral, Rotation
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.timeline import STANDING_NS
-from pose_graph_ros.core.saved_columns import Integers, Pairs, Rows5
 
 # Rotations of independent sensors that differ by more contradict each other [sigma].
 CONTRADICTORY = 1.5
@@ -134,12 +133,9 @@ class Turn(NamedTuple):
 class SavedGyro:
     """Saved state of a gyroscope."""
 
-    rates: SavedRates
+    rates: tuple[YawRate, ...]  # from the last node on that was reached
     next_node: int  # number of the hidden node that the next rotation leads to
-    # stamps of rotations that are not in the graph yet, shape (W,); see `Turn` [ns]
-    waiting_ns: Integers
-    waiting_ends: Pairs  # ids of their nodes, shape (W, 2)
-    waiting: Rows5  # angle, variance, time, and what rest tells, shape (W, 5)
+    waiting: tuple[Turn, ...]  # rotations that are not in the graph yet
 
 
 class Gyros:
@@ -290,21 +286,12 @@ class Gyros:
 
     def saved(self, waiting: Sequence[Turn]) -> dict[str, SavedGyro]:
         """Return the state of each gyroscope, with the rotations that wait for an update."""
-        result = {}
-        for source, stream in self.streams.items():
-            turns = [turn for turn in waiting if turn.source == source]
-            result[source] = SavedGyro(
-                stream.saved(), self._next[source],
-                np.array([turn.stamp_ns for turn in turns], dtype=np.int64),
-                np.array([(turn.i, turn.j) for turn in turns], dtype=np.int64).reshape(-1, 2),
-                np.array([turn[4:] for turn in turns], dtype=np.float64).reshape(-1, 5))
-        return result
+        return {source: SavedGyro(
+            stream.saved(), self._next[source],
+            tuple(turn for turn in waiting if turn.source == source))
+            for source, stream in self.streams.items()}
 
-    def restore(self, source: str, saved: SavedGyro) -> list[Turn]:
-        """Return the rotations that wait, after restoring the saved state of a gyroscope."""
+    def restore(self, source: str, saved: SavedGyro) -> None:
+        """Restore the saved state of a gyroscope."""
         self._stream(source).restore(saved.rates)
         self._next[source] = saved.next_node
-        return [Turn(source, i, j, stamp_ns, *numbers)
-                for stamp_ns, (i, j), numbers in zip(
-                    saved.waiting_ns.tolist(), saved.waiting_ends.tolist(),
-                    saved.waiting.tolist(), strict=True)]
