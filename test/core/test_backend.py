@@ -141,18 +141,7 @@ REFERENCE = run(ALL)
 REFERENCE_PATH = path(REFERENCE)
 
 
-# --- Hidden nodes ----------------------------------------------------------------------------
-
-def test_hidden_nodes_come_from_odometry_alone() -> None:
-    odometry_alone = run(DRIVE.odometry)
-    assert odometry_alone.graph.n_nodes == REFERENCE.graph.n_nodes
-    np.testing.assert_array_equal(odometry_alone.node_stamps_ns, REFERENCE.node_stamps_ns)
-    # 70 m with a node a metre (two samples; with 5 cm of noise now and then three)
-    assert 50 <= REFERENCE.graph.n_nodes <= 71
-
-
-# --- Order of arrival ------------------------------------------------------------------------
-
+# --- The path --------------------------------------------------------------------------------
 
 def test_the_path_is_near_the_truth_and_exact_without_noise() -> None:
     stamps = [sample.stamp_ns for sample in DRIVE.odometry]
@@ -169,38 +158,6 @@ def test_the_path_is_near_the_truth_and_exact_without_noise() -> None:
 
 
 # --- Answers ---------------------------------------------------------------------------------
-
-def test_a_measurement_is_pending_until_odometry_reaches_its_stamp() -> None:
-    backend = PoseGraphBackend(prompt())
-    for sample in DRIVE.odometry[:50]:
-        backend.add_odometry(sample)
-    late = next(p for p in DRIVE.positions if p.stamp_ns > DRIVE.odometry[50].stamp_ns)
-    answer = feed(backend, late)
-    assert answer.status is AnswerStatus.PENDING
-    assert backend.n_waiting == 1
-    assert backend.counts['Position', 'accepted'] == 0
-    assert backend.update().new_constraints == 0
-    for sample in DRIVE.odometry[50:]:
-        before = backend.n_waiting
-        backend.add_odometry(sample)
-        if before == 1 and backend.n_waiting == 0:
-            assert sample.stamp_ns >= late.stamp_ns
-    assert backend.n_waiting == 0
-    assert backend.counts['Position', 'accepted'] == 1
-
-
-def test_a_loop_closure_waits_for_the_later_of_its_two_stamps() -> None:
-    backend = PoseGraphBackend(prompt())
-    for sample in DRIVE.odometry[:50]:
-        backend.add_odometry(sample)
-    early, late = DRIVE.odometry[10].stamp_ns, DRIVE.odometry[60].stamp_ns
-    assert backend.add_measurement(
-        LoopClosure(early, np.zeros(3), np.eye(3), reference_ns=late), 'scan',
-    ).status is AnswerStatus.PENDING
-    for sample in DRIVE.odometry[50:61]:
-        backend.add_odometry(sample)
-    assert backend.counts['scan', 'accepted'] == 1
-
 
 @pytest.mark.parametrize(('sample', 'reason'), [
     (OdometrySample(0, np.zeros(3)), 'zero_stamp'),
@@ -530,19 +487,6 @@ def test_a_heading_that_drifts_far_in_a_long_outage_is_wound_the_right_way(
     backend.graph.set_poses(truth)
     from_truth = optimizer.optimize(backend.graph, BackendConfig().final_optimization)
     assert found <= from_truth.chi2 * (1.0 + 1e-9)
-
-
-def test_a_loop_closure_that_came_too_early_can_be_sent_again() -> None:
-    backend = run(DRIVE.odometry[:60])
-    node = backend.graph.n_nodes + 5
-    closure = LoopClosure(DRIVE.odometry[30].stamp_ns, np.zeros(3), np.eye(3),
-                          reference_node=node)
-    assert backend.add_measurement(closure, 'loop').reason == 'unknown_node'
-    for sample in DRIVE.odometry[60:]:
-        backend.add_odometry(sample)
-    assert backend.graph.n_nodes > node
-    assert backend.add_measurement(closure, 'loop').status is AnswerStatus.ACCEPTED
-    assert backend.add_measurement(closure, 'loop').reason == 'duplicate_stamp'
 
 
 def test_one_poor_position_does_not_delay_the_alignment() -> None:

@@ -2,20 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings that change under way: for what comes from then on, and for nothing before."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import (
-    AlignmentPolicy,
     BackendConfig,
-    CovariancePolicy,
     Loss,
     MeasurementSource,
     NodePolicy,
@@ -162,26 +159,6 @@ def test_what_must_stay_is_refused_and_then_nothing_changes(
 
 # --- Odometry ------------------------------------------------------------------------------------
 
-def test_nodes_are_made_by_the_new_policy_from_then_on_and_those_before_stay() -> None:
-    def policy(distance: float) -> BackendConfig:
-        return replace(CONFIG, nodes=NodePolicy(
-            minimum_travel_distance=distance, minimum_travel_heading=3.0, moving_interval=600.0))
-
-    samples = [OdometrySample(SECOND + k * SECOND // 10, np.array([0.25 * k, 0.0, 0.0]))
-               for k in range(401)]     # 100 m
-    dense = feed(PoseGraphBackend(policy(1.0)), [('odom', sample) for sample in samples])
-    assert len(dense.node_stamps_ns) == 101
-    backend = feed(PoseGraphBackend(policy(1.0)), [('odom', one) for one in samples[:203]])
-    before = backend.graph.poses.copy()
-    backend.configure(policy(5.0))
-    assert len(backend.node_stamps_ns) == 51
-    feed(backend, [('odom', sample) for sample in samples[203:]])
-    np.testing.assert_array_equal(backend.node_stamps_ns[:51], dense.node_stamps_ns[:51])
-    np.testing.assert_array_equal(backend.graph.poses[:51], before)
-    # from the node at 50 m on one each 5 m: 2 s
-    assert np.diff(backend.node_stamps_ns[50:]).tolist() == 10 * [2 * SECOND]
-
-
 @pytest.mark.parametrize('wanted', [
     with_odometry(noise=OdometryNoise(sigma_distance=0.4, sigma_heading_turn=0.3)),
     with_odometry(covariance_scale=9.0),
@@ -245,28 +222,6 @@ def test_another_reorder_window_takes_what_comes_late_from_then_on() -> None:
 
 # --- Measurements --------------------------------------------------------------------------------
 
-@pytest.mark.parametrize('change', [
-    lambda policy: replace(policy, override=(2.0,)), lambda policy: replace(policy, scale=7.0),
-    lambda policy: replace(policy, position_floor=3.0),
-    lambda policy: replace(policy, position_ceiling=0.2)])
-def test_covariances_are_treated_as_set_when_a_measurement_comes(
-    change: Callable[[CovariancePolicy], CovariancePolicy],
-) -> None:
-    events = only(DRIVE, 'odom', 'fix')
-    wanted = with_fix(covariance=change(CovariancePolicy()))
-    old, new = (feed(PoseGraphBackend(config), events) for config in (CONFIG, wanted))
-    backend = feed(PoseGraphBackend(CONFIG), events[:len(events) // 2])
-    made = sum(source == 'fix' for source, _ in events[:len(events) // 2])
-    backend.configure(wanted)
-    feed(backend, events[len(events) // 2:])
-    for one in (old, new, backend):
-        one.optimize()
-    assert 5 < made < backend.graph.n_observed - 5
-    np.testing.assert_array_equal(
-        observed(backend), np.concatenate((observed(old)[:made], observed(new)[made:])))
-    assert not np.allclose(observed(old), observed(new), rtol=0.1)
-
-
 def test_a_loss_counts_for_what_joins_from_then_on() -> None:
     events = [(source, replace(event, position=event.position + np.array((9.0, 0.0)))
                if source == 'fix' and k % 3 == 0 else event)
@@ -293,16 +248,3 @@ def test_a_loss_counts_for_what_joins_from_then_on() -> None:
     np.testing.assert_array_equal(backend.graph.weights[1][:made], 1.0)
     assert np.min(backend.graph.weights[1][made:]) < 0.1
     np.testing.assert_allclose(ended(backend), before, atol=1e-9)
-
-
-def test_the_map_is_aligned_as_soon_as_the_new_policy_lets_it() -> None:
-    events = only(DRIVE, 'odom', 'fix')
-    strict = replace(CONFIG, alignment=AlignmentPolicy(minimum_baseline=900.0))
-    backend = feed(PoseGraphBackend(strict), events, 50)
-    backend.update()
-    assert backend.estimate().alignment is AlignmentState.UNALIGNED
-    backend.configure(CONFIG)
-    backend.update()
-    assert backend.estimate().alignment is AlignmentState.ALIGNED
-    expected = feed(PoseGraphBackend(CONFIG), events)
-    np.testing.assert_allclose(ended(backend), ended(expected), atol=1e-9)

@@ -122,15 +122,6 @@ def test_with_a_window_nodes_that_were_thinned_out_leave_with_it_and_lose_their_
         assert 0.0 < np.trace(place.noise[:2, :2]) < 1.0
 
 
-def test_saved_halfway_a_thinned_graph_goes_on_as_without() -> None:
-    once, other = (driven(settings(2.0), at)[0] for at in (-1, 3 * PER_LAP))
-    one, two = once.estimate(), other.estimate()
-    assert one is not None
-    assert two is not None
-    assert abs(once.graph.n_nodes - other.graph.n_nodes) <= 10
-    assert np.max(np.hypot(*(one.path.poses - two.path.poses)[:, :2].T)) < 0.1
-
-
 def test_fixes_with_correlated_errors_leave_with_their_biases() -> None:
     config = settings(2.0)
     config = replace(config, thinning=replace(config.thinning, newest=8))

@@ -226,21 +226,6 @@ def test_one_bad_fix_of_many_is_set_aside_by_its_name(aligned: bool) -> None:
         backend.estimate().path.poses, whole.estimate().path.poses, atol=1e-6)
 
 
-def test_many_bad_ones_are_set_aside_over_the_next_updates() -> None:
-    smoother = Picky()
-    backend = driven(20, smoother)
-    quarantined = []
-    while len(quarantined) < 20 and (not quarantined or quarantined[-1] < 20):
-        before = smoother.asked
-        backend.update()
-        assert smoother.asked - before <= 4 * (transaction.MOST_ATTEMPTS + 4)
-        quarantined.append(backend.n_quarantined)
-    assert quarantined == sorted(set(quarantined))  # each update finds at least one
-    backend.update()
-    assert backend.graph.n_observed == 101
-    assert all(name.startswith('fix at ') for name in backend.set_aside(3))
-
-
 def test_a_stream_ends_with_all_good_ones_in_the_graph() -> None:
     backend = driven(20, Picky())
     assert backend.optimize().status is Status.FAILED

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A back end with a window: the same poses as without, and a graph that does not grow."""
 
-from dataclasses import replace
 import functools
 
 import numpy as np
@@ -21,8 +20,6 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import (
-    AnswerStatus,
-    GlobalPose,
     LoopClosure,
     Measurement,
     OdometrySample,
@@ -157,24 +154,6 @@ def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:
     assert np.all(last <= 1.15 * first + 5)
 
 
-def test_measurements_before_the_window_are_refused_and_counted() -> None:
-    events, _ = drive(N)
-    backend = run(events, WINDOW)
-    first = backend._nodes.n_frozen
-    stamps = backend.node_stamps_ns
-    old, between, kept = (int(stamps[first - 2]), int(stamps[first - 1] + stamps[first]) // 2,
-                          int(stamps[first + 5]))
-    fix = Position(old + 1, np.zeros(2), np.eye(2), np.zeros(2))
-    assert add(backend, ('late', fix)) == 'before_window'
-    for reference in ({'reference_ns': old}, {'reference_node': 3}):
-        closure = LoopClosure(kept + 1, np.zeros(3), np.eye(3), **reference)
-        assert add(backend, ('loop_closure', closure)) == 'before_window'
-    assert backend.counts['loop_closure', 'before_window'] == 2
-    assert 'the graph begins at' in backend.refusals['late', 'before_window']
-    assert add(backend, ('late', replace(fix, stamp_ns=between))) == 'accepted'
-    assert backend._pipeline.queue.observed[-1].attachment.node == backend._nodes.ids[first]
-
-
 def test_delayed_and_shuffled_within_the_window_the_path_is_the_same() -> None:
     events, _ = drive(N)
     rng = np.random.default_rng(1)
@@ -215,26 +194,6 @@ def test_a_path_that_has_left_moves_into_the_map_when_the_angle_is_found() -> No
     # a frozen path is that of odometry, in one piece
     steps = se2.between(estimate.path.poses[:-2], estimate.path.poses[1:-1])
     assert np.max(np.hypot(steps[:, 0] - 1.0, steps[:, 1])) < 0.7
-
-
-def test_a_pose_that_is_set_and_a_smaller_window_at_run_time() -> None:
-    events, _ = drive(N)
-    at = 2 * len(events) // 3
-    backend = run(events[:at], WINDOW)
-    pose = GlobalPose(0, np.array([50.0, 60.0, 1.0]), 0.01 * np.eye(3))
-    assert backend.set_pose(pose, 'set_pose').status is AnswerStatus.ACCEPTED
-    backend.configure(BackendConfig(window=WindowConfig(nodes=40)))
-    kept = []
-    for number, event in enumerate(events[at:]):
-        if event[0] == 'odom':      # all else contradicts the pose that was set
-            add(backend, event)
-        if number % 12 == 11:
-            assert backend.update().status is not Status.FAILED
-            kept.append(len(backend._nodes) - backend._nodes.n_frozen)
-    assert kept[0] <= 45
-    assert max(kept) <= 45 + 12
-    estimate = backend.estimate()
-    assert np.linalg.norm(estimate.T_map_base[:2] - (50.0, 60.0)) < 110.0
 
 
 def test_a_closure_that_waits_holds_its_node_but_not_for_ever() -> None:
