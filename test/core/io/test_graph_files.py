@@ -79,7 +79,7 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.ids, :2])
     members = json.loads(side.read_text(encoding='ascii'))
-    assert members['version'] == 5
+    assert members['version'] == 6
     assert members['datum'] == {
         'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0, 'yaw': 0.25}
     assert members['nodes']['stamps_ns'] == saved.nodes.stamps_ns.tolist()
