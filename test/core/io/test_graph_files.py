@@ -224,12 +224,26 @@ def old_columns(new: dict[str, Any]) -> dict[str, Any]:
         'sources', 'source', 'stamps_ns', 'state', 'since_ns', 'decision', 'distance')}
 
 
+def old_stream(new: dict[str, Any]) -> dict[str, Any]:
+    waiting, last = new['waiting'], new['last']
+    row, window, speeds = last['row'], last['window'], last['window']['speeds']
+    return {**new, 'waiting_ns': [each['stamp_ns'] for each in waiting], 'waiting': [
+        [*each['pose'], each['speed'], *(each['variance'] or [0.0] * 3)] for each in waiting],
+        'last': {
+            **{name: last[name] for name in ('raw', 'offset', 'jumped')},
+            **{name: row[name] for name in ('counted', 'counted_ns', 'held')},
+            **{name: window[name] for name in ('since_ns', 'since')}, 'way': window['path'],
+            'rate': [*speeds['velocity'], *speeds['recent'], *speeds['greatest']]}}
+
+
 def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_path: Path) -> None:
     _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
 
     def as_version_4(members: dict[str, Any]) -> None:
         members['version'] = 4
         members['graph']['edge_weight'][0] = 0.01
+        streams = members['nodes']['streams']
+        streams |= {name: old_stream(stream) for name, stream in streams.items()}
         new = members['judgement']
         members['judgement'] = {
             'closures': old_columns(new['closures']) | {'scales': new['closures']['scales']},
@@ -246,6 +260,9 @@ def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_p
     saved = read_graph(side)
     assert saved.rows.edges.weight[0] == 0.01
     assert_same_value(saved.judgement, saved_drive().judgement)
+    for name, stream in saved_drive().nodes.streams.items():
+        assert_same_value(saved.nodes.streams[name].last, stream.last)
+        assert len(saved.nodes.streams[name].waiting) == len(stream.waiting) > 0
 
 
 @pytest.mark.parametrize('body', [b'', b'"format": ', b'}}', b'"a": ' + b'[' * 10**5])
