@@ -20,7 +20,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from pose_graph_ros.core.config import OdometryNoise
+from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
@@ -163,17 +163,14 @@ class Consensus:
     sigma_heading: float
     node: int  # hidden node at which the angle has the least variance
     walk: float  # variance of the heading by odometry up to the node [rad^2]
-    baseline: float  # diagonal of the box around the inliers in the odometry frame [m]
-    # standard deviation of a position, by the mean weight, inflated by the residuals [m]
-    sigma_position: float
-    scale: float  # ratio of lengths in the map to lengths by odometry
-    count: int  # number of inliers
-    inlier_fraction: float  # number of inliers over the number of positions
     # whether the mirror image of odometry fits better, as with a left-handed frame
     is_mirrored: bool
+    is_certain: bool  # whether the angle is known well enough to align the graph
 
 
-def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
+def consensus(
+    positions: Positions, policy: AlignmentPolicy, noise: OdometryNoise,
+) -> Consensus | None:
     """Return the motion that most positions agree on; None if no two agree on an angle."""
     variance = positions.variance + _drift(positions, noise)
     inlier, cost = _inliers(positions.odometry, positions.observed, variance)
@@ -194,14 +191,24 @@ def consensus(positions: Positions, noise: OdometryNoise) -> Consensus | None:
     inflation = max(1.0, chi2 / (2.0 * n - 4.0)) if n > 2 else 1.0
     variance_heading, best = _heading_variance(chosen, weight * p / spread, z, noise)
     shift = q_mean - z / abs(z) * p_mean
+    sigma = float(np.sqrt(inflation * variance_heading))
+    is_mirrored = bool(cost_of_mirrored < cost - TUNED.truncation
+                       and np.mean(mirrored) >= TUNED.least_agreement)
+    # only a third position could show that one of two is wrong
+    of_two = n > 2 or (n == len(inlier) and abs(abs(z) - 1.0) <= 2.0 * float(
+        np.hypot(sigma, TUNED.scale_of_two)))
+    sigma_position = float(np.sqrt(inflation / np.mean(1.0 / chosen.variance)))
+    sigmas = policy.baseline_in_sigmas * (1.0 if n > 2 else 2.0)
+    # with a scale far from 1, odometry or positions do not follow the robot (spinning wheels, a
+    # frozen receiver), and the angle is meaningless
+    is_certain = (
+        of_two and not is_mirrored and sigma <= policy.sigma_heading
+        and chosen.baseline >= max(policy.minimum_baseline, sigmas * sigma_position)
+        and 1.0 / TUNED.largest_scale <= abs(z) <= TUNED.largest_scale
+        and n / len(inlier) >= TUNED.least_agreement - 1e-9)
     return Consensus(
-        T_map_odom=np.array([shift.real, shift.imag, np.angle(z)]),
-        sigma_heading=float(np.sqrt(inflation * variance_heading)),
-        node=int(chosen.node[best]), walk=float(chosen.walk[best]), baseline=chosen.baseline,
-        sigma_position=float(np.sqrt(inflation / np.mean(1.0 / chosen.variance))),
-        scale=abs(z), count=n, inlier_fraction=n / len(inlier), is_mirrored=bool(
-            cost_of_mirrored < cost - TUNED.truncation
-            and np.mean(mirrored) >= TUNED.least_agreement))
+        np.array([shift.real, shift.imag, np.angle(z)]), sigma, int(chosen.node[best]),
+        float(chosen.walk[best]), is_mirrored, is_certain)
 
 
 def _drift(positions: Positions, noise: OdometryNoise) -> FloatArray:

@@ -99,24 +99,6 @@ def recheck(
     return found if difference > limit else None
 
 
-def _certain(found: Consensus, policy: AlignmentPolicy) -> bool:
-    """Tell whether the angle of a fit is known well enough to align the graph."""
-    sigmas = policy.baseline_in_sigmas
-    if found.count < 3:
-        # only a third position could show that one of the two is wrong
-        tolerance = 2.0 * float(np.hypot(found.sigma_heading, TUNED.scale_of_two))
-        if found.inlier_fraction < 1.0 or abs(found.scale - 1.0) > tolerance:
-            return False
-        sigmas *= 2.0
-    # with a scale far from 1, odometry or positions do not follow the robot (spinning wheels, a
-    # frozen receiver), and the angle is meaningless
-    return (not found.is_mirrored and found.sigma_heading <= policy.sigma_heading
-            and found.baseline >= policy.minimum_baseline
-            and found.baseline >= sigmas * found.sigma_position
-            and 1.0 / TUNED.largest_scale <= found.scale <= TUNED.largest_scale
-            and found.inlier_fraction >= TUNED.least_agreement - 1e-9)
-
-
 def _from_positions(
     positions: Positions, policy: AlignmentPolicy, noise: OdometryNoise,
 ) -> GraphAlignment:
@@ -127,7 +109,7 @@ def _from_positions(
     for shortening in TUNED.shortenings:
         least = TUNED.least_of_shortened if shortening > 1.0 else min(3, len(positions.node))
         stretches = _stretches(positions, shortening)
-        found = [consensus(stretch, noise) if len(stretch.node) >= least else None
+        found = [consensus(stretch, policy, noise) if len(stretch.node) >= least else None
                  for stretch in stretches]
         sparse = sparse and all(len(stretch.node) < least for stretch in stretches)
         left_handed = [item.is_mirrored for item in found if item is not None]
@@ -142,7 +124,7 @@ def _from_positions(
     if sparse:
         # every stretch of the long drive has too few positions
         whole = positions.thinned()
-        best = _supported([whole], [consensus(whole, noise)], policy, 3)
+        best = _supported([whole], [consensus(whole, policy, noise)], policy, 3)
     return best or GraphAlignment(None, sigma)
 
 
@@ -167,7 +149,7 @@ def _supported(
     """Return the newest certain fit that enough stretches agree with, up to odometry's drift."""
     candidates, n_relevant = [], 0
     for stretch, item in zip(stretches, found, strict=True):
-        if item is not None and _certain(item, policy):
+        if item is not None and item.is_certain:
             candidates.append(item)
             n_relevant += 1
         else:

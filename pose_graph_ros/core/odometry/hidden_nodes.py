@@ -24,7 +24,7 @@ from pose_graph_ros.core.odometry.several_sources import (
     Silence,
 )
 from pose_graph_ros.core.odometry.stream import OdometryStream
-from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
+from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline, Row
 from pose_graph_ros.core.saved_columns import as_matrix, as_pose
 
 
@@ -50,7 +50,7 @@ class HiddenNodes(NodeTable):
         self.streams: dict[str, OdometryStream] = {}  # by the name of the source
         # stamp after which a source is the primary one [ns], and its name, by stamp
         self._primaries: list[tuple[int, str]] = []
-        self._n_forgotten_primaries = 0
+        self.n_primaries = 0  # number of times that a source became the primary one
         # stamp of the newest sample of the primary source that was checked for a node [ns]: up to
         # there everything is settled; -1 before the first odometry
         self.covered_ns = -1
@@ -82,11 +82,6 @@ class HiddenNodes(NodeTable):
     def primary(self) -> str:
         """Source that makes the nodes; empty before the first one."""
         return self._primaries[-1][1] if self._primaries else ''
-
-    @property
-    def n_primaries(self) -> int:
-        """Number of times that a source became the primary one."""
-        return self._n_forgotten_primaries + len(self._primaries)
 
     @property
     def newest_ns(self) -> int:
@@ -158,11 +153,15 @@ class HiddenNodes(NodeTable):
         assert first_ns is not None
         stream.settle_all(first_ns)
         pose = stream.timeline.poses[0]
-        self._primaries.append((-1, source))
+        self._set_primary(-1, source)
         self.covered_ns = self._base_ns = first_ns
         self._append(
             first_ns, self._make_node(pose.copy(), None, source), as_pose(pose), pose.copy())
         self._catch_up()
+
+    def _set_primary(self, after_ns: int, source: str) -> None:
+        self._primaries.append((after_ns, source))
+        self.n_primaries += 1
 
     def _replace_silent_primary(self, source: str, settled_ns: int) -> None:
         """Replace the primary source if it was silent before a settled sample of a source."""
@@ -183,7 +182,7 @@ class HiddenNodes(NodeTable):
         stream.settle_all(silence.known_ns)
         self._add_secondary_edges()
         timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
-        self._primaries.append((last_ns, source))
+        self._set_primary(last_ns, source)
         if self._span is None and timeline.covers(node_ns):
             self._base_ns = node_ns
         else:
@@ -325,12 +324,12 @@ class HiddenNodes(NodeTable):
 
     def _between_nodes(self, node: int, stamp_ns: int) -> Motion:
         """Return the motion from a node to before the next one, without the samples there."""
-        ends, row = OdometryTimeline(), None
+        rows: list[Row] = []
         for number in (node, node + 1):
-            row = next_row(row, int(self.stamps_ns[number]),
-                           as_pose(self.odometry[number - self.n_frozen]))
-            ends.append(row)
-        return ends.motion(int(self.stamps_ns[node]), stamp_ns)
+            rows.append(next_row(
+                rows[-1] if rows else None, int(self.stamps_ns[number]),
+                as_pose(self.odometry[number - self.n_frozen])))
+        return OdometryTimeline(rows).motion(int(self.stamps_ns[node]), stamp_ns)
 
     def drop_samples(self, newest: int) -> None:
         """
@@ -359,7 +358,6 @@ class HiddenNodes(NodeTable):
                 self._secondary.skip_to(source, max(node, first), reached=False)
         n_old = sum(after_ns < last_ns for after_ns, _ in self._primaries) - 1
         del self._primaries[:max(n_old, 0)]
-        self._n_forgotten_primaries += max(n_old, 0)
 
     def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
@@ -390,7 +388,8 @@ class HiddenNodes(NodeTable):
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
         self.fill(saved)
-        self._primaries = list(zip(saved.leads_after_ns.tolist(), saved.leads, strict=True))
+        for after_ns, source in zip(saved.leads_after_ns.tolist(), saved.leads, strict=True):
+            self._set_primary(after_ns, source)
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
         if saved.bridge is not None:
             self._span = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)

@@ -274,9 +274,7 @@ class OdometryStream(ReorderBuffer[Received]):
         after = bisect.bisect_left(rows, stamp_ns, key=lambda row: row.stamp_ns)
         if not 0 < after < len(rows):
             return None
-        ends = OdometryTimeline()
-        for row in rows[after - 1:after + 1]:
-            ends.append(row)
+        ends = OdometryTimeline(rows[after - 1:after + 1])
         if not ends.covers(stamp_ns, closely=True):
             return None
         first = self.timeline.motion_to(since_ns, rows[after - 1])

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Odometry samples by stamp, and the motion between any two instants that they cover."""
 
+from collections.abc import Iterable
 import math
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ class OdometryTimeline:
     the last are kept.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rows: Iterable[Row] = ()) -> None:
         self._stamps = GrowingArray((), np.int64)
         # x, y, theta, path length, sum of absolute turns
         self._samples = GrowingArray((5,), np.float64)
@@ -86,6 +87,8 @@ class OdometryTimeline:
         self._last: Row | None = None
         # whether the newest two samples are equal: an equal one would replace the newest
         self.resting = False
+        for row in rows:
+            self.append(row)
 
     def __len__(self) -> int:
         return len(self._stamps)

@@ -312,19 +312,6 @@ def by_twist(times: FloatArray, twist: tuple[float, float, float]) -> list[Odome
                            twist=twist) for k, t in enumerate(times.tolist())]
 
 
-def test_twists_between_messages_are_integrated_to_the_second_order() -> None:
-    for step, bound in ((0.1, 0.012), (0.05, 0.003)):
-        times = np.arange(0.0, 10.0 + 1e-9, step)
-        truth = drive(times, lambda t: 1.0 + 0.5 * np.sin(t), np.cos)
-        samples = [OdometrySample(one.stamp_ns, np.zeros(3), twist=(
-            1.0 + 0.5 * math.sin(t), 0.0, math.cos(t)))
-            for one, t in zip(truth, times.tolist(), strict=True)]
-        stream = settled(samples, integrate=Integrate.TWIST)
-        pose = stream.timeline.poses[-1]
-        assert math.hypot(*(pose - truth[-1].pose)[:2]) < bound
-        assert stream.n_jumps == 0
-
-
 def test_a_gap_between_twists_is_an_uncertain_motion() -> None:
     times = np.array([0.0, 0.5, 1.0, 3.5, 4.0])
     stream = settled(by_twist(times, (1.0, 0.0, 0.0)), integrate=Integrate.TWIST)
