@@ -123,11 +123,6 @@ class Corrected(NamedTuple):
     covariance: FloatArray  # in map axes, shape (3, 3)
 
 
-class _Passed(NamedTuple):
-    edge: Edges  # from the newest node to a state of the bias of its source, or to none, -1
-    is_gated: bool
-
-
 def corrected(parts: Parts, node: Corrected) -> Corrected:
     """Return the newest node of an aligned graph with what odometry has passed."""
     if parts.graph.has_touched:
@@ -135,7 +130,7 @@ def corrected(parts: Parts, node: Corrected) -> Corrected:
     passed = _passed(parts)
     if len(passed) == 0:
         return node
-    ids = [int(parts.nodes.ids[-1]), *sorted({int(each.edge.j[0]) for each in passed} - {-1})]
+    ids = [int(parts.nodes.ids[-1]), *sorted({int(edge.j[0]) for edge, _ in passed} - {-1})]
     state, joint = parts.graph.poses_of(ids), _joint(parts.smoother, ids)
     for edge, is_gated in passed:
         error, jacobian, noise = _linearized(edge, state, ids)
@@ -148,8 +143,10 @@ def corrected(parts: Parts, node: Corrected) -> Corrected:
     return Corrected(se2.wrapped(state[0]), 0.5 * (joint[:3, :3] + joint[:3, :3].T))
 
 
-def _passed(parts: Parts) -> list[_Passed]:
-    """Return what waits for odometry to be settled only, in the order of stamps."""
+def _passed(parts: Parts) -> list[tuple[Edges, bool]]:
+    """
+    Return what waits for odometry to be settled only, in the order of stamps, and if it is gated.
+    """
     found = []
     for source, given in parts.pipeline.waiting.until(parts.nodes.newest_ns):
         attachment = parts.nodes.attach_ahead(given.stamp_ns)
@@ -162,7 +159,7 @@ def _passed(parts: Parts) -> list[_Passed]:
         if isinstance(measurement, Position) and value_defect(measurement.position) is not None:
             continue
         settings = parts.factors.config.measurement_source(source, type(measurement))
-        found.append(_Passed(
+        found.append((
             _edge(measurement, attachment, model),
             settings.robust is Robust.JUDGED or settings.applied_loss is not Loss.NONE))
     return found

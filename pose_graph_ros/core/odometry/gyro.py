@@ -93,32 +93,24 @@ class GyroStream(ReorderBuffer[YawRate]):
         n = bisect.bisect_right(self._settled, stamp_ns, key=stamp_of) - 1
         del self._settled[:max(n, 0)]
 
-    def integral(self, start_ns: StampNs, end_ns: StampNs) -> 'RateIntegral | None':
-        """Return the integral of the rate; None if samples do not cover the time without a gap."""
-        begin, end = _around(self._settled, start_ns, end_ns)
-        if begin < 0 or end > len(self._settled):
-            return None
-        return self._integrated(self._settled[begin:end])
-
-    def newest(self, start_ns: StampNs, end_ns: StampNs) -> 'Rotation | None':
+    def integral(
+        self, start_ns: StampNs, end_ns: StampNs, *, to_come: bool = False,
+    ) -> 'RateIntegral | None':
         """
-        Return the rotation between two instants, by samples that need not be settled.
+        Return the integral of the rate; None if samples do not cover the time without a gap.
 
-        The newest rate is taken to last until the end, if that is no gap. None as for `integral`.
+        Where samples are still to come, the newest rate is taken to last until the end.
         """
         every = self._settled + self._waiting
-        begin, end = _around(every, start_ns, end_ns)
-        if begin < 0 or end_ns - start_ns <= 0:
+        begin = bisect.bisect_right(every, start_ns, key=stamp_of) - 1
+        if begin < 0:
             return None
-        samples = every[begin:end]
-        if end > len(every):
-            samples.append(replace(every[-1], stamp_ns=end_ns))
-        integral = self._integrated(samples)
-        return None if integral is None else integral.between(start_ns, end_ns)
-
-    def _integrated(self, samples: list[YawRate]) -> 'RateIntegral | None':
+        samples = every[begin:bisect.bisect_left(every, end_ns, key=stamp_of) + 1]
+        if to_come and samples[-1].stamp_ns < end_ns:
+            samples.append(replace(samples[-1], stamp_ns=end_ns))
         stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
-        if len(stamps_ns) < 2 or np.max(np.diff(stamps_ns)) > self._gap_ns:
+        if (len(stamps_ns) < 2 or stamps_ns[-1] < end_ns
+                or np.max(np.diff(stamps_ns)) > self._gap_ns):
             return None
         rates = np.array([(each.rate, each.variance) for each in samples])
         return RateIntegral(stamps_ns, rates, self._source)
@@ -132,12 +124,6 @@ class GyroStream(ReorderBuffer[YawRate]):
         self._waiting = [*saved]
         if len(saved) > 0:
             self.settle(self._waiting[-1].stamp_ns - self._window_ns)
-
-
-def _around(samples: list[YawRate], start_ns: StampNs, end_ns: StampNs) -> tuple[int, int]:
-    """Return the range of samples that cover a time; it may begin at -1 or end too late."""
-    return (bisect.bisect_right(samples, start_ns, key=stamp_of) - 1,
-            bisect.bisect_left(samples, end_ns, key=stamp_of) + 1)
 
 
 class RateIntegral:

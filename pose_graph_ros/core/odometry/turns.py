@@ -277,11 +277,13 @@ class Gyros:
 
         It is that of the first source that has one, among those with a bias [rad/s].
         """
-        for source, bias in biases.items():
+        for source, bias in biases.items() if start_ns < end_ns else ():
             stream = self.streams.get(source)
-            rotation = None if stream is None else stream.newest(start_ns, end_ns)
-            if rotation is not None:
-                return rotation.angle - bias * rotation.seconds, rotation.variance
+            integral = None if stream is None else stream.integral(
+                start_ns, end_ns, to_come=True)
+            if integral is not None:
+                angle, variance, seconds = integral.between(start_ns, end_ns)
+                return angle - bias * seconds, variance
         return None
 
     def saved(self, waiting: Sequence[Turn]) -> dict[str, SavedGyro]:
