@@ -158,10 +158,6 @@ class Input:
         self.posted_at = time.monotonic()  # time of the last of them, by a monotonic clock [s]
         self.is_streaming = False  # whether any were posted since the final optimisation
 
-    def configure(self, values: Mapping[str, Any]) -> None:
-        """Set the parameters that can change while the node runs."""
-        self.reader.configure(values)
-
     def start_new_graph(self, values: Mapping[str, Any]) -> None:
         """Forget all messages but those of /tf_static; those that are held back stay so."""
         self.reader = MessageReader(values, self.reader.frames, self.reader.keeper)
@@ -230,30 +226,21 @@ class Input:
         The engine has counted measurements by source and 'accepted' or a reason, and kept the
         details of the newest refusals.
         """
-        now = time.monotonic()
+        now, details = time.monotonic(), {**details, **self._details}
         self.silent = self.liveness.silent(now) if active else []
         self.quiet = self.liveness.quiet(now) if active else 0.0
+        self.refused = self._refusals.update(self.received, counts + self.rejected, details, now)
         for (source, reason), detail in details.items():
-            self._tell_refusal(source, reason, detail)
-        self.refused = self._refusals.update(
-            self.received, counts + self.rejected, {**details, **self._details}, now)
+            if source in self.reader.sources and (source, reason) not in self._told:
+                self._told.add((source, reason))
+                logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
+                           '%s: %s: %s (logged once, counted in diagnostics)',
+                           source, reason, detail)
 
     def reject(self, source: str, answer: Answer) -> None:
-        """Count a message that cannot be used; log the first for each source and reason."""
-        self.count(source, answer)
-        self._tell_refusal(source, answer.reason, answer.detail)
-
-    def _tell_refusal(self, source: str, reason: str, detail: str) -> None:
-        if (source, reason) not in self._told:
-            self._told.add((source, reason))
-            logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
-                       '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
-
-    def count(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used."""
         self.rejected[source, answer.reason] += 1
         self._details[source, answer.reason] = answer.detail
-
 
 
 # A step in the stamps by more than this may be a mistake: it is treated as a jump [ns].

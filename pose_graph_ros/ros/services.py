@@ -44,9 +44,8 @@ class Services:
     def __init__(self, node: Node, session: Session) -> None:
         self._node, self._session = node, session
         self._closed = self._saving = False
-        self._quick = [node.create_service(kind, f'~/{name}', self._answering(act))
-                       for name, kind, act in (('reset', Trigger, self._reset),
-                                               ('pause', SetBool, self._pause))]
+        self._quick = [node.create_service(Trigger, '~/reset', self._answering(self._reset)),
+                       node.create_service(SetBool, '~/pause', self._answering(self._pause))]
         # it is within the node's own name, and none of the arguments that rename that are for it
         self._own = Node(HIDDEN_NODE, namespace=node.get_fully_qualified_name(),
                          context=node.context, use_global_arguments=False, enable_rosout=False,

@@ -169,7 +169,7 @@ class Session:
         """Set the parameters that can change while the node runs."""
         self.values = dict(values)
         self._config = config = backend_config(values)
-        self.input.configure(values)
+        self.input.reader.configure(values)
         self.out.configure(values)
         for name, source in config.odometry.items():
             self._continuity[name].maximum_speed = source.maximum_speed
@@ -228,7 +228,7 @@ class Session:
         answer = PAUSED if self.input.paused else self._set_pose_input.receive(
             message, early=self.worker.estimate is None)
         if answer is not None:
-            self.input.count(SET_POSE, answer)
+            self.input.reject(SET_POSE, answer)
             logger.warning(
                 'the pose is not set: %s: %s', answer.reason, answer.detail, extra=ANSWER)
         self._set_pose()

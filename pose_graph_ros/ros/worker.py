@@ -82,7 +82,7 @@ class Worker:
         self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
         self._condition = threading.Condition()
         self._revision = backend.revision
-        self._solves, self._solve_total, self._solve_max = 0, 0.0, 0.0
+        self._durations = 0, 0.0, 0.0  # number, sum and longest of updates with a solve [s]
         self._jumps: Counter[str] = Counter()  # of odometries, that were told
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
@@ -250,8 +250,8 @@ class Worker:
         report = update()
         if report.iterations > 0:
             seconds = time.monotonic() - start
-            self._solves, self._solve_total = self._solves + 1, self._solve_total + seconds
-            self._solve_max = max(self._solve_max, seconds)
+            count, total, longest = self._durations
+            self._durations = count + 1, total + seconds, max(longest, seconds)
         if report.reason != '':
             logger.warning('the solver failed with what is set aside, the estimate is without it: '
                            '%s', report.reason)
@@ -278,12 +278,13 @@ class Worker:
         doubted = {source for source, each in verdicts.items() if each.doubting}
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
+        count, total, longest = self._durations
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
             refusals=dict(backend.refusals),
             pending=backend.n_waiting, quarantined=backend.n_quarantined,
-            set_aside=backend.set_aside(3), updates=self._solves,
-            solve_mean=self._solve_total / max(self._solves, 1), solve_max=self._solve_max,
+            set_aside=backend.set_aside(3), updates=count, solve_mean=total / max(count, 1),
+            solve_max=longest,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
             biases=backend.gyro_biases(backend.graph),

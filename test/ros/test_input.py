@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From messages to measurements without a node: counts, reasons, and messages held back."""
 
+from collections import Counter
 from collections.abc import Iterator
 import math
 from types import SimpleNamespace as Space
@@ -106,6 +107,7 @@ def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
     assert given.input.received == {source: 3}
     assert given.rejected() == {f'{source}.{reason}': 3}
     assert given.input.posted == 0
+    given.input.watch(Counter(), {}, active=True)
     (sentence,) = caplog.messages
     assert sentence.startswith(f'{source}: {reason}: ')
     assert sentence.endswith('(logged once, counted in diagnostics)')
@@ -119,6 +121,7 @@ def test_a_full_inbox_is_a_reason_and_no_measurement(caplog: pytest.LogCaptureFi
     given.use('fix', fix(1.2))
     assert given.rejected() == {'odom.inbox_full': 2, 'fix.inbox_full': 1}
     assert given.input.reader.datum.plane is None
+    given.input.watch(Counter(), {}, active=True)
     assert 'the solver does not keep up' in caplog.messages[0]
 
 
@@ -135,7 +138,7 @@ def test_fixes_ahead_of_odometry_are_told_with_what_to_do(ahead: float, told: bo
         assert f'stamps of fix are {ahead:.1f} s ahead of those of odom' in (
             given.input.delays.wrong['fix'])
         assert 'fix.time_offset' in given.input.delays.wrong['fix']
-    given.input.configure(checked({'fix.time_offset': -ahead}))
+    given.input.reader.configure(checked({'fix.time_offset': -ahead}))
     given.use('fix', fix(120.0 + ahead))
     assert given.input.delays.wrong == {}
 
@@ -172,6 +175,7 @@ def test_a_new_graph_forgets_all_but_what_is_held_back(
     given.use('fix', fix(101.0, status=-1))
     given.use('odom', odometry(50.0))
     frames = given.input.reader.frames
+    given.input.watch(Counter(), {}, active=True)
     given.input.start_new_graph(checked(given.values))
     assert given.input.received == given.input.rejected == {}
     assert (given.input.posted, given.input.is_streaming) == (0, False)
@@ -181,4 +185,5 @@ def test_a_new_graph_forgets_all_but_what_is_held_back(
     assert [received.source for received in given.input.time_jumps.release()] == ['odom']
     # what was logged before is not logged again
     given.use('fix', fix(101.0, status=-1))
+    given.input.watch(Counter(), {}, active=True)
     assert len(caplog.messages) == 1

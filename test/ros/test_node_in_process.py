@@ -32,7 +32,6 @@ from pose_graph_ros.adapters.parameter_table import Change
 from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import all_parameters, checked
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics, requests, services
 from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.node import PoseGraphNode
@@ -41,12 +40,6 @@ from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
 SUCCESS = TransitionCallbackReturn.SUCCESS
-
-
-@pytest.fixture(autouse=True, scope='module')
-def _compiled() -> None:
-    """Compile the kernels, which may take half a minute, outside of the tests."""
-    warm_up(lambda: False)
 
 
 class Managed(Driver):

@@ -37,7 +37,6 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
-from pose_graph_ros.core.warm_up import warm_up
 from pose_graph_ros.ros import diagnostics
 from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.session import Session
@@ -45,12 +44,6 @@ from pose_graph_ros.ros.session import Session
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0}
-
-
-@pytest.fixture(autouse=True, scope='module')
-def _compiled() -> None:
-    """Compile the kernels, which may take half a minute, outside of the tests."""
-    warm_up(lambda: False)
 
 
 def health(session: object) -> tuple[bytes, str]:

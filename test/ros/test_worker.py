@@ -168,7 +168,7 @@ def test_between_updates_the_estimate_is_refined_until_nothing_is_left(start: St
         worker.post('odom', sample(step))
         if step % 10 == 0:
             worker.post('pose', GlobalPose(step * 100_000_000, np.array(
-                [0.3 * step, 0.0, 0.0]) + 0.1 * rng.normal(size=3), 0.01 * np.eye(3)))
+                [0.3 * step, 0.0, 0.0]) + 0.3 * rng.normal(size=3), 0.01 * np.eye(3)))
     worker.request_update()
     wait_until(lambda: len(backend.refinements) > 0 and backend.refinements[-1].finished)
     path = worker.call(lambda backend: backend.estimate().path).result(PATIENCE)
