@@ -10,6 +10,7 @@ Command line of the benchmark: choose a page or sections of it, measure, report,
 
 import argparse
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from datetime import date
 from importlib import import_module
 from importlib.util import find_spec
@@ -20,8 +21,7 @@ import time
 import traceback
 
 from benchmark import metrics, ours, report
-from benchmark.files import DATA
-from benchmark.section import kept_with, Options, say, Section
+from benchmark.section import about, kept_with, Options, say, Section
 
 PAGES = 'engine', 'solve', 'inputs', 'robust', 'window', 'load'
 """Modules with a page each: its title, its sections by name, and what it is about."""
@@ -38,31 +38,32 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         '  robust --quick                    another page\n'
         '  load --size 1000 --seconds 8      the node with 1000 hidden nodes\n'
         '  --write-baseline                  after a change for the better, on purpose\n')
+    parser.set_defaults(**asdict(Options()))
     parser.add_argument('names', nargs='*', default=[FIRST], metavar='NAME',
                         help=f'a page ({", ".join(PAGES)}; default {FIRST}) or sections of one, '
                         'as engine.loops; those that are not made again stay on the page')
     parser.add_argument('--quick', action='store_true', help='small worlds, few drives: minutes')
-    parser.add_argument('--case', action='append', default=[], metavar='TEXT',
+    parser.add_argument('--case', dest='cases', action='append', default=[], metavar='TEXT',
                         help='only worlds, drives and graphs with TEXT in their names; may be '
                         'given several times; other rows of the page stay')
-    parser.add_argument('--repeats', type=int, metavar='N', default=3,
+    parser.add_argument('--repeats', type=int, metavar='N',
                         help='runs of each tool that is timed (default %(default)s)')
     parser.add_argument('--runs', type=int, metavar='N', help='seeded drives of each kind')
-    parser.add_argument('--limit', type=float, default=60.0, metavar='SECONDS',
+    parser.add_argument('--limit', type=float, metavar='SECONDS',
                         help='cut a run of one tool after this time (default %(default)s); '
                         'ratios are then over the steps that were done')
-    parser.add_argument('--size', type=int, nargs='+', default=[], metavar='N',
+    parser.add_argument('--size', dest='sizes', type=int, nargs='+', metavar='N',
                         help='load: hidden nodes; window.samples: samples of odometry')
     parser.add_argument('--hours', type=float, metavar='H', help='window.day: length of drives')
-    parser.add_argument('--rates', type=float, nargs='+', default=Options().rates, metavar='HZ',
+    parser.add_argument('--rates', type=float, nargs='+', metavar='HZ',
                         help='load: of odometry (default %(default)s)')
-    parser.add_argument('--seconds', type=float, default=Options().seconds, metavar='S',
+    parser.add_argument('--seconds', type=float, metavar='S',
                         help='load: at each rate (default %(default)s)')
-    parser.add_argument('--data', type=Path, default=DATA, metavar='DIR',
+    parser.add_argument('--data', type=Path, metavar='DIR',
                         help='folder with public data; what is not there is skipped')
-    parser.add_argument('--without-gtsam', action='store_true',
+    parser.add_argument('--without-gtsam', dest='gtsam', action='store_false',
                         help='measure ours alone: no ratios')
-    parser.add_argument('--out', type=Path, metavar='DIR',
+    parser.add_argument('--out', type=Path, default=None, metavar='DIR',
                         help='folder of the page (default build/benchmark/PAGE)')
     parser.add_argument('--gate', action='store_true',
                         help='compare with benchmark/baseline.json and exit with 1 if anything '
@@ -107,16 +108,14 @@ def _measure(name: str, function: Callable[[Options], Section], options: Options
 def main(arguments: list[str]) -> int:
     """Run the benchmark; return 1 if a section failed or something got worse, 2 without GTSAM."""
     chosen = _parse(arguments)
-    gtsam = find_spec('gtsam') is not None
-    if chosen.page == FIRST and not chosen.without_gtsam and not gtsam:
-        say('gtsam is not installed: `make bench` does that, or give --without-gtsam')
-        return 2
-    out = chosen.out or Path('build/benchmark', chosen.page)
+    if chosen.gtsam and find_spec('gtsam') is None:
+        if chosen.page == FIRST:
+            say('gtsam is not installed: `make bench` does that, or give --without-gtsam')
+            return 2
+        chosen.gtsam = False
+    out = chosen.out = chosen.out or Path('build/benchmark', chosen.page)
     out.mkdir(parents=True, exist_ok=True)
-    options = Options(
-        chosen.quick, chosen.repeats, chosen.runs, chosen.data, tuple(chosen.case), chosen.limit,
-        gtsam and not chosen.without_gtsam, tuple(chosen.size), chosen.hours,
-        tuple(chosen.rates), chosen.seconds, out)
+    options = Options(**{each.name: getattr(chosen, each.name) for each in fields(Options)})
     # folders are others elsewhere
     shown = [word if before not in ('--data', '--out') else before[2:].upper()
              for before, word in zip(['', *arguments], arguments, strict=False)]
@@ -133,7 +132,7 @@ def main(arguments: list[str]) -> int:
                          rows=len(options.cases) > 0)
         path = report.write(
             kept, out, f'python -m benchmark {chosen.page}', title=chosen.module.TITLE,
-            about=chosen.module.__doc__ or '',
+            about=about(chosen.module),
             curves=[curve for each in made for curve in each.curves])
     figures = [metric for section in made for metric in section.metrics]
     asked = [metric for metric in figures if metric.target is not None]

@@ -7,33 +7,24 @@ Each drive is made in a process of its own, which prints a line of JSON for each
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from enum import Enum
 import gc
 import json
-from mmap import mmap
-import subprocess
-import sys
 import time
-from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 
 from benchmark.course import Course, SECOND, START_NS, WINDOWS
-from benchmark.parts import resident_bytes
-from benchmark.section import Options, say, Section, Table
+from benchmark.parts import child, resident_bytes
+from benchmark.section import about, Options, say, Section, Table
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.warm_up import warm_up
 
-DEPTH = 3
-"""Names of attributes in the name of an owner of memory."""
-OTHERS = (type, ModuleType, FunctionType, BuiltinFunctionType, Enum)
-"""What belongs to nobody."""
 RATE = 50.0
 """Of odometry [Hz]."""
 HOURS = 24.0
@@ -44,8 +35,6 @@ UPDATE_EVERY = 0.5
 REFINEMENTS = 4
 """Most iterations between two updates."""
 CALLS = 'odom', 'fix', 'loop_closure', 'update', 'refine'
-OWNERS = 12
-"""What is told of the memory: so many owners."""
 
 
 @dataclass(slots=True)
@@ -71,8 +60,6 @@ class Hour:
     """The longest update [ms]."""
     answers: dict[str, int]
     """Number of answers so far."""
-    owners: dict[str, int]
-    """Bytes by owner."""
 
 
 def resident() -> float:
@@ -131,8 +118,8 @@ def _squared_error(backend: PoseGraphBackend, course: Course) -> float:
     estimate = backend.estimate(with_path=False)
     if estimate is None:
         return 0.0
-    true = course.truth(np.array([(estimate.stamp_ns - START_NS) / SECOND]))[0]
-    return float(np.sum((estimate.T_map_base - true)[:2]**2))
+    off = estimate.T_map_base - course.truth_at(estimate.stamp_ns)
+    return float(np.sum(off[:2]**2))
 
 
 def _hour(
@@ -146,30 +133,21 @@ def _hour(
         8e-6 * float(head[tb.POOL_F_END]) + 4e-6 * float(head[tb.POOL_I_END]),
         float(np.sqrt(np.mean(squares))),
         means, 1e3 * float(np.percentile(updates, 99)), 1e3 * max(updates),
-        {f'{source} {answer}': n for (source, answer), n in backend.counts.items()},
-        dict(holdings(backend).most_common(OWNERS)))
+        {f'{source} {answer}': n for (source, answer), n in backend.counts.items()})
 
 
 def in_process(course: Course, window: str, part: float) -> list[Hour]:
     """Drive a course in a new process; return what became of each part of it [h]."""
     program = f'from benchmark.day import main\nmain({asdict(course)!r}, {window!r}, {part!r})'
-    made = []
-    with subprocess.Popen([sys.executable, '-c', program], stdout=subprocess.PIPE,
-                          text=True) as child:
-        assert child.stdout is not None
-        for line in child.stdout:
-            made.append(Hour(**json.loads(line)))
-            say(f'  {made[-1]}')
-    if child.returncode != 0:
-        raise RuntimeError(f'the drive ended with {child.returncode}')
-    return made
+    return [Hour(**json.loads(line)) for line in child(program).splitlines()]
 
 
 def main(course: dict[str, Any], window: str, part: float) -> None:
     """Drive a course and print what became of each part, as JSON; for a process of its own."""
     warm_up()
     for hour in drive(Course(**course), BackendConfig(**WINDOWS[window]), part):
-        print(json.dumps(asdict(hour)), flush=True)
+        say(f'  {hour}')
+        print(json.dumps(asdict(hour)))
 
 
 HALL = {'length': 200.0, 'laps_back': (1, 2, 5, 20, 100), 'closure_period': 5.0, 'aside': 0.1}
@@ -180,30 +158,28 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def section(options: Options) -> Section:
-    """Drive for hours."""
+    """
+    Drive for hours.
+
+    Odometry at {RATE:.0f} Hz, fixes at 5 Hz, a loop closure every 10 s (in the hall every 5 s, up
+    to 100 laps back), an update every half second, with default settings, each drive in a process
+    of its own. Resident memory of the process after a garbage collection, with Python, NumPy and
+    compiled code; mean times of calls. Flat means: the last hour at most {GROWN:g} times the
+    memory and {SLOWER:g} times the time of an update of the first.
+    """
     hours = options.hours or (0.4 if options.quick else HOURS)
-    found = Section(
-        'A day', f'Odometry at {RATE:.0f} Hz, fixes at 5 Hz, a loop closure every 10 s (in the '
-        'hall every 5 s, up to 100 laps back), an update every half second, with default '
-        'settings, each drive in a process of its own. Resident memory of the process after a '
-        'garbage collection, with Python, NumPy and compiled code; '
-        f'mean times of calls. Flat means: the last hour at most {GROWN:g} times the memory and '
-        f'{SLOWER:g} times the time of an update of the first.')
+    found = Section('A day', about(section))
     times = found.table(
         'By hour', 'drive', 'hour', 'resident MB', 'nodes', 'edges', 'observed', 'cliques MB',
         *(f'{call} us' for call in CALLS), 'update p99 ms', 'max', 'rms m')
-    owners = found.table('What has grown since the first hour', 'drive', 'owner',
-                         'first hour kB', 'last hour kB')
     for name, (window, changed) in CASES.items():
         if options.wants(name):
             course = Course(3600.0 * hours, odometry_rate=RATE, **changed)
-            _fill(found, name, times, owners, in_process(course, window, min(1.0, hours / 4.0)))
+            _fill(found, name, times, in_process(course, window, min(1.0, hours / 4.0)))
     return found
 
 
-def _fill(
-    found: Section, name: str, times: Table, owners: Table, hours: list[Hour],
-) -> None:
+def _fill(found: Section, name: str, times: Table, hours: list[Hour]) -> None:
     """Add rows and figures of a drive."""
     for k in sorted({0, 1, 2, len(hours) // 2, len(hours) - 1} & set(range(len(hours)))):
         hour = hours[k]
@@ -212,10 +188,6 @@ def _fill(
                   *(f'{hour.mean[call]:.0f}' for call in CALLS), f'{hour.p99:.1f}',
                   f'{hour.longest:.0f}', f'{hour.rms:.3f}')
     first, last = hours[0], hours[-1]
-    grown = {owner: size - first.owners.get(owner, 0) for owner, size in last.owners.items()}
-    for owner in sorted(grown, key=lambda owner: -grown[owner])[:5]:
-        owners.add(name, owner, f'{1e-3 * first.owners.get(owner, 0):.0f}',
-                   f'{1e-3 * last.owners[owner]:.0f}')
     refused = {answer: n for answer, n in last.answers.items() if 'accepted' not in answer}
     found.notes.append(f'{name}, answers: {last.answers}' if refused else
                        f'{name}: all measurements were accepted.')
@@ -225,46 +197,3 @@ def _fill(
         found.ask(f'{name}: {what}, hour {last.hours:g} over hour {first.hours:g}', ratio,
                   most=most)
     found.ask(f'{name}: memory at the end', last.resident, ' MB')
-
-
-def holdings(root: Any) -> Counter[str]:
-    """Return the number of bytes by owner: the first attributes on the way from an object."""
-    found: Counter[str] = Counter()
-    # what is nearer to the root owns what several refer to
-    seen, level = {id(root)}, [('', root)]
-    while level:
-        further = []
-        for owner, item in level:
-            found[owner] += len(item) if isinstance(item, mmap) else (
-                # a view owns nothing
-                0 if getattr(item, 'base', None) is not None else sys.getsizeof(item))
-            for name, part in _parts(item):
-                if id(part) not in seen and part is not None and not isinstance(part, OTHERS):
-                    seen.add(id(part))
-                    named = name != '' and owner.count('.') + 1 < DEPTH
-                    further.append((f'{owner}.{name}'.strip('.') if named else owner, part))
-        level = further
-    return found
-
-
-def _parts(item: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the names and values of what an object refers to; without a name what it contains."""
-    if isinstance(item, np.ndarray):
-        yield '', item.base
-    elif isinstance(item, memoryview):
-        yield '', item.obj
-    elif isinstance(item, Mapping):
-        for key, value in list(item.items()):
-            # names of streams and sources; other keys are too many to name
-            yield (key if isinstance(key, str) else ''), value
-    else:
-        names = list(getattr(item, '__dict__', ()))
-        for kind in type(item).__mro__:
-            slots = kind.__dict__.get('__slots__', ())
-            names += [slots] if isinstance(slots, str) else list(slots)
-        for name in names:
-            if not name.startswith('__'):
-                yield name.strip('_'), getattr(item, name, None)
-        if len(names) == 0:
-            for part in gc.get_referents(item):
-                yield '', part

@@ -9,7 +9,7 @@ one process, figures are medians over the runs. A ratio is GTSAM's time divided 
 half of chi2 above the batch optimum of the graph so far, each tool under its own error model.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -26,7 +26,7 @@ from benchmark.runs import (
     timing,
     Tool,
 )
-from benchmark.section import Curve, Options, say, Section, Table
+from benchmark.section import about, Curve, Options, say, Section, Table
 from benchmark.worlds import chain, World
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
@@ -55,8 +55,6 @@ LARGE = 8000
 """Sets with as many nodes are sampled ten times more rarely."""
 EXCESS_FLOOR = 1e-6
 """Excess below this is none: rounding, where a graph is still a tree."""
-QUICK_SIZE = 1300
-"""Sets with more nodes and loop closures are left out of quick runs."""
 TIME_HEADER = ('world', 'nodes', 'closures', 'tool', 'mean', 'p50', 'p99', 'max', 'total s',
                'ratio mean', 'p50', 'p99', 'runs', 'note')
 EXCESS_HEADER = ('world', 'samples', 'tool', 'median', 'p95', 'max', 'worst position mm: median',
@@ -208,10 +206,13 @@ def _tables(section: Section, comparisons: list[Comparison]) -> None:
 
 
 def chains(options: Options) -> Section:
-    """Measure chains of 1 000 to 1 000 000 nodes."""
-    section = Section(
-        'Chain', 'Odometry at 10 Hz and a global pose on every tenth node. p50 is asked to be '
-        f'flat, within {FLATNESS}x from the shortest to the longest chain.')
+    """
+    Measure chains of 1 000 to 1 000 000 nodes.
+
+    Odometry at 10 Hz and a global pose on every tenth node. p50 is asked to be flat, within
+    {FLATNESS}x from the shortest to the longest chain.
+    """
+    section = Section('Chain', about(chains))
     sizes = (1000, 10000, 30000) if options.quick else (1000, 10000, 100000, 1000000)
     comparisons = []
     for world in options.chosen([(f'chain {n}', lambda n=n: chain(n)) for n in sizes]):
@@ -232,12 +233,14 @@ def chains(options: Options) -> Section:
 
 
 def variants(options: Options) -> Section:
-    """Measure chains whose global poses are late, without heading, or missing for long."""
+    """
+    Measure chains whose global poses are late, without heading, or missing for long.
+
+    The same with global poses 30 nodes late; without heading; none on long stretches. Each is
+    asked to take no more than {VARIANT_FACTOR:.0f} times the mean of the prompt case.
+    """
     n, every = (3000, 5 * SAMPLE_EVERY) if options.quick else (10000, SAMPLE_EVERY)
-    section = Section(
-        'Chain: late, position-only, dropped',
-        f'The same with global poses 30 nodes late; without heading; none on long stretches. Each '
-        f'is asked to take no more than {VARIANT_FACTOR:.0f} times the mean of the prompt case.')
+    section = Section('Chain: late, position-only, dropped', about(variants))
     comparisons = [_compare(chain(n, variant), options, every, gtsam=not options.quick,
                             careful=False) for variant in ('prompt', *VARIANTS)]
     _tables(section, comparisons)
@@ -272,28 +275,26 @@ def _time_curves(item: Comparison) -> list[Curve]:
 
 
 def loops(options: Options) -> Section:
-    """Measure generated worlds and those of the folder with graph files."""
-    section = Section(
-        'Loop closures',
-        f'Asked for: at least {LOOPS:.0f} times GTSAM, in the mean and at p99, where neither the '
-        'median nor the maximum of the excess is above that of GTSAM with skip 10.')
-    generated: dict[str, Callable[[], World]] = {
-        'laps': worlds.laps, 'campus': worlds.campus, 'grid': worlds.grid, 'drive': worlds.drive,
-        'city GPS': worlds.city}
-    if options.quick:
-        generated = {'campus': worlds.campus, 'laps': worlds.laps,
-                     'grid': lambda: worlds.grid(1200)}
-    read = options.file_worlds(section.notes, QUICK_SIZE if options.quick else np.inf)
-    return _closing(section, 'loops', options.chosen(generated.items()) + [
-        world for world in read if world.name not in FLOPPY_NAMES], options, ratio=LOOPS)
+    """
+    Measure generated worlds and those of the folder with graph files.
+
+    Asked for: at least {LOOPS:.0f} times GTSAM, in the mean and at p99, where neither the median
+    nor the maximum of the excess is above that of GTSAM with skip 10.
+    """
+    section = Section('Loop closures', about(loops))
+    return _closing(section, 'loops', [
+        world for world in options.closing(section.notes) if world.name not in FLOPPY_NAMES],
+        options, ratio=LOOPS)
 
 
 def floppy(options: Options) -> Section:
-    """Measure the corridor, and ais2klinik where there is a file of that name."""
-    section = Section(
-        'The floppy case',
-        f'Weak heading, thousands of nodes swing at a closure. Asked for: at least '
-        f'{FLOPPY:.0f} times GTSAM at its excess (or a maximum of {FLOPPY_EXCESS}).')
+    """
+    Measure the corridor, and ais2klinik where there is a file of that name.
+
+    Weak heading, thousands of nodes swing at a closure. Asked for: at least {FLOPPY:.0f} times
+    GTSAM at its excess (or a maximum of {FLOPPY_EXCESS}).
+    """
+    section = Section('The floppy case', about(floppy))
     n = 2000 if options.quick else 15000
     read = options.file_worlds(section.notes, 0 if options.quick else np.inf)
     return _closing(section, 'floppy', options.chosen([('corridor', lambda: worlds.corridor(n))])

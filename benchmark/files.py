@@ -6,15 +6,16 @@ Worlds from graph files: recordings and the public sets, put into the order of a
 Node k comes with all edges whose later end is k. `EDGE2` is read in TORO's order.
 """
 
+from dataclasses import replace
 from functools import cache
 import os
 from pathlib import Path
 
 import numpy as np
 
-from benchmark.worlds import World
+from benchmark.worlds import arranged, World
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import EdgeKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.g2o import read_g2o
 
@@ -70,25 +71,18 @@ def load(path: Path) -> World:
 
 def online(name: str, graph: Graph, *, has_start: bool) -> World:
     """Put the constraints of a graph into the order of an online run."""
-    edges, n = graph.edges, graph.n_nodes
+    edges = graph.edges
     later, gap = np.maximum(edges.i, edges.j), np.abs(edges.j - edges.i)
     # of the edges that arrive with a node the one from the node before it comes first, forward
     # ones before backward ones, then in the order of the file
-    order = np.lexsort((edges.i > edges.j, np.minimum(gap, 2), later))
-    edges, later = edges.rows(order), later[order]
-    stops = np.searchsorted(later, np.arange(n), side='right')
+    world = arranged(name, graph.poses, edges.rows(np.lexsort(
+        (edges.i > edges.j, np.minimum(gap, 2), later))), graph.observed)
+    stops = world.edge_stops
     alone = np.flatnonzero(np.diff(stops) == 0) + 1
     if len(alone) > 0:
         raise ValueError(f'node {alone[0]} has no edge to an earlier one, and {len(alone) - 1} '
                          f'others: no online run')
-    first = np.concatenate(([0], stops[:-1]))[1:]
     kind = np.full(len(edges), EdgeKind.LOOP_CLOSURE)
-    kind[first] = EdgeKind.ODOMETRY
-    edges = Edges(edges.i, edges.j, edges.mean, edges.information, kind)
-    observed = graph.observed
-    by_node = np.argsort(observed.node, kind='stable')
-    observed = observed.rows(by_node)
-    return World(
-        name, graph.poses[0].copy(), edges, stops, observed,
-        np.searchsorted(observed.node, np.arange(n), side='right'),
-        start=graph.poses.copy() if has_start else None)
+    kind[stops[:-1]] = EdgeKind.ODOMETRY
+    return replace(world, edges=replace(world.edges, kind=kind), truth=None,
+                   start=graph.poses.copy() if has_start else None)

@@ -26,7 +26,7 @@ from benchmark.drives import (
     simulated,
 )
 from benchmark.recordings import drain
-from benchmark.section import Options, Section
+from benchmark.section import about, Options, Section
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, POSITIONS, Robust
@@ -109,16 +109,18 @@ def doubted(backend: PoseGraphBackend) -> set[tuple[str, int]]:
 
 
 def section(options: Options) -> Section:
-    """Measure drives with wrong fixes; of the recorded one only an outage in a quick run."""
-    found = Section(
-        'Fixes', 'Fixes of 1 m at 1 Hz, in the map: no rigid motion is taken out. *Only right*: '
-        'without the wrong ones, all others believed. *Newest*: error of the newest pose over all '
-        'updates, and the largest one from the fault on. *Wins*: time from when what is right '
-        'comes (again) until the newest pose stays within 3 m. *Doubt said*: share of the updates '
-        'in the fault at which the verdicts have some of its fixes waiting or doubted. Asked: at '
-        f'most {WORSE} times the rms of only right ones ({OUTAGE_RMS} m in the case of the '
-        f'requirements with an outage), {WINS:.0f} s, and a doubt that is said in at least half '
-        'of the fault.')
+    """
+    Measure drives with wrong fixes; of the recorded one only an outage in a quick run.
+
+    Fixes of 1 m at 1 Hz, in the map: no rigid motion is taken out. *Only right*: without the wrong
+    ones, all others believed. *Newest*: error of the newest pose over all updates, and the largest
+    one from the fault on. *Wins*: time from when what is right comes (again) until the newest pose
+    stays within 3 m. *Doubt said*: share of the updates in the fault at which the verdicts have
+    some of its fixes waiting or doubted. Asked: at most {WORSE} times the rms of only right ones
+    ({OUTAGE_RMS} m in the case of the requirements with an outage), {WINS:.0f} s, and a doubt that
+    is said in at least half of the fault.
+    """
+    found = Section('Fixes', about(section))
     found.table('', 'drive', 'fault', 'only right, rms [m]', 'rms [m]', 'newest, rms [m]',
                 'newest, worst [m]', 'wins [s]', 'doubt said', 'right doubted', 'wrong believed')
     makers: dict[str, Callable[[int], Drive]] = {

@@ -202,13 +202,12 @@ def optimize(
         On the relative and the absolute decrease of the error; the default is GTSAM's.
 
     """
-    names = {'lm': ('LevenbergMarquardtParams', 'LevenbergMarquardtOptimizer'),
-             'gn': ('GaussNewtonParams', 'GaussNewtonOptimizer')}[method]
-    params = getattr(gtsam, names[0])()
+    name = {'lm': 'LevenbergMarquardt', 'gn': 'GaussNewton'}[method]
+    params = getattr(gtsam, f'{name}Params')()
     params.setMaxIterations(MAX_ITERATIONS)
     params.setRelativeErrorTol(tolerance)
     params.setAbsoluteErrorTol(tolerance)
-    return getattr(gtsam, names[1])(graph, start, params).optimize()
+    return getattr(gtsam, f'{name}Optimizer')(graph, start, params).optimize()
 
 
 def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:

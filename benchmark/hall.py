@@ -11,7 +11,7 @@ import numpy as np
 from benchmark.day import GROWN, resident, SLOWER
 from benchmark.drives import nees, off_truth
 from benchmark.recordings import add, drain, Recording, UPDATE_EVERY
-from benchmark.section import Options, Section
+from benchmark.section import about, Options, Section
 from benchmark.wrong_closures import simulated
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Robust, ThinningConfig
@@ -71,15 +71,17 @@ def _run(recording: Recording, thinning: ThinningConfig) -> list[Tenth]:
 
 
 def section(options: Options) -> Section:
-    """Compare the thinned graph with the whole one."""
+    """
+    Compare the thinned graph with the whole one.
+
+    A forklift drives through the aisles of a hall of 28 x 30 m in any order. A hidden node each
+    metre, a closure to an earlier drive every 5 m, no fixes, all believed, an update every
+    {UPDATE_EVERY} m. Errors are those of the newest pose, the first one being known.
+    `thinning.cell` is 1 m or 2 m.
+    """
     hours, shared = (QUICK_HOURS, QUICK_SHARED) if options.quick else (HOURS, SHARED)
     n = options.runs or 2
-    found = Section(
-        'Does the graph grow with the area or with the time?',
-        'A forklift drives through the aisles of a hall of 28 x 30 m in any order. A hidden node '
-        'each metre, a closure to an earlier drive every 5 m, no fixes, all believed, an update '
-        f'every {UPDATE_EVERY} m. Errors are those of the newest pose, the first one being known. '
-        f'`thinning.cell` is {" or ".join(f"{cell:g} m" for cell in CELLS)}.')
+    found = Section('Does the graph grow with the area or with the time?', about(section))
     table = found.table(f'{n} drives of {shared:g} hours', 'graph', 'nodes', 'edges', 'rms [m]',
                         'over whole', 'NEES', 'step, last tenth [ms]')
     long = found.table(f'One drive of {hours:g} hours, {CELLS[-1]:g} m', 'hours', 'nodes',

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmark import drives
 from benchmark.drives import Drive, Event, nees, off_truth, path_rms, rms, SECOND
-from benchmark.section import Options, Section
+from benchmark.section import about, Options, Section
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
@@ -90,13 +90,15 @@ def _backend(source: MeasurementSource) -> PoseGraphBackend:
 
 
 def uncertainty(options: Options) -> Section:
-    """Measure the NEES of the newest pose."""
-    section = Section(
-        'Is the claimed uncertainty right?',
-        'The newest pose at the end of a drive, over seeded runs; NEES with its standard error. '
-        f'Asked for: NEES of {NEES[0]} to {NEES[1]} for white errors, for correlated ones that '
-        'are treated so (*a bias* is told the true time constant), and with the default, without '
-        f'a parameter being set; at most {WEAK} with 30 fixes.')
+    """
+    Measure the NEES of the newest pose.
+
+    The newest pose at the end of a drive, over seeded runs; NEES with its standard error. Asked
+    for: NEES of {NEES[0]} to {NEES[1]} for white errors, for correlated ones that are treated so
+    (*a bias* is told the true time constant), and with the default, without a parameter being set;
+    at most {WEAK} with 30 fixes.
+    """
+    section = Section('Is the claimed uncertainty right?', about(uncertainty))
     section.table('', 'drive', 'fixes treated as', 'NEES', 'error, rms [m]',
                   'claimed [m]', 'unaligned', 'tau found [s]', 'runs')
     runs = 2 if options.quick else options.runs or RUNS
@@ -144,15 +146,18 @@ def _ask_nees(section: Section, key: str, value: float, most: float) -> None:
 
 
 def gyroscope(options: Options) -> Section:
-    """Measure heading and pose in outages of the fixes, with a gyroscope and without."""
-    section = Section(
-        'A gyroscope', f'Drives of {END:.0f} s at up to 2 m/s that begin with rest; odometry at '
-        '20 Hz, a gyroscope at 100 Hz, fixes of 0.5 m at 1 Hz but for the last 60 s. The errors '
-        'are those that the engine is told, but for the drift of the wheels. Root mean square of '
-        'the error of the heading during the outage, of the position at its end; NEES of the '
-        'heading (mean over the outage) and of the newest pose (at its end) with their standard '
-        f'errors. Asked for: the heading {TIMES_BETTER:.0f} times better with drifting wheels, '
-        f'and NEES of {NEES[0]} to {NEES[1]} where all errors are as told.')
+    """
+    Measure heading and pose in outages of the fixes, with a gyroscope and without.
+
+    Drives of {END:.0f} s at up to 2 m/s that begin with rest; odometry at 20 Hz, a gyroscope at
+    100 Hz, fixes of 0.5 m at 1 Hz but for the last 60 s. The errors are those that the engine is
+    told, but for the drift of the wheels. Root mean square of the error of the heading during the
+    outage, of the position at its end; NEES of the heading (mean over the outage) and of the
+    newest pose (at its end) with their standard errors. Asked for: the heading {TIMES_BETTER:.0f}
+    times better with drifting wheels, and NEES of {NEES[0]} to {NEES[1]} where all errors are as
+    told.
+    """
+    section = Section('A gyroscope', about(gyroscope))
     table = section.table('', 'drive', 'heading by', 'heading [mrad]', 'position [m]',
                           'NEES of heading', 'NEES of pose', 'worse with it', 'runs')
     runs = 2 if options.quick else max((options.runs or RUNS) * 2 // 5, 2)
@@ -193,12 +198,14 @@ def _outage(drift: float, seed: int, *, gyro: bool) -> tuple[float, float, float
 
 
 def arrival(options: Options) -> Section:
-    """Measure what delays, disorder and duplicates change."""
-    section = Section(
-        'Does the order of arrival matter?',
-        'The same drive with its fixes prompt, and late. Largest difference of a position from '
-        'the prompt run, after the last update and after the closing optimisation. Asked for: '
-        'a few millimetres, and 1e-9 m.')
+    """
+    Measure what delays, disorder and duplicates change.
+
+    The same drive with its fixes prompt, and late. Largest difference of a position from the
+    prompt run, after the last update and after the closing optimisation. Asked for: a few
+    millimetres, and 1e-9 m.
+    """
+    section = Section('Does the order of arrival matter?', about(arrival))
     table = section.table('', 'drive', 'fixes', 'before closing [m]', 'after closing [m]')
     for kind, source in ((CART, MeasurementSource()),
                          (SHORT, MeasurementSource(correlation_time=SHORT.tau)),
@@ -260,10 +267,13 @@ def _paths(source: MeasurementSource, events: list[Event]) -> tuple[Trajectory, 
 
 
 def outliers(options: Options) -> Section:
-    """Measure what a loss does against wrong fixes."""
-    section = Section(
-        'Wrong fixes', 'Fixes of 1 m at 1 Hz of which some are up to 50 m off, with the '
-        'covariance of the others. Position error of the closed path, rms over nodes and runs.')
+    """
+    Measure what a loss does against wrong fixes.
+
+    Fixes of 1 m at 1 Hz of which some are up to 50 m off, with the covariance of the others.
+    Position error of the closed path, rms over nodes and runs.
+    """
+    section = Section('Wrong fixes', about(outliers))
     table = section.table('', 'share of wrong fixes', *(loss.value for loss in Loss))
     for share in (0.0, 0.05, 0.2):
         made = [Kind('', outliers=share).drive(seed) for seed in range(_few(options))]
@@ -274,11 +284,14 @@ def outliers(options: Options) -> Section:
 
 
 def plaza(options: Options) -> Section:
-    """Measure a lawn mower's drive, where the data is there."""
-    section = Section(
-        'A lawn mower', 'Plaza 1 (1933 s, 1.86 km): dead reckoning at 5 Hz, fixes made from the '
-        'truth with seeded noise of 1 m at 1 Hz. Position error of the closed path. Asked for: '
-        '0.35 m, also with fixes that come 1 s late.')
+    """
+    Measure a lawn mower's drive, where the data is there.
+
+    Plaza 1 (1933 s, 1.86 km): dead reckoning at 5 Hz, fixes made from the truth with seeded noise
+    of 1 m at 1 Hz. Position error of the closed path. Asked for: 0.35 m, also with fixes that come
+    1 s late.
+    """
+    section = Section('A lawn mower', about(plaza))
     if not (options.data / drives.PLAZA).is_dir():
         section.notes.append('The data is not there.')
         return section

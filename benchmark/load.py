@@ -24,10 +24,8 @@ import time
 import numpy as np
 
 from benchmark.feeder import DATUM, Feeder, Phase
-from benchmark.section import Options, Section
-from pose_graph_ros.adapters.output_cdr import path_cdr
+from benchmark.section import about, Options, Section
 from pose_graph_ros.cli.demo import isolated_environment
-from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.ros.spinning import EventsExecutor
 
 TITLE = 'The node under load'
@@ -43,8 +41,8 @@ CPU_BESIDE, LATENCY_BESIDE = 1.5, 3.0
 """Times those of the echo by rclpy.spin, at 200 and 500 Hz, with a graph of any size."""
 MEMORY = 400.0
 """[MB], of which a third are pages of libraries that the system can take back."""
-PATH_TIME, START_TIME = 10.0, 3.0
-"""[ms] and [s]."""
+START_TIME = 3.0
+"""[s]"""
 LADDER = (1000.0, 1500.0, 2000.0, 3000.0, 4000.0, 6000.0, 8000.0)
 STARTS = 5
 READY = 'ready, listening', 'kernels ready'
@@ -138,10 +136,13 @@ FLOOR: dict[float, Phase] = {}
 
 
 def echo(options: Options) -> Section:
-    """Measure a process that does nothing but send back."""
-    section = Section(
-        'The floor: an echo', 'A node of rclpy that republishes the bytes of each odometry '
-        'message. No lost messages are counted: it has no diagnostics.')
+    """
+    Measure a process that does nothing but send back.
+
+    A node of rclpy that republishes the bytes of each odometry message. No lost messages are
+    counted: it has no diagnostics.
+    """
+    section = Section('The floor: an echo', about(echo))
     for title, parameters, higher in (
             ('as rclpy.spin runs it', (), LADDER[1:3]),
             ('by the EventsExecutor, as the node', ('events:=true',), ())):
@@ -167,10 +168,14 @@ def _sizes(options: Options) -> tuple[int, ...]:
 
 
 def graphs(options: Options) -> Section:
-    """Measure the node with graphs of some sizes."""
+    """
+    Measure the node with graphs of some sizes.
+
+    {seconds:.0f} s at each rate, fixes at 10 Hz; `path` has no subscriber. Memory of the node
+    after the graph was filled, and at the end.
+    """
     section = Section(
-        'Rates, latencies and memory', f'{_seconds(options):.0f} s at each rate, fixes at 10 Hz; '
-        '`path` has no subscriber. Memory of the node after the graph was filled, and at the end.')
+        'Rates, latencies and memory', about(graphs, seconds=_seconds(options)))
     for count in _sizes(options):
         with started(NODE, PARAMETERS) as (process, feeder):
             feeder.wait_until_ready()
@@ -230,30 +235,15 @@ def _ask(section: Section, nodes: int, phase: Phase) -> None:
                         most=LATENCY_BESIDE)
 
 
-def path_time(_options: Options) -> Section:
-    """Time the serialisation of a long path."""
-    section = Section('The path', f'nav_msgs/Path of {LARGE} poses to bytes.')
-    rng = np.random.default_rng(0)
-    path = Trajectory(np.arange(1, LARGE + 1) * 200_000_000 + 1_700_000_000_000_000_000,
-                      rng.normal(0.0, 1.0, (LARGE, 3)))
-    times = []
-    for _ in range(20):
-        begin = time.perf_counter()
-        data = path_cdr(path, 1, 'map')
-        times.append(1e3 * (time.perf_counter() - begin))
-    table = section.table('', 'poses', 'bytes', 'p50 [ms]', 'most [ms]')
-    table.add(str(LARGE), str(len(data)), f'{np.median(times):.2f}', f'{max(times):.2f}')
-    section.ask(f'path of {LARGE} poses serialised', float(np.median(times)), ' ms',
-                most=PATH_TIME)
-    return section
-
-
 def starting(_options: Options) -> Section:
-    """Time the start of the node up to its being ready, from compiled kernels."""
-    section = Section(
-        'The start', 'From the start of the process until its log says that it listens and has '
-        'its kernels, compiled before, and until a peer has heard the same in diagnostics. In '
-        'between lies the discovery of DDS, which takes 3 s more when an announcement is lost.')
+    """
+    Time the start of the node up to its being ready, from compiled kernels.
+
+    From the start of the process until its log says that it listens and has its kernels, compiled
+    before, and until a peer has heard the same in diagnostics. In between lies the discovery of
+    DDS, which takes 3 s more when an announcement is lost.
+    """
+    section = Section('The start', about(starting))
     said, heard = [], []
     for _ in range(STARTS + 1):
         begin = time.monotonic()
@@ -275,4 +265,4 @@ def starting(_options: Options) -> Section:
     return section
 
 
-SECTIONS = {'start': starting, 'echo': echo, 'graphs': graphs, 'path': path_time}
+SECTIONS = {'start': starting, 'echo': echo, 'graphs': graphs}

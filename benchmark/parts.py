@@ -8,6 +8,7 @@ from collections import defaultdict
 from collections.abc import Callable
 import json
 import os
+from pathlib import Path
 import subprocess
 import sys
 import tempfile
@@ -18,7 +19,7 @@ import numpy as np
 from benchmark import ours, worlds
 from benchmark.metrics import ACCURACY, OPTIMUM, RATIO
 from benchmark.runs import MICROSECOND, Plan, quiet
-from benchmark.section import Options, Section, Table
+from benchmark.section import about, Options, Section, Table
 from benchmark.worlds import chain, World
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometrySource
@@ -36,13 +37,15 @@ CALLS = ('add_odometry', 'add_measurement', 'update, nothing new', 'update, a gl
 
 
 def back_end(options: Options) -> Section:
-    """Measure chains of 1 000 to 100 000 nodes."""
-    section = Section(
-        'Chain through the back end',
-        'What the node does with the same chain: a hidden node by `PoseGraphBackend.add_odometry` '
-        'at 10 Hz, each global pose by `add_measurement`, `update` at its timer of 10 Hz, and '
-        '`refine` in the time that is left. The rows above time only what the first three call of '
-        'the smoother: `extend` and `update`. An update also computes chi2 of all constraints.')
+    """
+    Measure chains of 1 000 to 100 000 nodes.
+
+    What the node does with the same chain: a hidden node by `PoseGraphBackend.add_odometry` at 10
+    Hz, each global pose by `add_measurement`, `update` at its timer of 10 Hz, and `refine` in the
+    time that is left. The rows above time only what the first three call of the smoother: `extend`
+    and `update`. An update also computes chi2 of all constraints.
+    """
+    section = Section('Chain through the back end', about(back_end))
     table = section.table(
         'Time of a call [us]', 'world', 'call', 'calls', 'mean', 'p50', 'p99', 'max')
     sizes = (1000, 10000) if options.quick else (1000, 10000, 100000)
@@ -101,7 +104,6 @@ ENOUGH = 0.2
 """What is over sooner is done again until it has taken so long in all [s], or ..."""
 MORE = 10
 """... so many times as often as asked for."""
-QUICK_SIZE = 1300
 
 BATCH = ('world', 'nodes', 'closures', 'ours, no guess ms', 'GTSAM LM, odometry ms', 'ratio',
            'ours, same start ms', 'GTSAM LM, same start ms', 'ratio', 'best chi2',
@@ -109,22 +111,20 @@ BATCH = ('world', 'nodes', 'closures', 'ours, no guess ms', 'GTSAM LM, odometry 
 
 
 def batch(options: Options) -> Section:
-    """Measure all worlds that have loop closures, and one chain."""
-    section = Section(
-        'Batch',
-        f'Whole graphs. Without a guess: our own start included, against GTSAM LM from odometry. '
-        f'From the same (chordal) start: the optimisation alone. Asked for: {FASTER:.0f} times '
-        'GTSAM in both, and the best known optimum. Best: the lowest that any run here leads to, '
-        'all of them under our error model; the chi2 of GTSAM are under its own.')
-    n = {'grid': 1200, 'chain': 1000} if options.quick else {'grid': 3500, 'chain': 10000}
-    chosen = [(f'chain {n["chain"]}', lambda: chain(n['chain'])), ('campus', worlds.campus),
-              ('laps', worlds.laps), ('grid', lambda: worlds.grid(n['grid']))]
-    if not options.quick:
-        chosen += [('drive', worlds.drive), ('corridor', worlds.corridor),
-                   ('city GPS', worlds.city)]
+    """
+    Measure all worlds that have loop closures, and one chain.
+
+    Whole graphs. Without a guess: our own start included, against GTSAM LM from odometry. From the
+    same (chordal) start: the optimisation alone. Asked for: {FASTER:.0f} times GTSAM in both, and
+    the best known optimum. Best: the lowest that any run here leads to, all of them under our
+    error model; the chi2 of GTSAM are under its own.
+    """
+    section = Section('Batch', about(batch))
+    n = 1000 if options.quick else 10000
+    chosen = [(f'chain {n}', lambda: chain(n)), ('corridor', worlds.corridor)]
     table = section.table('', *BATCH)
-    most = QUICK_SIZE if options.quick else np.inf
-    for world in options.chosen(chosen) + options.file_worlds(section.notes, most):
+    for world in options.chosen(chosen[:1] if options.quick else chosen) + options.closing(
+            section.notes):
         _measure_world(section, table, world, options)
     return section
 
@@ -234,14 +234,16 @@ print(imported - begin, warm - imported, time.perf_counter() - warm)
 
 
 def covariances(options: Options) -> Section:
-    """Measure covariances: of the newest node after each step, of all nodes, of a pair."""
-    section = Section(
-        'Covariances',
-        f'Asked for: the newest one below {NEWEST:.0f} us a step; those of all nodes in at most '
-        f'{ALL_OVER_FACTORIZATION:.0f} times a factorisation. An iteration is linearizing, '
-        'factorising and solving once (batch.optimize with one iteration). The deviation is the '
-        'largest of an element, over the roots of the diagonal, from those of a fresh smoother, '
-        'linearized at the estimate.')
+    """
+    Measure covariances: of the newest node after each step, of all nodes, of a pair.
+
+    Asked for: the newest one below {NEWEST:.0f} us a step; those of all nodes in at most
+    {ALL_OVER_FACTORIZATION:.0f} times a factorisation. An iteration is linearizing, factorising
+    and solving once (batch.optimize with one iteration). The deviation is the largest of an
+    element, over the roots of the diagonal, from those of a fresh smoother, linearized at the
+    estimate.
+    """
+    section = Section('Covariances', about(covariances))
     table = section.table('', 'world', 'nodes', 'newest p50 us', 'newest p99 us', 'all ms',
                           'iteration ms', 'all / iteration', 'pair us', 'deviation all',
                           'deviation newest')
@@ -299,12 +301,14 @@ def _deviation(covariances: FloatArray, oracle: FloatArray) -> float:
 
 
 def start(options: Options) -> Section:
-    """Measure the first start, with an empty cache of compiled code, and the next ones."""
-    section = Section(
-        'Compilation and start',
-        f'A new process: import, warm-up, and a first node, closure and covariance, which tell '
-        f'whether the warm-up has left anything out. Asked for: below {COLD:.0f} s with an empty '
-        f'cache, below {WARM} s with a full one.')
+    """
+    Measure the first start, with an empty cache of compiled code, and the next ones.
+
+    A new process: import, warm-up, and a first node, closure and covariance, which tell whether
+    the warm-up has left anything out. Asked for: below {COLD:.0f} s with an empty cache, below
+    {WARM} s with a full one.
+    """
+    section = Section('Compilation and start', about(start))
     table = section.table('', 'start', 'import s', 'warm-up s', 'first use s', 'total s')
     with tempfile.TemporaryDirectory() as folder:
         cold = _start(folder)
@@ -318,16 +322,19 @@ def start(options: Options) -> Section:
 
 def _start(cache: str) -> list[float]:
     """Return the times [s] of importing, warming up and first use, in a new process."""
-    return [float(word) for word in _child(_START, NUMBA_CACHE_DIR=cache).split()[-3:]]
+    return [float(word) for word in child(_START, NUMBA_CACHE_DIR=cache).split()[-3:]]
 
 
 def memory(options: Options) -> Section:
-    """Measure what a node of a long chain takes."""
+    """
+    Measure what a node of a long chain takes.
+
+    Growth of the resident set of a new process over a chain of {n} nodes, its data and compiled
+    code not counted. Asked for: below {BYTES:.0f} bytes a node.
+    """
     n = 100000 if options.quick else 1000000
-    section = Section(
-        'Memory', f'Growth of the resident set of a new process over a chain of {n} nodes, its '
-        f'data and compiled code not counted. Asked for: below {BYTES:.0f} bytes a node.')
-    figures = json.loads(_child(
+    section = Section('Memory', about(memory, n=n))
+    figures = json.loads(child(
         f'from benchmark.parts import chain_memory\nchain_memory({n})').splitlines()[-1])
     table = section.table('', 'nodes', 'bytes a node', 'peak, bytes a node', 'step us')
     table.add(str(n), f'{figures["grown"] / n:.0f}', f'{figures["peak"] / n:.0f}',
@@ -357,11 +364,11 @@ def chain_memory(n: int) -> None:
 
 def resident_bytes() -> int:
     """Return the size of the resident set of this process [bytes]."""
-    with open('/proc/self/statm', encoding='ascii') as file:
-        return int(file.read().split()[1]) * os.sysconf('SC_PAGE_SIZE')
+    pages = Path('/proc/self/statm').read_text(encoding='ascii').split()[1]
+    return int(pages) * os.sysconf('SC_PAGE_SIZE')
 
 
-def _child(program: str, **environment: str) -> str:
+def child(program: str, **environment: str) -> str:
     """Run a program in a new process and return what it prints."""
     return subprocess.run(
         [sys.executable, '-c', program], env=os.environ | environment, check=True,

@@ -37,8 +37,6 @@ def main() -> None:
         initial = gtsam.lago.initialize(graph)
     elif start == 'chordal':
         initial = chordal(graph)
-    elif start == 'odometry':
-        initial = composed(graph, initial.size())
     closures = ([] if method in ('gn', 'lm') else
                 [k for k in range(graph.size()) if is_closure(graph.at(k))])
     optimizer = optimizer_of(graph, initial, method, closures)
@@ -90,21 +88,6 @@ def optimizer_of(
             graph.replace(k, gtsam.BetweenFactorPose2(*factor.keys(), factor.measured(), model))
     return (gtsam.GaussNewtonOptimizer if method == 'gn'
             else gtsam.LevenbergMarquardtOptimizer)(graph, initial, params)
-
-
-def composed(graph: gtsam.NonlinearFactorGraph, n: int) -> gtsam.Values:
-    """Return the poses by odometry alone."""
-    steps = {}
-    for k in range(graph.size()):
-        factor = graph.at(k)
-        keys = factor.keys()
-        if len(keys) == 2 and keys[1] == keys[0] + 1:
-            steps[keys[0]] = factor.measured()
-    values, pose = gtsam.Values(), gtsam.Pose2()
-    for k in range(n):
-        values.insert(k, pose)
-        pose = pose.compose(steps.get(k, gtsam.Pose2()))
-    return values
 
 
 def chordal(graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:

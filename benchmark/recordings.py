@@ -33,6 +33,7 @@ from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 from pose_graph_ros.offline.simulation.graph import composed
+from pose_graph_ros.offline.simulation.motion import path_length
 
 SECOND = 1_000_000_000
 TRUE, FAR = 3.0, 6.0
@@ -338,8 +339,7 @@ def _truth(file: Path, stamps_ns: IntArray, chain: FloatArray) -> Trajectory:
         poses = composed(np.zeros(3), np.array([steps[k] for k in sorted(steps)], dtype=float))
     if len(poses) == len(stamps_ns):
         return Trajectory(stamps_ns, poses)
-    shares = [np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
-              for path in (composed(np.zeros(3), chain), poses)]
+    shares = [path_length(path) for path in (composed(np.zeros(3), chain), poses)]
     shares = [share / share[-1] for share in shares]
     heading = np.unwrap(poses[:, 2])
     return Trajectory(stamps_ns, se2.wrapped(np.column_stack([

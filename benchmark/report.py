@@ -8,10 +8,12 @@ The colours of the pictures are after Okabe and Ito, as in `pose_graph_ros.cli.p
 
 from datetime import date
 from importlib import metadata
+from importlib.util import find_spec
 import json
 import os
 from pathlib import Path
 import platform
+import re
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -39,12 +41,11 @@ def write(
     folder : Path
     command : str, by which all of them are made
     title : str
-    about : str, a docstring, whose last paragraph becomes the remarks
+    about : str
     curves : list of Curve
 
     """
-    remarks = about.strip().split('\n\n')[-1].replace('\n', ' ')
-    parts = [f'# {title}', '', *_environment(command), '', remarks, '',
+    parts = [f'# {title}', '', *_environment(command), '', about, '',
              '## Requirements', '', *_verdicts(sections)]
     picture = folder / 'step_time.png'
     if len(curves) > 0:
@@ -66,12 +67,8 @@ def write(
 
 
 def _environment(command: str) -> list[str]:
-    versions = []
-    for name in VERSIONS:
-        try:
-            versions.append(f'{name} {metadata.version(name)}')
-        except metadata.PackageNotFoundError:
-            versions.append(f'without {name}')
+    versions = [f'{name} {metadata.version(name)}' if find_spec(name) else f'without {name}'
+                for name in VERSIONS]
     return [f'{date.today().isoformat()}, {_processor()}, {os.cpu_count()} cores, '
             f'{platform.system()} {platform.machine()}, Python {platform.python_version()}, '
             f'{", ".join(versions)}.', '', 'Made by', '', f'    {command}']
@@ -79,13 +76,9 @@ def _environment(command: str) -> list[str]:
 
 def _processor() -> str:
     """Return the name of the processor."""
-    try:
-        for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines():
-            if line.startswith('model name'):
-                return line.partition(':')[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or 'unknown processor'
+    file = Path('/proc/cpuinfo')
+    found = re.search('model name.*: (.*)', file.read_text() if file.exists() else '')
+    return found[1] if found else platform.processor() or 'unknown processor'
 
 
 def _verdicts(sections: list[Section]) -> list[str]:

@@ -40,7 +40,7 @@ from benchmark.recordings import (
     while_driving,
 )
 from benchmark.report import panels
-from benchmark.section import Options, Section, Table
+from benchmark.section import about, Options, Section, Table
 from benchmark.wrong_closures import LEAST_WRONG, of_world, simulated, wide_gates, with_false
 from pose_graph_ros.cli.believe import believe
 from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, INK, PURPLE, VERMILION
@@ -143,12 +143,15 @@ def _read(options: Options, names: tuple[str, ...], section: Section) -> Recordi
 
 
 def places(options: Options) -> Section:
-    """Measure a recording of place recognition, where the files are there."""
-    section = Section(
-        'Place recognition', 'Recordings, fed online in order. Errors are rms of the path [m], '
-        'with no closure, with all, with only the right ones, and with default settings. Ratios '
-        'to odometry while driving: rms of the newest pose over the drive, and the worst rms of '
-        'the path so far (there odometry counts as at least 0.5 m off).')
+    """
+    Measure a recording of place recognition, where the files are there.
+
+    Recordings, fed online in order. Errors are rms of the path [m], with no closure, with all,
+    with only the right ones, and with default settings. Ratios to odometry while driving: rms of
+    the newest pose over the drive, and the worst rms of the path so far (there odometry counts as
+    at least 0.5 m off).
+    """
+    section = Section('Place recognition', about(places))
     table = section.table('', 'recording', *CLOSURES)
     recording = _read(options, B25B, section)
     if recording is not None:
@@ -196,12 +199,15 @@ def _draw(recording: Recording, run: Run, file: Path) -> None:
 
 
 def worlds(options: Options) -> Section:
-    """Measure simulated place recognition."""
-    section = Section(
-        'Simulated place recognition', 'Drives through a hall and a small Manhattan, from '
-        f'seeds, with right closures, {GROUPS.singles} single wrong ones and {GROUPS.groups} '
-        f'groups of {GROUPS.size} wrong ones that agree, of stretches that run in one direction. '
-        '2.5x, 5x: scatter of the right ones in sigmas that come with them.')
+    """
+    Measure simulated place recognition.
+
+    Drives through a hall and a small Manhattan, from seeds, with right closures, {GROUPS.singles}
+    single wrong ones and {GROUPS.groups} groups of {GROUPS.size} wrong ones that agree, of
+    stretches that run in one direction. 2.5x, 5x: scatter of the right ones in sigmas that come
+    with them.
+    """
+    section = Section('Simulated place recognition', about(worlds))
     table = section.table('', 'world, seed', *CLOSURES)
     for world, duration, over in (('hall', 2700.0, 2.5), ('grid', 1500.0, 5.0)):
         for seed in range(options.runs or 1):
@@ -216,10 +222,12 @@ def worlds(options: Options) -> Section:
 
 
 def arrivals(_options: Options) -> Section:
-    """Measure closures that come in other ways."""
-    section = Section(
-        'Other circumstances', 'One drive through the hall (2.5x), whose closures come in other '
-        'ways.')
+    """
+    Measure closures that come in other ways.
+
+    One drive through the hall (2.5x), whose closures come in other ways.
+    """
+    section = Section('Other circumstances', about(arrivals))
     table = section.table('', 'circumstances', *CLOSURES)
     drive = simulated('hall', 2700.0, 10, claimed=0.4, false=GROUPS)
     rng, n = np.random.default_rng(1), len(drive.ends)
@@ -237,13 +245,15 @@ def arrivals(_options: Options) -> Section:
 
 
 def gates(options: Options) -> Section:
-    """Measure a world in which wrong closures come first, where odometry could have drifted."""
-    section = Section(
-        'Wide gates', 'A way round of 960 m before anything is seen again: the sigma of odometry '
-        'is above 10 m. Five lone wrong closures, 10 to 25 m off, come first; 25 right ones on '
-        'the second lap. Wrong ones that lie within three sigmas of the path even then cannot be '
-        'told from right ones: asked is that the path is not worse than odometry while driving, '
-        'and much better at the end.')
+    """
+    Measure a world in which wrong closures come first, where odometry could have drifted.
+
+    A way round of 960 m before anything is seen again: the sigma of odometry is above 10 m. Five
+    lone wrong closures, 10 to 25 m off, come first; 25 right ones on the second lap. Wrong ones
+    that lie within three sigmas of the path even then cannot be told from right ones: asked is
+    that the path is not worse than odometry while driving, and much better at the end.
+    """
+    section = Section('Wide gates', about(gates))
     table = section.table('', 'seed', *CLOSURES)
     for seed in range(options.runs or 1):
         judged = judge(table, replace(wide_gates(seed), name=str(seed)))
@@ -254,10 +264,13 @@ def gates(options: Options) -> Section:
 
 
 def grids(options: Options) -> Section:
-    """Measure graphs with very many closures, to which wrong ones are added."""
-    section = Section(
-        'Graphs with very many closures', 'M3500 and a simulated grid of its kind, with wrong '
-        'closures anywhere; the share is that of all closures. *Groups*: ten at a time agree.')
+    """
+    Measure graphs with very many closures, to which wrong ones are added.
+
+    M3500 and a simulated grid of its kind, with wrong closures anywhere; the share is that of all
+    closures. *Groups*: ten at a time agree.
+    """
+    section = Section('Graphs with very many closures', about(grids))
     table = section.table('', 'graph', *CLOSURES)
     read = _read(options, M3500, section)
     mixes = ((0.1, 1), (0.3, 1), (0.5, 1), (0.1, 10), (0.3, 10), (0.5, 10))
@@ -303,20 +316,21 @@ class Solved(NamedTuple):
 
 
 def peers(options: Options) -> Section:
-    """Compare with GTSAM on the same graphs."""
-    section = Section(
-        'Beside GTSAM', 'Each tool gets one file with the same nodes, odometry and '
-        'closures, starts from odometry, and knows that odometry is right. GTSAM: graduated '
-        'non-convexity (GncLMOptimizer, 99 %) for truncated least squares and Geman-McClure, and '
-        'Levenberg-Marquardt with a loss; *floors*: closures with at least 0.3 m and 0.05 rad, '
-        'which ours has for its decision anyway. *Ours, batch*: `pose-graph solve --robust`. '
-        '*Ours, online*: all calls of the back end over the whole drive. *Solver*: without '
-        'reading files and starting a process (ours: kernels compiled, the median of '
-        f'{REPEATS}); *command*: the process from its start to its end. A command is cut after '
-        f'{options.limit:.0f} s. Asked of ours, batch: an rms of at most {AS_GOOD} times that of '
-        f"the best of GTSAM's GNC, of those that were not cut (if all were, of its losses), and "
-        f'{FASTER:.0f} times as fast as the fastest of them; one that is cut counts with the '
-        f'limit.')
+    """
+    Compare with GTSAM on the same graphs.
+
+    Each tool gets one file with the same nodes, odometry and closures, starts from odometry, and
+    knows that odometry is right. GTSAM: graduated non-convexity (GncLMOptimizer, 99 %) for
+    truncated least squares and Geman-McClure, and Levenberg-Marquardt with a loss; *floors*:
+    closures with at least 0.3 m and 0.05 rad, which ours has for its decision anyway. *Ours,
+    batch*: `pose-graph solve --robust`. *Ours, online*: all calls of the back end over the whole
+    drive. *Solver*: without reading files and starting a process (ours: kernels compiled, the
+    median of {REPEATS}); *command*: the process from its start to its end. A command is cut after
+    {options.limit:.0f} s. Asked of ours, batch: an rms of at most {AS_GOOD} times that of the best
+    of GTSAM's GNC, of those that were not cut (if all were, of its losses), and {FASTER:.0f} times
+    as fast as the fastest of them; one that is cut counts with the limit.
+    """
+    section = Section('Beside GTSAM', about(peers, options=options))
     section.table('', 'graph', 'tool', 'rms [m]', 'kept', 'kept wrong', 'lost right',
                   'solver [s]', 'command [s]')
     if not options.gtsam:
@@ -403,7 +417,7 @@ def _peer(method: str, file: Path, limit: float) -> Solved:
     """Run a method of GTSAM as a command."""
     out = file.with_name('gtsam.g2o')
     try:
-        done = solve.run(solve.peer(file, out, 'g2o', 'odometry', method), limit)
+        done = solve.run(solve.peer(file, out, 'g2o', 'file', method), limit)
     except subprocess.TimeoutExpired:
         return Solved(None, np.empty(0, dtype=bool), limit, limit)
     return Solved(read_g2o(out).graph.poses, np.array(done.result['kept'], dtype=bool),

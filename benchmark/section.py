@@ -4,17 +4,23 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+import inspect
 import json
 from pathlib import Path
 import sys
 from typing import Any
 
+import numpy as np
+
+from benchmark import worlds
 from benchmark.files import DATA, load_folder
 from benchmark.metrics import Metric, RATIO, Slack
 from benchmark.worlds import World
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 KEPT = 'sections.json'
+QUICK_SIZE = 1300
+"""Sets with more nodes are left out of quick runs."""
 LABELS = 2
 """Cells at the begin of a row that name it."""
 
@@ -30,15 +36,15 @@ class Options:
     """Seeded drives of each kind."""
     data: Path = DATA
     """Folder with public data."""
-    cases: tuple[str, ...] = ()
+    cases: Sequence[str] = ()
     """Only what has one of these in its name, ignoring case; all if empty."""
     limit: float = 60.0
     """The time after which a run of one tool is cut [s]."""
     gtsam: bool = True
     """Whether to run GTSAM at all."""
-    sizes: tuple[int, ...] = ()
+    sizes: Sequence[int] = ()
     hours: float | None = None
-    rates: tuple[float, ...] = (50.0, 200.0, 500.0, 1000.0)
+    rates: Sequence[float] = (50.0, 200.0, 500.0, 1000.0)
     seconds: float = 20.0
     out: Path = Path()
     """Folder of the page."""
@@ -47,15 +53,23 @@ class Options:
         """Tell whether a world, a drive or a graph is to be measured."""
         return not self.cases or any(part.lower() in name.lower() for part in self.cases)
 
-    def chosen(self, worlds: Iterable[tuple[str, Callable[[], World]]]) -> list[World]:
+    def chosen(self, made: Iterable[tuple[str, Callable[[], World]]]) -> list[World]:
         """Make the worlds that are to be measured."""
-        return [make() for name, make in worlds if self.wants(name)]
+        return [make() for name, make in made if self.wants(name)]
 
-    def file_worlds(self, notes: list[str], most: float = float('inf')) -> list[World]:
+    def closing(self, notes: list[str]) -> list[World]:
+        """Return the wanted worlds that are no chains, generated ones and those from files."""
+        made = {'laps': worlds.laps, 'campus': worlds.campus, 'grid': worlds.grid}
+        made |= {'grid': lambda: worlds.grid(1200)} if self.quick else {
+            'drive': worlds.drive, 'city GPS': worlds.city}
+        return self.chosen(made.items()) + self.file_worlds(
+            notes, QUICK_SIZE if self.quick else np.inf)
+
+    def file_worlds(self, notes: list[str], most: float = np.inf) -> list[World]:
         """Return the wanted worlds from graph files up to a size; complaints go to the notes."""
-        worlds, complaints = load_folder(self.data / 'graphs')
+        read, complaints = load_folder(self.data / 'graphs')
         notes += complaints
-        return [world for world in worlds if self.wants(world.name) and world.n_nodes <= most]
+        return [world for world in read if self.wants(world.name) and world.n_nodes <= most]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +122,16 @@ class Section:
         self.metrics.append(Metric(
             key, float(value), unit, slack, most if least is None else least,
             higher_is_better=least is not None or slack is RATIO))
+
+
+def about(what: Any, **further: object) -> str:
+    """
+    Return the last paragraph of a docstring, for the page.
+
+    What stands in braces is a constant of the module, or one of `further`.
+    """
+    text = (inspect.getdoc(what) or '').split('\n\n')[-1].replace('\n', ' ')
+    return text.format(**getattr(what, '__globals__', {}), **further)
 
 
 def kept_with(

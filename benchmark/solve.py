@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmark.recordings import B25B, M3500, read_recording, Recording, rms, TRUE
-from benchmark.section import Options, Section
+from benchmark.section import about, Options, Section
 from benchmark.wrong_closures import with_false
 from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -80,17 +80,19 @@ def peer(path: Path, out: Path, order: str, start: str, method: str) -> list[str
 
 
 def files(options: Options) -> Section:
-    """Measure graph files."""
+    """
+    Measure graph files.
+
+    In turns: `pose-graph solve FILE -o OUT`, the same with `--no-certificate`, and the script. For
+    each file the script has the start (lago, chordal, poses of the file) and the optimiser
+    (Gauss-Newton, Levenberg-Marquardt) with which it is fastest of those with which it reaches the
+    optimum of its own error, which is not (3.48), from our result to 1e-6. Ours is the known one
+    to 1e-6 in each run. Times in ms, least / median of {repeats} runs, with one thread. The ratio
+    is that of the least times, GTSAM's over ours with the certificate; above 1 ours is faster.
+    Other work on the machine is felt less by the processor time than by the wall time.
+    """
     repeats = 2 if options.quick else REPEATS
-    section = Section(
-        'Graph files', 'In turns: `pose-graph solve FILE -o OUT`, the same with '
-        '`--no-certificate`, and the script. For each file the script has the start (lago, '
-        'chordal, poses of the file) and the optimiser (Gauss-Newton, Levenberg-Marquardt) with '
-        'which it is fastest of those with which it reaches the optimum of its own error, which '
-        'is not (3.48), from our result to 1e-6. Ours is the known one to 1e-6 in each run. Times '
-        f'in ms, least / median of {repeats} runs, with one thread. The ratio is that of the '
-        "least times, GTSAM's over ours with the certificate; above 1 ours is faster. Other work "
-        'on the machine is felt less by the processor time than by the wall time.')
+    section = Section('Graph files', about(files, repeats=repeats))
     table = section.table(
         '', 'file', 'wall, ours', 'no certificate', 'GTSAM', 'ratio', 'processor, ours',
         'no certificate', 'GTSAM', 'ratio', "GTSAM's way")
@@ -150,12 +152,15 @@ def _best_peer(path: Path, order: str, folder: Path) -> list[str] | None:
 
 
 def methods(options: Options) -> Section:
-    """Measure the robust methods."""
-    section = Section(
-        'Robust methods', 'B25b is a recording with place recognition, M3500 is simulated, with '
-        f'wrong closures added up to these shares, each alone or {GROUP} that agree. A closure is '
-        f'right if the end that it measures is at most {TRUE:g} m from the true one. Error of all '
-        'poses after the best rigid motion; time of the whole process.')
+    """
+    Measure the robust methods.
+
+    B25b is a recording with place recognition, M3500 is simulated, with wrong closures added up to
+    these shares, each alone or {GROUP} that agree. A closure is right if the end that it measures
+    is at most {TRUE:g} m from the true one. Error of all poses after the best rigid motion; time
+    of the whole process.
+    """
+    section = Section('Robust methods', about(methods))
     table = section.table('', 'graph', 'method', 'wrong ones left out', 'right ones left out',
                           'rms [m]', 'certificate', 's')
     cases = [('B25b_0.150', B25B, 0.0, 0)] + [

@@ -11,10 +11,10 @@ from benchmark.worlds import World
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
-from pose_graph_ros.offline.simulation.graph import graph_of
+from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.offline.simulation.graph import graph_of, odometry_edges
+from pose_graph_ros.offline.simulation.motion import path_length
 from pose_graph_ros.offline.simulation.recording import course
-from pose_graph_ros.offline.simulation.sensors import model_variances
 from pose_graph_ros.offline.simulation.settings import (
     ClaimedSigma,
     CLOSURES,
@@ -88,22 +88,16 @@ def wide_gates(seed: int, lone: int = 5, right: int = 25) -> Recording:
     """
     rng = np.random.default_rng(seed)
     corners = np.vstack([COMB] * (int(LAPS) + 1) + [COMB[:1]])
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
-    at = np.arange(0.0, LAPS * AROUND, STEP)
+    at, along = np.arange(0.0, LAPS * AROUND, STEP), path_length(corners)
     points = np.column_stack([np.interp(at, along, corners[:, axis]) for axis in (0, 1)])
     moves = np.diff(points, axis=0)
     truth = np.column_stack((points[:-1], np.arctan2(moves[:, 1], moves[:, 0])))
-    steps = se2.between(truth[:-1], truth[1:])
-    variances = model_variances(steps)
     n = len(truth)
-    information = np.zeros((n - 1, 3, 3))
-    information[:, range(3), range(3)] = 1.0 / variances
-    chain = Edges(np.arange(n - 1), np.arange(1, n),
-                  se2.compose(steps, np.sqrt(variances) * rng.normal(size=steps.shape)),
-                  information, np.full(n - 1, EdgeKind.ODOMETRY))
     # at 1.2 m/s and at most 1 rad/s
-    time = np.concatenate(([0.0], np.cumsum(np.maximum(STEP / 1.2, np.abs(steps[:, 2])))))
+    turns = np.abs(se2.wrap(np.diff(truth[:, 2])))
+    time = np.concatenate(([0.0], np.cumsum(np.maximum(STEP / 1.2, turns))))
     stamps = SECOND + np.round((time + 1e-3 * np.arange(n)) * SECOND).astype(np.int64)
+    chain = odometry_edges(rng, Trajectory(stamps, truth))
     lap = round(AROUND / STEP)
     j = np.sort(rng.choice(np.arange(round(0.65 * lap), lap, 60), lone, replace=False))
     i = rng.integers(0, round(0.2 * lap), lone)

@@ -8,6 +8,7 @@ what is false or moved, and for a claimed sigma that is not 1. So chi2 at the tr
 is distributed as chi-square with as many degrees of freedom as there are measured numbers.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,7 +85,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     if setup.fixes is None and setup.poses is None:
         poses = se2.between(poses[0], poses)
     truth = Trajectory(way.truth.stamps_ns[at], poses)
-    odometry = _odometry(streams['odometry'], truth, setup.jumps_of(ODOMETRY))
+    odometry = odometry_edges(streams['odometry'], truth, setup.jumps_of(ODOMETRY))
     loops, group, missing = _closures(
         way, Path(truth.stamps_ns, poses, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
@@ -95,8 +96,8 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
 
-def _odometry(
-    generator: np.random.Generator, truth: Trajectory, jumps: list[Jump],
+def odometry_edges(
+    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[Jump] = (),
 ) -> Edges:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
