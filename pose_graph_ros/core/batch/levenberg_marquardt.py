@@ -104,6 +104,12 @@ class BatchResult:
     start: Start = Start.PRESENT
 
 
+def is_trusted(result: BatchResult, before: float) -> bool:
+    """Tell whether a start has led to a minimum that is not above chi2 of the poses before."""
+    return result.status is Status.CONVERGED and (
+        result.chi2 <= before + SAME_MINIMUM * max(before, 1.0))
+
+
 Result = TypeVar('Result')
 Optimization = Generator[None, None, BatchResult]
 """An optimisation that pauses after parts of at most an iteration; it returns the result."""

@@ -18,8 +18,9 @@ Nothing in here is compiled. `gauss_newton.CompiledChordal` solves the systems o
 the cliques of a graph.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
+import math
 from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from pose_graph_ros.core.graph.priors import Prior
 
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
-Ends = tuple[Blocks, Blocks]   # one for each end of a constraint
+Ends = Sequence[Blocks]   # one for each end of a constraint
 
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
@@ -104,10 +105,13 @@ class NodeSystem:
     """
     Normal equations of constraints between two nodes, with a block for each node that is free.
 
-    `i` and `j` are the ends, n is the map; `free` has the shape (n,).
+    `i` and `j` are the ends, n is the map; `free` has the shape (n,). `places` are those of the
+    free nodes in an order of elimination with little fill; without them one is found.
     """
 
-    def __init__(self, i: IntArray, j: IntArray, free: BoolArray) -> None:
+    def __init__(
+        self, i: IntArray, j: IntArray, free: BoolArray, places: IntArray | None = None,
+    ) -> None:
         self.free = np.flatnonzero(free)
         self._ends, self._n = (i, j), len(free) + 1
         number = np.full(self._n, -1)
@@ -116,7 +120,7 @@ class NodeSystem:
         pairs = (i, i), (i, j), (j, i), (j, j)
         self._kept = [(row >= 0) & (column >= 0) for row, column in pairs]
         both = self._kept[1]
-        self.places = order_of(i[both], j[both], len(nodes))
+        self.places = order_of(i[both], j[both], len(nodes)) if places is None else places
         """Place of each free node in the order of elimination."""
         rows, columns = (np.concatenate([*(
             pair[side][kept] for pair, kept in zip(pairs, self._kept, strict=True)), nodes])
@@ -133,13 +137,19 @@ class NodeSystem:
         return self._pattern.factors(blocks())
 
     def gathered(self, by: Ends, weighted: Blocks) -> Blocks:
-        """Return the sums of by^H times weighted residuals, (M, r), at the free nodes, (F, b)."""
+        """
+        Return the sums of by^H times weighted residuals at the free nodes, shape (F, b).
+
+        The residuals have the shape (M, r); with C columns, (M, r, C), the sums are (F, b, C).
+        """
         total: Blocks = np.zeros(())
         for end, each in zip(self._ends, by, strict=True):
-            values = np.ascontiguousarray(np.einsum('mrk,mr->mk', each.conj(), weighted))
+            values = np.ascontiguousarray(np.einsum('mrk,mr...->mk...', each.conj(), weighted))
             # bincount takes one column of real numbers
-            total = total + np.stack([np.bincount(end, column, self._n) for column in values.view(
-                np.float64).T], axis=1).view(values.dtype)
+            columns = values.reshape(
+                len(values), math.prod(values.shape[1:])).view(np.float64).T
+            total = total + np.stack([np.bincount(end, column, self._n) for column in columns],
+                                     axis=1).view(values.dtype).reshape(-1, *values.shape[1:])
         return np.asarray(total[self.free])
 
     def solver(

@@ -16,6 +16,7 @@ import numpy as np
 from pose_graph_ros.core.batch import gauss_newton, linear_starts
 from pose_graph_ros.core.batch.levenberg_marquardt import (
     BatchResult,
+    is_trusted,
     minimize,
     Optimization,
     SAME_MINIMUM,
@@ -114,7 +115,7 @@ def from_linear_start(
             (yield from _minimize(graph, few, chi2_of(graph))), start=start)
         better = result.status is not Status.FAILED and (
             best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM))
-        trusted = result.status is Status.CONVERGED and result.chi2 <= chi2
+        trusted = is_trusted(result, chi2)
         if better and trusted:
             return result
         if better:

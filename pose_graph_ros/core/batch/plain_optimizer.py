@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.batch.levenberg_marquardt import (
     BatchResult,
+    is_trusted,
     minimize,
     Start,
-    Status,
     to_the_end,
     TRUSTED_ITERATIONS,
 )
@@ -154,8 +154,7 @@ class PlainOptimizer:
                 if chi2 < np.inf:
                     result = to_the_end(minimize(
                         self, chi2, replace(self._config, max_iterations=steps)))
-                    if result.status is Status.CONVERGED and (
-                            start is Start.PRESENT or result.chi2 <= first):
+                    if is_trusted(result, first if start is Start.CHORDAL else chi2):
                         return replace(result, start=start)
             except LinearSolveError:
                 pass

@@ -31,16 +31,15 @@ for each node. Headings may also be rows of r complex numbers each (`riemannian`
 columns as well.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pose_graph_ros.core.batch.linear_starts import complex_of, Constrained, Terms
+from pose_graph_ros.core.batch.linear_starts import complex_of, Constrained, NodeSystem, Terms
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import NodeKind
-from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, Blocks, components, order_of
+from pose_graph_ros.core.sparse import BlockFactors, components
 
 
 class NotCoveredError(PoseGraphError):
@@ -164,59 +163,36 @@ class QuadraticForm:
     def __init__(self, form: Formulation, places: IntArray | None = None) -> None:
         self.n = form.n_unknowns
         """Number of headings."""
-        self._i, self._j = form.i, form.j
-        self._root_tau, root_kappa = np.sqrt(form.tau), np.sqrt(form.kappa)
-        # what the residuals are of z_i and z_j
-        self._upper = -self._root_tau * form.arm_i, self._root_tau * form.arm_j
-        self._lower = -root_kappa * form.rotation, root_kappa + 0j
-        # of the blocks (i, i), (i, j), (j, i) and (j, j) of each term
-        self._rows = form.i, form.i, form.j, form.j
-        self._columns = form.i, form.j, form.i, form.j
-        nodes = np.arange(self.n)
-        self._pattern = BlockPattern(
-            np.concatenate((*self._rows, nodes)), np.concatenate((*self._columns, nodes)),
-            order_of(form.i, form.j, self.n) if places is None else places)
-        self._blocks = self._matrix_blocks()
-        laplacian = [block[:, :1, :1].real for block in self._blocks]
-        self._laplacian = self._pattern.factors((
-            *self._without_map(laplacian, 0), _unit(self.n, 1, 0).real))
-        self.diagonal: FloatArray = np.zeros(self.n)
+        self._ends = form.i, form.j
+        root_tau, root_kappa = np.sqrt((form.tau, form.kappa))
+        # what the residuals of position and heading are of t and z of both ends
+        by = self._by = np.zeros((2, len(form.tau), 2, 2), dtype=np.complex128)
+        by[:, :, 0, 0] = -root_tau, root_tau
+        by[:, :, 0, 1] = -root_tau * form.arm_i, root_tau * form.arm_j
+        by[:, :, 1, 1] = -root_kappa * form.rotation, root_kappa
+        self._nodes = NodeSystem(form.i, form.j, np.ones(self.n, dtype=bool), places)
+        squares = self._nodes.gathered([*np.abs(by)**2], np.ones(by.shape[1:3]))
+        self.diagonal: FloatArray = squares[:, 1]
         """Entries of M at the headings, shape (n,)."""
-        for row, column, block in zip(self._rows, self._columns, self._blocks, strict=True):
-            self.diagonal += _scattered(row, block[:, 1, 1] * (row == column), self.n).real
-
-    def _matrix_blocks(self) -> list[ComplexArray]:
-        """Return the parts of M in (t, z) of the ends: (i, i), (i, j), (j, i) and (j, j)."""
-        rows = []
-        for sign, upper, lower in zip((-1.0, 1.0), self._upper, self._lower, strict=True):
-            row = np.zeros((len(self._i), 2, 2), dtype=np.complex128)
-            row[:, 0, 0], row[:, 0, 1], row[:, 1, 1] = sign * self._root_tau, upper, lower
-            rows.append(row)
-        return [a.conj().swapaxes(1, 2) @ b for a in rows for b in rows]
-
-    def _without_map(self, blocks: Sequence[Blocks], component: int) -> list[Blocks]:
-        """Return the blocks of the terms with zeros in the map's row and column of a component."""
-        left = []
-        for row, column, block in zip(self._rows, self._columns, blocks, strict=True):
-            kept = block.copy()
-            kept[row == 0, component, :] = 0.0
-            kept[column == 0, :, component] = 0.0
-            left.append(kept)
-        return left
+        # f depends on differences of positions, so to pull that of the map to 0 holds it there
+        self._pull = squares[0, 0] or 1.0
+        self._by_t = by[0, :, :1, :1].real.copy(), by[1, :, :1, :1].real.copy()
+        own = np.zeros((self.n, 1, 1))
+        own[0] = self._pull
+        self._laplacian = self._nodes.factors(self._by_t, self._by_t, own)
 
     def factors(self, shift: FloatArray, *, turned: bool = True) -> BlockFactors:
         """
         Return the factors of M with numbers added to the diagonal at the headings.
 
-        The position of the map is held, and its heading unless `turned`. Raises LinearSolveError
-        if the matrix is singular.
+        The position of the map is held, and nearly its heading unless `turned`. Raises
+        LinearSolveError if the matrix is singular.
         """
-        blocks, single = self._without_map(self._blocks, 0), _unit(self.n, 2, 0)
-        single[:, 1, 1] = shift
+        own = np.zeros((self.n, 2, 2))
+        own[0, 0, 0], own[:, 1, 1] = self._pull, shift
         if not turned:
-            blocks = self._without_map(blocks, 1)
-            single[0, 1, 1] = 1.0
-        return self._pattern.factors((*blocks, single))
+            own[0, 1, 1] = 1e8 * np.max(self.diagonal)
+        return self._nodes.factors([*self._by], [*self._by], own)
 
     def inverse(self, factors: BlockFactors, v: ComplexArray) -> ComplexArray:
         """
@@ -230,48 +206,32 @@ class QuadraticForm:
 
     def positions(self, z: ComplexArray) -> ComplexArray:
         """Return the best positions, shape (n, r), for headings of this shape; 0 of the map."""
-        upper = self._root_tau[:, None] * self._of(self._upper, z)
-        right = _scattered(self._j, upper, self.n) - _scattered(self._i, upper, self.n)
-        right[0] = 0.0
+        return self._positions(self._of_headings(z))
+
+    def _positions(self, of_headings: ComplexArray) -> ComplexArray:
+        right = self._nodes.gathered(self._by_t, of_headings[:, :1])[:, 0]
         # a complex column as two real ones
-        solved = self._laplacian.solve(-right.view(np.float64))
+        solved = self._laplacian.solve(-np.ascontiguousarray(right).view(np.float64))
         return np.ascontiguousarray(solved).view(np.complex128)
 
-    def _of(self, factors: tuple[ComplexArray, ComplexArray], z: ComplexArray) -> ComplexArray:
-        return factors[0][:, None] * z[self._i] + factors[1][:, None] * z[self._j]
+    def _of_headings(self, z: ComplexArray) -> ComplexArray:
+        """Return what headings add to the residuals, shape (M, 2, r)."""
+        (i, j), (by_i, by_j) = self._ends, self._by[:, :, :, 1:]
+        return np.asarray(by_i * z[i, None] + by_j * z[j, None])
 
-    def residuals(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return the whitened residuals of positions and headings, shape (M, r) each."""
-        t = self.positions(z)
-        return (self._of(self._upper, z) + self._root_tau[:, None] * (t[self._j] - t[self._i]),
-                self._of(self._lower, z))
+    def residuals(self, z: ComplexArray) -> ComplexArray:
+        """Return the whitened residuals of positions and headings, shape (M, 2, r)."""
+        residuals, (i, j) = self._of_headings(z), self._ends
+        t = self._positions(residuals)
+        residuals[:, 0] += self._by_t[1][:, 0] * (t[j] - t[i])
+        return residuals
 
     def cost(self, z: ComplexArray) -> float:
         """Return f for headings z of shape (n, r)."""
-        return float(sum(np.sum(np.abs(part)**2) for part in self.residuals(z)))
+        return float(np.sum(np.abs(self.residuals(z))**2))
 
     def product(self, z: ComplexArray) -> ComplexArray:
         """Return Q z, half the gradient of f, for z of shape (n, r)."""
         # the residuals are orthogonal to the columns of C_t
-        upper, lower = self.residuals(z)
-        return sum((_scattered(end, self._upper[k].conj()[:, None] * upper
-                               + self._lower[k].conj()[:, None] * lower, self.n)
-                    for k, end in enumerate((self._i, self._j))), np.zeros_like(z))
-
-
-def _scattered(nodes: IntArray, values: ComplexArray, n: int) -> ComplexArray:
-    """Return the sums of complex values at each of n nodes, shape (n,) or (n, r)."""
-    sums = np.empty((n, *values.shape[1:]), dtype=np.complex128)
-    # bincount takes one column of real numbers
-    for source, target in ((values, sums),) if values.ndim == 1 else zip(
-            values.T, sums.T, strict=True):
-        target.real = np.bincount(nodes, source.real, n)
-        target.imag = np.bincount(nodes, source.imag, n)
-    return sums
-
-
-def _unit(n: int, size: int, component: int) -> ComplexArray:
-    """Return blocks of single nodes, shape (n, size, size), 1 for a component of the map."""
-    blocks = np.zeros((n, size, size), dtype=np.complex128)
-    blocks[0, component, component] = 1.0
-    return blocks
+        by_i, by_j = self._by[:, :, :, 1:]
+        return self._nodes.gathered((by_i, by_j), self.residuals(z))[:, 0]
