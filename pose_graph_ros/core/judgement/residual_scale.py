@@ -1,28 +1,19 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The factor on the sigmas of a source of closures that its believed closures show, in three ways.
+The factor on the sigmas of a source of closures that the residuals of its believed ones show.
 
-All are too small if anything, so the largest one counts.
+The residual of a constraint in the graph has the covariance `s^2 R - C`, with R the claimed one, s
+the factor and `C = J P J^T` its part that the estimate has followed. So `e^T R^-1 e / s^2` is
+expected to be its redundancy, `r = 3 - tr(R^-1 C) / s^2`, and s^2 is the sum of all squares over
+that of the redundancies, the estimate of a variance component by restricted maximum likelihood
+(K.-R. Koch, "Parameter estimation and hypothesis testing in linear models", 1999, section 3.6). A
+square counts up to where 99 % of them are, so that one wrong closure does not decide.
 
-By their *residuals*: that of a constraint in the graph has the covariance `s^2 R - C`, with R the
-claimed one, s the factor and `C = J P J^T` its part that the estimate has followed. So `e^T R^-1 e
-/ s^2` is expected to be its redundancy, `r = 3 - tr(R^-1 C) / s^2`, and s^2 is the sum of all
-squares over that of the redundancies, the estimate of a variance component by restricted maximum
-likelihood (K.-R. Koch, "Parameter estimation and hypothesis testing in linear models", 1999,
-section 3.6). A square counts up to where 99 % of them are, so that one wrong closure does not
-decide. But closures that the graph follows have no residuals left.
-
-By the residuals of *groups*: closures of one place often share an error, as the same view is
-recognised again. The mean of a group, weighted by information, is a constraint with the sum of the
-informations; if errors are independent, it shows the same s, and else a larger one, with which the
-group counts as what it is. Its C is taken to be the mean of those of its closures, a little too
-large.
-
-By their *agreement*: neighbours differ by their own errors and by the odometry of a few metres
-between them, whatever the graph does. With these covariances `s^2 (R_a + R_b) + Q`, the median of
-the squared distances is that of chi2 for the right s. But what neighbours have in common is not
-seen.
+Closures of one place often share an error, as the same view is recognised again. So they are one
+constraint: their mean, weighted by information, with the sum of the informations. If errors are
+independent, it shows the same s, and else a larger one, with which the group counts as what it is.
+Its C is taken to be the mean of those of its closures, a little too large.
 """
 
 import math
@@ -37,7 +28,7 @@ from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.beliefs import Beliefs, ScaleLeft
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
-from pose_graph_ros.core.judgement.closures import claims, ClosureTable, GATE, squared_distances
+from pose_graph_ros.core.judgement.closures import ClosureTable, GATE
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import STATES
@@ -59,17 +50,13 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
     chain.extend(graph)
     if len(chain) < graph.n_nodes or len(closures) == 0:
         return scale
-    edges, inside = graph.edges_at(closures), np.ones(len(closures), dtype=bool)
-    table = ClosureTable(chain)
-    table.append(claims(edges))
-    group = places(table, edges)
-    agreement = agreement_scale(table, np.arange(len(closures)), inside, edges)
+    edges = graph.edges_at(closures)
+    group = places(chain, edges)
     for _ in range(BELIEF.scale_rounds):
         if optimize(graph, CONFIG).status is Status.FAILED:
             break
         errors, covariances = innovations(graph.memory.head, edges)
-        shown = max(agreement, residual_scale(
-            errors, covariances, edges.information, group, scale))
+        shown = residual_scale(errors, covariances, edges.information, group, scale)
         if shown <= scale:
             break
         scale = shown
@@ -77,10 +64,10 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
     return scale
 
 
-def places(table: ClosureTable, edges: Edges) -> IntArray:
+def places(chain: OdometryChain, edges: Edges) -> IntArray:
     """Return to which place closures belong, numbers from 0, shape (M,)."""
     stretch = np.floor(np.column_stack(
-        [table.chain.travel(nodes) for nodes in (edges.j, edges.i)]) / BELIEF.place_length)
+        [chain.travel(nodes) for nodes in (edges.j, edges.i)]) / BELIEF.place_length)
     _, place = np.unique(stretch, axis=0, return_inverse=True)
     return np.asarray(place.ravel())
 
@@ -105,20 +92,14 @@ def residual_scale(
     # what no closure of a group measures stays at 0
     largest = np.max(np.abs(total), axis=(1, 2))[:, None, None]
     mean = np.linalg.solve(total + 1e-12 * largest * np.eye(3), weighted[:, :, None])[:, :, 0]
-    return max(_shown(errors, covariances, information, scale),
-               _shown(mean, common / size[:, None, None], total, scale))
-
-
-def _shown(
-    errors: FloatArray, covariances: FloatArray, information: FloatArray, scale: float,
-) -> float:
-    trace = np.einsum('mij,mji->m', information, covariances)
-    rank = np.count_nonzero(np.einsum('mii->mi', information) > 0.0, axis=1)
+    common /= size[:, None, None]
+    trace = np.einsum('mij,mji->m', total, common)
+    rank = np.count_nonzero(np.einsum('mii->mi', total) > 0.0, axis=1)
     redundancy = np.maximum(rank - trace / scale**2, 0.0) / 3.0
     n = float(np.sum(redundancy))
     if n < BELIEF.least_shown:
         return scale
-    squares = np.einsum('mi,mij,mj->m', errors, information, errors)
+    squares = np.einsum('mi,mij,mj->m', mean, total, mean)
     shown = math.sqrt(float(np.sum(squares)) / (3.0 * n))
     for _ in range(BELIEF.scale_steps):
         # from above, as the sum of what counts shrinks with its limits
@@ -126,41 +107,7 @@ def _shown(
         shown, before = math.sqrt(float(np.sum(counted)) / (3.0 * LEFT * n)), shown
         if shown > 0.99 * before:
             break
-    return _believed(shown, n)
-
-
-def agreement_scale(
-    table: ClosureTable, numbers: IntArray, inside: BoolArray, edges: Edges,
-) -> float:
-    """
-    Return the factor on the sigmas of a source, at least 1, by the neighbours of its closures.
-    """
-    place = np.cumsum(inside) - 1    # among those of `inside`
-    first, second = list[int](), list[int]()
-    for number in numbers.tolist():
-        agree, _ = table.neighbours(number)
-        others = place[agree[inside[agree]]][:BELIEF.neighbours].tolist()
-        first += [int(place[number])] * len(others)
-        second += others
-    if len(set(first)) < BELIEF.least_shown:
-        return 1.0
-    claimed, pairs = claims(edges, np.zeros(3)), (np.array(first), np.array(second))
-
-    def distance(factor: float) -> float:
-        return float(np.median(squared_distances(
-            table.chain, claimed._replace(noise=factor**2 * claimed.noise), *pairs)))
-
-    scale, ratio = 1.0, BELIEF.scale_ratio
-    share = math.log(distance(1.0) / distance(ratio)) / (2.0 * math.log(ratio))
-    # up to the median of chi2 with three degrees of freedom
-    while scale < BELIEF.largest_scale and distance(scale) > 2.366:
-        scale *= ratio
-    # where odometry makes most of the distance, it tells little of closures
-    return _believed(scale, share * len(set(first)))
-
-
-def _believed(shown: float, n: float) -> float:
-    """Return the factor to use if n closures show one."""
+    # if n closures show it
     return _stepped(math.log(max(shown, 1e-3)) * n / (n + BELIEF.prior_closures))
 
 
@@ -178,8 +125,6 @@ def together(shown: float, n: float, left: ScaleLeft) -> float:
     prior = BELIEF.prior_closures
     return _stepped(((n + prior) * math.log(shown) + n_left * math.log(left.scale)) / (
         n + (prior if n > 0.0 else 0.0) + n_left))
-
-
 
 
 class ScaleLearner:
@@ -256,16 +201,16 @@ class ScaleLearner:
     def _shown(self, source: int, numbers: IntArray, most: int) -> float:
         states, graph = self._states, self._smoother.graph
         some, group = self._sample(numbers, most)
-        edges, inside = graph.edges_at(states.held[some]), self._of(source)
-        return together(max(
+        edges = graph.edges_at(states.held[some])
+        return together(
             residual_scale(*self._smoother.edge_innovations(edges), edges.information, group,
                            self._beliefs.scales[source]),
-            agreement_scale(self._table, some, inside, graph.edges_at(states.held[inside]))),
             float(len(some)), self._beliefs.scales_left[source])
 
     def _sample(self, numbers: IntArray, most: int) -> tuple[IntArray, IntArray]:
         """Return at most so many closures, from all along the path, and the group of each."""
-        group = places(self._table, self._smoother.graph.edges_at(self._states.held[numbers]))
+        edges = self._smoother.graph.edges_at(self._states.held[numbers])
+        group = places(self._table.chain, edges)
         n_groups = int(group.max()) + 1
         n_chosen = min(max(n_groups * most // len(numbers), 1), n_groups)
         chosen = np.linspace(0, n_groups - 1, n_chosen).astype(np.int64)
