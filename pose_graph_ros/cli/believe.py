@@ -19,8 +19,9 @@ from pose_graph_ros.core.batch.optimizer import (
     optimize_from_linear_start,
     SAME_MINIMUM,
     Status,
+    to_the_end,
 )
-from pose_graph_ros.core.batch.truncated import Choice, CONFIG, Surrogate, TruncatedProblem
+from pose_graph_ros.core.batch.truncated import Choosing, CONFIG, Surrogate, TruncatedProblem
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
@@ -72,21 +73,21 @@ def believe(
     n_parts, part = connected_components(coo_array(
         (np.ones(len(odometry)), (odometry.i, odometry.j)), (graph.n_nodes, graph.n_nodes)))
     n_parts -= int(np.sum(~graph.is_pose))
-    best, rows, lowered = None, closures, 1.0
+    best, rows = None, closures
     for k in range(TRIES if n_parts > 1 else 1):
         known = _joining(edges, closures, part.astype(np.int64), k)
         problem = _from_odometry(graph, softened, closures[~np.isin(closures, known)])
-        choice = None if problem is None else SELECTIONS[method](problem)
+        choice = None if problem is None else to_the_end(
+            SELECTIONS[method](problem))
         if problem is not None and choice is not None and (
                 best is None or choice.cost < best.cost):
-            best, rows, lowered = choice, problem.rows, problem.lowered()
+            best, rows = choice, problem.rows
     plain = _minimum_of_all(graph, edges, closures)
     starts = [poses for poses in (plain, graph.poses.copy() if given else None)
               if poses is not None]
     for start in starts:
         problem = TruncatedProblem(_filled(graph, softened), closures, start)
-        problem.limits *= lowered
-        choice = problem.near_start()
+        choice = to_the_end(problem.near_start())
         if choice is not None and (best is None or choice.cost < best.cost):
             best, rows = choice, closures
     if best is None:
@@ -117,7 +118,7 @@ def _not_worse(
     for start in starts:
         if problem.cost_at(start) < result.cost * (1.0 - SAME_MINIMUM):
             problem = TruncatedProblem(_filled(graph, scaled), closures, start)
-            choice = problem.near_start()
+            choice = to_the_end(problem.near_start())
             if choice is not None and choice.cost < result.cost:
                 result = replace(result, believed=choice.believed, poses=choice.poses,
                                  cost=choice.cost)
@@ -154,7 +155,7 @@ def _from_odometry(graph: Graph, edges: Edges, closures: IntArray) -> TruncatedP
     return TruncatedProblem(copy, closures, start=copy.poses.copy())
 
 
-SELECTIONS: dict[str, Callable[[TruncatedProblem], Choice | None]] = {
+SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
     'selection': final.best,
     'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED, patient=True),
     'gnc-gm': partial(

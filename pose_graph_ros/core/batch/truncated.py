@@ -32,13 +32,14 @@ surrogate (where its curvature, -2 mu between the bounds, does not outweigh the 
 from twice the largest s to 1 for that of Geman-McClure.
 """
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import chi2_of, optimize, Status
+from pose_graph_ros.core.batch.optimizer import chi2_of, in_parts, Status, to_the_end
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
@@ -53,6 +54,10 @@ GRADUATION = 1.4
 # Of a set that is compared, and of a step on the way to one.
 CONFIG = SolverConfig(max_iterations=60, step_tolerance=1e-6)
 ROUGH = SolverConfig(max_iterations=15, step_tolerance=1e-4)
+
+
+Solution: TypeAlias = Generator[None, None, bool]
+"""Solves a graph, and pauses at each iteration; tells whether that was possible."""
 
 
 class Surrogate(Enum):
@@ -85,6 +90,10 @@ class Choice:
     poses: Poses  # those that minimise chi2 of what is believed
 
 
+Choosing: TypeAlias = Generator[None, None, Choice | None]
+"""Looks for a set, and pauses at each iteration; None if the graph cannot be solved."""
+
+
 class TruncatedProblem:
     """
     A graph with M edges that may be wrong. Their weights and its poses are for trying.
@@ -100,35 +109,27 @@ class TruncatedProblem:
         self.graph, self.rows = graph, rows
         self.edges = graph.edges_at(rows)
         """What may be wrong; their weights have no meaning."""
-        self._full_limits = LIMITS[_ranks(self.edges.information)]
-        self.limits = self._full_limits.copy()
+        self.limits = LIMITS[_ranks(self.edges.information)]
         """c^2 of each, shape (M,)."""
-        self.allowed = np.ones(len(self.limits), dtype=bool)
-        """Which of them a set may believe, shape (M,)."""
         self._weights = self.edges.weight
-        self._choices: dict[tuple[bytes, bytes, SolverConfig], Choice] = {}
+        self._choices: dict[tuple[bytes, SolverConfig], Choice] = {}
         """The last sets that were solved for, the newest last."""
         self.start = graph.poses.copy() if start is None else start
-        if start is None and self.solve(np.zeros(len(self)), CONFIG):
+        if start is None and to_the_end(self.solve(np.zeros(len(self)), CONFIG)):
             self.start = graph.poses.copy()
 
     def __len__(self) -> int:
         return len(self.limits)
 
-    def lowered(self) -> float:
-        """Return the factor by which the limits have been lowered."""
-        return float(np.min(self.limits / np.maximum(self._full_limits, 1e-9), initial=1.0))
-
     def solve(
         self, weights: FloatArray, config: SolverConfig = ROUGH, *, go_on: bool = False,
-    ) -> bool:
-        """
-        Return whether the graph could be moved from the start to the minimum for some weights.
-        """
+    ) -> Solution:
+        """Move the graph from the start to the minimum for some weights."""
         self._weigh(weights)
         if not go_on:
             self.graph.set_poses(self.start)
-        return optimize(self.graph, config).status is not Status.FAILED
+        result = yield from in_parts(self.graph, config)
+        return result.status is not Status.FAILED
 
     def factorisation(self, weights: FloatArray) -> int:
         """Return the number of entries of a factorisation with these weights, shape (M,)."""
@@ -140,37 +141,37 @@ class TruncatedProblem:
         return energies(self.graph.edge_errors(self.edges), self.edges.information)
 
     def shares(self) -> FloatArray:
-        """Return r^2 / c^2 at the present poses, infinite for those that may not be believed."""
-        return np.where(self.allowed, self.energies() / self.limits, np.inf)
+        """Return r^2 / c^2 at the present poses, shape (M,)."""
+        return self.energies() / self.limits
 
     def errors(self, numbers: IntArray) -> FloatArray:
         """Return the errors of some of the edges at the present poses, shape (K, 3)."""
         return self.graph.edge_errors(self.edges.rows(numbers))
 
-    def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choice | None:
+    def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choosing:
         """Return a set with its cost; None if it leaves a node undetermined."""
         # retests of different sets often lead to the same one
-        key = believed.tobytes(), self.limits.tobytes(), config
-        choice = self._choices.pop(key, None) or self._solved(believed, config)
+        key = believed.tobytes(), config
+        choice = self._choices.pop(key, None) or (yield from self._solved(believed, config))
         if choice is not None:
             self._choices[key] = choice
             if len(self._choices) > 16:
                 del self._choices[next(iter(self._choices))]
         return choice
 
-    def _solved(self, believed: BoolArray, config: SolverConfig) -> Choice | None:
-        if not self.solve(believed.astype(np.float64), config):
+    def _solved(self, believed: BoolArray, config: SolverConfig) -> Choosing:
+        if not (yield from self.solve(believed.astype(np.float64), config)):
             return None
         squares = self.energies()
         known = chi2_of(self.graph) - float(np.sum(squares[believed]))
         cost = known + float(np.sum(np.minimum(squares, self.limits)))
         return Choice(believed.copy(), squares, cost, self.graph.poses.copy())
 
-    def near_start(self) -> Choice | None:
+    def near_start(self) -> Choosing:
         """Return a set with poses of no higher truncated cost than the start; None as `choice`."""
         self.graph.set_poses(self.start)
-        choice = self.choice(self.allowed & (self.energies() <= self.limits))
-        return None if choice is None else self.improved(choice)
+        choice = yield from self.choice(self.energies() <= self.limits)
+        return None if choice is None else (yield from self.improved(choice))
 
     def cost_at(self, poses: FloatArray) -> float:
         """Return the truncated cost of poses, shape (N, 3), whatever is believed."""
@@ -178,24 +179,24 @@ class TruncatedProblem:
         self.graph.set_poses(poses)
         return chi2_of(self.graph) + float(np.sum(np.minimum(self.energies(), self.limits)))
 
-    def graduated(self, surrogate: Surrogate, *, patient: bool = False) -> Choice | None:
+    def graduated(self, surrogate: Surrogate, *, patient: bool = False) -> Choosing:
         """
         Return the set that graduated non-convexity ends with.
 
         None if no step could be solved, or, unless `patient`, if each would take long: with many
         random edges the factorisation is nearly dense.
         """
-        if not patient and self.factorisation(self.allowed.astype(np.float64)) > 500_000:
+        if not patient and self.factorisation(np.ones(len(self))) > 500_000:
             return None
-        if not self.solve(np.zeros(len(self))):
+        if not (yield from self.solve(np.zeros(len(self)))):
             return None
         share = self.shares()
-        largest = float(np.max(share, initial=0.0, where=np.isfinite(share)))
+        largest = float(np.max(share, initial=0.0))
         if largest > 1.0:
             mu = surrogate.first(largest)
             for _ in range(100):
                 weights = surrogate.weights(share, mu)
-                if not self.solve(weights):
+                if not (yield from self.solve(weights)):
                     break
                 share = self.shares()
                 if surrogate is Surrogate.GEMAN_MCCLURE:
@@ -206,11 +207,11 @@ class TruncatedProblem:
                     break   # all weights are final
                 else:
                     mu *= GRADUATION
-        return self.choice(share <= 1.0)
+        return (yield from self.choice(share <= 1.0))
 
     def improved(
         self, choice: Choice, retests: int = 20, config: SolverConfig = CONFIG,
-    ) -> Choice:
+    ) -> Generator[None, None, Choice]:
         """
         Return a set that no retest lowers the cost of.
 
@@ -218,10 +219,10 @@ class TruncatedProblem:
         as that lowers the cost.
         """
         for _ in range(retests):
-            believed = self.allowed & (choice.energies <= self.limits)
+            believed = choice.energies <= self.limits
             if np.array_equal(believed, choice.believed):
                 break
-            other = self.choice(believed, config)
+            other = yield from self.choice(believed, config)
             if other is None or other.cost >= choice.cost:
                 break
             choice = other

@@ -3,8 +3,7 @@
 """
 Which of the loop closures that have passed the gate are believed, and when one is tested again.
 
-`BeliefRule` chooses; `Beliefs` changes states and weights together. Some changes cannot be made in
-the time of an update, as its iterations diverge with them: these are tried by `closure_trial`.
+`BeliefRule` chooses; `Beliefs` changes states and weights together.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,14 +13,14 @@ import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closure_states import ClosureStates, NEVER
 from pose_graph_ros.core.judgement.closure_trial import ClosureTrial, Found
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import DOUBTED, OUT, State, STATES, USED
-from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
+from pose_graph_ros.core.judgement.verdicts import OUT, State, STATES, USED
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
 
 
@@ -32,17 +31,17 @@ class Retests:
     Closures are tested again whenever more or less is believed. But those that contradict one
     another could take turns in the graph for ever, so one that was thrown out a few times waits
     for the next closure to come. And the iterations of an update diverge with some: these wait
-    until the graph has grown, twice as long after each failure, so that all failures together take
-    a time in proportion to the drive.
+    until the graph has grown by a share, so that all failures together take a time in proportion
+    to the drive.
     """
 
     def __init__(self, states: ClosureStates) -> None:
         self._states = states
 
-    def due(self, now: int, next_node: int, *, failed: bool = True) -> BoolArray:
+    def due(self, now: int, next_node: int) -> BoolArray:
         """Return which closures may be tested, shape (M,)."""
         return np.asarray((self._states.round < now) & (self._states.turns < BELIEF.most_turns)
-                          & ~self.resting(next_node) & (failed | (self._states.failures == 0)))
+                          & ~self.resting(next_node))
 
     def resting(self, next_node: int) -> BoolArray:
         """Return which closures wait for a node with an id from this on, shape (M,)."""
@@ -51,22 +50,19 @@ class Retests:
     def tested(self, numbers: IntArray | slice, now: int) -> None:
         self._states.round[numbers] = now
 
-    def again(self, numbers: Iterable[int] | slice) -> None:
+    def again(self, numbers: IntArray | slice) -> None:
         """Have closures tested, whatever was found before."""
-        chosen = numbers if isinstance(numbers, slice) else [*numbers]
-        self._states.round[chosen], self._states.resting[chosen] = NEVER, 0
+        self._states.round[numbers], self._states.resting[numbers] = NEVER, 0
 
     def thrown_out(self, numbers: IntArray) -> None:
         self._states.turns[numbers] += 1
 
-    def failed(self, numbers: Iterable[int], n_nodes: int, next_node: int) -> None:
+    def failed(self, numbers: Iterable[int], graph: Graph) -> None:
         """Let closures rest, as the iterations diverge where their belief is changed."""
         chosen = [*numbers]
-        doublings = np.minimum(self._states.failures[chosen], BELIEF.rest_doublings)
-        self._states.failures[chosen] += 1
         self._states.round[chosen] = NEVER
-        self._states.resting[chosen] = next_node + np.maximum(
-            (BELIEF.rest_share * n_nodes * 2.0**doublings).astype(np.int64), BELIEF.least_rest)
+        self._states.resting[chosen] = graph.next_ids.node + max(
+            int(BELIEF.rest_share * graph.n_nodes), BELIEF.least_rest)
 
     def begin_turns(self) -> None:
         """Let all closures in again that have taken turns, as another one has come."""
@@ -89,9 +85,8 @@ class BeliefRule:
     def choose(self, passed: IntArray, chance: FloatArray) -> dict[int, State]:
         """Return what to believe of closures that have passed; of wide gates only one."""
         chosen: dict[int, State] = {}
-        failures = self._states.failures[passed]
-        for k in np.lexsort((chance, failures)).tolist():
-            if (chance[k] > BELIEF.narrow_chance or failures[k] > 0) and len(chosen) > 0:
+        for k in np.argsort(chance, kind='stable').tolist():
+            if chance[k] > BELIEF.narrow_chance and len(chosen) > 0:
                 break
             state = self._belief(int(passed[k]), float(chance[k]))
             if state.in_graph:
@@ -158,10 +153,7 @@ class Beliefs:
         weights = self.weights_with(changes)
         result = self._smoother.update(GraphUpdate(weigh_edges=weights), fall_back=at_once)
         if result.status is Status.FAILED:
-            if result.reason == DIVERGED:
-                self.trial.begin(changes, weights)
             return False
-        self.trial.was_not_needed()
         self._keep(changes)
         return True
 
@@ -178,9 +170,17 @@ class Beliefs:
         return done
 
     def try_set(self, found: Found) -> None:
-        changes, graph = self._states.changes_to(found.inside), self._smoother.graph
-        self.trial.begin(changes, self.weights_with(changes),
+        graph = self._smoother.graph
+        self.trial.begin(found, self.weights_with(self._changes_to(found)),
                          continued(graph, found.poses, found.nodes))
+
+    def _changes_to(self, found: Found) -> dict[int, State]:
+        states = self._states
+        inside = states.in_graph
+        numbers = states.numbers(found.edges)
+        numbers = numbers[states.judged[numbers]]
+        inside[numbers] = np.isin(states.held[numbers], found.believed)
+        return states.changes_to(inside)
 
     def weights_with(self, changes: Mapping[int, State]) -> dict[int, float]:
         """Return the weights of edges, by id, after a change of states."""
@@ -200,29 +200,22 @@ class Beliefs:
         self.set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self.round += 1
 
-    def try_part(self) -> list[int] | None:
-        """Do a part of a trial; return what is to be tested again, None without a trial."""
+    def try_part(self) -> bool:
+        """Do a part of a trial; tell whether there was any."""
         trial, states = self.trial, self._states
         if not trial.work():
-            return None
-        if not trial.is_finished:
-            return []
-        changes, later = trial.changes, trial.later
-        if trial.is_outdated or (len(changes) > 0 and (
-                trial.weights != self.weights_with(changes)
-                or not np.all(states.judged[[*changes]]))):
-            later |= set(changes)
-        else:
-            bad = trial.misfits(self._table)
-            if len(bad) == 0 and trial.adopt():
+            return False
+        if trial.is_finished:
+            changes = {} if trial.found is None else {
+                number: state for number, state in self._changes_to(trial.found).items()
+                if int(states.held[number]) in trial.weights}
+            # the set is as when the trial began, but for what has left the graph
+            wanted = self.weights_with(changes)
+            there = states.held[np.isin(states.held, [*trial.weights])].tolist()
+            if wanted == {edge: trial.weights[edge] for edge in there} and trial.adopt():
                 self._keep(changes)
-                later |= set(changes)
-            for number in bad:
-                before, states.state[number] = int(states.state[number]), DOUBTED
-                states.announce(number, before, self.now_ns)
-            later |= set(changes) - set(bad) if len(bad) > 0 else set()
-        trial.end()
-        return sorted(later)
+            trial.end()
+        return True
 
     def closures_left(self, numbers: IntArray) -> None:
         """Keep what believed closures have shown of the errors of their sources."""

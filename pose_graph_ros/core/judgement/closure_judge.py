@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Edges
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -54,7 +55,7 @@ class ClosureJudge:
         self._rule = BeliefRule(self._states, self._table)
         self._final = (0, 0, 0, -1)  # next ids of the graph and round at the last final decision
         self._n_staged = 0
-        self._search = SetSearch(self._states, self._table)
+        self._search = SetSearch(self._states)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
 
@@ -82,7 +83,8 @@ class ClosureJudge:
         if not np.any(self._states.in_graph[numbers]):
             return None
         self._states.state[numbers] = WAITING
-        self._retests.again(numbers.tolist())
+        self._retests.again(numbers)
+        self._search.want()
         return self._beliefs.weights(numbers)
 
     @property
@@ -144,12 +146,8 @@ class ClosureJudge:
 
     def test(self) -> bool:
         """Do a bounded part of the tests that are left; tell whether there was any."""
-        return len(self._states) > 0 and self._test_again(self._most)
-
-    @property
-    def most_parts(self) -> int:
-        """Parts of the work that end it unless beliefs go round in a circle."""
-        return BELIEF.parts + BELIEF.parts_of_each * len(self._states)
+        return (len(self._states) > 0 and not self._smoother.graph.has_touched
+                and self._test_again(self._most))
 
     @property
     def _most(self) -> int:
@@ -157,13 +155,11 @@ class ClosureJudge:
         return max(min(BELIEF.tests_in_part, by_size), 1)
 
     def _try(self) -> bool:
-        before, again = self._beliefs.round, self._beliefs.try_part()
-        if again is None:
-            return False
-        self._retests.again(again)
+        before = self._beliefs.round
+        tried = self._beliefs.try_part()
         if self._beliefs.round > before:
             self._table.spread[:] = 0.0
-        return True
+        return tried
 
     def _part(self, most: int) -> bool:
         if len(self._states) == 0 or self._smoother.graph.has_touched:
@@ -193,12 +189,9 @@ class ClosureJudge:
 
     def _test_again(self, most: int) -> bool:
         """Test some closures that wait; tell whether some are left."""
-        if self._beliefs.trial.keeps_others_out:
-            return False
         waiting = np.flatnonzero(
             ~self._states.in_graph & self._states.judged
-            & self._retests.due(self._beliefs.round, self._smoother.graph.next_ids.node,
-                                failed=not self._beliefs.trial.is_pausing))
+            & self._retests.due(self._beliefs.round, self._smoother.graph.next_ids.node))
         if len(waiting) == 0:
             return False
         some = self._table.rows(waiting)
@@ -212,15 +205,7 @@ class ClosureJudge:
         rest = waiting[~hopeless]
         rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
         passed, chance = self._test(rest[:most])
-        chosen = self._rule.choose(passed, chance)
-        if self._change(chosen):
-            return True
-        # what the update diverges with does not keep out the others, if that is an exception
-        others = passed[:0]
-        if len(chosen) > 0 and not self._beliefs.trial.is_pausing:
-            others = np.setdiff1d(passed, [*chosen])
-            self._retests.again(others.tolist())
-        return len(rest) > most or len(others) > 0
+        return self._change(self._rule.choose(passed, chance)) or len(rest) > most
 
     def _change(self, states: dict[int, State]) -> bool:
         """Change states; tell whether there were any, and the update has not diverged."""
@@ -228,8 +213,8 @@ class ClosureJudge:
             return False
         done = self._beliefs.apply(states)
         if not done:
-            graph = self._smoother.graph
-            self._retests.failed(states, graph.n_nodes, graph.next_ids.node)
+            self._retests.failed(states, self._smoother.graph)
+            self._search.want()
         return done
 
     def decide_leaving(self, edges: IntArray) -> list[Verdict]:
@@ -254,12 +239,10 @@ class ClosureJudge:
 
     def forget(self, nodes: IntArray, edges: IntArray) -> None:
         states, gone = self._states, self._states.numbers(edges)
-        self._beliefs.trial.forget(set(edges.tolist()), set(gone.tolist()))
         if len(gone) > 0:
             self._beliefs.closures_left(gone)
             # all others get other numbers
             kept = np.setdiff1d(np.arange(len(states)), gone)
-            self._beliefs.trial.renumber(np.searchsorted(kept, np.arange(len(states))))
             for table in (states, self._table):
                 table.select(kept)
             self.reports.forget()
@@ -274,8 +257,8 @@ class ClosureJudge:
             return
         forced = states.held[states.in_graph & ~states.judged]
         inside = states.in_graph
-        choice = final.decide(
-            graph, self._reweighting, states.held[judged], forced, inside[judged])
+        choice = to_the_end(final.decide(
+            graph, states.held[judged], forced, inside[judged], self._reweighting))
         if choice is None:
             return
         inside[judged] = choice.believed
@@ -294,7 +277,7 @@ class ClosureJudge:
         def bring_back() -> None:
             states_back()
             self._scales.set_state(*scales)
-            self._search = SetSearch(self._states, self._table)
+            self._search = SetSearch(self._states)
             self._beliefs.trial.end()
             self._retests.again(slice(None))
             self._table.spread[:] = 0.0
@@ -302,9 +285,9 @@ class ClosureJudge:
 
     def _look_for_another_set(self) -> bool:
         """Do a part of the search of another set; tell whether there was anything to do."""
-        more = self._search.work(self._smoother.graph, self._beliefs.round)
-        if self._search.found is not None:
-            self._beliefs.try_set(self._search.found)
+        more, found = self._search.work(self._smoother.graph)
+        if found is not None:
+            self._beliefs.try_set(found)
         return more
 
     def saved(self) -> SavedVerdicts:

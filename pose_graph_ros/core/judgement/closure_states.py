@@ -31,7 +31,7 @@ NEVER = -1  # round of the last test of one that was not tested
 
 class ClosureStates(Judgements):
     forgotten, corroborated = Column(), Column()
-    round, turns, failures, resting = Column(), Column(), Column(), Column()
+    round, turns, resting = Column(), Column(), Column()
 
     def __init__(self) -> None:
         super().__init__(
@@ -40,9 +40,8 @@ class ClosureStates(Judgements):
             # whether a clique of closures outside of the graph supports it while it is doubted
             corroborated=False,
             # what its next test waits for, see `Retests`: round of the last one, times that it was
-            # thrown out in turn, updates that have diverged with it, and the node until which it
-            # rests
-            round=NEVER, turns=0, failures=0, resting=0)
+            # thrown out in turn, and the node until which it rests
+            round=NEVER, turns=0, resting=0)
 
     @property
     def judged(self) -> BoolArray:

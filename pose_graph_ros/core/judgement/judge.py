@@ -163,11 +163,11 @@ class Judge:
         """Tell whether an update that has diverged may solve for all at once."""
         trial = self._closures.trial
         is_large = self._smoother.graph.n_nodes > BELIEF.large
-        return not (is_large or trial.is_due_or_pausing) and trial.may_solve()
+        return not is_large and trial.may_solve()
 
     def solve_later(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
         """Solve the graph with some weights as a copy between the updates, as these diverge."""
-        self._closures.trial.begin({}, edges, observed=observed)
+        self._closures.trial.solve_later(edges, observed)
 
     @property
     def solves_later(self) -> bool:
@@ -294,7 +294,7 @@ class Judge:
 
     def finish(self) -> Callable[[], None]:
         """
-        Do all the work that is left, then decide on all by the graph alone.
+        Test the closures that wait, then decide on all by the graph alone.
 
         What is returned undoes all that, if what follows fails: verdicts, weights and poses. The
         next update of the smoother then eliminates the graph again.
@@ -309,9 +309,9 @@ class Judge:
             self._reweighting.set_base_weights(base)
             graph.set_weights(weights)
             graph.set_poses(poses)
-        for _ in range(self._closures.most_parts):  # the end of it is decided anew anyway
-            if not self.work():
-                break
+        # each part believes one more, or leaves fewer to be tested
+        while self._closures.test():
+            pass
         self._fixes.finish()
         self._keep_gaps()
         self._closures.decide_finally()

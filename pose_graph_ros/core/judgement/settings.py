@@ -20,17 +20,13 @@ class BeliefSettings:
     # nodes above which an update adds closures with weight 0 and leaves all tests to the work
     # after it, so that it has nothing to solve for but what is new
     large: int = 500
-    # most parts of the work, and more for each closure: a test, a change and a trial for each of
-    # its turns, and searches of other sets, each some hundred iterations of a copy
-    parts: int = 3000
-    parts_of_each: int = 6
     leaving_rounds: int = 4  # rounds of tests of closures that leave the graph
     most_turns: int = 2  # times that one is thrown out before it waits for the next one to come
     # the graph has to grow by this share, and by so many nodes, before the next test of a closure
-    # that an update has diverged with; that doubles so many times
-    rest_share: float = 0.02
+    # that an update has diverged with, and by another one before the next search for a set then
+    rest_share: float = 0.1
     least_rest: int = 10
-    rest_doublings: int = 6
+    search_again: float = 0.1
 
     # --- when a closure is believed
     # least sigmas to decide by, as claimed covariances are mostly too small [m, m, rad]
@@ -50,56 +46,26 @@ class BeliefSettings:
     hopeless_closure: float = 10.0  # squared distance of one that nobody supports [gates]
     most_changes: int = 1000  # changes that are kept until they are announced
 
-    # --- beliefs and whole sets that are tried on a copy
-    without_pause: int = 3  # updates that diverge before there is a pause
-    pause: float = 0.01  # growth of the graph until the next trial, as a share of it
-    pause_doublings: int = 4  # that doubles with each further one that diverges, so many times
-    make_up: int = 3  # updates that do not diverge and make up for one that does
+    # --- what is solved on a copy
+    pause: float = 0.02  # growth of the graph until the next trial, as a share of it
     small: int = 100  # nodes up to which there is no pause: all is solved for in milliseconds
-    # limits of r^2 in the rounds of a trial of a set [gates]; a clique stays in for the first ones
-    narrowing: tuple[float, ...] = (16.0, 4.0, 2.0, 1.0, 1.0, 1.0, 1.0)
-    forced_rounds: int = 3
-    # so many more closures, and half more, speak for another set than the last time it was tried
+    # closures that agree with one another and are kept out begin the search of another set: so
+    # many more, and half more, than at the last one
     more_corroborated: int = 5
-    most_seeds: int = 50  # closures that the clique is grown from
 
     # --- the best set of closures of a whole graph
     most_at_end: int = 30_000  # nodes and closures above which the set is only improved
     retests_at_end: int = 3  # so often
-    supported: int = 50  # closures with neighbours from which on these speak for the others
     # entries of the factorisation with all closures, per node: above, some must be wrong
     most_numbers: int = 400
-    group_rounds: int = 4  # rounds in which groups are taken in or out
-    groups_in: int = 30  # trials in a round
-    groups_out: int = 10
-    group_work: int = 60_000  # nodes times trials
-    group_retests: int = 4  # of a trial
 
     # --- the surest closures first
     round_factor: float = 4.0  # volumes up to this times the smallest one count as equal
     most_rounds: int = 200
-    # factor on the volume with no neighbour that agrees, one, and more
-    lonely_factors: tuple[float, ...] = (1000.0, 30.0, 1.0)
-    pairs_of_each: int = 200  # closures that one is compared with, in one direction
     thrown_out: int = 2  # times after which one is doubted
-    # limits are lowered by so many believed closures, and this share of them with its chi2 of
-    # three degrees of freedom; they stay above what these show by a factor, and above the least
-    limits_from: int = 50
-    limits_share: float = 0.9
-    limits_chi2: float = 6.25
-    limits_margin: float = 3.0
-    least_limits: float = 0.02
-    # volumes shrink: those above so many times that of the round are not looked at in it
-    volume_reach: float = 20.0
-    # the smallest so many volumes, or this share of them, are looked at before all others; both
-    # double after a round in which most of these were believed
+    # the smallest so many volumes, or this share of them, are looked at before all others
     first_volumes: int = 200
-    first_volumes_share: float = 1.0 / 16.0
-    group_size: int = 3  # least size of a group of closures that agree
-    by_chance: float = 0.1  # chance of as many that fit, above which none is believed
-    place_size: float = 20.0  # size of a place [m]
-    telling_chance: float = 0.5  # to fit: above, a candidate tells nothing
-    least_telling: int = 8  # least number of candidates that tell something
+    first_volumes_share: float = 0.125
     # what is not measured of an error could be anything within this [m, m, rad]
     error_extent: tuple[float, float, float] = (100.0, 100.0, 2.0 * math.pi)
 
@@ -111,7 +77,6 @@ class BeliefSettings:
     least_shown: int = 10  # closures, or sum of their redundancies, that show anything
     prior_closures: float = 10.0  # closures that a factor of 1 is believed as much as
     most_counted: int = 100  # of those that have left the graph
-    neighbours: int = 3  # that a closure is compared with
     place_length: float = 2.0  # closures with both ends in one such stretch are of one place [m]
     scale_steps: int = 50  # to the limits of squares
     scale_rounds: int = 6  # of a whole graph

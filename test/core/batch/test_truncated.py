@@ -11,6 +11,7 @@ import pytest
 from random_graphs import slow_edge
 from scipy.optimize import least_squares
 
+from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.batch.truncated import LIMITS, Surrogate, TruncatedProblem
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
@@ -97,7 +98,7 @@ def small(seed: int) -> TruncatedProblem:
 def test_the_set_is_that_of_dense_graduated_non_convexity() -> None:
     problem = problem_of(laps(0, n_laps=2, n=5, every=2, n_wrong=2))
     dense = Dense(problem, problem.graph.poses.copy())
-    choice = problem.graduated(Surrogate.TRUNCATED)
+    choice = to_the_end(problem.graduated(Surrogate.TRUNCATED))
     np.testing.assert_array_equal(choice.believed, dense.gnc())
     assert choice.cost == pytest.approx(dense.truncated(choice.believed), rel=1e-6)
 
@@ -106,9 +107,9 @@ def test_the_set_is_that_of_dense_graduated_non_convexity() -> None:
 def test_no_subset_has_a_lower_cost(seed: int) -> None:
     problem = small(seed)
     costs = {subset: choice.cost for subset in product((False, True), repeat=len(problem))
-             if (choice := problem.choice(np.array(subset))) is not None}
+             if (choice := to_the_end(problem.choice(np.array(subset)))) is not None}
     for surrogate in Surrogate:
-        choice = problem.improved(problem.graduated(surrogate))
+        choice = to_the_end(problem.improved(to_the_end(problem.graduated(surrogate))))
         assert choice.cost == pytest.approx(min(costs.values()), rel=1e-6)
 
 
@@ -117,12 +118,14 @@ def test_no_subset_has_a_lower_cost(seed: int) -> None:
 def test_right_closures_are_believed_and_wrong_ones_not() -> None:
     drive = laps(3, n_wrong=8)
     problem, before = problem_of(drive), drive.graph.poses.copy()
-    choices = [problem.choice(drive.right)]
-    choices += [problem.improved(problem.graduated(surrogate)) for surrogate in Surrogate]
+    choices = [to_the_end(problem.choice(drive.right))]
+    choices += [to_the_end(problem.improved(to_the_end(problem.graduated(surrogate))))
+                for surrogate in Surrogate]
     for choice in choices:
         np.testing.assert_array_equal(choice.believed, drive.right)
         assert drive.error(choice.poses) < 0.3 * drive.error(before)
     # the cost counts what is doubted with its limit
-    all_, none = (problem.choice(np.full(len(problem), each)) for each in (True, False))
+    all_, none = (to_the_end(problem.choice(np.full(len(problem), each)))
+                  for each in (True, False))
     assert choices[0].cost < min(all_.cost, none.cost)
     assert none.cost == pytest.approx(np.sum(np.minimum(none.energies, problem.limits)), abs=1e-9)
