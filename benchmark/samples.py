@@ -4,9 +4,7 @@
 
 from collections.abc import Iterator
 import json
-import os
 from pathlib import Path
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,6 +15,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from benchmark.course import Course
 from benchmark.drives import Event
+from benchmark.parts import child
 from benchmark.section import about, Options, say, Section
 from pose_graph_ros.adapters.bag_writer import BAG_VERSION
 from pose_graph_ros.adapters.output_cdr import odometry_cdr
@@ -94,15 +93,14 @@ def _others(others: list[Event], course: Course) -> Iterator[tuple]:
 
 def replay(bag: Path, out: Path, *arguments: str) -> tuple[float, float]:
     """Return the time of a replay [s], and the largest resident memory of the process [MB]."""
+    command = [str(Path(sys.executable).with_name('pose-graph')), 'replay', str(bag), '-o',
+               str(out), *arguments]
     begin = time.monotonic()
-    child = subprocess.Popen(
-        [str(Path(sys.executable).with_name('pose-graph')), 'replay', str(bag), '-o', str(out),
-         *arguments], stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode not in (0, 1):
-        raise RuntimeError(f'replay ended with {child.returncode}')
-    return time.monotonic() - begin, usage.ru_maxrss * 1024e-6
+    # by a small process, as the largest size of the one that starts a process counts as well
+    said = child('import resource, subprocess\n'
+                 f'assert subprocess.call({command!r}, stdout=subprocess.DEVNULL) in (0, 1)\n'
+                 'print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)')
+    return time.monotonic() - begin, int(said) * 1024e-6
 
 
 def section(options: Options) -> Section:
