@@ -33,7 +33,6 @@ from pose_graph_ros.adapters.bags import (
 )
 from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
@@ -42,7 +41,7 @@ FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63
 
 class BagWriter:
     """
-    A new rosbag2 folder, a context manager.
+    A new rosbag2 folder in mcap, a context manager.
 
     The bag is moved to its name when the context ends. If the context ends with an exception, no
     bag is written, and a bag that was to be overwritten is kept; what is no rosbag2 folder is
@@ -51,12 +50,9 @@ class BagWriter:
     """
 
     def __init__(
-        self, folder: str | Path, storage: str = 'mcap', *, overwrite: bool = False,
-        latched: Collection[str] = (),
+        self, folder: str | Path, *, overwrite: bool = False, latched: Collection[str] = (),
     ) -> None:
         self.folder = Path(folder).resolve()
-        if storage not in STORAGES:
-            raise BagError(f'{folder}: storage {storage!r}, expected {" or ".join(STORAGES)}')
         if self.folder.exists() and not overwrite:
             raise BagError(f'{folder}: exists already, not overwritten')
         if self.folder.exists() and not _is_nothing_but_a_bag(self.folder):
@@ -75,7 +71,7 @@ class BagWriter:
             raise BagError(f'{folder}: cannot be written: {one_line(error)}') from error
         self._writer = Writer(
             self._scratch / self.folder.name, version=BAG_VERSION,
-            storage_plugin=STORAGES[storage])
+            storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
 
     def __enter__(self) -> Self:

@@ -9,10 +9,10 @@ that one that cannot be decoded (`MessageError`) does not end the iteration. A r
 short or damaged is read as far as it goes, with a warning (`damaged_bags`).
 """
 
-from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+import copy
 from dataclasses import dataclass, field
 from functools import partial
 import glob
@@ -87,36 +87,8 @@ WHOLE = Span()
 
 
 Reader = Rosbag1Reader | Rosbag2Reader
-
-
-class Bag(ABC):
-    """What a bag and one that is watched have in common."""
-
-    path: Path | str
-    topics: dict[str, TopicInfo]  # topics by name
-    start_ns: int  # when the first message was recorded [ns]
-    end_ns: int  # 1 ns after the last one was; not after `start_ns` if there are no messages
-
-    def messages(self, topics: Collection[str], span: Span = WHOLE) -> Iterator[BagMessage]:
-        """
-        Iterate over the messages of some topics in the order in which they were recorded.
-
-        Raises `BagError`: at the call for an unknown topic, on iteration for a damaged file.
-        """
-        unknown = sorted(set(topics) - set(self.topics))
-        if unknown:
-            raise BagError(
-                f'{self.path}: no topic {", ".join(unknown)}; the bag has {self.describe()}')
-        return self._messages(topics, span)
-
-    def describe(self) -> str:
-        """Return the topics with their types on one line, for error messages."""
-        return ', '.join(
-            f'{name} ({info.type})' for name, info in self.topics.items()) or 'no topics'
-
-    @abstractmethod
-    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
-        """Iterate over the messages of topics that the bag has."""
+Watch = Callable[[Iterable[BagMessage], int], Iterable[BagMessage]]
+"""What passes messages on, given about how many there are."""
 
 
 def _absolute(connection: Connection) -> str:
@@ -124,8 +96,13 @@ def _absolute(connection: Connection) -> str:
     return '/' + connection.topic.removeprefix('/')
 
 
-class OpenBag(Bag):
-    """Bags that follow each other, or one, read as one; a context manager."""
+class Bag:
+    """
+    Bags that follow each other, or one, read as one; a context manager.
+
+    `path` names them, `topics` are those in them by name. The first message was recorded at
+    `start_ns`, the last one 1 ns before `end_ns`, which is not later if there are no messages.
+    """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         with ExitStack() as stack:
@@ -133,6 +110,7 @@ class OpenBag(Bag):
             self._stack = stack.pop_all()
         self._parts = sorted(parts, key=lambda part: part[1].start_time)
         self._decoders: dict[tuple[Path, str], Callable[[bytes], Any]] = {}
+        self.watch: Watch = lambda messages, _: messages
         self.path = ', '.join(str(path) for path, _ in self._parts)
         connections = sorted((c for _, reader in parts for c in reader.connections), key=_absolute)
         self.topics = {}
@@ -150,9 +128,33 @@ class OpenBag(Bag):
         """Close the files; messages that were read before can still be decoded."""
         self._stack.close()
 
-    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
+    def messages(self, topics: Collection[str], span: Span = WHOLE) -> Iterator[BagMessage]:
+        """
+        Iterate over the messages of some topics in the order in which they were recorded.
+
+        Raises `BagError`: at the call for an unknown topic, on iteration for a damaged file.
+        """
+        unknown = sorted(set(topics) - set(self.topics))
+        if unknown:
+            raise BagError(
+                f'{self.path}: no topic {", ".join(unknown)}; the bag has {self.describe()}')
         parts = [self._read(*part, topics, span) for part in self._parts]
-        return heapq.merge(*parts, key=lambda message: message.recorded_ns)
+        begin_ns, end_ns = span.begin_ns or self.start_ns, span.end_ns or self.end_ns
+        share = (min(end_ns, self.end_ns) - begin_ns) / max(self.end_ns - self.start_ns, 1)
+        return iter(self.watch(
+            heapq.merge(*parts, key=lambda message: message.recorded_ns),
+            round(share * sum(self.topics[topic].count for topic in topics))))
+
+    def watched(self, watch: Watch) -> Self:
+        """Return the same bag, whose messages pass what is told about how many they are."""
+        seen = copy.copy(self)
+        seen.watch = watch
+        return seen
+
+    def describe(self) -> str:
+        """Return the topics with their types on one line, for error messages."""
+        return ', '.join(
+            f'{name} ({info.type})' for name, info in self.topics.items()) or 'no topics'
 
     def _read(
         self, path: Path, reader: Reader, topics: Collection[str], span: Span,
@@ -201,7 +203,7 @@ class OpenBag(Bag):
         return self._decoders[key]
 
 
-def open_bag(path: str | Path) -> OpenBag:
+def open_bag(path: str | Path) -> Bag:
     """
     Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
 
@@ -210,9 +212,9 @@ def open_bag(path: str | Path) -> OpenBag:
     return open_bags([path])
 
 
-def open_bags(paths: Sequence[str | Path]) -> OpenBag:
+def open_bags(paths: Sequence[str | Path]) -> Bag:
     """Open bags that follow each other, in any order; raises `BagError` as `open_bag` does."""
-    return OpenBag([Path(path) for path in paths])
+    return Bag([Path(path) for path in paths])
 
 
 def _reader(path: Path, stack: ExitStack) -> Reader:

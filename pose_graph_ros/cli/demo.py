@@ -1,19 +1,17 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Play a bag to the node over DDS, and write the corrected path, a picture and what a report needs.
+Play a bag to the node over DDS; write the same results as a replay, and what the node published.
 
-That comes from the graph that the node saved, whose engine is restored, and from what it
-published. Times of updates are in the recorded diagnostics: each message has the number of updates
-and their mean and longest time since the start. The stamp of an update is that of the newest
-odometry that the node had published before.
+The results are those of the graph that the node saved, whose engine is restored. Times of updates
+are in the recorded diagnostics: each message has the number of updates and their mean and longest
+time since the start. The stamp of an update is that of the newest odometry that the node had
+published before.
 """
 
 import argparse
-from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, ExitStack
-from dataclasses import replace
 import fcntl
 from importlib.util import find_spec
 import json
@@ -27,22 +25,18 @@ import tempfile
 import time
 from typing import Any
 
-import numpy as np
-
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns, states_in
-from pose_graph_ros.adapters.sources import backend_config, ODOMETRY_KINDS, source_list
+from pose_graph_ros.adapters.conversions import stamp_ns
+from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli import shared
-from pose_graph_ros.cli.drive import collect_drive, Drive, with_refused, write_results
-from pose_graph_ros.cli.run.document import write_document
+from pose_graph_ros.cli.drive import drive_in
+from pose_graph_ros.cli.results import write_results
 from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.graph_files import read_graph
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
@@ -73,62 +67,21 @@ def execute(options: argparse.Namespace) -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
     converged = _run(bag_path, inputs, values, options)
     seconds = time.monotonic() - start
-    recorded = options.out / RECORDED
-    path = _last(recorded, '/path')
-    poses = {stamp_ns(item): planar_pose(item.pose) for item in path.poses}
-    corrected = Trajectory(np.array(list(poses), dtype=np.int64),
-                           np.array([pose for pose in poses.values() if pose is not None]))
-    diagnostics = _last(recorded, DIAGNOSTICS).status[0]
-    verdicts = _last(recorded, '/pose_graph/verdicts')
-    backend = PoseGraphBackend.restored(
-        backend_config(values), saved := read_graph(options.out / GRAPH))
-    backend.update()
+    saved, recorder = read_graph(options.out / GRAPH), Recorder()
+    backend = PoseGraphBackend.restored(backend_config(values), saved)
+    report = backend.optimize()
+    diagnostics = _updates(options.out / RECORDED, recorder, int(backend.node_stamps_ns[-1]))
     with open_bag(bag_path) as bag:
-        drive = with_refused(collect_drive(
-            bag, inputs, values, corrected, truth,
-            states={} if verdicts is None else states_in(verdicts)), backend)
-    table = write_results(drive, options.out, title, {
-        'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
-        'seconds': seconds, 'node': {item.key: item.value for item in diagnostics.values}})
-    estimate = backend.estimate()
-    assert estimate is not None, 'a saved graph has a hidden node'
-    # chi2 of the node has robust costs, that of an update does not
-    estimate = replace(estimate, chi2=saved.chi2)
-    recorder = _arrivals(drive, inputs)
-    counts = _counts(_updates(recorded, recorder, estimate.stamp_ns), inputs)
-    write_document(Run(
-        title, 'the node over DDS', replace(drive, corrected=estimate.path), backend, estimate,
-        backend.verdicts(), recorder, values, inputs.kinds, counts,
-        None if converged else UpdateReport(Status.MAX_ITERATIONS, '', 0, 0, estimate.chi2),
-        saved.datum, seconds, _not_added(drive, backend)), options.out)
-    print(f'\n{table}\n')
-    print(f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json, '
-          f'{GRAPH}, run.json')
-    print(f'a page of it: pose-graph report {options.out}')
-    return 0 if converged else 1
-
-
-def _arrivals(drive: Drive, inputs: Inputs) -> Recorder:
-    """Return when the measurements were made that the node has got."""
-    recorder = Recorder()
-    for source in inputs.of(*ODOMETRY_KINDS)[:1]:
-        for stamp in drive.odometry.stamps_ns.tolist():
-            recorder.add_measurement(source, stamp)
-    for source, stamp, out in zip(drive.fix_sources, drive.fix_stamps_ns.tolist(),
-                                  drive.fix_held_out.tolist(), strict=True):
-        if not out:
-            recorder.add_measurement(source, stamp)
-    return recorder
-
-
-def _not_added(drive: Drive, backend: PoseGraphBackend) -> dict[tuple[str, int, int | None], str]:
-    """Return why the graph does not have some loop closures, by source and stamps."""
-    known = {(each.source, each.stamp_ns, each.reference_ns) for each in backend.verdicts()}
-    keys = [(source, later, earlier) for source, (earlier, later) in zip(
-        drive.loop_sources, drive.loop_stamps_ns.tolist(), strict=True)]
-    return dict.fromkeys(
-        (key for key in keys if key not in known),
-        'Refused: the node has not added it; its reasons are among the counts.')
+        drive = drive_in(bag, inputs, values, backend, truth, origin=saved.datum)
+    lines = write_results(Run(
+        title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds,
+        _counts(diagnostics, inputs), report, seconds), options.out, {
+            'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
+            'seconds': seconds, 'node': diagnostics})
+    print('\n'.join([*lines, f'written to {options.out}/: path.tum, corrected/ (rosbag2), '
+                     f'drive.png, summary.json, {GRAPH}, run.json',
+                     f'a page of it: pose-graph report {options.out}']))
+    return 0 if converged and report.status is Status.CONVERGED else 1
 
 
 def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, str]:
@@ -150,8 +103,8 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
                 mean = (total - before[1]) / (count - before[0])
                 recorder.add_update(Update(
                     newest_ns, int(values['hidden_nodes']),
-                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2']),
-                    -1), count - before[0])
+                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2'])),
+                    count - before[0])
                 before = count, total, longest
     return values
 
@@ -268,10 +221,3 @@ def _stop(node: 'subprocess.Popen[bytes]') -> int:
     except subprocess.TimeoutExpired:
         node.kill()
         return node.wait()
-
-
-def _last(folder: Path, topic: str) -> Any:
-    """Return the last message on a topic in the bag that the player has recorded; None if none."""
-    with open_bag(folder) as bag:
-        messages = deque(bag.messages([topic]) if topic in bag.topics else (), maxlen=1)
-        return messages[0].decode() if len(messages) > 0 else None

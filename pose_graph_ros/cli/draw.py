@@ -18,10 +18,8 @@ from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 import networkx as nx
 import numpy as np
 
@@ -48,6 +46,7 @@ UNIT, LARGEST = 0.8, 14.0  # distance of neighbours, and most of the width and h
 DIAMETER = 0.32  # of a hidden node [inch]; less where neighbours are nearer
 SETTINGS: dict[Any, Any] = {
     'svg.fonttype': 'none', 'svg.hashsalt': 'pose_graph_ros', 'text.color': GREY,
+    'axes.edgecolor': GREY, 'legend.title_fontsize': 8.0,
     'font.family': ['DejaVu Sans', 'sans-serif'], 'font.size': 8.0}
 
 
@@ -136,13 +135,10 @@ def _fill(data: dict[str, Any]) -> str:
     return FILLS[data['role']] if data['role'] in FILLS else COLOURS[data['term'].sort]
 
 
-def _line(arc: dict[str, Any]) -> str:
-    """Return the colour of an arc; grey if it stands for all terms of its ends."""
-    return GREY if arc['sort'] is None else COLOURS[arc['sort']]
-
-
-def _has_name(data: dict[str, Any]) -> bool:
-    return data['role'] not in SIZES
+def _meaning(data: dict[str, Any]) -> str:
+    """Return what a vertex is, for the legend."""
+    role = data['role']
+    return str(role.value if role in FILLS else f'{role.value}: {data["term"].sort.value}')
 
 
 def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> dict[str, Any]:
@@ -169,137 +165,107 @@ def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> d
 
 def _draw(panels: Sequence[Panel], path: Path, notes: Sequence[str], *, headings: bool) -> None:
     """Draw views below each other into a file, each beside its pattern."""
-    places = [np.array(list(panel.at.values())) for panel in panels]
-    sizes = np.array([np.ptp(at, axis=0) + 1.0 for at in places])
+    sizes = np.array([np.ptp(list(panel.at.values()), axis=0) + 1.0 for panel in panels])
     unit = min(UNIT, LARGEST / float(np.max(sizes)))
-    side = 0.4 + max((min(0.06 * sum(panel.pattern.sizes), 4.5) for panel in panels
-                      if panel.pattern is not None), default=-0.4)
-    heights = [max(unit * float(size[1]), 0.5 * side if len(panels) > 1 else side)
-               + (0.3 if panel.title else 0.1) for size, panel in zip(sizes, panels, strict=True)]
-    width = max(unit * float(np.max(sizes[:, 0])) + side, 5.0)
+    heights = np.maximum(unit * sizes[:, 1], 1.2)
+    patterns = [panel.pattern for panel in panels if panel.pattern is not None]
+    widths = [max(unit * float(np.max(sizes[:, 0])), 4.0), *(
+        [min(max(0.06 * sum(patterns[-1].sizes), 1.2), 4.5)] if len(patterns) > 0 else [])]
+    if len(panels) == 1:
+        heights = np.maximum(heights, widths[1:] or 0.0)
+    width = sum(widths)
     text = [line for note in notes for line in textwrap.wrap(note, int(width / 0.065))]
-    entries = _legend(panels)
-    columns = max(int(width / 2.2), 1)
-    below = 0.17 * (-(-len(entries) // columns)) + 0.15 * len(text) + 0.15
-    height = sum(heights) + below
     with rc_context(SETTINGS):
-        figure = Figure(figsize=(width, height), dpi=200)
-        FigureCanvasAgg(figure)
-        top = height
-        for panel, at, tall in zip(panels, places, heights, strict=True):
-            top -= tall
-            axes = figure.add_axes((0.0, top / height, 1.0 - side / width, tall / height))
+        figure = Figure(figsize=(width, float(np.sum(heights)) + 1.0 + 0.15 * len(text)), dpi=200,
+                        layout='constrained')
+        grid = figure.subplots(len(panels), len(widths), squeeze=False, width_ratios=widths,
+                               height_ratios=heights)
+        for panel, (axes, *beside) in zip(panels, grid, strict=True):
+            axes.set_title(panel.title, loc='left', size=9)
             _draw_view(axes, panel, unit, headings=headings)
-            low, high = np.min(at, axis=0) - 0.5, np.max(at, axis=0) + 0.5
-            axes.set(aspect='equal', xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-            if panel.title:
-                figure.text(0.01, (top + tall - 0.15) / height, panel.title, size=9, va='center')
-            if panel.pattern is not None and len(panel.pattern.names) > 0:
-                own = min(0.06 * sum(panel.pattern.sizes), 4.5)
-                _draw_pattern(figure.add_axes((
-                    1.0 - (side - 0.3) / width, (top + 0.5 * (tall - 0.3 - own)) / height,
-                    own / width, own / height)), panel.pattern, own)
-        figure.legend(handles=entries, loc='upper left', bbox_to_anchor=(0.0, below / height),
-                      ncol=columns, frameon=False, borderaxespad=0.3, handletextpad=0.4)
-        figure.text(0.01, 0.02 / height, '\n'.join(text), va='bottom')
+            for other in beside:
+                _draw_pattern(other, panel.pattern)
+        entries = {label: handle for axes in figure.axes for handle, label in zip(
+            *axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(
+            entries.values(), entries.keys(), loc='outside lower left', frameon=False,
+            ncols=max(int(width / 2.2), 1), title='\n'.join(text), alignment='left')
         options = {'metadata': {'Date': None}} if path.suffix.lower() == '.svg' else {}
         figure.savefig(path, transparent=True, **options)
 
 
 def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None:
-    axes.set_axis_off()
-    diameter = 72.0 * min(DIAMETER, 0.5 * unit)  # [pt]
+    diameter = 72.0 * min(DIAMETER, 0.4 * unit)  # [pt]
     vertices = dict(panel.view.nodes(data=True))
     area = {node: (diameter * SIZES.get(data['role'], 1.0))**2 for node, data in vertices.items()}
-    width = 0.05 * diameter
+    looks: dict[Any, list[int]] = defaultdict(list)
+    for node, data in sorted(vertices.items(), key=lambda each: list(Role).index(each[1]['role'])):
+        opaque = 1.0 if 'term' not in data or data['term'].used else 0.5
+        looks[_meaning(data), _fill(data), area[node], data['role'], opaque].append(node)
+        if data.get('fixed', False):
+            looks['fixed (known): double border', _fill(data), 0.6 * area[node], data['role'],
+                  opaque].append(node)
+    for (meaning, colour, size, role, opaque), nodes in looks.items():
+        nx.draw_networkx_nodes(
+            panel.view, panel.at, nodelist=nodes, ax=axes, node_color=colour, node_size=size,
+            linewidths=0.05 * diameter, edgecolors=INK, alpha=opaque,
+            node_shape='s' if role is Role.FACTOR else 'o')
+        axes.plot([], [], 's' if role is Role.FACTOR else 'o', color=colour, markeredgecolor=INK,
+                  label=meaning)
+    named = {data['term'].sort for data in vertices.values()
+             if 'term' in data and data['role'] not in FILLS}
     groups: dict[Any, Any] = defaultdict(nx.DiGraph)  # arcs that look alike
     drawn = set[tuple[int, int]]()
     for start, end, arc in panel.arcs:
         # of several between the same vertices, all but the first are bent
-        style = f'arc3,rad={0.25 * (not drawn.isdisjoint({(start, end), (end, start)}))}'
+        bend = 0.25 * (not drawn.isdisjoint({(start, end), (end, start)}))
         drawn.add((start, end))
-        if vertices[end]['role'] is Role.MEASUREMENT and panel.at[end][1] > 1.5:
-            style = 'angle,angleA=90,angleB=0,rad=0'
-        groups[_line(arc), style, arc['used'], arc['directed']].add_edge(start, end)
-    for (colour, style, used, directed), alike in groups.items():
+        groups[arc['sort'], bend, arc['used'], arc['directed']].add_edge(start, end)
+    for (sort, bend, used, directed), alike in groups.items():
+        colour = GREY if sort is None else COLOURS[sort]
         nx.draw_networkx_edges(
-            alike, panel.at, ax=axes, edge_color=colour, width=width, connectionstyle=style,
-            style='solid' if used else 'dashed', arrows=True, arrowsize=0.45 * diameter,
-            arrowstyle='-|>' if directed else '-', nodelist=list(alike),
-            node_size=[area[node] for node in alike])
-    looks: dict[Any, list[int]] = defaultdict(list)
-    for node, data in vertices.items():
-        opaque = 1.0 if 'term' not in data or data['term'].used else 0.5
-        look = (_fill(data), area[node], 's' if data['role'] is Role.FACTOR else 'o', opaque)
-        looks[look].append(node)
-        if data.get('fixed', False):
-            looks[look[0], 0.6 * look[1], *look[2:]].append(node)
-    for (colour, size, shape, opaque), nodes in looks.items():
-        nx.draw_networkx_nodes(
-            panel.view, panel.at, nodelist=nodes, ax=axes, node_color=colour, node_size=size,
-            linewidths=width, edgecolors=INK, node_shape=shape, alpha=opaque)
+            alike, panel.at, ax=axes, edge_color=colour, width=0.05 * diameter,
+            connectionstyle=f'arc3,rad={bend}', style='solid' if used else 'dashed', arrows=True,
+            arrowsize=0.45 * diameter, arrowstyle='-|>' if directed else '-',
+            nodelist=list(alike), node_size=[area[node] for node in alike])
+        if sort not in named:
+            axes.plot([], [], color=colour,
+                      label='in a term together' if sort is None else sort.value)
     longest = max((len(data['name']) for data in vertices.values()), default=1)
     nx.draw_networkx_labels(
         panel.view, panel.at, {node: data['name'] for node, data in vertices.items()
-                               if _has_name(data)}, ax=axes, font_color=INK,
+                               if data['role'] not in SIZES}, ax=axes, font_color=INK,
         font_size=min(0.42, 1.2 / longest) * diameter)
-    poses = [node for node, data in vertices.items() if data['role'] is Role.POSE]
     if headings:
+        poses = [node for node, data in vertices.items() if data['role'] is Role.POSE]
         turns = np.array([vertices[node]['pose'][2] for node in poses])
-        ways = np.column_stack((np.cos(turns), np.sin(turns)))
-        radius = 0.5 * diameter / 72.0 / unit
-        at = np.array([panel.at[node] for node in poses]) + radius * ways
-        axes.quiver(*at.T, *(0.6 * radius * ways).T, angles='xy', scale_units='xy', scale=1.0,
-                    color=INK, units='inches', width=0.02, headlength=3, headaxislength=3,
-                    zorder=3)
+        ways = 0.5 * diameter / 72.0 / unit * np.column_stack((np.cos(turns), np.sin(turns)))
+        axes.quiver(*(np.array([panel.at[node] for node in poses]) + ways).T, *(0.6 * ways).T,
+                    angles='xy', scale_units='xy', scale=1.0, color=INK, units='inches',
+                    width=0.02, headlength=3, headaxislength=3, zorder=3)
+    (left, low), (right, high) = (limit(list(panel.at.values()), axis=0)
+                                  for limit in (np.min, np.max))
+    axes.set(xlim=(left - 0.5, right + 0.5), ylim=(low - 0.5, high + 0.5))
+    axes.set_aspect('equal', anchor='W')
+    axes.set_axis_off()
 
 
-def _draw_pattern(axes: Axes, blocks: Pattern, side: float) -> None:
-    """Draw the pattern of H on axes of a size [inch]."""
+def _draw_pattern(axes: Axes, blocks: Pattern) -> None:
+    """Draw the pattern of H."""
     ends = np.concatenate(([0], np.cumsum(blocks.sizes)))
-    cells = np.where(blocks.blocks, 0.0, np.where(blocks.fill, 1.0, np.nan))
-    axes.pcolormesh(ends, ends, np.ma.masked_invalid(cells), vmin=0.0, vmax=1.0,
-                    cmap=ListedColormap([BLOCK, FILL]), edgecolors='white',
-                    linewidth=min(0.5, 4.0 * side / len(blocks.names)))
-    axes.invert_yaxis()
-    every = -(-len(blocks.names) // max(int(side / 0.11), 1))
+    for cells, colour, meaning in ((blocks.blocks, BLOCK, 'block of H that is not zero'),
+                                   (blocks.fill, FILL, 'fill of its factor R')):
+        if np.any(cells):
+            axes.pcolormesh(ends, ends, np.ma.masked_equal(cells, 0), edgecolors='white',
+                            cmap=ListedColormap([colour]), linewidth=0.5)
+            axes.plot([], [], 's', color=colour, label=meaning)
+    every = -(-len(blocks.names) // 40)
     middles, names = (0.5 * (ends[:-1] + ends[1:]))[::every], blocks.names[::every]
-    axes.set_xticks(middles, names, rotation=90 if every > 1 or max(map(len, names)) > 2 else 0)
+    axes.set(aspect='equal', xlim=(0, ends[-1]), ylim=(ends[-1], 0))
+    axes.set_xticks(middles, names, rotation=90)
     axes.set_yticks(middles, names)
     axes.tick_params(length=0, pad=1, labelsize=6, labelcolor=GREY, top=True, labeltop=True,
                      bottom=False, labelbottom=False)
-    for spine in axes.spines.values():
-        spine.set(color=GREY, linewidth=0.8)
-
-
-def _legend(panels: Sequence[Panel]) -> list[Line2D]:
-    """Return the entries of a legend of all that is in some views of the same kind."""
-    entries: dict[str, Line2D] = {}
-
-    def add(words: str, colour: str, **shape: Any) -> None:
-        entries.setdefault(words, Line2D([], [], color=colour, label=words, **shape))
-
-    marker = {'linestyle': 'none', 'markeredgecolor': INK, 'markeredgewidth': 0.8}
-    vertices = [data for panel in panels for data in panel.view.nodes(data=True)]
-    for _, data in sorted(vertices, key=lambda each: list(Role).index(each[1]['role'])):
-        role = data['role']
-        words = role.value if role in FILLS else f'{role.value}: {data["term"].sort.value}'
-        add(words, _fill(data), marker='s' if role is Role.FACTOR else 'o', **marker)
-    if any(data.get('fixed', False) for _, data in vertices):
-        add('fixed (known): double border', '#ffffff', marker='o', **marker)
-    named = {data['term'].sort for _, data in vertices
-             if 'term' in data and data['role'] not in FILLS}
-    for _, _, arc in [arc for panel in panels for arc in panel.arcs]:
-        if arc['sort'] is None:
-            add('in a term together', GREY)
-        elif arc['sort'] not in named:
-            add(arc['sort'].value, _line(arc))
-    patterns = [panel.pattern for panel in panels if panel.pattern is not None]
-    if len(patterns) > 0:
-        add('block of H that is not zero', BLOCK, marker='s', linestyle='none')
-    if any(np.any(each.fill) for each in patterns):
-        add('fill of its factor R', FILL, marker='s', linestyle='none')
-    return list(entries.values())
 
 
 def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
@@ -318,14 +284,16 @@ def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
             x, y = UNIT * (panel.at[node] + (0.0, top - float(np.max(places[:, 1]))))
             shape = ('doublecircle' if data.get('fixed', False) else
                      {Role.FACTOR: 'square', Role.JOINT: 'point'}.get(data['role'], 'circle'))
+            name = json.dumps('' if data['role'] in SIZES else data['name'])
             lines.append(
-                f'  n{n}_{node} [label={json.dumps(data["name"] if _has_name(data) else "")}, '
-                f'shape={shape}, width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
+                f'  n{n}_{node} [label={name}, shape={shape}, '
+                f'width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
                 f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
         for start, end, arc in panel.arcs:
             style = ('' if arc['directed'] else ', dir=none') + (
                 '' if arc['used'] else ', style=dashed')
-            lines.append(f'  n{n}_{start} -> n{n}_{end} [color="{_line(arc)}"{style}];')
+            colour = GREY if arc['sort'] is None else COLOURS[arc['sort']]
+            lines.append(f'  n{n}_{start} -> n{n}_{end} [color="{colour}"{style}];')
         if len(panels) > 1:
             lines.append('  }')
     return '\n'.join([*lines, '}']) + '\n'

@@ -10,12 +10,10 @@ its map may begin elsewhere, as where only a part of a recording is replayed.
 """
 
 from array import array
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-import json
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +21,7 @@ from scipy.special import gammaincinv
 
 from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
+from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
@@ -36,13 +35,24 @@ from pose_graph_ros.core.geometry.se2 import (
     PoseVector,
 )
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
-from pose_graph_ros.core.io.path_files import write_tum
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import Fix, GlobalPose, LoopClosure, OdometrySample
+from pose_graph_ros.core.measurements import (
+    Answer,
+    Fix,
+    GlobalPose,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
+    Position,
+)
 from pose_graph_ros.core.quantities import StampNs
 
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
+STATES = (State.BELIEVED.value, State.WEAKLY_BELIEVED.value, State.WAITING.value,
+          State.DOUBTED.value, 'refused', 'held out')
+BELIEVED, WEAKLY_BELIEVED, WAITING, DOUBTED, REFUSED, HELD_OUT = range(len(STATES))
+"""What became of a measurement: the states of verdicts, not in the graph, kept out of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,33 +73,26 @@ class Drive:
     """Input and result of the pose graph, and the truth if it is known; all finite."""
 
     odometry: Trajectory  # raw, `T_odom_base`
-    fix_stamps_ns: IntArray  # (M,)
-    fix_positions: Points  # in the map, (M, 2)
-    fix_held_out: BoolArray  # whether a fix was kept out of the pose graph, (M,)
     corrected: Trajectory  # result, `T_map_base`
     truth: Trajectory | None  # `T_map_base`; None if unknown
+    fix_stamps_ns: IntArray  # (M,)
+    fix_positions: Points  # in the map, (M, 2)
+    fix_states: IntArray  # numbers of `STATES`, (M,)
+    fix_sources: Sequence[str]
     loop_stamps_ns: IntArray  # of both ends of the loop closures, (L, 2)
+    loop_states: IntArray  # numbers of `STATES`, (L,)
+    loop_sources: Sequence[str]
     map_axes: tuple[str, str] = ('x', 'y')
-    fix_unused: BoolArray | np.bool_ = np.False_  # whether it is doubted or waits, (M,) or of all
-    fix_refused: BoolArray | np.bool_ = np.False_  # whether it is not in the graph
-    fix_sources: Sequence[str] = ()  # none if unknown
-    loop_states: Sequence[State] = ()  # none if all are believed
-    loop_sources: Sequence[str] = ()  # none if unknown
+    arrived_ns: 'Mapping[str, Sequence[StampNs]]' = field(default_factory=dict)
+    """Stamps of what was measured and not held out, in the order of arrival, by source."""
     truth_moved: tuple[float, float] | None = None  # to fit the path [m, rad]; None: it was not
 
     @property
     def fix_kinds(self) -> dict[str, BoolArray]:
-        """Which fixes are used, doubted, held out and refused, shape (M,) each."""
-        held_out, refused, doubted = np.broadcast_arrays(
-            self.fix_held_out, self.fix_refused, self.fix_unused)
-        rest = ~held_out & ~refused
-        return {'used': rest & ~doubted, 'doubted': rest & doubted, 'held out': held_out,
-                'refused': refused}
-
-    def loops(self, state: State) -> BoolArray:
-        """Return which loop closures are in a state, shape (L,)."""
-        known = self.loop_states or [State.BELIEVED] * len(self.loop_stamps_ns)
-        return np.array([each is state for each in known], dtype=bool)
+        """Which fixes are used, doubted or waiting, held out and refused, shape (M,) each."""
+        states = self.fix_states
+        return {'used': states <= WEAKLY_BELIEVED, 'doubted': np.isin(states, (WAITING, DOUBTED)),
+                'held out': states == HELD_OUT, 'refused': states == REFUSED}
 
     @cached_property
     def placed_odometry(self) -> Trajectory:
@@ -229,19 +232,6 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
         'errors': [asdict(row) for row in drive.rows], **extra}
 
 
-def write_results(drive: Drive, folder: Path, title: str, facts: Mapping[str, Any]) -> str:
-    """Return a table of errors, after writing `path.tum`, `drive.png` and `summary.json`."""
-    # matplotlib takes half a second to load, and wrong input needs none of it
-    from pose_graph_ros.cli.picture import draw_drive  # noqa: PLC0415
-
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tum(drive.corrected, folder / 'path.tum')
-    draw_drive(drive, folder / 'drive.png', title)
-    text = json.dumps(summary(drive, facts), indent=2)
-    (folder / 'summary.json').write_text(text + '\n', encoding='utf-8')
-    return format_table(drive.rows)
-
-
 class Samples:
     """Samples of a path, as they come."""
 
@@ -272,36 +262,80 @@ class _Fix(NamedTuple):
     held_out: bool
 
 
-def collect_drive(
-    bag: Bag, inputs: Inputs, values: Mapping[str, Any], corrected: Trajectory,
-    truth_topic: str | None, *, origin: MapOrigin | None = None,
-    states: Mapping[Key, State] = MappingProxyType({}),
+Measured = tuple[str, OdometrySample | Measurement, bool]
+"""A measurement after its source, and whether it is kept out of the graph."""
+
+
+def measured_in(
+    bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]], *,
+    held_out: bool,
+) -> Iterator[Measured]:
+    """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
+    for source, message, is_held_out in read_inputs(bag, inputs):
+        if is_held_out and not held_out:
+            continue
+        try:
+            measurement = reader.read(source, message.decode())
+        except MessageError:
+            refused[source, 'malformed'] += 1
+            continue
+        if isinstance(measurement, Answer):
+            refused[source, measurement.reason] += 1
+        else:
+            yield source, measurement, is_held_out
+
+
+def drive_in(
+    bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
+    truth_topic: str | None, *, origin: MapOrigin | None,
+    refused: Collection[Key] | None = None,
 ) -> Drive:
     """
-    Return the corrected path together with the measurements of the bag that went into the graph.
+    Return the path of an engine together with the measurements of the bag that it is made of.
 
-    The truth is moved to where it fits the path best. What has none of the `states` is believed;
-    without the `origin` of the graph's map, the first fix on the path makes it. Raises `BagError`
-    if `truth_topic` is missing or of an unsupported type.
+    Without the `origin` of its map, the first fix on the path makes it. Raises `BagError` if
+    `truth_topic` is missing or of an unsupported type. Else as `collect_drive`.
     """
     reader = reader_of(bag, values)
     if origin is not None:
         reader.datum.keep(origin)
-    preferred = inputs.of(*ODOMETRY_KINDS)[0]
+    is_on_earth = len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
+    drive = collect_drive(
+        measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
+        inputs.of(*ODOMETRY_KINDS)[0], refused)
+    return place_truth(replace(
+        drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
+        truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
+
+
+def collect_drive(
+    measurements: Iterable[Measured], backend: PoseGraphBackend, odometry_source: str,
+    refused: Collection[Key] | None,
+) -> Drive:
+    """
+    Return the path of an engine together with the measurements that it is made of.
+
+    Loop closures without a verdict are believed but for those that were `refused`; None if it is
+    not known which: then all of sources that are judged.
+    """
+    estimate, verdicts = backend.estimate(), backend.verdicts()
+    assert estimate is not None, 'a drive has a hidden node'
+    corrected = estimate.path
     odometry, fixes, loops = Samples(), list[_Fix](), list[Key]()
-    for source, message, held_out in read_inputs(bag, inputs):
-        try:
-            measurement = reader.read(source, message.decode())
-        except MessageError:
-            continue
+    arrived: dict[str, array[int]] = {}
+    for source, measurement, held_out in measurements:
+        if not held_out:
+            arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
             case Fix(stamp, _, _, lever_arm):
                 fixes.append(_Fix(source, stamp, measurement, lever_arm, held_out))
             case GlobalPose(stamp, pose, _):
                 fixes.append(_Fix(source, stamp, pose[:2], np.zeros(2), held_out))
+            case Position(stamp, position, _, lever_arm):
+                fixes.append(_Fix(source, stamp, position, lever_arm, held_out))
             case LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
-            case OdometrySample(stamp, pose) if source == preferred:
+            case OdometrySample(stamp, pose) if source == odometry_source:
                 odometry.add(stamp, pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
     arms = np.array([each.arm for each in fixes]).reshape(-1, 2)
@@ -313,32 +347,35 @@ def collect_drive(
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
-    return place_truth(Drive(
-        odometry.path(), stamps, positions,
-        np.array([each.held_out for each in fixes], dtype=bool), corrected,
-        None if truth_topic is None else read_truth(bag, truth_topic, inputs.span),
+    known = {(each.source, each.stamp_ns, each.reference_ns): STATES.index(each.state.value)
+             for each in verdicts}
+    judged = {each.source for each in verdicts}
+    return Drive(
+        odometry.path(), corrected, None, stamps, positions,
+        _fix_states(fixes, known, backend, int(backend.node_stamps_ns[estimate.n_frozen])),
+        [each.source for each in fixes],
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
-        map_axes=('east', 'north') if len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
-        else ('x', 'y'),
-        fix_unused=np.array([not states.get((each.source, each.stamp_ns, None),
-                                            State.BELIEVED).in_graph for each in fixes], bool),
-        fix_sources=[each.source for each in fixes],
-        loop_states=[states.get(key, State.BELIEVED) for key in loops],
-        loop_sources=[source for source, _, _ in loops]))
+        np.array([known.get(key, REFUSED if (
+            key[0] in judged if refused is None else key in refused) else BELIEVED)
+            for key in loops], dtype=np.int64),
+        [source for source, _, _ in loops], arrived_ns=arrived)
 
 
-def with_refused(drive: Drive, backend: PoseGraphBackend) -> Drive:
-    """Return a drive with the measurements in the map that its graph has not, where it could."""
-    estimate = backend.estimate(with_path=False)
-    assert estimate is not None, 'a drive has a hidden node'
-    stamps, begin_ns = drive.fix_stamps_ns, backend.node_stamps_ns[estimate.n_frozen]
-    refused = ~drive.fix_held_out & (stamps >= begin_ns)
-    names = np.array(drive.fix_sources, dtype=str)
+def _fix_states(
+    fixes: Sequence[_Fix], known: Mapping[Key, int], backend: PoseGraphBackend, begin_ns: StampNs,
+) -> IntArray:
+    """Return the states of fixes; those that the graph has not from its begin on are refused."""
+    states = np.array([known.get((each.source, each.stamp_ns, None), BELIEVED) for each in fixes],
+                      dtype=np.int64)
+    held_out = np.array([each.held_out for each in fixes], dtype=bool)
+    stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
+    names = np.array([each.source for each in fixes], dtype=str)
+    refused = stamps >= begin_ns
     for source, added in backend.measured().items():
-        at = np.flatnonzero((names == source) & np.isin(stamps, added) & ~drive.fix_held_out)
+        at = np.flatnonzero((names == source) & np.isin(stamps, added) & ~held_out)
         # of several with one stamp the first one was added
         refused[at[np.unique(stamps[at], return_index=True)[1]]] = False
-    return replace(drive, fix_refused=refused)
+    return np.where(held_out, HELD_OUT, np.where(refused, REFUSED, states))
 
 
 def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:

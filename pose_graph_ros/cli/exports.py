@@ -7,11 +7,10 @@ The bag is a copy with the path, odometry in the map, and the transform to odom.
 """
 
 import bisect
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,17 +28,12 @@ from pose_graph_ros.adapters.output_cdr import (
 )
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.arguments import Exports
+from pose_graph_ros.cli.run.recorder import Run
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import (
-    between_one,
-    compose_one,
-    Covariances,
-    FloatArray,
-    Pose,
-)
+from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, Pose
 from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection, Trajectory
 from pose_graph_ros.core.io.path_files import (
     csv_lines,
@@ -74,48 +68,32 @@ def require_datum(exports: Exports, *, known: bool) -> None:
             "'datum:=[LATITUDE, LONGITUDE]')")
 
 
-def write_exports(
-    exports: Exports, folder: Path, title: str, *, backend: PoseGraphBackend, estimate: Estimate,
-    datum: Datum | None,
-) -> list[Path]:
+def write_exports(exports: Exports, folder: Path, run: Run, datum: Datum | None) -> list[Path]:
     """
     Return the files that were written into a folder, `path.kitti` and so on.
 
     Raises `ExportError` if a format needs a place on the Earth, which is unknown, after all others
     are written.
     """
-    written = []
+    written, path = [], run.estimate.path
     # before the first measurement in the map, its place on the Earth is unknown
     placed = (datum is not None and datum.plane is not None
-              and estimate.alignment is not AlignmentState.LOCAL)
+              and run.estimate.alignment is not AlignmentState.LOCAL)
     for name in exports.formats:
         if name == 'kitti':
-            lines = kitti_lines(estimate.path)
+            lines = kitti_lines(path)
         elif name == 'csv':
-            lines = csv_lines(estimate.path, covariances(backend, estimate))
+            lines = csv_lines(path, run.covariances)
         elif placed:
             assert datum is not None
-            lines = _on_earth(LINES[name], estimate, datum, title)
+            places = datum.geodetic(path.poses[:, :2])[:, :2]
+            lines = LINES[name](path.stamps_ns, places, run.title)
         else:
             continue
         written.append(folder / f'path.{name}')
         write_lines(written[-1], lines)
     require_datum(exports, known=placed)
     return written
-
-
-def covariances(backend: PoseGraphBackend, estimate: Estimate) -> FloatArray:
-    """Return those of the path, shape (N, 3, 3); raises `ExportError` if the solver failed."""
-    try:
-        return backend.path_covariances(estimate)
-    except ValueError as error:
-        raise ExportError(f'there are no covariances: {error}') from error
-
-
-def _on_earth(
-    lines: Callable[..., Iterator[str]], estimate: Estimate, datum: Datum, title: str,
-) -> Iterator[str]:
-    return lines(estimate.path.stamps_ns, datum.geodetic(estimate.path.poses[:, :2])[:, :2], title)
 
 
 def write_lines(path: Path, lines: Iterator[str]) -> None:
@@ -173,19 +151,16 @@ class LivePoses:
 class _Corrector:
     """Makes what is published with each message of the primary odometry."""
 
-    def __init__(
-        self, bag: Bag, inputs: Inputs, values: Mapping[str, Any], estimate: Estimate,
-        covariances: Covariances,
-    ) -> None:
-        self._source = estimate.primary
+    def __init__(self, bag: Bag, inputs: Inputs, run: Run) -> None:
+        path, values, self._source = run.estimate.path, run.values, run.estimate.primary
         self.topic = inputs.topics[self._source]
         self._has_poses = inputs.kinds[self._source] is Kind.ODOMETRY
         self.map_frame, self.odom_frame, self._base_frame = (
             frame(values[key]) for key in ('map_frame', 'odom_frame', 'base_link_frame'))
-        odometry = interpolated(estimate.path, self._samples(
+        odometry = interpolated(path, self._samples(
             bag.messages([self.topic], inputs.span), MessageReader(values)))
-        self._correction = PathCorrection(estimate.path, odometry)
-        self._stamps, self._covariances = estimate.path.stamps_ns.tolist(), covariances
+        self._correction = PathCorrection(path, odometry)
+        self._stamps, self._covariances = path.stamps_ns.tolist(), run.covariances
         self._newest_ns = 0
         # from the first message on again, as it remembers the stamps before
         self._reader = reader_of(bag, values)
@@ -225,10 +200,7 @@ class _Corrector:
                 self.map_frame, self.odom_frame)
 
 
-def write_corrected(
-    writer: BagWriter, bag: Bag, inputs: Inputs, values: Mapping[str, Any], *,
-    estimate: Estimate, covariances: Covariances,
-) -> dict[str, int]:
+def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> dict[str, int]:
     """
     Return how many messages were copied, with the result, and how many were not.
 
@@ -237,13 +209,13 @@ def write_corrected(
 
     With each message of the primary odometry comes its pose in the map by the whole recording,
     and the transform from map to odom if its frame is `odom_frame`. The path comes first, on a
-    `LATCHED` topic. Covariances are those of the path; NaN where unknown.
+    `LATCHED` topic.
     """
-    corrector = _Corrector(bag, inputs, values, estimate, covariances)
+    corrector, path = _Corrector(bag, inputs, run), run.estimate.path
     begin_ns = inputs.span.begin_ns
     writer.write(
         PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
-        path_cdr(_thinned(estimate.path), int(estimate.path.stamps_ns[-1]), corrector.map_frame))
+        path_cdr(_thinned(path), int(path.stamps_ns[-1]), corrector.map_frame))
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))

@@ -17,11 +17,18 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from pose_graph_ros.cli.drive import distances, Drive
+from pose_graph_ros.cli.drive import (
+    BELIEVED,
+    distances,
+    DOUBTED,
+    Drive,
+    REFUSED,
+    WAITING,
+    WEAKLY_BELIEVED,
+)
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import Points
-from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.simulation.graph import SimulatedGraph
 from pose_graph_ros.offline.simulation.recording import Recording
@@ -29,11 +36,11 @@ from pose_graph_ros.offline.simulation.recording import Recording
 # After Okabe and Ito, so that people with any kind of colour vision can distinguish them.
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
 SKY, INK, GREY, GRID, SHADE = '#56B4E9', '#222222', '#666666', '#E2E2E2', '#F0F0F0'
-LOOPS = (  # name in the legend, colour, line, and order in depth
-    (State.BELIEVED, 'loop closures', GREEN, '-', 5),
-    (State.WEAKLY_BELIEVED, 'loop closures\nbelieved weakly', GREEN, '--', 5),
-    (State.WAITING, 'loop closures that wait,\nnot used', SKY, '--', 2),
-    (State.DOUBTED, 'doubted or refused\nloop closures, not used', GREY, '--', 2))
+LOOPS = (  # states, name in the legend, colour, line, and order in depth
+    ((BELIEVED,), 'loop closures', GREEN, '-', 5),
+    ((WEAKLY_BELIEVED,), 'loop closures\nbelieved weakly', GREEN, '--', 5),
+    ((WAITING,), 'loop closures that wait,\nnot used', SKY, '--', 2),
+    ((DOUBTED, REFUSED), 'doubted or refused\nloop closures, not used', GREY, '--', 2))
 USED_FIXES: dict[str, Any] = {
     'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
@@ -94,8 +101,8 @@ def _facts(drive: Drive) -> str:
     steps = np.diff(path.poses[:, :2], axis=0)
     numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()
                if kind != 'refused'}
-    doubted, waiting = (
-        int(np.sum(drive.loops(state))) for state in (State.DOUBTED, State.WAITING))
+    doubted, waiting = (int(np.sum(np.isin(drive.loop_states, states)))
+                        for states in ((DOUBTED, REFUSED), (WAITING,)))
     parts = [f'{numbers.pop("used")} fixes used' + ''.join(
         f', {number} {kind}' for kind, number in numbers.items() if number > 0),
         f'{len(drive.loop_stamps_ns) - doubted - waiting} loop closures' + ''.join(
@@ -143,8 +150,8 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
         if np.any(chosen):
             axes.plot(*thinned(drive.fix_positions[chosen]).T, **style, zorder=2, label=name)
     inside = np.all(path.covers(drive.loop_stamps_ns), axis=1)
-    for state, name, colour, line, order in LOOPS:
-        shown = inside & drive.loops(state)
+    for states, name, colour, line, order in LOOPS:
+        shown = inside & np.isin(drive.loop_states, states)
         if np.any(shown):
             ends = path.at(thinned(drive.loop_stamps_ns[shown]))[..., :2]
             apart = np.full((len(ends), 1, 2), np.nan)
@@ -171,7 +178,7 @@ def _draw_errors(axes: Axes, drive: Drive) -> None:
     of_odometry = {'color': PURPLE, 'linewidth': 1.2, 'zorder': 2}
     of_result = {'color': BLUE, 'linewidth': 2.2, 'zorder': 3}
     stamps, positions = drive.fix_stamps_ns, drive.fix_positions
-    doubted, held_out = drive.fix_kinds['doubted'], drive.fix_held_out
+    doubted, held_out = drive.fix_kinds['doubted'], drive.fix_kinds['held out']
     if truth is not None:
         target, true = 'the truth', (truth.stamps_ns, truth.poses[:, :2])
         lines = [(odometry, *true, of_odometry),

@@ -3,7 +3,7 @@
 """What several tools share: topics, parameters and times by their options; progress bars."""
 
 import argparse
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 import math
 from pathlib import Path
 import sys
@@ -13,13 +13,15 @@ from typing import Any, TypeVar
 import yaml
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, OPTIONS
-from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, one_line, Span
+from pose_graph_ros.adapters.bags import Bag, BagError, one_line, Span
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.core.exceptions import ConfigError
 
 DELAY = 0.5  # after which a bar appears [s]
 Item = TypeVar('Item')
+
+
 def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
     """Return the topics given by the options, by name of the source; None if not given."""
     return {source: getattr(options, source) for source in OPTIONS}
@@ -108,17 +110,6 @@ def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
     return tqdm(items, leave=False, delay=DELAY, **looks)
 
 
-class WatchedBag(Bag):
-    """A bag that shows on a terminal how far its messages have been read."""
-
-    def __init__(self, bag: Bag, title: str) -> None:
-        self.path, self.topics = bag.path, bag.topics
-        self.start_ns, self.end_ns = bag.start_ns, bag.end_ns
-        self._bag, self._title = bag, title
-
-    def _messages(self, topics: Collection[str], span: Span) -> Iterator[BagMessage]:
-        begin_ns, end_ns = span.begin_ns or self.start_ns, span.end_ns or self.end_ns
-        share = (min(end_ns, self.end_ns) - begin_ns) / max(self.end_ns - self.start_ns, 1)
-        return iter(watched(
-            self._bag.messages(topics, span), desc=self._title,
-            total=round(share * sum(self.topics[topic].count for topic in topics))))
+def watched_bag(bag: Bag, title: str) -> Bag:
+    """Return a bag that shows on a terminal how far its messages have been read."""
+    return bag.watched(lambda messages, total: watched(messages, desc=title, total=total))

@@ -26,20 +26,15 @@ from pose_graph_ros.offline.simulation.settings import (
 
 PICTURES = ('.png', '.pdf', '.svg')
 FALSE_SIZE = 4  # closures of a group of false ones
-# Options of what a graph does not have, by their names among the parsed ones.
-ONLY_IN_BAGS = ('odometry', 'wheel_scale', 'slip', 'heading_drift', 'gyro', 'gyro_noise', 'delay',
-                'duplicate', 'clock_offset')
+# Options of what a graph does not have, and where their values are.
+ONLY_IN_BAGS = {
+    '--odometry': 'wheels.errors', '--wheel-scale': 'wheels.scale',
+    '--slip': 'wheels.slip_events_per_s', '--heading-drift': 'wheels.heading_drift',
+    '--gyro': 'gyro', '--gyro-noise': 'gyro.sigma,bias,bias_walk', '--delay': 'delay',
+    '--duplicate': 'duplicate', '--clock-offset': 'clock_offset'}
 SENSORS: dict[str, Any] = {
     'wheels': settings.Wheels, 'gyro': settings.Gyro, 'fixes': settings.Fixes,
     'poses': settings.GlobalPoses, 'closures': settings.Closures}
-# The sensor and its numbers that an option sets.
-FIELDS = {
-    'odometry': ('wheels', 'errors'), 'wheel_scale': ('wheels', 'scale'),
-    'slip': ('wheels', 'slip_events_per_s'), 'heading_drift': ('wheels', 'heading_drift'),
-    'gyro_noise': ('gyro', 'sigma', 'bias', 'bias_walk'), 'fix_period': ('fixes', 'period_s'),
-    'fix_sigma': ('fixes', 'white'), 'fix_correlated': ('fixes', 'correlated', 'correlation_s'),
-    'global_pose': ('poses', 'period_s'), 'global_pose_sigma': ('poses', 'sigmas'),
-    'closures': ('closures', 'rate'), 'closure_sigma': ('closures', 'sigmas')}
 # Grammar, class, name in the setup and help of each disturbance, by its option.
 DISTURBANCES: dict[str, tuple[str, Callable[..., Any], str, str]] = {
     'outage': ('TOPIC:FROM:TO', settings.Outage, 'outages', 'nothing is measured in between'),
@@ -111,44 +106,55 @@ def _by_world(values: dict[str, float]) -> str:
 
 
 def _add_sensors(parser: argparse.ArgumentParser) -> None:
-    """Add the options on sensors and disturbances."""
+    """Add the options on sensors; `dest` is the sensor, with the fields of it that are set."""
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
-    wheels.add_argument('--odometry', choices=[*OdometryErrors],
+    wheels.add_argument('--odometry', dest='wheels.errors', type=_odometry,
+                        choices=[each.value for each in OdometryErrors],
                         help='errors of two wheels, or a random walk as the node assumes it '
                              '(default: wheels; a graph always has the latter)')
-    wheels.add_argument('--wheel-scale', metavar='LEFT,RIGHT', type=_numbers(0, 1),
+    wheels.add_argument('--wheel-scale', dest='wheels.scale', metavar='LEFT,RIGHT',
+                        type=_numbers(0, 1),
                         help='ratio of measured to true distance (default: 1.0068,1.0070)')
-    wheels.add_argument('--slip', metavar='PER_MINUTE', type=number(0.0, factor=1.0 / 60.0),
+    wheels.add_argument('--slip', dest='wheels.slip_events_per_s', metavar='PER_MINUTE',
+                        type=number(0.0, factor=1.0 / 60.0),
                         help='events of slip of each wheel, which then measures 1 cm too much at '
                              '1 m/s (default: 1; hall: 0.5)')
-    wheels.add_argument('--heading-drift', metavar='RAD_PER_M', type=number(),
+    wheels.add_argument('--heading-drift', dest='wheels.heading_drift', metavar='RAD_PER_M',
+                        type=number(),
                         help='drift of the heading by the wheels [rad/m] (default: 0)')
     gyro = parser.add_argument_group('gyroscope on /imu/data, 100 Hz')
     gyro.add_argument('--gyro', action='store_true', help='with a gyroscope')
-    gyro.add_argument('--gyro-noise', metavar='WHITE,BIAS,WALK', type=_numbers(0, 1, 2),
+    gyro.add_argument('--gyro-noise', dest='gyro.sigma,bias,bias_walk',
+                      metavar='WHITE,BIAS,WALK', type=_numbers(0, 1, 2),
                       help='white noise [rad/sqrt(s)], bias at the start [rad/s] and its walk '
                            '[rad/s/sqrt(s)]; implies --gyro (default: 5e-4,0.01,2e-5)')
     fixes = parser.add_argument_group('GNSS on /gps/fix')
     fixes.add_argument('--fix', action=argparse.BooleanOptionalAction,
                        help='with fixes (default: in the drive; the options below imply it)')
-    fixes.add_argument('--fix-period', metavar='S', type=number(0.01), help='(default: 0.5)')
-    fixes.add_argument('--fix-sigma', metavar='M', type=number(0.0),
+    fixes.add_argument('--fix-period', dest='fixes.period_s', metavar='S', type=number(0.01),
+                       help='(default: 0.5)')
+    fixes.add_argument('--fix-sigma', dest='fixes.white', metavar='M', type=number(0.0),
                        help='white error of a coordinate (default: 0.4)')
-    fixes.add_argument('--fix-correlated', metavar='M,S', type=_numbers(0, 1),
+    fixes.add_argument('--fix-correlated', dest='fixes.correlated,correlation_s', metavar='M,S',
+                       type=_numbers(0, 1),
                        help='standard deviation and time constant of the correlated '
                             '(Gauss-Markov) error of a coordinate; 0,1 for none '
                             '(default: 1.2,60)')
     poses = parser.add_argument_group('global poses on /global_pose')
-    poses.add_argument('--global-pose', metavar='PERIOD', type=number(0.01),
+    poses.add_argument('--global-pose', dest='poses.period_s', metavar='PERIOD',
+                       type=number(0.01),
                        help='a pose in the map every so many seconds (default: there are none)')
-    poses.add_argument('--global-pose-sigma', metavar='M,RAD', type=_numbers(0, 1),
+    poses.add_argument('--global-pose-sigma', dest='poses.sigmas', metavar='M,RAD',
+                       type=_numbers(0, 1),
                        help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
     loops = parser.add_argument_group('loop closures on /loop_closure')
-    loops.add_argument('--closures', metavar='RATE', type=number(0.0, 1.0),
+    loops.add_argument('--closures', dest='closures.rate', metavar='RATE',
+                       type=number(0.0, 1.0),
                        help='share of the stretches driven before in which a closure is found, '
                             '0 to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
                             '(default: 1; grid: 0.5)')
-    loops.add_argument('--closure-sigma', metavar='M,RAD', type=_numbers(0, 0, 1),
+    loops.add_argument('--closure-sigma', dest='closures.sigmas', metavar='M,RAD',
+                       type=_numbers(0, 0, 1),
                        help='(default: 0.1,0.0175; hall: 0.05,0.01; grid: 0.1,0.02)')
     loops.add_argument('--false-rate', metavar='SHARE', type=number(0.0),
                        help='share of all closures that tie two different places '
@@ -171,13 +177,12 @@ def changed(usual: Setup, options: argparse.Namespace) -> Setup:
     """Return what is simulated, by the usual of the world and the options; raises ConfigError."""
     given: dict[str, dict[str, Any]] = {
         sensor: {} for sensor, there in (('gyro', options.gyro), ('fixes', options.fix)) if there}
-    for option, (sensor, *names) in FIELDS.items():
-        value = getattr(options, option)
-        if option == 'odometry' and value is not None:
-            value = OdometryErrors(value)
-        if value is not None:
+    for place, value in vars(options).items():
+        sensor, dot, names = place.partition('.')
+        if dot and value is not None:
+            fields = names.split(',')
             given.setdefault(sensor, {}).update(
-                zip(names, value if len(names) > 1 else (value,), strict=True))
+                zip(fields, value if len(fields) > 1 else (value,), strict=True))
     given.setdefault('closures', {})
     if options.false_rate is not None or options.false_groups is not None:
         groups, size = options.false_groups or (0, FALSE_SIZE)
@@ -210,13 +215,17 @@ def changed(usual: Setup, options: argparse.Namespace) -> Setup:
 
 def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
     """Raise ConfigError if an option is given that a graph cannot have."""
-    for name in ONLY_IN_BAGS:
-        if getattr(options, name) not in (None, False, []):
-            raise ConfigError(f'--{name.replace("_", "-")}: only a bag has it, but {options.out} '
-                              'is a graph')
+    for option, place in ONLY_IN_BAGS.items():
+        if getattr(options, place) not in (None, False, []):
+            raise ConfigError(f'{option}: only a bag has it, but {options.out} is a graph')
     for topic, _ in options.outage:
         if topic == settings.ODOMETRY:
             raise ConfigError(f'--outage {settings.ODOMETRY}: a graph cannot do without odometry')
+
+
+def _odometry(text: str) -> OdometryErrors | str:
+    """Return where errors come from; another word is none of the choices."""
+    return OdometryErrors(text) if text in [*OdometryErrors] else text
 
 
 def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:

@@ -33,7 +33,7 @@ def execute(options: argparse.Namespace) -> int:
     with open_bags(options.bags) as bag:
         inputs = shared.inputs_of(bag, options, values)
         truth = None if options.truth is None else read_truth(bag, options.truth)
-        tuning = Tuning(shared.WatchedBag(bag, 'reading'), inputs, values, _show)
+        tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values, _show)
     try:
         outcome = tuning.tune(options.folds, start + options.budget, truth)
     finally:

@@ -10,16 +10,18 @@ import pytest
 from scipy.stats import chi2
 
 from pose_graph_ros.cli.drive import (
+    BELIEVED,
     consistency,
     distances,
+    DOUBTED,
     Drive,
+    HELD_OUT,
     place_truth,
     summary,
 )
 from pose_graph_ros.cli.picture import BLUE, draw_drive, GREEN, VERMILION
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.judgement.verdicts import State
 
 NOTHING = Trajectory(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 SECOND = 10**9
@@ -39,8 +41,10 @@ def hand_made_drive() -> Drive:
         odometry=Trajectory(odometry.stamps_ns, se2.compose(start, odometry.poses)),
         fix_stamps_ns=np.array([0, 15, 30, 90, 200]) * SECOND // 10,
         fix_positions=np.array([[0.0, 1.0], [1.5, 1.0], [3.0, -2.0], [9.0, 2.0], [20.0, 0.0]]),
-        fix_held_out=np.array([False, False, True, True, False]),
-        corrected=straight(0.5), truth=straight(), loop_stamps_ns=np.array([[1, 8]]) * SECOND)
+        fix_states=np.array([BELIEVED, BELIEVED, HELD_OUT, HELD_OUT, BELIEVED]),
+        fix_sources=['fix'] * 5, corrected=straight(0.5), truth=straight(),
+        loop_stamps_ns=np.array([[1, 8]]) * SECOND, loop_states=np.array([BELIEVED]),
+        loop_sources=['loop_closure'])
 
 
 def without_truth(drive: Drive) -> Drive:
@@ -50,7 +54,7 @@ def without_truth(drive: Drive) -> Drive:
 def without_fixes(drive: Drive) -> Drive:
     return replace(
         drive, fix_stamps_ns=np.zeros(0, dtype=np.int64), fix_positions=np.zeros((0, 2)),
-        fix_held_out=np.zeros(0, dtype=bool))
+        fix_states=np.zeros(0, dtype=np.int64), fix_sources=[])
 
 
 def test_distances_interpolate_inside_the_time_of_the_path_only() -> None:
@@ -162,8 +166,8 @@ def test_a_truth_in_another_map_gives_path_and_odometry_the_same_errors() -> Non
 
 def test_what_is_doubted_is_no_reference_and_counted_apart() -> None:
     drive = replace(
-        hand_made_drive(), fix_unused=np.array([False, True, False, True, False]),
-        loop_states=[State.DOUBTED])
+        hand_made_drive(),
+        fix_states=np.array([BELIEVED, DOUBTED, HELD_OUT, HELD_OUT, BELIEVED]))
     rows = {row.name: row for row in drive.rows}
     assert rows['corrected path to fixes used'].count == 1
     assert rows['corrected path to fixes doubted'].count == 1
@@ -171,8 +175,6 @@ def test_what_is_doubted_is_no_reference_and_counted_apart() -> None:
     assert rows['corrected path to fixes held out'].count == 2
     result = summary(drive, {})
     assert (result['fixes_used'], result['fixes_doubted'], result['fixes_held_out']) == (2, 1, 2)
-    assert drive.loops(State.DOUBTED).tolist() == [True]
-    assert hand_made_drive().loops(State.BELIEVED).tolist() == [True]
 
 
 @pytest.mark.parametrize(('turn', 'shape'), [(0.0, 'wide'), (np.pi / 2.0, 'tall')])

@@ -26,14 +26,13 @@ from pose_graph_ros.cli.bag_messages import (
     odometry_messages,
     write_bag,
 )
-from pose_graph_ros.cli.drive import collect_drive, read_truth
+from pose_graph_ros.cli.drive import drive_in, read_truth, REFUSED
 from pose_graph_ros.cli.main import guarded, main
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.judgement.verdicts import State
 
 TYPES = message_types()
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -157,10 +156,10 @@ def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
         result = replay.run(bag, inputs, values)
-        drive = collect_drive(
-            bag, inputs, values, truth, None, states=replay.states_of(result.backend))
+        drive = drive_in(bag, inputs, values, result.backend, None, origin=None,
+                         refused=result.refused)
     assert result.backend.counts['loop_closure', 'before_window'] == 1
-    assert drive.loops(State.BELIEVED).tolist() == [False]
+    assert drive.loop_states.tolist() == [REFUSED]
 
 
 @pytest.mark.parametrize(('datum', 'axes'), [
@@ -170,7 +169,8 @@ def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(datum, axes,
     values = checked({'datum': datum})
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
-        drive = collect_drive(bag, inputs, values, circle(), None)
+        drive = drive_in(bag, inputs, values, replay.run(bag, inputs, values).backend, None,
+                         origin=None)
     assert drive.map_axes == axes
     assert drive.truth is None
     np.testing.assert_array_equal(drive.odometry.stamps_ns, circle().stamps_ns)

@@ -19,7 +19,7 @@ from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.bag_messages import Message, write_bag
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.replay import run
-from pose_graph_ros.cli.shared import WatchedBag
+from pose_graph_ros.cli.shared import watched_bag
 
 START = int(circle().stamps_ns[0])
 
@@ -117,10 +117,10 @@ def test_a_terminal_sees_how_far_a_bag_is_read(tmp_path, capsys, monkeypatch) ->
     monkeypatch.setattr('pose_graph_ros.cli.shared.DELAY', 0.0)
     with open_bags([tmp_path / 'bag']) as bag:
         plain = [message.raw for message in bag.messages(['/odom'])]
-        assert [each.raw for each in WatchedBag(bag, 'reading').messages(['/odom'])] == plain
+        assert [each.raw for each in watched_bag(bag, 'reading').messages(['/odom'])] == plain
         assert capsys.readouterr().err == ''
         monkeypatch.setattr(sys.stderr, 'isatty', lambda: True)
-        assert [each.raw for each in WatchedBag(bag, 'reading').messages(['/odom'])] == plain
+        assert [each.raw for each in watched_bag(bag, 'reading').messages(['/odom'])] == plain
     assert 'reading:   0%|' in capsys.readouterr().err
 
 

@@ -76,7 +76,8 @@ def test_a_bag_is_replayed_first(bag, tmp_path, capsys) -> None:
     assert list(problems(data)) == []
     assert data['errors']['against'] == 'held-out fixes'
     assert data['duration'] == pytest.approx(30.0, abs=0.2)
-    assert sum(data['fixes'][0]['held_out']) == len(data['errors']['t'])
+    held_out = data['states'].index('held out')
+    assert data['fixes'][0]['state'].count(held_out) == len(data['errors']['t'])
     assert 0.0 < max(data['errors']['position']) < 0.5
 
 def test_page_summary_and_messages_count_measurements_alike(tmp_path) -> None:

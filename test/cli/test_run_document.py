@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """run.json: its form, its numbers, and what it says of runs whose faults are known."""
 
+from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 import json
 from typing import Any
 
@@ -14,22 +14,12 @@ from run_schema import problems
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.drive import Drive, place_truth
+from pose_graph_ros.cli.drive import collect_drive, place_truth
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.document import document
-from pose_graph_ros.cli.run.findings import silences
-from pose_graph_ros.cli.run.places import simplified
-from pose_graph_ros.cli.run.recorder import (
-    MOST_SILENCES,
-    MOST_UPDATES,
-    Recorder,
-    Run,
-    silent,
-    thinned,
-    Update,
-)
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.cli.run.findings import MOST_SILENCES, silences, silent
+from pose_graph_ros.cli.run.recorder import MOST_UPDATES, Recorder, Run, thinned, Update
 
 WHITE = ('global_pose.correlation_time', 0.0)
 SECOND = 10**9
@@ -41,20 +31,15 @@ def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
     drive = HonestDrive(**{'seed': 1, 'seconds': 240.0, 'closures': 20} | of_drive)
     values, recorder = checked(dict(settings)), Recorder()
     backend, report = run_measurements(drive.measurements(), values, recorder)
-    estimate, stamps = backend.estimate(), drive.truth.stamps_ns
-    assert estimate is not None
-    fixes = drive.fix_at[:len(drive.fix_at) * drive.fixes]
-    compared = place_truth(Drive(
-        drive.odometry, stamps[fixes], drive.positions[:len(fixes)],
-        np.zeros(len(fixes), dtype=bool), estimate.path, drive.truth, stamps[drive.closure_at],
-        fix_sources=['global_pose'] * len(fixes),
-        loop_sources=['loop_closure'] * len(drive.closure_at)))
+    compared = place_truth(replace(collect_drive(
+        ((*each, False) for each in drive.measurements()), backend, 'odom', ()),
+        truth=drive.truth))
     kinds = {'odom': Kind.ODOMETRY, 'global_pose': Kind.GLOBAL_POSE,
              'loop_closure': Kind.LOOP_CLOSURE}
     # as it is read from the file
     return dict(json.loads(json.dumps(document(Run(
-        'a drive', 'made up', compared, backend, estimate, backend.verdicts(), recorder, values,
-        kinds, backend.counts, report)), allow_nan=False)))
+        'a drive', 'made up', compared, backend, recorder, values, kinds, backend.counts, report,
+        1.0)), allow_nan=False)))
 
 
 def texts(found: dict[str, Any], *levels: str) -> list[str]:
@@ -195,35 +180,10 @@ def test_a_path_that_is_worse_than_odometry_alone_is_not_called_good() -> None:
     assert not any('rms from the truth' in text for text in texts(found, 'good', 'notice'))
 
 
-def test_a_line_keeps_within_the_tolerance_of_all_points() -> None:
-    generator = np.random.default_rng(1)
-    for n in (2, 3, 700, 5000):
-        points = np.cumsum(generator.normal(size=(n, 2)), axis=0)
-        for tolerance in (0.0, 0.5, 5.0):
-            kept = simplified(points, tolerance)
-            assert (kept[0], kept[-1]) == (0, n - 1)
-            assert distance_from_line(points, kept) <= tolerance + 1e-9
-    straight = np.column_stack((np.arange(500.0), np.zeros(500)))
-    assert simplified(straight).tolist() == [0, 499]
-    assert len(simplified(points, 0.01, most=300)) <= 300
-    assert simplified(np.zeros((4, 2))).tolist() == [0, 3]
-
-
-def distance_from_line(points: FloatArray, kept: np.ndarray) -> float:
-    """The slow way: each point from the part of the line that it belongs to."""
-    largest = 0.0
-    for first, last in pairwise(kept.tolist()):
-        along = points[last] - points[first]
-        for point in points[first + 1:last]:
-            share = np.clip((point - points[first]) @ along / max(along @ along, 1e-18), 0.0, 1.0)
-            largest = max(largest, float(np.hypot(*(point - points[first] - share * along))))
-    return largest
-
-
 def test_of_many_updates_the_slowest_are_kept() -> None:
     recorder, count = Recorder(), 9 * MOST_UPDATES + 7
     for k in range(count):
-        recorder.add_update(Update(k, k, 500.0 if k == 12_345 else 1.0, 0.0, 1))
+        recorder.add_update(Update(k, k, 500.0 if k == 12_345 else 1.0, 0.0))
     kept = thinned(recorder.updates)
     assert recorder.n_updates == count
     assert MOST_UPDATES // 2 <= len(kept) <= MOST_UPDATES
@@ -232,43 +192,36 @@ def test_of_many_updates_the_slowest_are_kept() -> None:
 
 
 def test_the_longest_silences_are_told_but_not_that_before_a_late_message() -> None:
-    recorder, stamp = Recorder(), 0
-    for k in range(5000):
-        stamp += SECOND // 10 + (k % 100 == 50) * (k + 100) * SECOND // 10
-        recorder.add_measurement('odom', stamp)
-    for late in (stamp - SECOND, 0):    # one without a stamp does not count
-        recorder.add_measurement('odom', late)
-    gaps = silent(recorder.stamps_ns['odom'], 1.0)
+    stamps = np.cumsum([SECOND // 10 + (k % 100 == 50) * (k + 100) * SECOND // 10
+                        for k in range(5000)]).tolist()
+    # one without a stamp does not count
+    gaps = silent([*stamps, stamps[-1] - SECOND, 0], 1.0)
     assert len(gaps) == MOST_SILENCES
     assert np.all(np.diff(gaps[:, 0]) > 0.0)
     assert np.ptp(gaps[-1]) == pytest.approx((4950 + 100) * 0.1 + 0.1)
 
 
 def test_a_silence_of_one_of_two_odometries_does_not_hide_the_motion() -> None:
-    recorder = Recorder()
-    for k in range(100):
-        recorder.add_measurement('wheels', (k + 1) * SECOND // 10)
-        if not 40 < k < 80:
-            recorder.add_measurement('visual', (k + 1) * SECOND // 10)
-            recorder.add_measurement('gyro', (k + 1) * SECOND // 10)
+    tenths = (np.arange(1, 101) * SECOND // 10).tolist()
+    interrupted = [*tenths[:41], *tenths[80:]]
+    arrived = {'wheels': tenths, 'visual': interrupted, 'gyro': interrupted}
     kinds = {'wheels': Kind.ODOMETRY, 'visual': Kind.ODOMETRY, 'gyro': Kind.GYRO}
     told = {text.partition(':')[0]: text.rpartition('; ')[2]
-            for _, text, _ in silences(recorder, kinds, 0)}
+            for _, text, _ in silences(arrived, kinds, 0)}
     assert told == {
         'visual': 'the motion there is that of other odometry, as far as it goes on',
         'gyro': 'the heading there is that of other sources'}
-    del kinds['wheels'], recorder.stamps_ns['wheels']
-    (_, text, _), _ = silences(recorder, kinds, 0)
+    del kinds['wheels'], arrived['wheels']
+    (_, text, _), _ = silences(arrived, kinds, 0)
     assert text.endswith('the motion there is not known')
 
 
 @pytest.mark.parametrize('source', ['odom', 'fix'])
 def test_a_silence_is_a_warning_from_20_s_on_as_the_docs_say(source) -> None:
     for length, level in ((7, 'notice'), (25, 'warning')):
-        recorder = Recorder()
-        for tenth in (*range(10, 110), *range(109 + 10 * length, 210 + 10 * length)):
-            recorder.add_measurement(source, tenth * SECOND // 10)
-        (found, text, _), = silences(recorder, {
-            'odom': Kind.ODOMETRY, 'fix': Kind.FIX}, SECOND)
+        stamps = [tenth * SECOND // 10 for tenth in (
+            *range(10, 110), *range(109 + 10 * length, 210 + 10 * length))]
+        (found, text, _), = silences(
+            {source: stamps}, {'odom': Kind.ODOMETRY, 'fix': Kind.FIX}, SECOND)
         assert found == level
         assert f'({length} s at most)' in text

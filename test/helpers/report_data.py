@@ -44,7 +44,6 @@ def example(
         'version': 1, 'title': title, 'subtitle': 'replay of figure_of_eight',
         'start': '2015-02-26T10:11:12.123Z', 'start_ns': '1424945472123000000',
         'duration': float(t[-1]), 'axes': ['east', 'north'], 'offset': [1200.0, -350.0],
-        'datum': {'latitude': 48.1, 'longitude': 11.6, 'altitude': 500.0},
         'facts': [
             {'label': label, 'value': value, 'note': note} for label, value, note in (
                 ('hidden nodes', str(poses), ''), ('path', '3.1 km', 'by corrected odometry'),
@@ -84,7 +83,7 @@ def example(
                      'series': None, 'autocorrelation': None, 'scale': 1.0}],
         'springs': [spring(rank, t, path) for rank in range(1, 11)],
         'updates': {
-            't': column(t[told]), 'nodes': (told + 1).tolist(), 'iterations': None,
+            't': column(t[told]), 'nodes': (told + 1).tolist(),
             'ms': column(np.exp(rng.normal(0.0, 0.7, len(told))) * (
                 1 + 30 * (rng.random(len(told)) < 0.01))),
             'chi2': column(np.cumsum(rng.chisquare(3, len(told)))), 'count': poses,
@@ -113,7 +112,7 @@ def fix_table(
     return {
         'source': 'gps', **columns(t=t[at], x=places[:, 0], y=places[:, 1]),
         'state': state.tolist(), 'why': np.select([state == 3, state == 4], [0, 2], -1).tolist(),
-        'held_out': (state == 5).astype(int).tolist(), 'id': [f'gps/{k}' for k in range(count)],
+        'id': [f'gps/{k}' for k in range(count)],
         'd': column(np.abs(rng.normal(0.0, 1.5, count)) + 9.0 * (state == 3), 2),
         'at': at.tolist()}
 
@@ -160,13 +159,13 @@ def source(
 
 
 def spring(rank: int, t: np.ndarray, path: np.ndarray) -> dict[str, Any]:
-    ends = [{'t': float(t[k]), 'x': float(path[k, 0]), 'y': float(path[k, 1]), 'node': int(k)}
+    ends = [{'t': float(t[k]), 'x': float(path[k, 0]), 'y': float(path[k, 1])}
             for k in ((37 * rank) % len(t), (37 * rank + 5) % len(t))]
     return {
         'rank': rank, 'name': f'loop_closure/{rank}', 'source': 'loop_closure',
         'kind': 'loop closure' if rank % 3 else 'fix', 'energy': 40.0 / rank, 'expected': 3,
-        'from': ends[0], 'to': ends[1] if rank % 3 else None, 'residual': [0.4, 0.1, 0.02],
-        'sigma': [0.1, 0.1, 0.01], 'text': 'from 0:37.0 to 2:10.5, pulls 0.41 m'}
+        'from': ends[0], 'to': ends[1] if rank % 3 else None,
+        'text': 'from 0:37.0 to 2:10.5, pulls 0.41 m'}
 
 
 def sparsity(title: str, size: int, fill: int) -> dict[str, Any]:

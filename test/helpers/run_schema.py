@@ -23,21 +23,20 @@ class Columns:
         self.columns = columns
 
 
-PATH = Columns(t=NUMBER, x=NUMBER, y=NUMBER, theta=NUMBER)
+PATH = Columns(x=NUMBER, y=NUMBER)
 RATIOS = {'ratio': Maybe(NUMBER), 'low': Maybe(NUMBER), 'high': Maybe(NUMBER)}
-PLACE = {'node': Maybe(COUNT), 't': NUMBER, 'x': NUMBER, 'y': NUMBER}
+PLACE = {'t': NUMBER, 'x': NUMBER, 'y': NUMBER}
 SCHEMA = {
     'version': COUNT, 'title': TEXT, 'subtitle': TEXT, 'start': Maybe(TEXT), 'start_ns': TEXT,
     'duration': NUMBER, 'axes': [TEXT], 'offset': [NUMBER],
-    'datum': Maybe({'latitude': NUMBER, 'longitude': NUMBER, 'altitude': NUMBER, 'yaw': NUMBER}),
     'facts': [{'label': TEXT, 'value': TEXT, 'note': TEXT}],
     'findings': [{'level': TEXT, 'text': TEXT, 'anchor': TEXT}],
-    'lines': {'corrected': PATH, 'odometry': Columns(t=NUMBER, x=NUMBER, y=NUMBER),
+    'lines': {'corrected': Columns(t=NUMBER, x=NUMBER, y=NUMBER, theta=NUMBER), 'odometry': PATH,
               'truth': Maybe(PATH)},
-    'ellipses': Columns(t=NUMBER, x=NUMBER, y=NUMBER, xx=NUMBER, xy=NUMBER, yy=NUMBER),
+    'ellipses': Columns(x=NUMBER, y=NUMBER, xx=NUMBER, xy=NUMBER, yy=NUMBER),
     'fixes': [Columns(
         source=None, left_out=None, t=NUMBER, x=NUMBER, y=NUMBER, state=COUNT, why=NUMBER,
-        held_out=COUNT, id=Maybe(TEXT), d=Maybe(NUMBER), at=NUMBER)],
+        id=TEXT, d=Maybe(NUMBER), at=NUMBER)],
     'closures': [Columns(
         source=None, left_out=None, t0=NUMBER, t1=NUMBER, x0=NUMBER, y0=NUMBER, x1=NUMBER,
         y1=NUMBER, state=COUNT, why=NUMBER, id=TEXT, d=Maybe(NUMBER))],
@@ -63,10 +62,10 @@ SCHEMA = {
     'springs': [{
         'rank': COUNT, 'name': TEXT, 'source': TEXT, 'kind': TEXT, 'energy': NUMBER,
         'expected': NUMBER, 'from': Maybe(PLACE), 'to': Maybe(PLACE),
-        'residual': Maybe([NUMBER]), 'sigma': Maybe([NUMBER]), 'text': TEXT}],
+        'text': TEXT}],
     'updates': Maybe({
-        't': [NUMBER], 'nodes': [COUNT], 'ms': [NUMBER], 'chi2': [NUMBER],
-        'iterations': Maybe([COUNT]), 'count': COUNT, 'period': NUMBER}),
+        't': [NUMBER], 'nodes': [COUNT], 'ms': [NUMBER], 'chi2': [NUMBER], 'count': COUNT,
+        'period': NUMBER}),
     'sparsity': [{'title': TEXT, 'size': COUNT, 'nonzeros': COUNT, 'fill': COUNT, 'bins': COUNT,
                   'cells': [[COUNT]]}]}
 

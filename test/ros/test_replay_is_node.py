@@ -11,6 +11,7 @@ from run_schema import problems
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bags import open_bag
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.simulate import simulate_drive, write_drive
 from pose_graph_ros.core.geometry import se2
@@ -78,4 +79,8 @@ def test_the_same_bag_gives_the_same_path(bag: Path, tmp_path: Path) -> None:
     with open_bag(tmp_path / 'node' / 'corrected') as corrected:
         assert {'/path', '/pose', '/odometry/filtered', '/diagnostics'} <= set(corrected.topics)
         assert corrected.topics['/path'].count == 1
+        published = {stamp_ns(each): planar_pose(each.pose)
+                     for each in next(corrected.messages(['/path'])).decode().poses}
+    assert difference(node, Trajectory(
+        np.array(list(published)), np.array(list(published.values())))) < SAME_PATH
     assert (tmp_path / 'node' / 'drive.png').read_bytes().startswith(b'\x89PNG')

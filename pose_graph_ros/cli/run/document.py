@@ -3,13 +3,13 @@
 """The JSON object of a run, as docs/tools.md describes it, and its file run.json."""
 
 from dataclasses import asdict
-from datetime import datetime, UTC
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pose_graph_ros.cli.drive import STATES
 from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.places import number, rounded
@@ -24,9 +24,9 @@ from pose_graph_ros.offline.residuals import variance_components
 VERSION = 1
 FILE = 'run.json'
 KEYS = (
-    'title', 'subtitle', 'start', 'start_ns', 'duration', 'axes', 'offset', 'datum', 'facts',
-    'findings', 'lines', 'ellipses', 'fixes', 'closures', 'states', 'errors', 'error_table',
-    'sources', 'springs', 'updates', 'sparsity', 'texts')
+    'title', 'subtitle', 'start', 'start_ns', 'duration', 'axes', 'offset', 'facts', 'findings',
+    'lines', 'ellipses', 'fixes', 'closures', 'states', 'errors', 'error_table', 'sources',
+    'springs', 'updates', 'sparsity', 'texts')
 
 
 def read_document(path: Path) -> dict[str, Any]:
@@ -55,29 +55,25 @@ def document(run: Run) -> dict[str, Any]:
     """Return the JSON object of a run."""
     drive, path = run.drive, run.drive.corrected
     frame = places.Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
-    covariances = run.backend.path_covariances(run.estimate)
-    errors = places.errors(drive, covariances, frame)
+    verdicts = {(each.source, each.stamp_ns, each.reference_ns): each for each in run.verdicts}
+    errors = places.errors(drive, run.covariances, frame)
     analysis = variance_components.analyse(run.backend.parts)
-    in_use = {source: each.in_use for source, each in run.backend.reports().items()}
-    analyses = analyse(analysis, run.kinds, in_use)
+    analyses = analyse(run, analysis)
     lines, at_ns = places.lines(drive, frame)
     return {
         'version': VERSION, 'title': run.title, 'subtitle': run.subtitle,
         'start': _utc(run.start_ns), 'start_ns': str(run.start_ns),
         'duration': round(float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9, 3),
         'axes': list(drive.map_axes), 'offset': rounded(frame.offset),
-        'datum': None if run.origin is None else {
-            'latitude': run.origin.latitude, 'longitude': run.origin.longitude,
-            'altitude': number(run.origin.altitude, 8), 'yaw': number(run.origin.yaw, 8)},
         'facts': _facts(run), 'findings': findings(run, analyses, errors), 'lines': lines,
-        'ellipses': places.ellipses(path, covariances, frame),
-        'fixes': places.fixes(drive, run.verdicts, at_ns, frame),
-        'closures': places.closures(drive, run.verdicts, run.refused, frame),
-        'states': list(places.STATES), 'errors': errors,
+        'ellipses': places.ellipses(path, run.covariances, frame),
+        'fixes': places.fixes(drive, verdicts, at_ns, frame),
+        'closures': places.closures(drive, verdicts, run.recorder.refused, frame),
+        'states': list(STATES), 'errors': errors,
         'error_table': [asdict(row) | {name: number(getattr(row, name), 5) for name in (
             'median', 'rms', 'p95', 'maximum')} for row in drive.rows],
         'sources': [source_entry(each, frame) for each in analyses.values()],
-        'springs': springs(run.backend, path, analysis.residuals, run.verdicts, frame),
+        'springs': springs(run, analysis.residuals, frame),
         'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
         'texts': list(frame.texts)}
 
@@ -92,14 +88,9 @@ def write_document(run: Run, folder: Path) -> dict[str, Any]:
 
 def _utc(stamp_ns: int) -> str | None:
     """Return a stamp as a time of day with milliseconds; None if it is not of this epoch."""
-    seconds, rest = divmod(stamp_ns, 1_000_000_000)
-    if seconds < 946_684_800:   # the year 2000; other stamps count from any beginning
-        return None
-    try:
-        text = datetime.fromtimestamp(seconds, UTC).strftime('%Y-%m-%dT%H:%M:%S')
-    except (OverflowError, ValueError, OSError):
-        return None
-    return f'{text}.{rest // 1_000_000:03d}Z'
+    stamp = np.datetime64(stamp_ns, 'ns')
+    # before, stamps count from any beginning
+    return None if stamp < np.datetime64('2000') else f'{stamp.astype("datetime64[ms]")}Z'
 
 
 def _facts(run: Run) -> list[dict[str, str]]:
@@ -117,18 +108,16 @@ def _facts(run: Run) -> list[dict[str, str]]:
         ('edges', str(estimate.n_edges), 'between poses'),
         ('measurements', str(estimate.n_observed), 'in the map, in the graph'),
         ('chi2', f'{estimate.chi2:.5g}', f'{freedom} degrees of freedom'),
-        ('alignment', estimate.alignment.value, 'of odometry with the map')]
-    if run.report is not None:
-        facts.append(('optimisation', run.report.status.value.replace('_', ' '),
-                      f'{run.report.iterations} iterations at the end'))
+        ('alignment', estimate.alignment.value, 'of odometry with the map'),
+        ('optimisation', run.report.status.value.replace('_', ' '),
+         f'{run.report.iterations} iterations at the end')]
     if len(drive.loop_stamps_ns) > 0:
         facts.append(('loop closures', str(len(drive.loop_stamps_ns)), ''))
     for row in drive.rows:
         if row.name in ('corrected path to truth', 'corrected path to fixes held out'):
             facts.append(('error', f'{row.rms:.2f} m rms', row.name.partition(' to ')[2]))
-    if run.seconds > 0.0:
-        facts.append(('time to run', f'{run.seconds:.1f} s',
-                      f'{duration / run.seconds:.0f} times as fast as driven'))
+    facts.append(('time to run', f'{run.seconds:.1f} s',
+                  f'{duration / max(run.seconds, 1e-9):.0f} times as fast as driven'))
     if longest is not None:
         facts.append(('longest update', f'{longest:.1f} ms', f'of {run.recorder.n_updates}'))
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
@@ -159,11 +148,9 @@ def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
     """Return the updates as columns; None if none was recorded."""
     if len(run.recorder.updates) == 0:
         return None
-    stamps, nodes, milliseconds, chi2, iterations = zip(
-        *thinned(run.recorder.updates), strict=True)
+    stamps, nodes, milliseconds, chi2 = zip(*thinned(run.recorder.updates), strict=True)
     return {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
             'ms': rounded(milliseconds, 2), 'chi2': [number(each, 6) for each in chi2],
-            'iterations': None if min(iterations) < 0 else list(iterations),
             'count': run.recorder.n_updates,
             'period': number(1e3 / float(run.values['frequency']))}
 

@@ -16,21 +16,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.run.recorder import Recorder, Run, silent
-from pose_graph_ros.cli.run.sources import claim, SourceAnalysis, WRONG
+from pose_graph_ros.cli.run.recorder import Run
+from pose_graph_ros.cli.run.sources import SourceAnalysis, verdict
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import number_of, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
 from pose_graph_ros.core.odometry.turns import CONTRADICTORY
-from pose_graph_ros.core.quantities import StampNs
-from pose_graph_ros.offline.residuals.scale import ScaleFit
+from pose_graph_ros.core.quantities import Seconds, StampNs
 
 LEVELS = ('warning', 'notice', 'good')
-MOST_TOLD = 3  # stretches, groups and gaps that are told one by one
-MANY = 3  # measurements of a stretch or of a group that are more than bad luck
+MOST_SILENCES = 20  # of a source that are looked at
+MOST_TOLD = 3  # stretches and gaps that are told one by one
+MANY = 3  # measurements that are more than bad luck
 
 
 class Finding(NamedTuple):
@@ -45,9 +44,8 @@ def findings(
     run: Run, analyses: Mapping[str, SourceAnalysis], errors: Mapping[str, Any] | None,
 ) -> list[dict[str, Any]]:
     """Return all findings for run.json, the worst first; `errors` are those over time in it."""
-    found = [*_whole(run), *(finding for each in analyses.values() for finding in _covariances(
-        run, each)), *_measurements(run), *_disagreements(run), *_updates(run),
-        *_path(run, errors)]
+    found = [*_whole(run), *_covariances(run, analyses), *_measurements(run),
+             *_disagreements(run), *_updates(run), *_path(run, errors)]
     if all(each.level == 'good' for each in found):
         found.append(Finding('good', 'nothing was found that needs a person', 'map'))
     found.sort(key=lambda each: LEVELS.index(each.level))
@@ -57,7 +55,7 @@ def findings(
 def _whole(run: Run) -> Iterator[Finding]:
     """Yield what concerns the whole graph."""
     estimate, report = run.estimate, run.report
-    if report is not None and report.status is not Status.CONVERGED:
+    if report.status is not Status.CONVERGED:
         reason = f': {report.reason}' if report.reason else ''
         yield Finding('warning', f'the final optimisation did not converge ({report.status.value}'
                                  f'{reason}): the path is not at the minimum', 'updates')
@@ -74,75 +72,24 @@ def _whole(run: Run) -> Iterator[Finding]:
                                  f'the solver fails with them: {names}', 'updates')
 
 
-def _covariances(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
-    """Yield what the residuals of a source say of its covariances and their independence."""
-    source, fit, anchor = (analysis.residuals.source, analysis.fit,
-                           f'source-{analysis.residuals.source}')
-    yield from _correlation(run, analysis)
-    if fit.says_nothing:
-        return
-    used = analysis.residuals.scale[analysis.residuals.used]
-    scale = float(np.median(used)) if len(used) > 0 else 1.0
-    if not analysis.is_wrong:
-        if not analysis.correlated and len(analysis.suspects) == 0:
-            yield Finding('good', f'{source}: its residuals agree with its covariances '
-                                  f'({short(fit.ratio)} times the sigma, {_interval(fit)})',
-                          anchor)
-        return
-    advice = _advice(run, analysis)
-    large = fit.ratio > 1.0
-    share = f'{short(fit.ratio)} times' if large else f'{short(100.0 * fit.ratio)} % of'
-    text = f'{source}: {claim(analysis)}, {share} the sigma ({_interval(fit)})'
-    if len(analysis.suspects) > 0:
-        yield Finding('notice', f'{text}; this may only be because errors of '
-                                f'{" and ".join(analysis.suspects)} are treated as independent',
-                      anchor)
-    elif 1.0 / WRONG < fit.ratio / scale < WRONG:
-        yield Finding('notice', f'{text}; the estimate allows for it (sigmas times '
-                                f'{short(scale)}); {advice} tells it from the beginning', anchor)
-    elif large:
-        yield Finding('warning', f'{text}: its covariances are {short(fit.ratio**2)} times too '
-                                 f'small; set {advice}', anchor)
-    elif analysis.residuals.kind == 'odometry':
-        yield Finding('good', f'{text}: on the safe side, as slow errors, such as of a wheel '
-                              'radius, hardly show from node to node', anchor)
-    else:
-        yield Finding('notice', f'{text}: its covariances are {short(fit.ratio**-2)} times too '
-                                f'large, so it counts for less than it could; {advice} would be '
-                                'right', anchor)
-
-
-def _interval(fit: ScaleFit) -> str:
-    return f'{short(fit.low)} to {short(fit.high)}'
-
-
-def _advice(run: Run, analysis: SourceAnalysis) -> str:
-    """Return the parameter that makes the sigmas of a source right, with its value."""
-    source, ratio = analysis.residuals.source, analysis.fit.ratio
-    # other odometry than the primary one has no sigma_scale that is used
-    if source == run.estimate.primary:
-        return f'{source}.sigma_scale to {short(ratio)}'
-    factor = ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
-    return f'{source}.covariance_scale to {short(factor)}'
-
-
-def _correlation(run: Run, analysis: SourceAnalysis) -> Iterator[Finding]:
-    """Yield whether errors of a source in the map go on from one measurement to the next."""
-    source = analysis.residuals.source
-    report = run.backend.reports().get(source)
-    if report is None:
-        return
-    anchor = f'source-{source}'
-    if report.in_use is not None:
-        by = 'found by itself and' if report.found else 'by its parameter,'
-        yield Finding('good', f'{source}: errors are correlated over '
-                              f'{short(report.in_use.tau)} s, {by} allowed for', anchor)
-    elif report.wrongly_white:
-        yield Finding(
-            'warning', f'{source}: errors of {short(report.errors.sigma_correlated)} m go on for '
-            f'{short(report.errors.tau)} s but are treated as independent, so that the path is '
-            f'less certain than its covariances say; set {source}.correlation_time to -1, which '
-            f'finds the time, at least {short(report.errors.tau)} s', anchor)
+def _covariances(run: Run, analyses: Mapping[str, SourceAnalysis]) -> Iterator[Finding]:
+    """Yield what the residuals of sources say of their covariances, and of their independence."""
+    reports = run.backend.reports()
+    for source, analysis in analyses.items():
+        anchor, report = f'source-{source}', reports.get(source)
+        if report is not None and report.in_use is not None:
+            by = 'found by itself and' if report.found else 'by its parameter,'
+            yield Finding('good', f'{source}: errors are correlated over '
+                                  f'{short(report.in_use.tau)} s, {by} allowed for', anchor)
+        elif report is not None and report.wrongly_white:
+            yield Finding(
+                'warning', f'{source}: errors of {short(report.errors.sigma_correlated)} m go on '
+                f'for {short(report.errors.tau)} s but are treated as independent, so that the '
+                f'path is less certain than its covariances say; set {source}.correlation_time to '
+                f'-1, which finds the time, at least {short(report.errors.tau)} s', anchor)
+        level, text = verdict(analysis)
+        if level:
+            yield Finding(level, f'{source}: {text}', anchor)
 
 
 def _disagreements(run: Run) -> Iterator[Finding]:
@@ -215,9 +162,9 @@ def _measurements(run: Run) -> Iterator[Finding]:
     for source in sorted({each.source for each in run.verdicts}):
         own = [each for each in run.verdicts if each.source == source]
         yield from _stretches(run, source, own)
-        yield from _groups(run, source, own)
+        yield from _closures(run, source, own)
         yield from _odometry(run, source, own)
-    yield from silences(run.recorder, run.kinds, run.start_ns)
+    yield from silences(run.drive.arrived_ns, run.kinds, run.start_ns)
     yield from _refusals(run)
 
 
@@ -247,30 +194,18 @@ def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[F
             f'contradict the path, alone or in other stretches, and are not used', 'map')
 
 
-def _groups(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
-    """Yield the groups of loop closures that are doubted, and how many wait."""
+def _closures(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
+    """Yield how many loop closures are doubted, and how many wait."""
     every = [each for each in verdicts if each.kind is Judged.LOOP_CLOSURE]
     of_all = f'of {number_of(len(every), Judged.LOOP_CLOSURE)}'
-    doubted = sorted((each for each in every if each.state is State.DOUBTED),
-                     key=lambda each: each.stamp_ns)
+    doubted = [each for each in every if each.state is State.DOUBTED]
     if len(doubted) > 0:
-        large = [group for group in _closure_groups(run, doubted) if len(group) >= MANY]
-        largest = ''
-        if len(large) > 0:
-            here, there = (f'{min(each):.0f} to {max(each):.0f} s' for each in (
-                (np.array(stamps) - run.start_ns) * 1e-9 for stamps in (
-                    [each.reference_ns or 0 for each in large[0]],
-                    [each.stamp_ns for each in large[0]])))
-            largest = (f'; {len(large)} group{"s" if len(large) > 1 else ""} of {MANY} or more, '
-                       f'the largest takes the place at {there} for that at {here} '
-                       f'({len(large[0])} closures)')
         worst = max(doubted, key=lambda each: np.nan_to_num(
             each.distance, nan=-1.0, posinf=-1.0))
         far = f', {worst.distance:.1f} sigma' if np.isfinite(worst.distance) else ''
         yield Finding(
             'warning' if len(doubted) >= MANY else 'notice', f'{source}: {len(doubted)} {of_all} '
-            f'contradict the others and are not used{largest}; the strongest: {worst.id}{far}',
-            'map')
+            f'contradict the others and are not used; the strongest: {worst.id}{far}', 'map')
     for state, text in (
             (State.WAITING, 'are not used, as too little speaks for or against them'),
             (State.WEAKLY_BELIEVED,
@@ -278,27 +213,6 @@ def _groups(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Find
         count = sum(each.state is state for each in every)
         if count > 0:
             yield Finding('notice', f'{source}: {count} {of_all} {text}', 'map')
-    refused = [reason for (name, _, _), reason in run.refused.items() if name == source]
-    if len(refused) > 0:
-        yield Finding('notice', f'{source}: {number_of(len(refused), Judged.LOOP_CLOSURE)} could '
-                                f'not be added; the first: {refused[0]}', 'map')
-
-
-def _closure_groups(run: Run, closures: Sequence[Verdict]) -> list[list[Verdict]]:
-    """Return closures in groups with both ends near each other, the largest first."""
-    path = run.drive.corrected
-    stamps = np.array([(each.stamp_ns, each.reference_ns or 0) for each in closures])
-    ends = path.at(np.clip(stamps, *path.stamps_ns[[0, -1]]))[:, :, :2]
-    groups: list[list[int]] = []
-    for k, here in enumerate(ends):
-        # as near as those are that can agree with one another
-        group = next((group for group in groups if np.all(
-            np.hypot(*(here - ends[group[-1]]).T) <= BELIEF.near)), None)
-        if group is None:
-            groups.append([k])
-        else:
-            group.append(k)
-    return [[closures[k] for k in group] for group in sorted(groups, key=len, reverse=True)]
 
 
 def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
@@ -319,11 +233,30 @@ def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
                                  'unknown', 'map')
 
 
+def silent(stamps_ns: Sequence[StampNs], least_s: Seconds) -> FloatArray:
+    """
+    Return the longest silences of a source: begin and end [s], shape (K, 2).
+
+    Stamps are in the order of arrival, not positive ones do not count; the silence before a late
+    one is not seen.
+    """
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    newest = np.maximum.accumulate(stamps[stamps > 0])
+    if len(newest) < 3:
+        return np.empty((0, 2))
+    lengths = np.diff(newest)
+    longest = np.argsort(lengths, kind='stable')[-MOST_SILENCES:]
+    others = np.delete(lengths, longest)
+    usual = float(np.mean(others) if len(others) > 0 else np.median(lengths))
+    found = np.sort(longest[lengths[longest] > max(least_s * 1e9, 8.0 * usual)])
+    return np.column_stack((newest[found], newest[found + 1])) * 1e-9
+
+
 def silences(
-    recorder: Recorder, kinds: Mapping[str, Kind], start_ns: StampNs,
+    arrived_ns: Mapping[str, Sequence[StampNs]], kinds: Mapping[str, Kind], start_ns: StampNs,
 ) -> Iterator[Finding]:
     """Yield silences of odometry, and of fixes and global poses."""
-    for source, stamps_ns in recorder.stamps_ns.items():
+    for source, stamps_ns in arrived_ns.items():
         kind = kinds.get(source)
         moves = kind in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO)
         if not moves and kind not in (Kind.FIX, Kind.GLOBAL_POSE):
@@ -335,7 +268,7 @@ def silences(
         told = gaps[np.sort(np.argsort(-lengths, kind='stable')[:MOST_TOLD])]
         where = ', '.join(f'{begin:.1f} to {end:.1f} s' for begin, end in told.tolist())
         more = f' and {len(gaps) - len(told)} more' if len(gaps) > len(told) else ''
-        others = any(each.is_odometry and name != source and name in recorder.stamps_ns
+        others = any(each.is_odometry and name != source and name in arrived_ns
                      for name, each in kinds.items())
         what = ('the path follows odometry there, and its covariance grows' if not moves else
                 'the heading there is that of other sources' if kind is Kind.GYRO else

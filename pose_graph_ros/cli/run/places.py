@@ -10,18 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.cli.drive import distances, Drive
+from pose_graph_ros.cli.drive import BELIEVED, distances, Drive, HELD_OUT, REFUSED
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import Key, sentence
 from pose_graph_ros.core.judgement.verdicts import Verdict
-from pose_graph_ros.core.quantities import Metres, StampNs
+from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.residuals.source_residuals import spread
 
-STATES = ('believed', 'believed weakly', 'waiting', 'doubted', 'refused', 'held out')
-"""What the numbers of states in run.json stand for."""
-BELIEVED, REFUSED, HELD_OUT = 0, 4, 5
+REFUSED_SOMEHOW = 'Refused; the counts of its source say why.'
 MOST_POSES = 10_000  # of a path
 MOST_OF_SOURCE = 20_000  # fixes or loop closures; half are kept for those not believed
 
@@ -37,47 +35,6 @@ def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
 def number(value: float | None, digits: int = 4) -> float | None:
     """Return a number with some significant digits; None if it is not finite."""
     return None if value is None or not math.isfinite(value) else float(f'{value:.{digits}g}')
-
-
-def simplified(points: Points, tolerance: Metres = 0.015, most: int = 20_000) -> IntArray:
-    """
-    Return which points a line needs, increasing: no others are farther from it than the tolerance.
-
-    This is the method of Douglas and Peucker, for all parts of a stretch at once. While more than
-    `most` points are needed, those that are left are simplified again with twice the tolerance.
-    """
-    kept = _needed(points, tolerance)
-    while len(kept) > most:
-        tolerance = max(2.0 * tolerance, 1e-3)
-        kept = kept[_needed(points[kept], tolerance)]
-    return kept
-
-
-def _needed(points: Points, tolerance: Metres) -> IntArray:
-    """Return which points a line needs, stretch by stretch, as memory grows with their length."""
-    n, stretch = len(points), 10_240
-    if n <= 2:
-        return np.arange(n)
-    return np.unique(np.concatenate([
-        begin + _needed_in_stretch(points[begin:begin + stretch + 1], tolerance)
-        for begin in range(0, n - 1, stretch)]))
-
-
-def _needed_in_stretch(points: Points, tolerance: Metres) -> IntArray:
-    n = len(points)
-    kept = np.unique(np.append(np.arange(0, n, 512), n - 1))  # some, so that rounds are few
-    while True:
-        part = np.clip(np.searchsorted(kept, np.arange(n), side='right') - 1, 0, len(kept) - 2)
-        begin, along = points[kept][part], np.diff(points[kept], axis=0)[part]
-        length2 = np.maximum(np.sum(along**2, axis=1), 1e-18)
-        share = np.clip(np.sum((points - begin) * along, axis=1) / length2, 0.0, 1.0)
-        far = np.hypot(*(points - begin - share[:, None] * along).T)
-        largest = np.maximum.reduceat(far, kept[:-1])
-        candidates = np.flatnonzero((far > tolerance) & (far == largest[part]))
-        _, first = np.unique(part[candidates], return_index=True)
-        if len(first) == 0:
-            return kept
-        kept = np.union1d(kept, candidates[first])
 
 
 @dataclass(slots=True)
@@ -104,24 +61,23 @@ class Frame:
 
 def lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
     """Return the paths, and the stamps of the poses of the corrected one [ns]."""
-    def line(path: Trajectory, *, heading: bool = True, whole: bool = False) -> dict[str, Any]:
-        kept = np.arange(len(path)) if whole and len(path) <= MOST_POSES else simplified(
-            path.poses[:, :2], most=MOST_POSES)
-        x, y = frame.places(path.poses[kept, :2])
-        columns = {'t': frame.seconds(path.stamps_ns[kept]), 'x': x, 'y': y}
-        return columns | ({'theta': rounded(path.poses[kept, 2])} if heading else {})
+    def places(path: Trajectory | None) -> dict[str, Any] | None:
+        return None if path is None else dict(zip('xy', frame.places(
+            path.poses[spread(len(path), MOST_POSES), :2]), strict=True))
 
-    corrected = line(drive.corrected, whole=True)
-    stamps = np.round(np.array(corrected['t']) * 1e9).astype(np.int64) + frame.start_ns
-    return {'corrected': corrected, 'odometry': line(drive.placed_odometry, heading=False),
-            'truth': None if drive.truth is None else line(drive.truth)}, stamps
+    path = drive.corrected
+    some = spread(len(path), MOST_POSES)
+    return {'corrected': {'t': frame.seconds(path.stamps_ns[some]), **(places(path) or {}),
+                          'theta': rounded(path.poses[some, 2])},
+            'odometry': places(drive.placed_odometry),
+            'truth': places(drive.truth)}, path.stamps_ns[some]
 
 
 def ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[str, Any]:
     """Return some 200 covariances of positions along a path, in map axes; NaN where unknown."""
     known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
     if len(known) == 0:
-        return {name: [] for name in ('t', 'x', 'y', 'xx', 'xy', 'yy')}
+        return {name: [] for name in ('x', 'y', 'xx', 'xy', 'yy')}
     # evenly along the path and in time, so that stops and fast stretches both have some
     steps = np.hypot(*np.diff(path.poses[known, :2], axis=0).T)
     travelled = np.concatenate(([0.0], np.cumsum(steps)))
@@ -130,7 +86,7 @@ def ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[s
     at = np.unique(np.searchsorted(measure, np.linspace(0.0, measure[-1], 200)))
     some = known[np.clip(at, 0, len(known) - 1)]
     x, y = frame.places(path.poses[some, :2])
-    return {'t': frame.seconds(path.stamps_ns[some]), 'x': x, 'y': y,
+    return {'x': x, 'y': y,
             **{name: [number(value) for value in covariances[some, row, column].tolist()]
                for name, row, column in (('xx', 0, 0), ('xy', 0, 1), ('yy', 1, 1))}}
 
@@ -143,72 +99,55 @@ def _by_source(sources: Sequence[str], stamps: IntArray) -> Iterator[tuple[str, 
 
 
 def _judged(
-    verdicts: Sequence[Verdict | None], states: Sequence[int], whys: Sequence[str], frame: Frame,
+    keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Verdict],
+    reasons: Mapping[Key, str], frame: Frame,
 ) -> dict[str, Any]:
     """Return the columns of what is believed, and why not."""
-    return {'state': list(states), 'why': [frame.text(why) for why in whys],
-            'id': ['' if each is None else each.id for each in verdicts],
+    found = [verdicts.get(key) for key in keys]
+    whys = ['' if state in (BELIEVED, HELD_OUT) else reasons.get(key, REFUSED_SOMEHOW)
+            if state == REFUSED or each is None else sentence(each, frame.start_ns)
+            for key, state, each in zip(keys, states.tolist(), found, strict=True)]
+    return {'state': states.tolist(), 'why': [frame.text(why) for why in whys],
+            'id': ['' if each is None else each.id for each in found],
             # when they were judged [sigma]
-            'd': rounded([np.nan if each is None else each.distance for each in verdicts], 2)}
+            'd': rounded([np.nan if each is None else each.distance for each in found], 2)}
 
 
 def fixes(
-    drive: Drive, verdicts: Sequence[Verdict], at_ns: IntArray, frame: Frame,
+    drive: Drive, verdicts: Mapping[Key, Verdict], at_ns: IntArray, frame: Frame,
 ) -> list[dict[str, Any]]:
     """Return the fixes and global poses of each source; `at_ns` are stamps of the path."""
-    known = {(each.source, each.stamp_ns): each for each in verdicts if each.reference_ns is None}
-    refused = drive.fix_kinds['refused']
     found = []
-    sources = drive.fix_sources or ['fix'] * len(drive.fix_stamps_ns)
-    for source, every in _by_source(sources, drive.fix_stamps_ns):
-        states = np.select([drive.fix_held_out[every], refused[every]], [HELD_OUT, REFUSED], [
-            _state(known.get((source, stamp))) for stamp in drive.fix_stamps_ns[every].tolist()])
-        some = _shown(states)
-        rows, states = every[some], states[some]
+    for source, every in _by_source(drive.fix_sources, drive.fix_stamps_ns):
+        rows = every[_shown(drive.fix_states[every])]
         stamps = drive.fix_stamps_ns[rows]
-        judged = [known.get((source, stamp)) for stamp in stamps.tolist()]
         x, y = frame.places(drive.fix_positions[rows])
-        columns = _judged(judged, states.tolist(), [
-            '' if verdict is None or state in (BELIEVED, HELD_OUT)
-            else sentence(verdict, frame.start_ns)
-            for verdict, state in zip(judged, states.tolist(), strict=True)], frame)
         found.append({
             'source': source, 'left_out': len(every) - len(rows), 't': frame.seconds(stamps),
-            'x': x, 'y': y,
-            **columns, 'id': columns['id'] if any(judged) else None,
-            'held_out': drive.fix_held_out[rows].astype(int).tolist(),
-            'at': _nearest(stamps, at_ns)})
+            'x': x, 'y': y, 'at': _nearest(stamps, at_ns), **_judged(
+                [(source, stamp, None) for stamp in stamps.tolist()], drive.fix_states[rows],
+                verdicts, {}, frame)})
     return found
 
 
 def closures(
-    drive: Drive, verdicts: Sequence[Verdict], refused: Mapping[Key, str], frame: Frame,
+    drive: Drive, verdicts: Mapping[Key, Verdict], reasons: Mapping[Key, str], frame: Frame,
 ) -> list[dict[str, Any]]:
     """Return the loop closures of each source, in the order of their later ends."""
-    known = {(each.source, each.stamp_ns, each.reference_ns): each for each in verdicts}
-    found = []
-    sources = drive.loop_sources or ['loop_closure'] * len(drive.loop_stamps_ns)
-    for source, rows in _by_source(sources, drive.loop_stamps_ns[:, 1]):
-        keys = [(source, later, earlier) for earlier, later in drive.loop_stamps_ns[rows].tolist()]
-        states = np.array([REFUSED if key in refused and key not in known
-                           else _state(known.get(key)) for key in keys], dtype=np.int64)
-        some = _shown(states)
-        keys, ends = [keys[k] for k in some], np.sort(drive.loop_stamps_ns[rows[some]], axis=1)
-        judged = [known.get(key) for key in keys]
-        path = drive.corrected
+    path, found = drive.corrected, []
+    for source, every in _by_source(drive.loop_sources, drive.loop_stamps_ns[:, 1]):
+        rows = every[_shown(drive.loop_states[every])]
+        stamps = drive.loop_stamps_ns[rows]
+        ends = np.sort(stamps, axis=1)
         places = path.at(np.clip(ends, *path.stamps_ns[[0, -1]]))[:, :, :2]
         (x0, y0), (x1, y1) = frame.places(places[:, 0]), frame.places(places[:, 1])
         found.append({
-            'source': source, 'left_out': len(rows) - len(keys),
+            'source': source, 'left_out': len(every) - len(rows),
             't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
-            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, **_judged(judged, states[some].tolist(), [
-                refused.get(key, '') if verdict is None else sentence(verdict, frame.start_ns)
-                for key, verdict in zip(keys, judged, strict=True)], frame)})
+            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, **_judged(
+                [(source, later, earlier) for earlier, later in stamps.tolist()],
+                drive.loop_states[rows], verdicts, reasons, frame)})
     return found
-
-
-def _state(verdict: Verdict | None) -> int:
-    return BELIEVED if verdict is None else STATES.index(verdict.state.value)
 
 
 def errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, Any] | None:
@@ -222,7 +161,7 @@ def errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, An
         against, stamps, places = 'truth', truth.stamps_ns, truth.poses
     else:
         order = np.argsort(drive.fix_stamps_ns, kind='stable')
-        order = order[drive.fix_held_out[order]]
+        order = order[drive.fix_states[order] == HELD_OUT]
         against, stamps, places = (
             'held-out fixes', drive.fix_stamps_ns[order], drive.fix_positions[order])
     inside = np.flatnonzero(path.covers(stamps))

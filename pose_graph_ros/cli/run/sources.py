@@ -10,11 +10,10 @@ import numpy as np
 
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run.places import Frame, number, rounded
-from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.cli.run.recorder import Run
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import short
-from pose_graph_ros.core.judgement.verdicts import Verdict
+from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.offline.residuals.scale import RowFit, ScaleFit, Whiteness, whiteness
@@ -36,6 +35,13 @@ class SourceAnalysis(NamedTuple):
     in_use: CorrelatedErrors | None  # that the graph is built with; None for white errors
     correlated: bool  # whether its errors are, and the graph takes them for independent
     suspects: tuple[str, ...]  # others of which this is so: their errors may show in its residuals
+    advice: str  # the parameter that makes its sigmas right, with its value
+
+    @property
+    def scale(self) -> float:
+        """Factor on its sigmas in the graph."""
+        used = self.residuals.scale[self.residuals.used]
+        return float(np.median(used)) if len(used) > 0 else 1.0
 
     @property
     def is_wrong(self) -> bool:
@@ -44,18 +50,23 @@ class SourceAnalysis(NamedTuple):
                                              and len(self.suspects) == 0))
 
 
-def analyse(
-    analysis: Analysis, kinds: Mapping[str, Kind],
-    in_use: Mapping[str, CorrelatedErrors | None],
-) -> dict[str, SourceAnalysis]:
+def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
     """Return the analysis of each source."""
     guesses = {'odometry': Kind.ODOMETRY, 'loop_closure': Kind.LOOP_CLOSURE, 'turn': Kind.GYRO,
                'map': Kind.GLOBAL_POSE}
-    return {source: SourceAnalysis(
-        each, kinds.get(source, guesses[each.kind]), analysis.at_estimate[source],
-        analysis.together[source], whiteness(each), in_use.get(source),
-        source in analysis.correlated, tuple(sorted(analysis.correlated - {source})))
-        for source, each in analysis.residuals.items()}
+    reports, found = run.backend.reports(), {}
+    for source, each in analysis.residuals.items():
+        fit, report = analysis.together[source], reports.get(source)
+        # other odometry than the primary one has no sigma_scale that is used
+        advice = f'{source}.sigma_scale to {short(fit.ratio)}'
+        if source != run.estimate.primary:
+            factor = fit.ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
+            advice = f'{source}.covariance_scale to {short(factor)}'
+        found[source] = SourceAnalysis(
+            each, run.kinds.get(source, guesses[each.kind]), analysis.at_estimate[source], fit,
+            whiteness(each), None if report is None else report.in_use,
+            source in analysis.correlated, tuple(sorted(analysis.correlated - {source})), advice)
+    return found
 
 
 def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
@@ -84,7 +95,7 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
                    'quantile95_share': number(present.within)},
         'ratio': number(found.ratio), 'low': number(found.low), 'high': number(found.high),
         'redundancy': number(present.redundancy), 'independent': number(found.independent),
-        'verdict': verdict(analysis),
+        'verdict': verdict(analysis)[1],
         'unused': {'count': len(unused.ids),
                    'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
         'histogram': None if len(values) == 0 or found.says_nothing else {
@@ -93,7 +104,7 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
         'series': {'t': frame.seconds(used.stamps_ns[some]),
                    'rows': [rounded(normalised[some, row], 2) for row in rows]},
         'autocorrelation': _autocorrelation(analysis),
-        'scale': number(float(np.median(used.scale))) if len(used.ids) > 0 else 1.0}
+        'scale': number(analysis.scale)}
 
 
 def _row(row: RowFit, together: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
@@ -115,26 +126,45 @@ def _autocorrelation(analysis: SourceAnalysis) -> dict[str, Any] | None:
             'in_use': None if analysis.in_use is None else number(analysis.in_use.tau)}
 
 
-def verdict(analysis: SourceAnalysis) -> str:
-    """Return in words whether the covariances of a source are right."""
-    found = analysis.fit
-    if found.n_used == 0:
-        return 'nothing of it is used'
-    if found.says_nothing:
-        return ('its covariances cannot be checked: the path follows it, so that its residuals '
-                f'are {short(100.0 * found.redundancy)} % of what its errors are'
-                if found.redundancy < 0.1 else
-                f'its covariances cannot be checked: {found.n_used} measurements are as few as '
-                f'{short(found.independent)} independent ones')
-    sizes = claim(analysis)
-    if not analysis.is_wrong and analysis.correlated:
-        return (f'its errors go on from one measurement to the next but are treated as '
-                f'independent, so that the path follows them; {sizes} or more')
-    if not analysis.is_wrong:
-        return f'agrees with its covariances: {sizes}, {short(found.ratio)} times'
-    variance = found.ratio**2
-    return (f'{sizes}: its covariances are {short(variance)} times too small' if variance > 1.0
-            else f'{sizes}: its covariances are {short(1.0 / variance)} times too large')
+def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
+    """Return whether the covariances of a source are right: level of the finding, and words."""
+    fit = analysis.fit
+    if fit.n_used == 0:
+        return '', 'nothing of it is used'
+    if fit.says_nothing:
+        return '', ('its covariances cannot be checked: the path follows it, so that its '
+                    f'residuals are {short(100.0 * fit.redundancy)} % of what its errors are'
+                    if fit.redundancy < 0.1 else
+                    f'its covariances cannot be checked: {fit.n_used} measurements are as few as '
+                    f'{short(fit.independent)} independent ones')
+    share = f'{short(fit.ratio)} times' if fit.ratio > 1.0 else f'{short(100.0 * fit.ratio)} % of'
+    text = f'{claim(analysis)}, {share} the sigma ({short(fit.low)} to {short(fit.high)})'
+    if analysis.is_wrong:
+        level, why = _wrong(analysis)
+        return level, f'{text}{why}'
+    if analysis.correlated:
+        return '', ('its errors go on from one measurement to the next but are treated as '
+                    f'independent, so that the path follows them; {text} or more')
+    return ('good' if len(analysis.suspects) == 0 else '',
+            f'its residuals agree with its covariances: {text}')
+
+
+def _wrong(analysis: SourceAnalysis) -> tuple[str, str]:
+    """Return how bad it is that covariances are wrong, and what to do."""
+    ratio, scale, advice = analysis.fit.ratio, analysis.scale, analysis.advice
+    if len(analysis.suspects) > 0:
+        return 'notice', (f'; this may only be because errors of {" and ".join(analysis.suspects)}'
+                          ' are treated as independent')
+    if 1.0 / WRONG < ratio / scale < WRONG:
+        return 'notice', (f'; the estimate allows for it (sigmas times {short(scale)}); {advice} '
+                          'tells it from the beginning')
+    if ratio > 1.0:
+        return 'warning', f': its covariances are {short(ratio**2)} times too small; set {advice}'
+    if analysis.residuals.kind == 'odometry':
+        return 'good', (': on the safe side, as slow errors, such as of a wheel radius, hardly '
+                        'show from node to node')
+    return 'notice', (f': its covariances are {short(ratio**-2)} times too large, so it counts '
+                      f'for less than it could; {advice} would be right')
 
 
 def claim(analysis: SourceAnalysis) -> str:
@@ -150,49 +180,41 @@ def claim(analysis: SourceAnalysis) -> str:
 
 
 def springs(
-    backend: PoseGraphBackend, path: Trajectory, residuals: Mapping[str, SourceResiduals],
-    verdicts: Sequence[Verdict], frame: Frame,
+    run: Run, residuals: Mapping[str, SourceResiduals], frame: Frame,
 ) -> list[dict[str, Any]]:
     """Return the constraints with the largest weighted energies, in descending order."""
-    names = {(each.edge, each.number): each.id for each in verdicts}
-    stamps = backend.node_stamps_ns
-    found = []
-    for rank, each in enumerate(backend.largest_energies(10), 1):
-        place = residual = sigma = expected = None
+    names = {(each.edge, each.number): each.id for each in run.verdicts}
+    stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []
+
+    def place(stamp_ns: StampNs, position: FloatArray) -> dict[str, float]:
+        x, y = frame.places(position)
+        return {'t': frame.seconds(np.array([stamp_ns]))[0], 'x': x[0], 'y': y[0]}
+
+    for rank, each in enumerate(run.backend.largest_energies(10), 1):
+        residual, expected = None, math.nan
         source = residuals.get(each.source)
-        at = [] if source is None else np.flatnonzero(
-            (source.ids == each.number) & (source.is_edge == each.edge)).tolist()
-        if source is not None and len(at) == 1:
-            one = source.rows(np.array(at))
-            residual, sigma = one.errors[0], one.sigmas[0] * one.measured[0]
-            left = float(one.redundancies[0])
-            expected = left if np.isfinite(left) else None
-        ends: list[dict[str, Any]] = []
-        for node in each.nodes:
-            if node < len(path):
-                x, y = frame.places(path.poses[node, :2])
-                ends.append({'node': node, 't': frame.seconds(stamps[[node]])[0],
-                             'x': x[0], 'y': y[0]})
+        at = np.zeros(0, dtype=bool) if source is None else (
+            (source.ids == each.number) & (source.is_edge == each.edge))
+        if source is not None and np.count_nonzero(at) == 1:
+            one = source.rows(at)
+            residual, expected = one.errors[0], float(one.redundancies[0])
+        ends = [place(stamps[node], path.poses[node, :2]) for node in each.nodes
+                if node < len(path)]
+        here = ends[:1]
         if len(ends) == 0 and each.stamp_ns >= 0 and path.covers(each.stamp_ns):
             # a bias is shown where the robot was
-            x, y = frame.places(path.at(each.stamp_ns)[:2])
-            ends = [{'node': None, 't': frame.seconds(np.array([each.stamp_ns]))[0],
-                     'x': x[0], 'y': y[0]}]
+            ends = here = [place(each.stamp_ns, path.at(each.stamp_ns)[:2])]
         elif len(ends) == 1 and residual is not None and each.kind != 'heading':
             # from where the estimate has it to where it was measured
-            x, y = frame.places(path.poses[each.nodes[0], :2] + residual[:2])
-            place = {'node': None, 't': ends[0]['t'], 'x': x[0], 'y': y[0]}
+            node = each.nodes[0]
+            ends = [*ends, place(stamps[node], path.poses[node, :2] + residual[:2])]
         found.append({
-            'rank': rank, 'name': names.get((each.edge, each.number), _name(
-                each, frame.start_ns)),
-            'source': each.source, 'kind': each.kind.replace('_', ' '),
+            'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
+            'name': names.get((each.edge, each.number), _name(each, frame.start_ns)),
             'energy': number(each.energy), 'expected': number(
-                float(each.freedom) if expected is None else expected),
-            'from': ends[0] if len(ends) > 0 else None,
-            'to': ends[1] if len(ends) > 1 else place,
-            'residual': None if residual is None else rounded(residual, 4),
-            'sigma': None if sigma is None else rounded(sigma, 4),
-            'text': _text(each, ends, residual)})
+                expected if math.isfinite(expected) else float(each.freedom)),
+            'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,
+            'text': _text(each, here if len(each.nodes) < 2 else ends, residual)})
     return found
 
 

@@ -23,7 +23,7 @@ Hidden nodes are named by their rows. They have the attributes `name`, `role`, `
 have `directed`, and `sort` and `used` of their term; `view.graph['notes']` is for the reader.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from enum import StrEnum
 from itertools import chain, combinations
 from typing import Any, NamedTuple
@@ -304,7 +304,8 @@ def _to_unit(at: FloatArray, names: list[int], lines: Any) -> FloatArray:
 
 
 LEVELS = {Role.CONTROL: 1.0, Role.MEASUREMENT: -1.0, Role.BIAS: -2.4, Role.LANDMARK: -3.6}
-"""Rows of a dynamic Bayesian network; measurements of several poses are from 2 on upwards."""
+"""Rows of a dynamic Bayesian network, whose poses are at 0."""
+ABOVE = 2.0  # row of measurements of several poses
 
 
 def time_slices(view: Any) -> dict[int, FloatArray]:
@@ -313,25 +314,21 @@ def time_slices(view: Any) -> dict[int, FloatArray]:
     column = {node: 1.2 * n for n, node in enumerate(
         node for node in view if data[node]['role'] is Role.POSE)}
     at = {node: np.array((x, 0.0)) for node, x in column.items()}
-    # ends of the rows of measurements of several poses, and what stands at the other levels
-    ends: list[float] = []
-    taken: dict[Role, list[float]] = {role: [] for role in LEVELS}
+    taken: dict[float, list[float]] = defaultdict(list)
     poses = {node: sorted(column[other] for other in set(data[node]['term'].nodes) & column.keys())
              for node in view if 'term' in data[node]}
     for node, xs in sorted(poses.items(), key=lambda each: each[1]):
-        role, term = data[node]['role'], data[node]['term']
-        if role is Role.MEASUREMENT and len(xs) > 1 and term.sort is not Sort.TURN:
-            row = next((n for n, end in enumerate(ends) if end < xs[0]), len(ends))
-            ends[row:row + 1] = [xs[-1]]
-            at[node] = np.array((0.5 * (xs[0] + xs[-1]), 2.0 + 0.8 * row))
-        else:
-            x = (xs or [0.0])[-1] - (0.6 if role is Role.CONTROL else 0.0)
-            at[node] = _free(x, taken[role], LEVELS[role])
+        role, level, x = data[node]['role'], LEVELS[data[node]['role']], (xs or [0.0])[-1]
+        if role is Role.CONTROL:
+            x -= 0.6
+        elif len(xs) > 1 and data[node]['term'].sort is not Sort.TURN:
+            x, level = 0.5 * (xs[0] + xs[-1]), ABOVE
+        at[node] = _free(x, taken[level], level)
     for node in view:
         if node not in at:
             others = [at[other][0] for other in nx.all_neighbors(view, node) if other in at]
-            role = data[node]['role']
-            at[node] = _free(float(np.mean(others or [0.0])), taken[role], LEVELS[role])
+            level = LEVELS[data[node]['role']]
+            at[node] = _free(float(np.mean(others or [0.0])), taken[level], level)
     return at
 
 
