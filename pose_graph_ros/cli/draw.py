@@ -179,7 +179,7 @@ def _draw(panels: Sequence[Panel], path: Path, notes: Sequence[str], *, headings
         figure = Figure(figsize=(width, float(np.sum(heights)) + 1.0 + 0.15 * len(text)), dpi=200,
                         layout='constrained')
         grid = figure.subplots(len(panels), len(widths), squeeze=False, width_ratios=widths,
-                               height_ratios=heights)
+                               height_ratios=heights.tolist())
         for panel, (axes, *beside) in zip(panels, grid, strict=True):
             axes.set_title(panel.title, loc='left', size=9)
             _draw_view(axes, panel, unit, headings=headings)
@@ -250,8 +250,9 @@ def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None
     axes.set_axis_off()
 
 
-def _draw_pattern(axes: Axes, blocks: Pattern) -> None:
+def _draw_pattern(axes: Axes, blocks: Pattern | None) -> None:
     """Draw the pattern of H."""
+    assert blocks is not None, 'all views have a pattern, or none'
     ends = np.concatenate(([0], np.cumsum(blocks.sizes)))
     for cells, colour, meaning in ((blocks.blocks, BLOCK, 'block of H that is not zero'),
                                    (blocks.fill, FILL, 'fill of its factor R')):

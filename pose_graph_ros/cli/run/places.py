@@ -104,9 +104,12 @@ def _judged(
 ) -> dict[str, Any]:
     """Return the columns of what is believed, and why not."""
     found = [verdicts.get(key) for key in keys]
-    whys = ['' if state in (BELIEVED, HELD_OUT) else reasons.get(key, REFUSED_SOMEHOW)
-            if state == REFUSED or each is None else sentence(each, frame.start_ns)
-            for key, state, each in zip(keys, states.tolist(), found, strict=True)]
+    whys = []
+    for key, state, each in zip(keys, states.tolist(), found, strict=True):
+        # of fixes nearly all are believed, for the same reason
+        silent = state == HELD_OUT or (state == BELIEVED and key[2] is None)
+        whys.append(reasons.get(key, REFUSED_SOMEHOW) if state == REFUSED
+                    else '' if silent or each is None else sentence(each, frame.start_ns))
     return {'state': states.tolist(), 'why': [frame.text(why) for why in whys],
             'id': ['' if each is None else each.id for each in found],
             # when they were judged [sigma]
