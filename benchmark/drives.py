@@ -134,18 +134,18 @@ def simulated(
     gyro : Gyro, optional, a further source; every fifth of its rates, of 20 Hz, is a mean
 
     """
-    way = course(WORLDS[world], seed, duration_s)
+    truth = course(WORLDS[world], seed, duration_s).motion.truth
     rng = np.random.default_rng((seed, 1))
     wheels = Wheels(OdometryErrors.MODEL, heading_drift=drift,
                     start=(5.0, -3.0, rng.uniform(-np.pi, np.pi)))
-    odometry = sensors.odometry(rng, way.truth, wheels)
-    stamps, places = sensors.positions(rng, way.truth, fixes)
+    odometry = sensors.odometry(rng, truth, wheels)
+    stamps, places = sensors.positions(rng, truth, fixes)
     others: tuple[Event, ...] = ()
     if gyro is not None:
-        rates = sensors.yaw_rates(rng, way.truth.poses[:, 2], gyro)
+        rates = sensors.yaw_rates(rng, truth.poses[:, 2], gyro)
         others = tuple(('gyro', YawRate(stamp, rate)) for stamp, rate in zip(
-            way.truth.stamps_ns.tolist(), rates.tolist(), strict=True))
-    return Drive(Trajectory(odometry.stamps_ns[::every], odometry.poses[::every]), way.truth,
+            truth.stamps_ns.tolist(), rates.tolist(), strict=True))
+    return Drive(Trajectory(odometry.stamps_ns[::every], odometry.poses[::every]), truth,
                  stamps, places, sigma=fixes.sigma, others=others)
 
 

@@ -33,11 +33,14 @@ from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import drive_in
 from pose_graph_ros.cli.results import write_results
 from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
-from pose_graph_ros.cli.simulate import simulate_drive, write_drive
+from pose_graph_ros.cli.simulate import write_drive
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.graph_files import read_graph
+from pose_graph_ros.offline.simulation.recording import course, record
+from pose_graph_ros.offline.simulation.settings import DURATIONS_S
+from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
@@ -129,7 +132,8 @@ def _bag(
         return options.bag, shared.wanted_topics(options), options.truth, options.bag.stem
     path = options.out / 'simulated_drive'
     print(f'simulating a drive (seed {options.seed})')
-    write_drive(simulate_drive(options.seed), path, overwrite=True)
+    way = course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])
+    write_drive(record(way), path, overwrite=True)
     wanted = {source: topic or SIMULATED_TOPICS.get(source)
               for source, topic in shared.wanted_topics(options).items()}
     return path, wanted, options.truth or '/ground_truth', 'Simulated drive'

@@ -32,6 +32,7 @@ from pose_graph_ros.core.geometry.se2 import Points
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.simulation.graph import SimulatedGraph
 from pose_graph_ros.offline.simulation.recording import Recording
+from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 
 # After Okabe and Ito, so that people with any kind of colour vision can distinguish them.
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
@@ -241,14 +242,15 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
     else:
         begin = max(truth.stamps_ns[0], simulated.odometry.stamps_ns[0])
         moved = se2.compose(truth.at(begin), se2.inverse(simulated.odometry.at(begin)))
-        group, odometry = simulated.loop_group, se2.compose(moved, simulated.odometry.poses)
-        ends = truth.at(np.clip(simulated.loop_stamps_ns, *truth.stamps_ns[[0, -1]]))[..., :2]
-        fixes = simulated.fixes
-        measured = simulated.poses[:, :2]
-        if len(fixes) > 0:
-            plane = TangentPlane(*fixes[0].tolist())
-            measured = np.concatenate((plane.to_map(*fixes.T), measured))
-        wrong = np.append(simulated.fix_is_wrong, simulated.pose_is_wrong)
+        fixes, poses, closures = (
+            simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
+        group, odometry = closures.wrong, se2.compose(moved, simulated.odometry.poses)
+        ends = truth.at(np.clip(closures.stamps_ns, *truth.stamps_ns[[0, -1]]))[..., :2]
+        measured = poses.values[:, :2]
+        if len(fixes.values) > 0:
+            plane = TangentPlane(*fixes.values[0].tolist())
+            measured = np.concatenate((plane.to_map(*fixes.values.T), measured))
+        wrong = np.append(fixes.wrong, poses.wrong) >= 0
     true, odometry = truth.poses[:, :2], odometry[:, :2]
     low, high = _limits(true, np.concatenate((odometry, measured)))
     width, height = np.clip(8.0 * (high - low) / np.max(high - low), 4.0, 8.0)

@@ -4,7 +4,7 @@
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 import heapq
 import json
 from operator import itemgetter
@@ -18,11 +18,10 @@ from pose_graph_ros.cli import bag_messages
 from pose_graph_ros.cli.shared import watched
 from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what_graphs_lack
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o_writing import g2o_text
 from pose_graph_ros.core.io.path_files import tum_text
-from pose_graph_ros.core.quantities import Seconds
 from pose_graph_ros.offline.simulation import settings
 from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
 from pose_graph_ros.offline.simulation.motion import PERIOD_S
@@ -55,7 +54,7 @@ def execute(options: argparse.Namespace) -> int:
                  options.duration or settings.DURATIONS_S[options.world],
                  lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
-             'duration_s': float(way.motion.time[-1])}
+             'duration_s': float(way.motion.truth.stamps_ns[-1] - settings.START_NS) / 1e9}
     files = dict[Path, bytes]()
     simulated: SimulatedGraph | Recording
     if is_graph:
@@ -104,21 +103,6 @@ def _lines(about: Mapping[str, Any]) -> Iterator[str]:
                'places that are apart and driven in the same direction')
 
 
-def simulate_drive(
-    seed: int = 1, duration_s: Seconds = 440.0, *, gyro: bool = False, heading_drift: float = 0.0,
-) -> Recording:
-    """
-    Return a simulated drive, whose second lap begins after about 310 s; equal arguments are equal.
-
-    All but the gyroscope is the same without. The heading by the wheels drifts per distance
-    [rad/m].
-    """
-    def change(usual: settings.Setup) -> settings.Setup:
-        return replace(usual, gyro=settings.Gyro() if gyro else None,
-                       wheels=replace(usual.wheels, heading_drift=heading_drift))
-    return record(course(WORLDS['drive'], seed, duration_s, change))
-
-
 def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> dict[str, Any]:
     """
     Write a recording as a rosbag2, message by message; return what there is to say of it.
@@ -133,14 +117,16 @@ def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> d
         for topic, type_name, recorded_ns, message in watched(
                 messages, desc='writing', total=total):
             bag.write(topic, type_name, recorded_ns, message)
+    fixes, poses, closures = (
+        drive.measured[topic] for topic in (settings.FIXES, settings.POSES, settings.CLOSURES))
     about = {
         'distance_m': drive.distance,
         'topics': {topic: len(recorded) for topic, (_, recorded) in drive.arrivals.items()
                    if len(recorded) > 0},
-        **_closures(drive.loop_group, drive.missing_groups, 'stamps_ns', drive.loop_stamps_ns),
-        'wrong_fixes_ns': drive.fix_stamps_ns[drive.fix_is_wrong].tolist(),
-        'wrong_global_poses_ns': drive.pose_stamps_ns[drive.pose_is_wrong].tolist(),
-        **_disturbances(drive.setup, drive.start_ns)}
+        **_closures(closures.wrong, drive.missing_groups, 'stamps_ns', closures.stamps_ns),
+        'wrong_fixes_ns': fixes.stamps_ns[fixes.wrong >= 0].tolist(),
+        'wrong_global_poses_ns': poses.stamps_ns[poses.wrong >= 0].tolist(),
+        **_disturbances(drive.setup)}
     for each, silenced in zip(about['outages'], drive.silenced, strict=True):
         each['left_out'] = silenced
     return about
@@ -148,29 +134,30 @@ def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> d
 
 def _messages(drive: Recording) -> dict[str, Iterator[bag_messages.Message]]:
     """Return the messages of all topics by stamp; of equally late ones the first is written."""
-    setup = drive.setup
-    odometry, truth, gyro, fixes, poses, closures = (
-        settings.ODOMETRY, settings.TRUTH, settings.GYRO, settings.FIXES, settings.POSES,
-        settings.CLOSURES)
+    setup, (odometry, gyro, fixes, poses, closures) = drive.setup, settings.TOPICS
+
+    def covariance(topic: str) -> FloatArray:
+        return np.diag(np.square(setup.sigmas(topic)))
+
     topics = {
         odometry: bag_messages.odometry_messages(
-            odometry, 'odom', drive.odometry, ODOMETRY_VARIANCES, drive.velocities),
-        truth: bag_messages.odometry_messages(truth, 'map', drive.truth, (0.0,) * 6)}
+            odometry, 'odom', drive.odometry, ODOMETRY_VARIANCES,
+            drive.measured[odometry].values[:, 3:]),
+        settings.TRUTH: bag_messages.odometry_messages(
+            settings.TRUTH, 'map', drive.truth, (0.0,) * 6)}
     if setup.gyro is not None:
         topics[gyro] = bag_messages.rate_messages(
-            gyro, drive.rate_stamps_ns, drive.rates,
+            gyro, *drive.measured[gyro][:2],
             setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S))
     if setup.fixes is not None:
         topics[fixes] = bag_messages.fix_messages(
-            fixes, drive.fix_stamps_ns, drive.fixes, setup.claimed(fixes) * setup.fixes.sigma)
+            fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
     if setup.poses is not None:
-        sigmas = setup.claimed(poses) * np.array(setup.poses.sigmas)[[0, 0, 1]]
         topics[poses] = bag_messages.pose_messages(
-            poses, drive.pose_stamps_ns, drive.poses, np.diag(np.square(sigmas)))
+            poses, *drive.measured[poses][:2], covariance(poses))
     if setup.closures is not None:
-        sigmas = setup.claimed(closures) * np.array(setup.closures.sigmas)
         topics[closures] = bag_messages.loop_closure_messages(
-            closures, drive.loop_stamps_ns, drive.loop_poses, np.diag(np.square(sigmas)))
+            closures, *drive.measured[closures][:2], covariance(closures))
     return topics
 
 
@@ -204,7 +191,7 @@ def _about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
         **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
             (loops.i, loops.j))),
         'wrong_observed_nodes': observed.node[simulated.wrong].tolist(),
-        **_disturbances(way.setup, int(way.truth.stamps_ns[0]))}
+        **_disturbances(way.setup)}
 
 
 def _closures(
@@ -217,16 +204,16 @@ def _closures(
             'missing_groups': missing}
 
 
-def _disturbances(setup: settings.Setup, start_ns: int) -> dict[str, Any]:
+def _disturbances(setup: settings.Setup) -> dict[str, Any]:
     """Return what is disturbed, with times as stamps."""
     def stamp(seconds: float) -> int:
-        return start_ns + round(seconds * 1e9)
+        return settings.START_NS + round(seconds * 1e9)
 
     def end(jump: settings.Jump) -> int | None:
         return stamp(jump.at_s + jump.seconds) if np.isfinite(jump.seconds) else None
 
     return {
-        'start_ns': start_ns,
+        'start_ns': settings.START_NS,
         'outages': [{'topic': each.topic, 'begin_ns': stamp(each.begin_s),
                      'end_ns': stamp(each.end_s)} for each in setup.outages],
         'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s), 'end_ns': end(each),

@@ -145,7 +145,7 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
                        type=number(0.01),
                        help='a pose in the map every so many seconds (default: there are none)')
     poses.add_argument('--global-pose-sigma', dest='poses.sigmas', metavar='M,RAD',
-                       type=_numbers(0, 1),
+                       type=_numbers(0, 0, 1),
                        help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
     loops = parser.add_argument_group('loop closures on /loop_closure')
     loops.add_argument('--closures', dest='closures.rate', metavar='RATE',
@@ -196,13 +196,11 @@ def changed(usual: Setup, options: argparse.Namespace) -> Setup:
     if options.fix is False:
         values['fixes'] = None
     setup = replace(usual, **values)
-    present = [settings.ODOMETRY, *(topic for topic, sensor in (
-        (settings.GYRO, setup.gyro), (settings.FIXES, setup.fixes), (settings.POSES, setup.poses),
-        (settings.CLOSURES, setup.closures)) if sensor is not None)]
+    present = setup.sensors
     for option, (_, _, name, _) in DISTURBANCES.items():
         found: Sequence[Change] = getattr(options, option)
         replaced = {topic for topic, _ in found}
-        for topic in replaced - {*present}:
+        for topic in replaced - present.keys():
             raise ConfigError(
                 f'--{option.replace("_", "-")} {topic}: nothing is simulated there, expected '
                 f'one of {", ".join(present)}')

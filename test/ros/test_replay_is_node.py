@@ -13,9 +13,11 @@ from tum_files import read_tum
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import simulate_drive, write_drive
+from pose_graph_ros.cli.simulate import write_drive
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.offline.simulation.recording import course, record
+from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
@@ -33,7 +35,7 @@ def difference(a: Trajectory, b: Trajectory) -> float:
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('bags') / 'drive'
-    write_drive(simulate_drive(seed=3, duration_s=200.0), folder)
+    write_drive(record(course(WORLDS['drive'], 3, 200.0)), folder)
     return folder
 
 

@@ -8,38 +8,26 @@ stretch is taken for another one that looks like it, such as an aisle of a hall 
 gives a group of closures that agree with one another.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial import KDTree
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
+from pose_graph_ros.offline.simulation.motion import Motion
+from pose_graph_ros.offline.simulation.sensors import Measured
 from pose_graph_ros.offline.simulation.settings import Closures
 
 TRIES, TRIED = 10_000, 8
 """Pairs of places that are tried for so many groups; a short drive has none that look alike."""
 
 
-@dataclass(frozen=True, slots=True)
-class Path:
-    """True poses along which closures are looked for."""
-
-    stamps_ns: IntArray
-    """Shape (N,)."""
-    poses: FloatArray
-    """Shape (N, 3)."""
-    distance: FloatArray
-    """Driven up to each of them, shape (N,) [m]."""
-
-
 def revisits(
-    generator: np.random.Generator, path: Path, places: IntArray, closures: Closures,
+    generator: np.random.Generator, path: Motion, places: IntArray, closures: Closures,
 ) -> tuple[IntArray, IntArray]:
     """
     Return the earlier and the later pose of true closures, shape (L,) each, as numbers of places.
     """
-    poses, stamps = path.poses[places], path.stamps_ns[places]
+    poses, stamps = path.truth.poses[places], path.truth.stamps_ns[places]
     pairs = KDTree(poses[:, :2]).query_pairs(closures.radius, output_type='ndarray')
     old, new = np.sort(pairs, axis=1).T
     good = (
@@ -63,7 +51,7 @@ def measured(
 
 
 def false_pairs(
-    generator: np.random.Generator, path: Path, sizes: list[int], closures: Closures,
+    generator: np.random.Generator, path: Motion, sizes: list[int], closures: Closures,
 ) -> tuple[IntArray, IntArray]:
     """
     Return the ends of false closures, shape (F, 2), and the number of the group of each, (F,).
@@ -73,11 +61,11 @@ def false_pairs(
     """
     false = closures.false
     begin = max(1, int(np.searchsorted(
-        path.stamps_ns, path.stamps_ns[0] + round(false.from_s * 1e9))))
+        path.truth.stamps_ns, path.truth.stamps_ns[0] + round(false.from_s * 1e9))))
     stretch = max(sizes, default=1) * false.spacing
     last = int(np.searchsorted(path.distance, path.distance[-1] - stretch))
     first = int(np.searchsorted(
-        path.stamps_ns, path.stamps_ns[0] + round(closures.first_s * 1e9)))
+        path.truth.stamps_ns, path.truth.stamps_ns[0] + round(closures.first_s * 1e9)))
     pairs, groups, k = list[tuple[int, int]](), list[int](), 0
     for _ in range(TRIES * -(-len(sizes) // TRIED) if last > begin else 0):
         if k == len(sizes):
@@ -86,7 +74,7 @@ def false_pairs(
         old = int(generator.integers(0, new))
         along = false.spacing * np.arange(sizes[k])
         at = np.searchsorted(path.distance, path.distance[[old, new]][:, None] + along)
-        places = path.poses[at]
+        places = path.truth.poses[at]
         away = np.hypot(*np.moveaxis(places[1] - places[0], -1, 0)[:2])
         alike = np.abs(se2.wrap(places[1, :, 2] - places[0, :, 2])) < closures.angle
         if np.all(away > false.min_distance) and np.all(alike) and first <= at[0, 0] and (
@@ -98,7 +86,7 @@ def false_pairs(
 
 
 def false_poses(
-    generator: np.random.Generator, path: Path, pairs: IntArray, groups: IntArray,
+    generator: np.random.Generator, path: Motion, pairs: IntArray, groups: IntArray,
     closures: Closures,
 ) -> FloatArray:
     """
@@ -109,7 +97,7 @@ def false_poses(
     Parameters
     ----------
     generator : numpy.random.Generator
-    path : Path
+    path : Motion
     pairs : ndarray, shape (F, 2), indices of poses
     groups : ndarray, shape (F,), numbers of the groups, in order
     closures : Closures
@@ -120,7 +108,7 @@ def false_poses(
     if closures.false.loose:
         return np.asarray(looks)
     _, first, group = np.unique(groups, return_index=True, return_inverse=True)
-    old, new = path.poses[pairs].transpose(1, 0, 2)
+    old, new = path.truth.poses[pairs].transpose(1, 0, 2)
     # both stretches are laid upon one another at the first closure of the group
     lead = first[group]
     moved = se2.compose(se2.inverse(se2.between(old[lead], old)), looks[lead])
@@ -129,19 +117,18 @@ def false_poses(
 
 
 def with_false(
-    generator: np.random.Generator, path: Path, closures: Closures, ends: IntArray,
+    generator: np.random.Generator, path: Motion, closures: Closures, ends: IntArray,
     poses: FloatArray,
-) -> tuple[IntArray, FloatArray, IntArray, int]:
+) -> tuple[Measured, int]:
     """
     Return true closures and false ones by their later ends, and how many groups are missing.
 
-    Of each its stamps, shape (L, 2), the measured pose, (L, 3), and the number of its group, (L,),
-    -1 if it is true.
+    In: the stamps of the true ones, shape (L, 2), and the measured poses, shape (L, 3).
     """
     sizes = closures.false.sizes(len(ends))
     pairs, groups = false_pairs(generator, path, sizes, closures)
     false = false_poses(generator, path, pairs, groups, closures)
-    every = np.concatenate((ends, path.stamps_ns[pairs]))
-    order = np.argsort(every[:, 1], kind='stable')
-    return (every[order], np.concatenate((poses, false))[order],
-            np.append(np.full(len(ends), -1), groups)[order], len(sizes) - len(np.unique(groups)))
+    every = Measured(np.concatenate((ends, path.truth.stamps_ns[pairs])),
+                     np.concatenate((poses, false)), np.append(np.full(len(ends), -1), groups))
+    return (every.rows(np.argsort(every.later_ns, kind='stable')),
+            len(sizes) - len(np.unique(groups)))

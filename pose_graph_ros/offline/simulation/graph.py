@@ -23,10 +23,10 @@ from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.closures import (
     measured,
-    Path,
     revisits,
     with_false,
 )
+from pose_graph_ros.offline.simulation.motion import Motion
 from pose_graph_ros.offline.simulation.recording import absolute, Course
 from pose_graph_ros.offline.simulation.settings import (
     CLOSURES,
@@ -81,13 +81,13 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     if len(at) < 2:
         raise ConfigError(f'distance of nodes: expected less than what is driven, '
                           f'{way.motion.distance[-1]:.3g} m, got {node_distance:g} m')
-    poses = se2.wrapped(way.truth.poses[at])
+    poses = se2.wrapped(way.motion.truth.poses[at])
     if setup.fixes is None and setup.poses is None:
         poses = se2.between(poses[0], poses)
-    truth = Trajectory(way.truth.stamps_ns[at], poses)
+    truth = Trajectory(way.motion.truth.stamps_ns[at], poses)
     odometry = odometry_edges(streams['odometry'], truth, setup.jumps_of(ODOMETRY))
     loops, group, missing = _closures(
-        way, Path(truth.stamps_ns, poses, way.motion.distance[at]), node_distance)
+        way, Motion(truth, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
     return SimulatedGraph(
@@ -124,52 +124,44 @@ def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
     return se2.wrapped(np.column_stack((positions, heading)))
 
 
-def _closures(way: Course, path: Path, node_distance: float) -> tuple[Edges, IntArray, int]:
+def _closures(way: Course, path: Motion, node_distance: float) -> tuple[Edges, IntArray, int]:
     """Return loop closures, the group of each, and how many groups are missing."""
-    settings, streams = way.setup.closures, way.streams
+    settings, streams, truth = way.setup.closures, way.streams, path.truth
     if settings is None:
         return Edges(), np.empty(0, dtype=np.int64), 0
     settings = replace(settings, first_s=0.0)
     # so that no two closures of a group have the same ends
     spacing = max(settings.false.spacing, 1.5 * node_distance)
     settings = replace(settings, false=replace(settings.false, spacing=spacing))
-    old, new = revisits(streams['closures'], path, np.arange(len(path.poses)), settings)
+    old, new = revisits(streams['closures'], path, np.arange(len(truth)), settings)
     found = streams['rate'].random(len(old)) < settings.rate
     old, new = old[found], new[found]
-    poses = measured(streams['closures'], path.poses[old], path.poses[new], settings)
-    stamps, poses, group, missing = with_false(
-        streams['false'], path, settings, path.stamps_ns[np.column_stack((old, new))], poses)
-    kept = sensors.heard(stamps[:, 1], CLOSURES, way.setup.outages)
-    ends, group = np.searchsorted(path.stamps_ns, stamps[kept]), group[kept]
-    sigmas = way.setup.claimed(CLOSURES) * np.array(settings.sigmas)
-    edges = Edges(ends[:, 0], ends[:, 1], poses[kept],
-                  np.tile(np.diag(sigmas**-2), (len(ends), 1, 1)),
+    poses = measured(streams['closures'], truth.poses[old], truth.poses[new], settings)
+    every, missing = with_false(
+        streams['false'], path, settings, truth.stamps_ns[np.column_stack((old, new))], poses)
+    every = every.rows(sensors.heard(every.later_ns, CLOSURES, way.setup.outages))
+    ends = np.searchsorted(truth.stamps_ns, every.stamps_ns)
+    information = np.diag(np.array(way.setup.sigmas(CLOSURES))**-2)
+    edges = Edges(ends[:, 0], ends[:, 1], every.values, np.tile(information, (len(ends), 1, 1)),
                   np.full(len(ends), EdgeKind.LOOP_CLOSURE))
-    return edges, group, missing
+    return edges, every.wrong, missing
 
 
 def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[ObservedNodes, IntArray]:
     """Return fixes or global poses, each with its error moved to the nearest node; the wrong."""
-    setup = way.setup
-    stamps, values, wrong = absolute(way, topic, way.truth)
-    kept = sensors.heard(stamps, topic, setup.outages)
-    stamps, values, wrong = stamps[kept], values[kept], wrong[kept]
+    found = absolute(way, topic, way.motion.truth)
+    stamps, values, wrong = found.rows(sensors.heard(found.stamps_ns, topic, way.setup.outages))
     if len(stamps) == 0:
         return ObservedNodes(), np.empty(0, dtype=np.int64)
-    if topic == FIXES:
-        assert setup.fixes is not None
-        sigmas, kind = np.array([setup.fixes.sigma] * 2), ObservedKind.POSITION
-    else:
-        assert setup.poses is not None
-        sigmas, kind = np.array(setup.poses.sigmas)[[0, 0, 1]], ObservedKind.GLOBAL_POSE
-    width = len(sigmas)
-    errors = values - way.truth.at(stamps)[:, :width]
+    kind = ObservedKind.POSITION if topic == FIXES else ObservedKind.GLOBAL_POSE
+    width = values.shape[1]
+    errors = values - way.motion.truth.at(stamps)[:, :width]
     # the nearest node in time, and the first of those that are nearest to it
     after = np.clip(np.searchsorted(truth.stamps_ns, stamps), 1, len(truth) - 1)
     nearer = stamps - truth.stamps_ns[after - 1] < truth.stamps_ns[after] - stamps
     nodes, first = np.unique(np.where(nearer, after - 1, after), return_index=True)
     mean, information = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
     mean[:, :width] = truth.poses[nodes, :width] + errors[first]
-    information[:, range(width), range(width)] = (setup.claimed(topic) * sigmas)**-2
+    information[:, range(width), range(width)] = np.array(way.setup.sigmas(topic))**-2
     return (ObservedNodes(nodes, None, se2.wrapped(mean), information, np.full(len(nodes), kind)),
-            np.flatnonzero(wrong[first]))
+            np.flatnonzero(wrong[first] >= 0))

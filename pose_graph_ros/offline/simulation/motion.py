@@ -14,7 +14,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Metres
+from pose_graph_ros.offline.simulation.settings import START_NS
 
 PERIOD_S = 0.01  # sample period of the motion [s]
 MARGIN_S = 5.0  # by which paths last longer than the motion, whose end is smoothed [s]
@@ -22,11 +24,10 @@ MARGIN_S = 5.0  # by which paths last longer than the motion, whose end is smoot
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Poses of the vehicle, every 10 ms."""
+    """True poses of a vehicle in the frame of the world, and how far it has driven."""
 
-    time: FloatArray  # time since the start, shape (N,) [s]
-    distance: FloatArray  # distance driven since the start, shape (N,) [m]
-    poses: FloatArray  # in the frame of the world, shape (N, 3) [m, m, rad]; not wrapped
+    truth: Trajectory  # headings need not be wrapped
+    distance: FloatArray  # driven up to each pose, shape (N,) [m]
     lap_time: float = np.inf  # when the second lap begins [s]; never if there are no laps
 
 
@@ -43,7 +44,7 @@ def follow(
     path: FloatArray, stops: IntArray, waits: FloatArray, limits: Limits, duration_s: float,
 ) -> tuple[Motion, FloatArray]:
     """
-    Return the motion along a path, and when each point of it is reached, shape (P,) [s].
+    Return the motion along a path every 10 ms, and when each point is reached, shape (P,) [s].
 
     Parameters
     ----------
@@ -77,7 +78,8 @@ def follow(
     distance = gaussian_filter1d(np.interp(time, knots, np.repeat(length, 2)), 0.25 / PERIOD_S)
     time, distance = time[time <= duration_s], distance[time <= duration_s]
     poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
-    return Motion(time, distance, poses), arrival
+    stamps: IntArray = START_NS + np.round(time * 1e9).astype(np.int64)
+    return Motion(Trajectory(stamps, poses), distance), arrival
 
 
 def path_length(path: FloatArray) -> FloatArray:

@@ -16,17 +16,17 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Seconds
 from pose_graph_ros.offline.simulation import sensors
 from pose_graph_ros.offline.simulation.closures import (
     measured,
-    Path,
     revisits,
     with_false,
 )
 from pose_graph_ros.offline.simulation.motion import Motion, PERIOD_S
+from pose_graph_ros.offline.simulation.sensors import Measured
 from pose_graph_ros.offline.simulation.settings import (
     CLOSURES,
     Closures,
@@ -35,7 +35,6 @@ from pose_graph_ros.offline.simulation.settings import (
     ODOMETRY,
     POSES,
     Setup,
-    START_NS,
     TOPICS,
     TRUTH,
 )
@@ -54,33 +53,25 @@ class Recording:
     setup: Setup
     distance: float  # driven [m]
     truth: Trajectory  # true poses, `T_map_base`
-    odometry: Trajectory  # measured poses, `T_odom_base`
-    velocities: FloatArray  # measured before each of them, in its frame, shape (N, 3) [m/s, rad/s]
-    fix_stamps_ns: IntArray  # stamps of the fixes, shape (M,) [ns]
-    fixes: FloatArray  # latitude, longitude and ellipsoidal height, shape (M, 3) [deg, deg, m]
-    fix_is_wrong: BoolArray  # whether a fix was moved by a jump, shape (M,)
-    pose_stamps_ns: IntArray  # stamps of the global poses, shape (P,) [ns]
-    poses: FloatArray  # global poses, in the map, shape (P, 3) [m, m, rad]
-    pose_is_wrong: BoolArray  # whether one was moved by a jump, shape (P,)
-    loop_stamps_ns: IntArray  # of the earlier and later pose of loop closures, shape (L, 2) [ns]
-    loop_poses: FloatArray  # measured later pose in the earlier one, shape (L, 3) [m, m, rad]
-    loop_group: IntArray  # number of the group of false closures, -1: true, shape (L,)
-    rate_stamps_ns: IntArray  # of the gyroscope, shape (R,) [ns]; none without one
-    rates: FloatArray  # its yaw rates, shape (R,) [rad/s]
+    measured: Mapping[str, Measured]
+    """
+    By topic.
+
+    Values of odometry, shape (N, 6), are poses `T_odom_base` and the velocity measured before each
+    in its frame [m/s, m/s, rad/s]; of a gyroscope yaw rates, shape (N,) [rad/s]; of fixes
+    latitude, longitude and ellipsoidal height, shape (N, 3) [deg, deg, m]; of global poses those
+    in the map, shape (N, 3); of closures the later pose in the earlier one, shape (N, 3).
+    """
     arrivals: Mapping[str, tuple[IntArray, IntArray]]
     """By topic: which messages are recorded, and when [ns], by that time, shape (K,) each."""
     silenced: tuple[int, ...]  # measurements that each outage has left out
     missing_groups: int  # of false closures, for which there were no places
 
     @property
-    def start_ns(self) -> int:
-        """Stamp of the start, from which all times count [ns]."""
-        return START_NS
-
-    @property
-    def loop_is_false(self) -> BoolArray:
-        """Whether a loop closure ties two different places, shape (L,)."""
-        return self.loop_group >= 0
+    def odometry(self) -> Trajectory:
+        """Measured poses, `T_odom_base`."""
+        stamps_ns, values, _ = self.measured[ODOMETRY]
+        return Trajectory(stamps_ns, values[:, :3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +79,6 @@ class Course:
     """A motion through a world, what is simulated there, and random numbers for it."""
 
     motion: Motion
-    truth: Trajectory  # in the frame of the world, every 10 ms; headings are not wrapped
     setup: Setup
     streams: Mapping[str, np.random.Generator]
 
@@ -101,15 +91,14 @@ def course(
     streams = {name: np.random.default_rng((seed, k)) for k, name in enumerate(STREAMS)}
     generator = np.random.default_rng(seed) if world.one_stream else streams['world']
     motion = world.drive(generator, duration_s)
-    truth = Trajectory(START_NS + np.round(motion.time * 1e9).astype(np.int64), motion.poses)
     usual = world.setup(motion)
     if world.one_stream:
-        streams |= _states(generator, motion, truth, usual)
-    return Course(motion, truth, change(usual), streams)
+        streams |= _states(generator, motion, usual)
+    return Course(motion, change(usual), streams)
 
 
 def _states(
-    generator: np.random.Generator, motion: Motion, truth: Trajectory, usual: Setup,
+    generator: np.random.Generator, motion: Motion, usual: Setup,
 ) -> dict[str, np.random.Generator]:
     """
     Return the states of a generator from which the usual sensors draw one after the other.
@@ -119,8 +108,7 @@ def _states(
     """
     assert usual.fixes is not None
     assert usual.closures is not None
-    fixes, closures = usual.fixes, usual.closures
-    path = Path(truth.stamps_ns, truth.poses, motion.distance)
+    truth, closures = motion.truth, usual.closures
     states: dict[str, np.random.Generator] = {}
 
     def state(name: str) -> np.random.Generator:
@@ -128,76 +116,49 @@ def _states(
         return generator
 
     sensors.odometry(state('odometry'), truth, usual.wheels)
-    stamps, values = sensors.positions(state('fixes'), truth, fixes)
-    ends, poses = _true_closures(state('closures'), truth, path, closures)
+    stamps, values = sensors.positions(state('fixes'), truth, usual.fixes)
+    ends, poses = _true_closures(state('closures'), motion, closures)
     sensors.moved(state('jumps'), stamps, values, usual.jumps_of(FIXES))
-    with_false(state('false'), path, closures, ends[:0], poses[:0])
+    with_false(state('false'), motion, closures, ends[:0], poses[:0])
     state('truth')
     return states
 
 
 def record(way: Course) -> Recording:
     """Return what all sensors say on a course."""
-    setup, truth, streams = way.setup, way.truth, way.streams
-    measured_at = dict.fromkeys(TOPICS, np.empty(0, dtype=np.int64))  # with what outages leave out
-
-    def heard(topic: str, stamps: IntArray) -> BoolArray:
-        measured_at[topic] = stamps
-        return sensors.heard(stamps, topic, setup.outages)
-
+    setup, truth, streams = way.setup, way.motion.truth, way.streams
     odometry = sensors.odometry(streams['odometry'], truth, setup.wheels)
-    velocities, to_map = sensors.velocities(odometry), _map(truth, odometry.poses[0])
-    odometry = sensors.jumped(odometry, setup)
-    kept = heard(ODOMETRY, odometry.stamps_ns)
-    odometry, velocities = Trajectory(
-        odometry.stamps_ns[kept], odometry.poses[kept]), velocities[kept]
-
-    fix_stamps, places, fix_is_wrong = absolute(way, FIXES, truth)
-    kept = heard(FIXES, fix_stamps)
-    fix_stamps, fix_is_wrong = fix_stamps[kept], fix_is_wrong[kept]
-    fixes = CITY.to_geodetic(places[kept])
-    if len(fixes) > 0:
-        to_map = _fixed_map(fixes[0])
-    pose_stamps, poses, pose_is_wrong = absolute(
-        way, POSES, Trajectory(truth.stamps_ns, to_map(truth.poses)))
-    kept = heard(POSES, pose_stamps)
-    pose_stamps, poses, pose_is_wrong = (
-        pose_stamps[kept], se2.wrapped(poses[kept]), pose_is_wrong[kept])
-    ends, loop_poses, group, missing = _closures(way)
-    kept = heard(CLOSURES, ends[:, 1])
-    ends, loop_poses, group = ends[kept], loop_poses[kept], group[kept]
-
+    path = np.column_stack((sensors.jumped(odometry, setup).poses, sensors.velocities(odometry)))
     rates = (np.empty(0) if setup.gyro is None else
              sensors.yaw_rates(streams['gyro'], truth.poses[:, 2], setup.gyro))
-    kept = heard(GYRO, rate_stamps := truth.stamps_ns[:len(rates)])
-    rate_stamps, rates = rate_stamps[kept], rates[kept]
-
-    truth_stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
-    arrivals = {topic: sensors.arrivals(
-        streams[topic], topic, stamps[sensors.heard(stamps, topic, setup.outages)], setup)
-        for topic, stamps in measured_at.items()}
-    arrivals[TRUTH] = sensors.arrivals(
-        np.random.default_rng(0), TRUTH, truth_stamps, setup)
+    fixes = absolute(way, FIXES, truth)
+    fixes = fixes._replace(values=CITY.to_geodetic(fixes.values))
+    heard = fixes.rows(sensors.heard(fixes.stamps_ns, FIXES, setup.outages)).values
+    to_map = _fixed_map(heard[0]) if len(heard) > 0 else _map(truth, odometry.poses[0])
+    poses = absolute(way, POSES, Trajectory(truth.stamps_ns, to_map(truth.poses)))
+    closures, missing = _closures(way)
+    every = {
+        ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
+        GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
+        FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)), CLOSURES: closures}
+    kept = {topic: each.rows(sensors.heard(each.later_ns, topic, setup.outages))
+            for topic, each in every.items()}
+    arrivals = {topic: sensors.arrivals(streams[topic], topic, each.later_ns, setup)
+                for topic, each in kept.items()}
+    stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
+    arrivals[TRUTH] = sensors.arrivals(np.random.default_rng(0), TRUTH, stamps, setup)
     ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
                         if each.topic == topic) for topic in TOPICS}
     return Recording(
-        setup=setup, distance=float(way.motion.distance[-1]),
-        truth=Trajectory(truth_stamps, to_map(truth.at(truth_stamps))),
-        odometry=Trajectory(odometry.stamps_ns + ahead[ODOMETRY], odometry.poses),
-        velocities=velocities,
-        fix_stamps_ns=fix_stamps + ahead[FIXES], fixes=fixes, fix_is_wrong=fix_is_wrong,
-        pose_stamps_ns=pose_stamps + ahead[POSES], poses=poses, pose_is_wrong=pose_is_wrong,
-        loop_stamps_ns=ends + ahead[CLOSURES], loop_poses=loop_poses, loop_group=group,
-        rate_stamps_ns=rate_stamps + ahead[GYRO], rates=rates, arrivals=arrivals,
-        silenced=tuple(int(np.sum(~sensors.heard(
-            measured_at[each.topic], each.topic, [each]))) for each in setup.outages),
-        missing_groups=missing)
+        setup, float(way.motion.distance[-1]), Trajectory(stamps, to_map(truth.at(stamps))),
+        {topic: each._replace(stamps_ns=each.stamps_ns + ahead[topic])
+         for topic, each in kept.items()}, arrivals,
+        tuple(int(np.sum(~sensors.heard(every[each.topic].later_ns, each.topic, [each])))
+              for each in setup.outages), missing)
 
 
-def absolute(
-    way: Course, topic: str, truth: Trajectory,
-) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return stamps of fixes or global poses, what they say in the map, and which are wrong."""
+def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
+    """Return fixes or global poses, in the frame of the truth."""
     setup, streams = way.setup, way.streams
     if topic == FIXES and setup.fixes is not None:
         stamps, values = sensors.positions(streams['fixes'], truth, setup.fixes)
@@ -205,9 +166,8 @@ def absolute(
         stamps, values = sensors.global_poses(streams['poses'], truth, setup.poses)
     else:
         stamps, values = np.empty(0, dtype=np.int64), np.empty((0, 2 if topic == FIXES else 3))
-    return stamps, *sensors.moved(
-        streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
-        setup.jumps_of(topic))
+    return sensors.moved(streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
+                         setup.jumps_of(topic))
 
 
 def _map(truth: Trajectory, origin: FloatArray) -> Callable[[FloatArray], FloatArray]:
@@ -227,29 +187,30 @@ def _fixed_map(fix: FloatArray) -> Callable[[FloatArray], FloatArray]:
     return to_map
 
 
-def _closures(way: Course) -> tuple[IntArray, FloatArray, IntArray, int]:
-    """Return stamps, measured poses and groups of closures, and how many groups are missing."""
+def _closures(way: Course) -> tuple[Measured, int]:
+    """Return closures, and how many groups of false ones are missing."""
     settings = way.setup.closures
     if settings is None:
-        return np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), np.empty(0, dtype=np.int64), 0
-    path = Path(way.truth.stamps_ns, way.truth.poses, way.motion.distance)
-    ends, poses = _true_closures(way.streams['closures'], way.truth, path, settings)
+        none = np.empty(0, dtype=np.int64)
+        return Measured(none.reshape(0, 2), np.empty((0, 3)), none), 0
+    ends, poses = _true_closures(way.streams['closures'], way.motion, settings)
     found = way.streams['rate'].random(len(ends)) < settings.rate
-    return with_false(way.streams['false'], path, settings, ends[found], poses[found])
+    return with_false(way.streams['false'], way.motion, settings, ends[found], poses[found])
 
 
 def _true_closures(
-    generator: np.random.Generator, truth: Trajectory, path: Path, settings: Closures,
+    generator: np.random.Generator, path: Motion, settings: Closures,
 ) -> tuple[IntArray, FloatArray]:
     """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
+    stamps = path.truth.stamps_ns
     # by distance, so that a vehicle at rest is at one place only
     places = np.unique(np.searchsorted(
         path.distance, np.arange(0.0, path.distance[-1], settings.place_distance)))
-    places = places[path.stamps_ns[places] >= path.stamps_ns[0] + settings.first_s * 1e9]
+    places = places[stamps[places] >= stamps[0] + settings.first_s * 1e9]
     old, new = revisits(generator, path, places, settings)
     # stamps of a camera, which is not synchronised with the other sensors
-    ends = path.stamps_ns[places[np.column_stack((old, new))]]
+    ends = stamps[places[np.column_stack((old, new))]]
     ends += generator.integers(1, round(PERIOD_S * 1e9), ends.shape)
-    ends = np.minimum(ends, path.stamps_ns[-1])
-    poses = truth.at(ends)
+    ends = np.minimum(ends, stamps[-1])
+    poses = path.truth.at(ends)
     return ends, measured(generator, poses[:, 0], poses[:, 1], settings)

@@ -8,6 +8,7 @@ disorder and messages that come twice.
 """
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -40,6 +41,23 @@ How often errors of odometry by the model are drawn [s].
 
 The engine sums up the turns that odometry shows; errors of each sample would lengthen that sum.
 """
+
+
+class Measured(NamedTuple):
+    """What a sensor says, M times."""
+
+    stamps_ns: IntArray  # shape (M,); of closures (M, 2), of the earlier and the later pose [ns]
+    values: FloatArray
+    wrong: IntArray  # number of the jump, or of the group of false closures; -1: right, shape (M,)
+
+    @property
+    def later_ns(self) -> IntArray:
+        """When it was measured, shape (M,) [ns]."""
+        return self.stamps_ns if self.stamps_ns.ndim == 1 else self.stamps_ns[:, 1]
+
+    def rows(self, which: BoolArray | IntArray) -> 'Measured':
+        """Return some of it."""
+        return Measured(self.stamps_ns[which], self.values[which], self.wrong[which])
 
 
 def jittered_stamps(
@@ -164,9 +182,8 @@ def global_poses(
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of global poses, shape (M,), and the poses, shape (M, 3) [m, m, rad]."""
     stamps = jittered_stamps(generator, truth, poses.period_s)
-    sigmas = np.array((poses.sigmas[0], poses.sigmas[0], poses.sigmas[1]))
     return stamps, se2.wrapped(
-        truth.at(stamps) + sigmas * generator.standard_normal((len(stamps), 3)))
+        truth.at(stamps) + np.array(poses.sigmas) * generator.standard_normal((len(stamps), 3)))
 
 
 def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
@@ -184,19 +201,17 @@ def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
 
 def moved(
     generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray, jumps: list[Jump],
-) -> tuple[FloatArray, BoolArray]:
-    """
-    Return fixes or global poses with jumps, shape (M, 2 or 3), and which of them are moved, (M,).
-    """
+) -> Measured:
+    """Return fixes or global poses, shape (M, 2 or 3), with jumps."""
     time = (stamps_ns - START_NS) * 1e-9
-    values, wrong = values.copy(), np.zeros(len(values), dtype=bool)
-    for jump in jumps:
+    values, wrong = values.copy(), np.full(len(values), -1)
+    for number, jump in enumerate(jumps):
         assert jump.step is not None
         now = (time >= jump.at_s) & (time < jump.at_s + jump.seconds)
         values[now] += jump.step[:values.shape[1]]
         values[now, :2] += generator.normal(0.0, jump.sigma, (int(np.sum(now)), 2))
-        wrong |= now
-    return values, wrong
+        wrong[now] = number
+    return Measured(stamps_ns, values, wrong)
 
 
 def heard(stamps_ns: IntArray, topic: str, outages: Iterable[Outage]) -> BoolArray:

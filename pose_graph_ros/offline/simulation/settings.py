@@ -10,8 +10,9 @@ out of range. Times are seconds since the start of the simulation.
 from dataclasses import dataclass, field
 from enum import StrEnum
 import math
+from typing import Any
 
-from pose_graph_ros.core.config import require, require_member
+from pose_graph_ros.core.config import check, require
 from pose_graph_ros.core.exceptions import ConfigError
 
 ODOMETRY, GYRO, FIXES, POSES, CLOSURES = (
@@ -29,9 +30,9 @@ CLAIMING = (GYRO, FIXES, POSES, CLOSURES)
 """What comes with a covariance that can be wrong."""
 
 
-def _known(topic: str) -> None:
-    if topic not in TOPICS:
-        raise ConfigError(f'expected a topic of {", ".join(TOPICS)}, got {topic}')
+def _known(topic: str, known: tuple[str, ...] = TOPICS, what: str = '') -> None:
+    if topic not in known:
+        raise ConfigError(f'{what}expected a topic of {", ".join(known)}, got {topic}')
 
 
 def _finite(name: str, values: tuple[float, ...], above: float = -math.inf) -> None:
@@ -75,9 +76,7 @@ class Wheels:
     """First pose in the frame of odometry, its heading minus the true one; by default 0."""
 
     def __post_init__(self) -> None:
-        require_member(self, 'errors', OdometryErrors)
-        require(self, 'slip_events_per_s', 'slip_s', 'wander')
-        require(self, 'track_width', 'track_scale', 'wander_time_s', positive=True)
+        check(self, 'track_width', 'track_scale', 'wander_time_s', but='heading_drift')
         _finite('wheels: scale', self.scale, above=0.0)
         _finite('wheels: heading drift', (self.heading_drift,))
 
@@ -94,7 +93,7 @@ class Gyro:
     """Of its walk [rad/s/sqrt(s)]."""
 
     def __post_init__(self) -> None:
-        require(self, 'sigma', 'bias', 'bias_walk')
+        check(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +109,7 @@ class Fixes:
     """Time constant of the correlated error."""
 
     def __post_init__(self) -> None:
-        require(self, 'white', 'correlated')
-        require(self, 'period_s', 'correlation_s', positive=True)
+        check(self, 'period_s', 'correlation_s')
         if self.white == 0.0 and self.correlated == 0.0:
             raise ConfigError('fixes: expected a white or a correlated error above 0, got 0 and 0')
 
@@ -120,17 +118,22 @@ class Fixes:
         """Standard deviation of a coordinate, of both errors together [m]."""
         return math.hypot(self.correlated, self.white)
 
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Those of both coordinates [m]."""
+        return self.sigma, self.sigma
+
 
 @dataclass(frozen=True, slots=True)
 class GlobalPoses:
     """Poses in the map, as of a localiser, with white errors."""
 
     period_s: float = 1.0
-    sigmas: tuple[float, float] = (0.1, 0.02)
-    """Of each coordinate and of the heading [m, rad]."""
+    sigmas: tuple[float, float, float] = (0.1, 0.1, 0.02)
+    """[m, m, rad]"""
 
     def __post_init__(self) -> None:
-        require(self, 'period_s', positive=True)
+        check(self, 'period_s')
         _finite('global poses: sigmas', self.sigmas, above=0.0)
 
 
@@ -155,8 +158,7 @@ class FalseClosures:
     """When they begin."""
 
     def __post_init__(self) -> None:
-        require(self, 'singles', 'groups', 'min_distance', 'from_s')
-        require(self, 'spacing', 'size', positive=True)
+        check(self, 'spacing', 'size')
         if self.share is not None and not 0.0 <= self.share < 1.0:
             raise ConfigError(f'share of false closures: expected 0 to below 1, got {self.share}')
 
@@ -204,8 +206,7 @@ class Closures:
     def __post_init__(self) -> None:
         if not 0.0 <= self.rate <= 1.0:
             raise ConfigError(f'rate of closures: expected 0 to 1, got {self.rate}')
-        require(self, 'min_time_s', 'min_distance', 'first_s')
-        require(self, 'spacing', 'radius', 'angle', 'place_distance', positive=True)
+        check(self, 'spacing', 'radius', 'angle', 'place_distance')
         _finite('closures: sigmas', self.sigmas, above=0.0)
 
 
@@ -244,9 +245,7 @@ class Jump:
     """Standard deviation by which the step of each fix or pose changes [m]."""
 
     def __post_init__(self) -> None:
-        if self.topic not in (ODOMETRY, FIXES, POSES):
-            raise ConfigError(
-                f'jump: expected a topic of {ODOMETRY}, {FIXES}, {POSES}, got {self.topic}')
+        _known(self.topic, (ODOMETRY, FIXES, POSES), 'jump: ')
         _finite('jump', (self.at_s, *(self.step or ())))
         if self.step is None and self.topic != ODOMETRY:
             raise ConfigError(f'jump of {self.topic}: expected DX,DY, as only {ODOMETRY} can '
@@ -308,9 +307,7 @@ class ClaimedSigma:
     factor: float
 
     def __post_init__(self) -> None:
-        if self.topic not in CLAIMING:
-            raise ConfigError(f'claimed sigma: expected a topic of {", ".join(CLAIMING)}, got '
-                              f'{self.topic}')
+        _known(self.topic, CLAIMING, 'claimed sigma: ')
         require(self, 'factor', positive=True)
 
 
@@ -330,9 +327,20 @@ class Setup:
     duplicates: tuple[Duplicates, ...] = ()
     claims: tuple[ClaimedSigma, ...] = ()
 
+    @property
+    def sensors(self) -> dict[str, Any]:
+        """The sensors that are there, by topic."""
+        every = zip(TOPICS, (self.wheels, self.gyro, self.fixes, self.poses, self.closures),
+                    strict=True)
+        return {topic: sensor for topic, sensor in every if sensor is not None}
+
     def claimed(self, topic: str) -> float:
         """Return the factor on the sigmas that a topic claims."""
         return math.prod(each.factor for each in self.claims if each.topic == topic)
+
+    def sigmas(self, topic: str) -> list[float]:
+        """Return the sigmas that fixes, poses or closures claim."""
+        return [self.claimed(topic) * sigma for sigma in self.sensors[topic].sigmas]
 
     def jumps_of(self, topic: str) -> list[Jump]:
         """Return the jumps of a topic."""

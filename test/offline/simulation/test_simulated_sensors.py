@@ -16,17 +16,22 @@ from pose_graph_ros.offline.simulation.recording import course, record, Recordin
 from pose_graph_ros.offline.simulation.settings import (
     ClaimedSigma,
     ClockOffset,
+    CLOSURES,
     Closures,
     Delay,
     Duplicates,
     FalseClosures,
+    FIXES,
     Fixes,
     GlobalPoses,
+    GYRO,
     Gyro,
     Jump,
     OdometryErrors,
     Outage,
+    POSES,
     Setup,
+    START_NS,
     Wheels,
 )
 from pose_graph_ros.offline.simulation.worlds import WORLDS
@@ -34,10 +39,10 @@ from pose_graph_ros.offline.simulation.worlds import WORLDS
 FIELDS = {
     'odometry': lambda drive: (drive.odometry.stamps_ns, drive.odometry.poses),
     'truth': lambda drive: (drive.truth.stamps_ns,),
-    'fixes': lambda drive: (drive.fix_stamps_ns, drive.fixes),
-    'poses': lambda drive: (drive.pose_stamps_ns,),
-    'closures': lambda drive: (drive.loop_stamps_ns, drive.loop_poses),
-    'gyro': lambda drive: (drive.rate_stamps_ns, drive.rates),
+    'fixes': lambda drive: drive.measured[FIXES],
+    'poses': lambda drive: (drive.measured[POSES].stamps_ns,),
+    'closures': lambda drive: drive.measured[CLOSURES],
+    'gyro': lambda drive: drive.measured[GYRO],
 }
 ALL = Setup(gyro=Gyro(), fixes=Fixes(), poses=GlobalPoses(),
             closures=Closures(spacing=5.0, radius=1.5, min_distance=20.0, first_s=3.0,
@@ -81,14 +86,17 @@ def test_disturbances_change_only_what_they_name(world: str) -> None:
     for name in ('odometry', 'truth', 'poses', 'closures'):
         for a, b in zip(FIELDS[name](usual), FIELDS[name](other), strict=True):
             np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(usual.rate_stamps_ns + 100_000_000, other.rate_stamps_ns)
-    np.testing.assert_array_equal(usual.rates, other.rates)
-    time = (usual.fix_stamps_ns - usual.start_ns) * 1e-9
+    before, after = (each.measured[GYRO] for each in (usual, other))
+    np.testing.assert_array_equal(before.stamps_ns + 100_000_000, after.stamps_ns)
+    np.testing.assert_array_equal(before.values, after.values)
+    before, after = (each.measured[FIXES] for each in (usual, other))
+    time = (before.stamps_ns - START_NS) * 1e-9
     kept = (time < 50.0) | (time >= 90.0)
-    np.testing.assert_array_equal(usual.fix_stamps_ns[kept], other.fix_stamps_ns)
+    np.testing.assert_array_equal(before.stamps_ns[kept], after.stamps_ns)
     moved = (time >= 100.0) & (time < 120.0)
-    np.testing.assert_array_equal(other.fix_is_wrong, moved[kept])
-    np.testing.assert_array_equal(usual.fixes[kept & ~moved], other.fixes[~other.fix_is_wrong])
+    np.testing.assert_array_equal(after.wrong >= 0, moved[kept])
+    np.testing.assert_array_equal(
+        before.values[kept & ~moved], after.values[after.wrong == -1])
     assert other.silenced == (int(np.sum(~kept)),)
 
 
