@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import math
 
 from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS
-from pose_graph_ros.core.quantities import Seconds
+from pose_graph_ros.core.quantities import Seconds, StampNs
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,161 +32,119 @@ class Expectations:
 EXPECTED = Expectations()
 
 
+INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
+
+
 @dataclass(slots=True)
-class _Arrivals:
-    at: float  # time of the newest message [s]
-    since: float  # the same, or later if the node was inactive meanwhile [s]
+class Arrivals:
+    """What is noticed of one source as its messages come."""
+
+    source: str
+    is_rare: bool = False  # whether its silence means nothing
+    count: int = 0  # number of messages
+    # frame_id and child_frame_id of the newest message that could be read; None before
+    frames: tuple[str, str] | None = None
+    at: Seconds = -math.inf  # time of the newest message
+    since: Seconds = -math.inf  # the same, or later if the node was inactive meanwhile
     gaps: deque[float] = field(default_factory=lambda: deque(maxlen=EXPECTED.gaps))
+    # how late the newest message was by odometry, less than 0 for ahead; None if not compared
+    delay: Seconds | None = None
+    wrong: str = ''  # what to say of its stamps if they are wrong
+    n_apart: int = 0  # number of the last messages that are too far ahead or behind
+    apart_since_ns: StampNs = 0  # stamp of odometry at the first of them
+    # when its newest message was accepted: how many were, the time, and how many were refused by
+    # reason
+    accepted: int = 0
+    accepted_at: Seconds = 0.0
+    refused: Counter[str] = field(default_factory=Counter)
 
     @property
-    def patience(self) -> float:
-        """Longest gap that is no silence [s]; infinite before there is a rhythm."""
+    def patience(self) -> Seconds:
+        """Longest gap that is no silence; infinite before there is a rhythm."""
         if len(self.gaps) < EXPECTED.rhythm:
             return math.inf
         gaps = sorted(self.gaps)
         return max(EXPECTED.least_silence, EXPECTED.medians * gaps[len(gaps) // 2],
                    EXPECTED.longest * gaps[-2])
 
-    def receive(self, now: float) -> None:
-        if self.since == self.at:
+    @property
+    def rate(self) -> float:
+        """Present rate [Hz]; 0 before the second message."""
+        gaps = [*self.gaps][-EXPECTED.present:]
+        return len(gaps) / sum(gaps) if sum(gaps) > 0.0 else 0.0
+
+    def receive(self, now: Seconds) -> None:
+        """Record that a message came."""
+        if self.since == self.at > -math.inf:
             self.gaps.append(now - self.at)
+        self.count += 1
         self.at = self.since = now
 
-    def is_active(self, now: float) -> bool:
+    def resume(self, now: Seconds) -> None:
+        """Let its silence begin now, since nothing could be received before."""
+        if self.at > -math.inf:
+            self.since = now
+
+    def is_active(self, now: Seconds) -> bool:
+        """Tell whether its newest message is not long ago."""
         return now - self.since <= (
             self.patience if math.isfinite(self.patience) else EXPECTED.quiet)
 
-
-class Liveness:
-    """Times of the messages of each source; the silence of those that are rare means nothing."""
-
-    def __init__(self, rare: Collection[str] = ()) -> None:
-        self._rare = frozenset(rare)
-        self._arrivals: dict[str, _Arrivals] = {}
-
-    def receive(self, source: str, now: Seconds) -> None:
-        """Record that a message came."""
-        arrivals = self._arrivals.get(source)
-        if arrivals is None:
-            self._arrivals[source] = _Arrivals(now, now)
-        else:
-            arrivals.receive(now)
-
-    def resume(self, now: float) -> None:
-        """Let all silences begin at a time [s], since nothing could be received before."""
-        for arrivals in self._arrivals.values():
-            arrivals.since = now
-
-    def silence(self, source: str, now: float) -> float | None:
-        """Return the time since the last message of a source [s]; None before the first."""
-        arrivals = self._arrivals.get(source)
-        return None if arrivals is None else now - arrivals.at
-
-    def rate(self, source: str) -> float:
-        """Return the present rate of a source [Hz]; 0 before its second message."""
-        gaps = [*self._arrivals[source].gaps][-EXPECTED.present:] if (
-            source in self._arrivals) else []
-        return len(gaps) / sum(gaps) if sum(gaps) > 0.0 else 0.0
-
-    def silent(self, now: float) -> list[str]:
-        """Return the sources that are silent at a time [s] at which another one is not."""
-        newest = max((arrivals.at for arrivals in self._arrivals.values()
-                      if arrivals.is_active(now)), default=-math.inf)
-        return sorted(name for name, arrivals in self._arrivals.items()
-                      if name not in self._rare
-                      and newest - arrivals.since > arrivals.patience)
-
-    def quiet(self, now: float) -> float:
-        """Return for how long no source has sent anything [s]; 0 if that is not long, or never."""
-        if len(self._arrivals) == 0 or any(
-                arrivals.is_active(now) for arrivals in self._arrivals.values()):
-            return 0.0
-        silence = now - max(arrivals.since for arrivals in self._arrivals.values())
-        return silence if silence > EXPECTED.quiet else 0.0
-
-
-@dataclass(slots=True)
-class _Delay:
-    seconds: float = 0.0  # of the newest message
-    n: int = 0  # number of the last messages that are too far ahead or behind
-    since_ns: int = 0  # stamp of odometry at the first of them
-
-
-class Delays:
-    """Compares stamps with the newest one of odometry, when they come."""
-
-    def __init__(self) -> None:
-        self._delays: dict[str, _Delay] = {}
-        self.wrong: dict[str, str] = {}  # sentences on sources whose stamps are wrong
-
-    @property
-    def seconds(self) -> dict[str, float]:
-        """How late the newest message of each source was; less than 0 for ahead [s]."""
-        return {source: each.seconds for source, each in self._delays.items()}
-
-    def receive(
-        self, source: str, stamp_ns: int, clock: tuple[str, int], *, may_be_late: bool,
-    ) -> None:
-        """Compare a stamp with the newest one of an odometry [ns]."""
+    def compare(self, stamp_ns: StampNs, clock: tuple[str, StampNs], *, may_be_late: bool) -> None:
+        """Compare a stamp with the newest one of an odometry."""
         odometry, clock_ns = clock
-        if odometry in ('', source):
+        if odometry in ('', self.source):
             return
-        delay, late_ns = self._delays.setdefault(source, _Delay()), clock_ns - stamp_ns
-        delay.seconds = 1e-9 * late_ns
+        late_ns = clock_ns - stamp_ns
+        self.delay = 1e-9 * late_ns
         if late_ns >= -LATEST_NS and (may_be_late or late_ns <= LATEST_NS):
-            delay.n = 0
-            self.wrong.pop(source, None)
+            self.n_apart, self.wrong = 0, ''
             return
-        if delay.n == 0:
-            delay.since_ns = clock_ns
-        delay.n += 1
+        if self.n_apart == 0:
+            self.apart_since_ns = clock_ns
+        self.n_apart += 1
         # odometry that is silent has fallen behind itself
-        if delay.n >= EVIDENCE and clock_ns - delay.since_ns >= EVIDENCE_NS:
+        if self.n_apart >= EVIDENCE and clock_ns - self.apart_since_ns >= EVIDENCE_NS:
             way = 'ahead of' if late_ns < 0 else 'behind'
             waits = ', for which its measurements wait' if may_be_late else ''
-            self.wrong[source] = (
-                f'the stamps of {source} are {abs(delay.seconds):.1f} s {way} those of {odometry}'
-                f'{waits}: mend the clock of its driver (GPS time is 18 s ahead of UTC), or set '
-                f'{source}.time_offset')
+            self.wrong = (
+                f'the stamps of {self.source} are {abs(self.delay):.1f} s {way} those of '
+                f'{odometry}{waits}: mend the clock of its driver (GPS time is 18 s ahead of '
+                f'UTC), or set {self.source}.time_offset')
+
+    def refusal(
+        self, counts: Counter[tuple[str, str]], details: Mapping[tuple[str, str], str],
+        now: Seconds,
+    ) -> str:
+        """Return what to say if its newest messages were all refused, else an empty text."""
+        refused = Counter({reason: counts[name, reason] for name, reason in details
+                           if name == self.source and reason not in INTENDED})
+        accepted = counts[self.source, 'accepted']
+        if accepted > self.accepted:
+            self.accepted, self.accepted_at, self.refused = accepted, now, refused
+        newest = refused - self.refused
+        count = newest.total()
+        if count < EXPECTED.refusals or (
+                accepted > 0 and now - self.accepted_at <= EXPECTED.refused_for):
+            return ''
+        begin = f'{count} of {self.count}' if accepted == 0 else f'the newest {count}'
+        # all reasons with the newest detail of each, the most frequent first
+        reasons = '; '.join(
+            (f'{n} times ' if len(newest) > 1 else '') + f'{reason} '
+            f'({details[self.source, reason]})' for reason, n in newest.most_common())
+        return f'{begin} messages of {self.source} were refused: {reasons}'
 
 
-INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
+def silent(sources: Collection[Arrivals], now: Seconds) -> list[str]:
+    """Return the sources that are silent at a time at which another one is not."""
+    newest = max((each.at for each in sources if each.is_active(now)), default=-math.inf)
+    return sorted(each.source for each in sources
+                  if not each.is_rare and newest - each.since > each.patience)
 
 
-class Refusals:
-    """Follows the counts of all sources, to tell those that nothing is accepted from any more."""
-
-    def __init__(self) -> None:
-        # of each source, when its newest message was accepted: how many were, the time [s], and
-        # how many were refused by reason
-        self._accepted: dict[str, tuple[int, Seconds, Counter[str]]] = {}
-
-    def update(
-        self, received: Mapping[str, int], counts: Counter[tuple[str, str]],
-        details: Mapping[tuple[str, str], str], now: Seconds,
-    ) -> dict[str, str]:
-        """Return what to say of the sources of which the newest messages were all refused."""
-        said = {}
-        for source, total in received.items():
-            refused = Counter({reason: counts[name, reason] for name, reason in details
-                               if name == source and reason not in INTENDED})
-            accepted = counts[source, 'accepted']
-            before, at, until_then = self._accepted.get(source, (0, 0.0, Counter()))
-            if accepted > before:
-                at, until_then = now, refused
-                self._accepted[source] = accepted, at, until_then
-            newest = refused - until_then
-            count = newest.total()
-            if count >= EXPECTED.refusals and (
-                    accepted == 0 or now - at > EXPECTED.refused_for):
-                begin = f'{count} of {total}' if accepted == 0 else f'the newest {count}'
-                said[source] = (f'{begin} messages of {source} were refused: '
-                                f'{_reasons(source, newest, details)}')
-        return said
-
-
-def _reasons(source: str, counts: Counter[str], details: Mapping[tuple[str, str], str]) -> str:
-    """Return all reasons with the newest detail of each, the most frequent first."""
-    return '; '.join(
-        (f'{count} times ' if len(counts) > 1 else '') + f'{reason} ({details[source, reason]})'
-        for reason, count in counts.most_common())
+def quiet(sources: Collection[Arrivals], now: Seconds) -> Seconds:
+    """Return for how long no source has sent anything; 0 if that is not long, or never."""
+    if any(each.is_active(now) for each in sources):
+        return 0.0
+    silence = now - max((each.since for each in sources), default=-math.inf)
+    return silence if EXPECTED.quiet < silence < math.inf else 0.0

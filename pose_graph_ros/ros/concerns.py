@@ -71,7 +71,8 @@ def concerns(session: 'Session') -> Iterator[Concern]:
                       'sources go on: check the drivers', logged=True)
     if session.active:
         yield from (Concern(WARN, text, logged=True) for text in doubts(session))
-    yield from (Concern(WARN, text, logged=True) for text in received.delays.wrong.values())
+    yield from (Concern(WARN, text, logged=True) for text in (
+        each.wrong for each in received.arrivals.values()) if text != '')
     if estimate is not None and estimate.alignment is AlignmentState.UNALIGNED:
         yield Concern(WARN, 'unaligned: the angle between odometry and map is not known yet. '
                       'Drive some metres while fixes come in')
@@ -180,7 +181,7 @@ def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str
     usual = node.resolve_topic_name(KNOWN_SOURCES[name][1]) if name in KNOWN_SOURCES else ''
     expected = source.kind.is_odometry or topic != usual or (
         name not in DEFAULT_SOURCES and source.kind is not Kind.LOOP_CLOSURE)
-    if session.input.received[name] > 0 or not expected:
+    if session.input.arrivals[name].count > 0 or not expected:
         return
     types = {info.topic_type for info in node.get_publishers_info_by_topic(source.topic)}
     if wanted in types:
@@ -196,9 +197,10 @@ def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str
 
 def _frames(session: 'Session', source: Source) -> Iterator[str]:
     name, out, estimate = source.name, session.out, session.worker.estimate
-    if name not in session.input.frames:
+    frames = session.input.arrivals[name].frames
+    if frames is None:
         return
-    parent, child = map(frame, session.input.frames[name])
+    parent, child = map(frame, frames)
     if source.kind is Kind.ODOMETRY:
         is_primary = estimate is not None and estimate.primary == name
         for what, found, parameter, expected, consequence in (

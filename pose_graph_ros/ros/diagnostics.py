@@ -28,10 +28,10 @@ def values(session: 'Session') -> dict[str, object]:
 
 def _state(session: 'Session') -> dict[str, object]:
     """Return the counts by source and reason, and the state of graph and solver."""
-    worker, received, rejected = session.worker, session.input.received, session.input.rejected
+    worker, rejected = session.worker, session.input.rejected
     status, estimate = worker.status, worker.estimate
     found: dict[str, object] = {
-        'received': sum(received.values()),
+        'received': sum(each.count for each in session.input.arrivals.values()),
         'processed': status.processed + sum(rejected.values()),
         'pending': status.pending, 'quarantined': status.quarantined,
         'updates': status.updates, 'prepared': int(worker.prepared),
@@ -42,7 +42,6 @@ def _state(session: 'Session') -> dict[str, object]:
         'memory_mb': f'{memory() / 1e6:.0f}'}
     if session.reset_reason != '':
         found['reset_reason'] = session.reset_reason
-    found |= {f'received.{source}': count for source, count in sorted(received.items())}
     found |= {f'{source}.{answer}': count
               for (source, answer), count in sorted((status.counts + rejected).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
@@ -105,17 +104,18 @@ def memory() -> int:
 
 
 def _inputs(session: 'Session') -> dict[str, object]:
-    """Return rate and silence of each source, the lever arms of antennas, and the datum."""
-    reader, liveness = session.input.reader, session.input.liveness
-    now = time.monotonic()
+    """Return what is noticed of each source, the lever arms of antennas, and the datum."""
+    reader, now = session.input.reader, time.monotonic()
     found: dict[str, object] = {}
-    for name in reader.sources:
-        silence, rate = liveness.silence(name, now), liveness.rate(name)
-        found[f'{name}.silence_s'] = 'never received' if silence is None else f'{silence:.1f}'
-        if rate > 0.0:
-            found[f'{name}.rate_hz'] = f'{rate:.1f}'
-    found |= {f'{name}.delay_s': f'{delay:.3f}'
-              for name, delay in session.input.delays.seconds.items()}
+    for name, arrivals in session.input.arrivals.items():
+        if arrivals.count > 0:
+            found[f'received.{name}'] = arrivals.count
+        silence = now - arrivals.at
+        found[f'{name}.silence_s'] = f'{silence:.1f}' if silence < math.inf else 'never received'
+        if arrivals.rate > 0.0:
+            found[f'{name}.rate_hz'] = f'{arrivals.rate:.1f}'
+        if arrivals.delay is not None:
+            found[f'{name}.delay_s'] = f'{arrivals.delay:.3f}'
     for name, fixes in reader.fixes.items():
         if fixes.antenna is not None:
             x, y = fixes.antenna.lever_arm

@@ -30,7 +30,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
-from pose_graph_ros.ros.arrivals import Delays, INTENDED, Liveness, Refusals
+from pose_graph_ros.ros.arrivals import Arrivals, INTENDED, quiet, silent
 
 logger = logging.getLogger(__name__)
 
@@ -139,19 +139,15 @@ class Input:
         self._told: set[tuple[str, str]] = set()
         self._odometry_at = 0.0
         self.paused = False  # whether all measurements are rejected
-        # frame_id and child_frame_id of the newest message by source
-        self.frames: dict[str, tuple[str, str]] = {}
         self._clear()
 
     def _clear(self) -> None:
-        self.received: Counter[str] = Counter()  # number of messages by source
+        self.arrivals = {
+            name: Arrivals(name, is_rare=source.kind is Kind.LOOP_CLOSURE)
+            for name, source in self.reader.sources.items()}
         self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
         self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
         self.posted = 0  # number of measurements that were handed to the engine
-        self.liveness = Liveness([source.name for source in self.reader.sources.values()
-                                  if source.kind is Kind.LOOP_CLOSURE])
-        self._refusals = Refusals()
-        self.delays = Delays()
         self.silent: list[str] = []  # sources that are silent while others are not
         self.quiet = 0.0  # for how long nothing at all has come, if that is long [s]
         self.refused: dict[str, str] = {}  # what to say of sources that all is refused from
@@ -165,9 +161,8 @@ class Input:
 
     def receive(self, source: str, message: Message) -> Decision:
         """Return which messages can be used now, after counting a new one."""
-        now = time.monotonic()
-        self.received[source] += 1
-        self.liveness.receive(source, now)
+        now, arrivals = time.monotonic(), self.arrivals[source]
+        arrivals.receive(now)
         measurement = self.read(source, message)
         if measurement is None:
             return Decision([])
@@ -177,8 +172,8 @@ class Input:
         if decision.is_old:
             self.reject(source, BEFORE_JUMP)
         elif decision.jump_ns == 0 and not isinstance(measurement, LoopClosure):
-            self.delays.receive(
-                source, measurement.stamp_ns, self.reader.keeper.clock,
+            arrivals.compare(
+                measurement.stamp_ns, self.reader.keeper.clock,
                 may_be_late=not isinstance(measurement, OdometrySample | YawRate))
         return decision
 
@@ -196,7 +191,7 @@ class Input:
         if isinstance(measurement, Answer):
             self.reject(source, measurement)
             return None
-        self.frames[source] = (
+        self.arrivals[source].frames = (
             message.header.frame_id, getattr(message, 'child_frame_id', ''))
         return measurement
 
@@ -227,9 +222,11 @@ class Input:
         details of the newest refusals.
         """
         now, details = time.monotonic(), {**details, **self._details}
-        self.silent = self.liveness.silent(now) if active else []
-        self.quiet = self.liveness.quiet(now) if active else 0.0
-        self.refused = self._refusals.update(self.received, counts + self.rejected, details, now)
+        arrivals, counts = self.arrivals.values(), counts + self.rejected
+        self.silent = silent(arrivals, now) if active else []
+        self.quiet = quiet(arrivals, now) if active else 0.0
+        self.refused = {each.source: sentence for each in arrivals
+                        if (sentence := each.refusal(counts, details, now)) != ''}
         for (source, reason), detail in details.items():
             if source in self.reader.sources and (source, reason) not in self._told:
                 self._told.add((source, reason))

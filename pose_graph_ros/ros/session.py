@@ -138,7 +138,8 @@ class Session:
                 CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS,
                 partial(self._on_message, source))
         self._watch_time()
-        self.input.liveness.resume(time.monotonic())
+        for arrivals in self.input.arrivals.values():
+            arrivals.resume(time.monotonic())
         self.active, self.activated_at = True, time.monotonic()
         logger.info('ready, listening to %s', ', '.join(
             self.node.resolve_topic_name(source.topic) for source in sources))
@@ -270,7 +271,7 @@ class Session:
         """Start a new graph with some messages; keep the datum by parameter and /tf_static."""
         self._replace(PoseGraphBackend(self._config), f'a new graph was started: {reason}')
         for source, message, *_ in messages:
-            self.input.received[source] += 1
+            self.input.arrivals[source].count += 1
             # read again, as the first fix of the new graph may be its datum
             measurement = self.input.read(source, message)
             if measurement is not None:

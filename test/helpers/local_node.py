@@ -123,11 +123,11 @@ class Driver:
 
     def send(self, source: str, *messages: object) -> None:
         """Publish messages, and wait until the session has counted them."""
-        received = self.session.input.received
-        wanted = received[source] + len(messages)
+        arrivals = self.session.input.arrivals[source]
+        wanted = arrivals.count + len(messages)
         for message in messages:
             self.publishers[source].publish(message)
-        self.wait(lambda: received[source] >= wanted, f'{wanted} messages of {source} come')
+        self.wait(lambda: arrivals.count >= wanted, f'{wanted} messages of {source} come')
 
     def drive(self, end: float, begin: float = 0.0, *, fixes: bool = True) -> None:
         """Publish a drive, odometry at 10 Hz and fixes at 2 Hz, and wait until it is processed."""

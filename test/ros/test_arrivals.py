@@ -7,84 +7,103 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from pose_graph_ros.ros.arrivals import EXPECTED, Liveness, Refusals
+from pose_graph_ros.ros.arrivals import Arrivals, EXPECTED, quiet, silent
 
 
-def receive_all(liveness: Liveness, source: str, start: float, end: float, period: float) -> None:
-    for now in np.arange(start, end + 1e-9, period).tolist():
-        liveness.receive(source, now)
+class Sources(dict[str, Arrivals]):
+    """Sources by name, which begin with their first message."""
+
+    def __init__(self, rare: str = '') -> None:
+        super().__init__()
+        self.rare = rare
+
+    def __missing__(self, source: str) -> Arrivals:
+        self[source] = Arrivals(source, source == self.rare)
+        return self[source]
+
+    def silent(self, now: float) -> list[str]:
+        return silent(self.values(), now)
+
+    def quiet(self, now: float) -> float:
+        return quiet(self.values(), now)
+
+    def receive_all(self, source: str, start: float, end: float, period: float) -> None:
+        for now in np.arange(start, end + 1e-9, period).tolist():
+            self[source].receive(now)
 
 
 def test_a_source_that_ends_before_another_is_silent() -> None:
-    liveness = Liveness()
-    receive_all(liveness, 'fix', 0.0, 10.0, 1.0)
-    receive_all(liveness, 'odom', 0.0, 10.0, 0.02)
-    assert liveness.silent(10.0) == []
-    receive_all(liveness, 'odom', 10.0, 14.9, 0.02)
-    assert liveness.silent(14.9) == []
+    sources = Sources()
+    sources.receive_all('fix', 0.0, 10.0, 1.0)
+    sources.receive_all('odom', 0.0, 10.0, 0.02)
+    assert sources.silent(10.0) == []
+    sources.receive_all('odom', 10.0, 14.9, 0.02)
+    assert sources.silent(14.9) == []
     # five of its own periods
-    receive_all(liveness, 'odom', 14.9, 20.0, 0.02)
-    assert liveness.silent(20.0) == ['fix']
-    assert liveness.silence('fix', 12.5) == 2.5
-    assert liveness.silence('imu', 12.5) is None
-    liveness.receive('fix', 20.1)
-    assert liveness.silent(20.2) == []
+    sources.receive_all('odom', 14.9, 20.0, 0.02)
+    assert sources.silent(20.0) == ['fix']
+    assert sources['fix'].at == 10.0
+    sources['fix'].receive(20.1)
+    assert sources.silent(20.2) == []
 
 
-def reports(liveness: Liveness, source: str, times: list[float], end: float) -> int:
+def reports(sources: Sources, source: str, times: list[float], end: float) -> int:
     """Return how often a source is newly silent while odometry goes on at 10 Hz."""
     count, said, left = 0, False, list(times)
     for now in np.arange(0.0, end, 0.1).tolist():
-        liveness.receive('odom', now)
+        sources['odom'].receive(now)
         while len(left) > 0 and left[0] <= now:
-            liveness.receive(source, left.pop(0))
-        silent = source in liveness.silent(now)
+            sources[source].receive(left.pop(0))
+        silent = source in sources.silent(now)
         count += silent and not said
         said = silent
-    assert liveness.silent(now) in ([], [source])
+    assert sources.silent(now) in ([], [source])
     return count
 
 
 def test_a_sporadic_source_is_not_reported_after_each_message() -> None:
     rng = np.random.default_rng(3)
     times = np.cumsum(rng.exponential(10.0, 150)).tolist()
-    assert reports(Liveness(), 'global_pose', times, 1200.0) <= 3
+    assert reports(Sources(), 'global_pose', times, 1200.0) <= 3
     # seen now and then, at a high rate: two silences are reported until that is its rhythm
     times = [start + 0.1 * step for start in range(0, 1200, 60) for step in range(100)]
-    assert reports(Liveness(), 'global_pose', times, 1200.0) <= 2
+    assert reports(Sources(), 'global_pose', times, 1200.0) <= 2
     # sent by hand: no rhythm at all
-    assert reports(Liveness(), 'global_pose', [5.0, 6.0, 8.0, 100.0], 300.0) == 0
+    assert reports(Sources(), 'global_pose', [5.0, 6.0, 8.0, 100.0], 300.0) == 0
 
 
 def test_the_time_without_subscriptions_is_no_silence() -> None:
-    liveness = Liveness()
-    receive_all(liveness, 'odom', 0.0, 10.0, 0.1)
-    receive_all(liveness, 'fix', 0.0, 10.0, 0.2)
-    liveness.resume(300.0)
-    assert liveness.quiet(300.0) == 0.0
-    receive_all(liveness, 'odom', 300.1, 301.0, 0.1)
-    assert liveness.silent(301.0) == []
-    assert liveness.silence('fix', 301.0) == pytest.approx(291.0)
-    receive_all(liveness, 'odom', 301.1, 303.0, 0.1)
+    sources = Sources()
+    sources.receive_all('odom', 0.0, 10.0, 0.1)
+    sources.receive_all('fix', 0.0, 10.0, 0.2)
+    for each in sources.values():
+        each.resume(300.0)
+    assert sources.quiet(300.0) == 0.0
+    sources.receive_all('odom', 300.1, 301.0, 0.1)
+    assert sources.silent(301.0) == []
+    assert 301.0 - sources['fix'].at == pytest.approx(291.0)
+    sources.receive_all('odom', 301.1, 303.0, 0.1)
     # it does not come back
-    assert liveness.silent(303.0) == ['fix']
-    assert liveness.rate('odom') == pytest.approx(10.0)
+    assert sources.silent(303.0) == ['fix']
+    assert sources['odom'].rate == pytest.approx(10.0)
 
 
 def test_it_is_said_when_nothing_comes_at_all() -> None:
-    liveness = Liveness(rare=['loop_closure'])
-    assert liveness.quiet(1000.0) == 0.0
-    liveness.receive('odom', 0.0)
-    assert liveness.quiet(9.0) == 0.0
-    assert liveness.quiet(11.0) == 11.0
-    receive_all(liveness, 'odom', 11.0, 20.0, 0.1)
-    liveness.receive('loop_closure', 25.0)
-    assert liveness.quiet(32.0) == 0.0
-    assert liveness.silent(32.0) == ['odom']
-    assert liveness.quiet(36.0) == 11.0
+    sources = Sources('loop_closure')
+    assert sources.quiet(1000.0) == 0.0
+    sources['fix'].resume(5.0)  # from which nothing has ever come
+    assert sources.quiet(1000.0) == 0.0
+    sources['odom'].receive(0.0)
+    assert sources.quiet(9.0) == 0.0
+    assert sources.quiet(11.0) == 11.0
+    sources.receive_all('odom', 11.0, 20.0, 0.1)
+    sources['loop_closure'].receive(25.0)
+    assert sources.quiet(32.0) == 0.0
+    assert sources.silent(32.0) == ['odom']
+    assert sources.quiet(36.0) == 11.0
     # slower than that
-    slow = Liveness()
-    receive_all(slow, 'odom', 0.0, 200.0, 20.0)
+    slow = Sources()
+    slow.receive_all('odom', 0.0, 200.0, 20.0)
     assert slow.quiet(280.0) == 0.0
     assert slow.quiet(320.0) == 120.0
 
@@ -96,18 +115,20 @@ class Counts:
     """What a node has counted, with the time in seconds."""
 
     def __init__(self) -> None:
-        self.refusals, self.now = Refusals(), 50.0
-        self.received, self.counts, self.details = Counter(), Counter(), {}
+        self.sources, self.now = Sources(), 50.0
+        self.counts, self.details = Counter(), {}
 
     def add(self, source: str, answer: str, count: int = 1, detail: str = '') -> None:
-        self.received[source] += count
+        self.sources[source].count += count
         self.counts[source, answer] += count
         if answer != 'accepted':
             self.details[source, answer] = detail
 
     def said(self, seconds: float = 0.0) -> dict[str, str]:
         self.now += seconds
-        return self.refusals.update(self.received, self.counts, self.details, self.now)
+        said = {name: each.refusal(self.counts, self.details, self.now)
+                for name, each in self.sources.items()}
+        return {name: sentence for name, sentence in said.items() if sentence != ''}
 
 
 def test_a_source_from_which_nothing_was_ever_accepted() -> None:
@@ -145,7 +166,7 @@ def test_what_was_asked_for_and_what_is_no_refusal_is_not_said() -> None:
     counts.add('fix', 'paused', 100, 'call ~/pause')
     counts.add('global_pose', 'accepted')
     counts.add('global_pose', 'thinned', 100, 'too close')
-    counts.received['odom'] = counts.counts['odom', 'sorted'] = 100
+    counts.sources['odom'].count = counts.counts['odom', 'sorted'] = 100
     assert counts.said() == counts.said(EXPECTED.refused_for + 0.1) == NOTHING
     counts.counts['set_pose', 'wrong_frame'] = 9
     counts.details['set_pose', 'wrong_frame'] = 'expected map'

@@ -13,6 +13,7 @@ import pytest
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.ros import input as input_module
+from pose_graph_ros.ros.arrivals import Arrivals
 from pose_graph_ros.ros.input import Decision, Input, LONGEST_DOUBT
 
 SECOND = 1_000_000_000
@@ -104,7 +105,7 @@ def test_an_unusable_message_is_counted_by_its_reason_and_logged_once(
     given = Given()
     for _ in range(3):
         given.use(source, message)
-    assert given.input.received == {source: 3}
+    assert given.input.arrivals[source].count == 3
     assert given.rejected() == {f'{source}.{reason}': 3}
     assert given.input.posted == 0
     given.input.watch(Counter(), {}, active=True)
@@ -132,15 +133,15 @@ def test_fixes_ahead_of_odometry_are_told_with_what_to_do(ahead: float, told: bo
         given.use('odom', odometry(100.0 + 0.1 * step))
         if step % 5 == 0:
             given.use('fix', fix(100.0 + 0.1 * step + ahead))
-    assert given.input.delays.seconds == {'fix': pytest.approx(-ahead)}
-    assert len(given.input.delays.wrong) == told
+    fixes = given.input.arrivals['fix']
+    assert fixes.delay == pytest.approx(-ahead)
+    assert (fixes.wrong != '') == told
     if told:
-        assert f'stamps of fix are {ahead:.1f} s ahead of those of odom' in (
-            given.input.delays.wrong['fix'])
-        assert 'fix.time_offset' in given.input.delays.wrong['fix']
+        assert f'stamps of fix are {ahead:.1f} s ahead of those of odom' in fixes.wrong
+        assert 'fix.time_offset' in fixes.wrong
     given.input.reader.configure(checked({'fix.time_offset': -ahead}))
     given.use('fix', fix(120.0 + ahead))
-    assert given.input.delays.wrong == {}
+    assert fixes.wrong == ''
 
 
 def test_late_fixes_are_no_mistake_but_odometry_that_is_apart_is() -> None:
@@ -149,7 +150,7 @@ def test_late_fixes_are_no_mistake_but_odometry_that_is_apart_is() -> None:
         given.use('odom', odometry(100.0 + 0.1 * step))
         given.use('visual', odometry(70.0 + 0.1 * step))
         given.use('fix', fix(60.0 + 0.1 * step))
-    (wrong,) = given.input.delays.wrong.values()
+    (wrong,) = (each.wrong for each in given.input.arrivals.values() if each.wrong != '')
     assert 'visual are 30.0 s behind those of odom' in wrong
 
 
@@ -177,10 +178,11 @@ def test_a_new_graph_forgets_all_but_what_is_held_back(
     frames = given.input.reader.frames
     given.input.watch(Counter(), {}, active=True)
     given.input.start_new_graph(checked(given.values))
-    assert given.input.received == given.input.rejected == {}
+    assert given.input.rejected == {}
+    assert all(each == Arrivals(name, each.is_rare)
+               for name, each in given.input.arrivals.items())
     assert (given.input.posted, given.input.is_streaming) == (0, False)
     assert given.input.reader.datum.plane is None
-    assert given.input.liveness.silence('odom', 1e9) is None
     assert given.input.reader.frames is frames
     assert [received.source for received in given.input.time_jumps.release()] == ['odom']
     # what was logged before is not logged again

@@ -37,7 +37,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
-from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros import diagnostics, input as input_module
 from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.session import Session
 
@@ -190,7 +190,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     worker = Space(alive=True, prepared=True, status=session.worker.status,
                    estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
-                     delays=Space(wrong={}), reader=Space(sources={}), received={})
+                     arrivals={'fix': Space(wrong='')}, reader=Space(sources={}))
     seen = Space(worker=worker, active=True, input=received, odometry_topics={}, final=None,
                  is_loaded=False, compiling=False, values=session.values,
                  node=Space(count_publishers=lambda _: 0),
@@ -209,7 +209,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
              'The newest measurements of fix are doubted and not used'),
             (worker, lambda: {'estimate': replace(
                 worker.estimate, alignment=AlignmentState.UNALIGNED)}, WARN, 'Unaligned'),
-            (received.delays, {'wrong': {'fix': 'The stamps of fix are 18.0 s ahead'}}, WARN,
+            (received.arrivals['fix'], {'wrong': 'the stamps of fix are 18.0 s ahead'}, WARN,
              'The stamps of fix are 18.0 s ahead.'),
             (received, {'silent': ['fix']}, WARN, 'Nothing comes from fix, while'),
             (received, {'silent': ['fix', 'imu']}, WARN, 'from fix and imu, while'),
@@ -263,7 +263,7 @@ def test_gyroscopes_that_are_of_no_use_or_wrong_are_warned_of(
 ) -> None:
     active.publishers['gyro'] = active.local.advertise(Imu, 'imu/data')
     # on a busy machine the gyroscope, which is sent first, is told to be silent instead
-    monkeypatch.setattr(active.session.input.liveness, 'silent', lambda now: [])
+    monkeypatch.setattr(input_module, 'silent', lambda sources, now: [])
 
     def rates(begin: float, end: float, late: float = 0.0) -> list[Imu]:
         """Of a gyroscope that is upside down, in the circle of the drive."""
