@@ -108,11 +108,18 @@ def twist_variance(values: Sequence[float]) -> FloatArray | None:
     return np.array(variance) if usable and any(variance) else None
 
 
-def global_pose(message: Message, map_frame: str, offset_ns: int = 0) -> GlobalPose | Answer:
-    """Return the global pose in a PoseWithCovarianceStamped, or the reason for rejecting it."""
+def global_pose(
+    message: Message, frames: Sequence[str], offset_ns: int = 0,
+) -> GlobalPose | Answer:
+    """
+    Return the pose in a PoseWithCovarianceStamped, or the reason for rejecting it.
+
+    It is in one of some frames, or in the first of them if it names none.
+    """
     named = frame(message.header.frame_id)
-    if named not in ('', map_frame):
-        return rejected('wrong_frame', f'expected frame {map_frame!r}, got {named!r}')
+    if named not in ('', *frames):
+        return rejected('wrong_frame', f'expected frame {" or ".join(map(repr, frames))}, got '
+                                       f'{named!r}')
     pose = planar_pose(message.pose.pose)
     if pose is None:
         return _bad_pose(message.pose.pose)

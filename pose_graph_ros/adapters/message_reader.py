@@ -90,7 +90,7 @@ class MessageReader:
                 return conversions.odometry_sample(
                     message, offset_ns, with_twist=source.integrates_twist)
             case Kind.GLOBAL_POSE:
-                return conversions.global_pose(message, self._map_frame, offset_ns)
+                return conversions.global_pose(message, (self._map_frame,), offset_ns)
             case Kind.IMU:
                 return conversions.heading(message, self.datum.yaw, source.yaw_offset, offset_ns)
             case Kind.FIX | Kind.TWIST | Kind.GYRO:

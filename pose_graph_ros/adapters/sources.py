@@ -85,18 +85,23 @@ class Source:
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
     """Return the sources by the checked parameters, odometry in the order of preference."""
-    return tuple(
-        Source(name, Kind(values[f'{name}.type']), values[f'{name}.topic'],
-               round(values[f'{name}.time_offset'] * NANOSECONDS),
-               tuple(values.get(f'{name}.lever_arm', (0.0, 0.0))),
-               values.get(f'{name}.yaw_offset', 0.0),
-               values.get(f'{name}.mounting', 'tf'), _integrates_twist(name, values))
-        for name in source_names(values['sources']))
+    return tuple(_source(name, _own(values, name)) for name in source_names(values['sources']))
 
 
-def _integrates_twist(name: str, values: Mapping[str, Any]) -> bool:
-    return values[f'{name}.type'] == Kind.TWIST.value or (
-        values.get(f'{name}.integrate') == Integrate.TWIST.value)
+def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Return the parameters of a source by their names without its own."""
+    return {name.removeprefix(f'{source}.'): value for name, value in values.items()
+            if name.startswith(f'{source}.')}
+
+
+def _source(name: str, own: Mapping[str, Any]) -> Source:
+    kind, given = Kind(own['type']), _same(own, Source)
+    if 'lever_arm' in given:
+        given['lever_arm'] = tuple(given['lever_arm'])
+    return Source(
+        name, kind, time_offset_ns=round(own['time_offset'] * NANOSECONDS),
+        integrates_twist=(kind is Kind.TWIST or own.get('integrate') == Integrate.TWIST.value),
+        **given)
 
 
 def source_names(listed: list[str]) -> list[str]:
@@ -121,8 +126,7 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
     odometry: dict[str, config.OdometrySource] = {}
     measurements, gyros = {SET_POSE: config.SET_POSES}, dict[str, GyroSource]()
     for source in source_list(values):
-        own = {name.removeprefix(f'{source.name}.'): value for name, value in values.items()
-               if name.startswith(f'{source.name}.')}
+        own = _own(values, source.name)
         try:
             if source.kind.is_odometry:
                 odometry[source.name] = _odometry_source(own, source)

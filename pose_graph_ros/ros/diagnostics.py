@@ -3,13 +3,13 @@
 """The values of /diagnostics by their keys."""
 
 from collections.abc import Sequence
-from concurrent.futures import Future
 import math
 import os
 from pathlib import Path
 import time
 from typing import TYPE_CHECKING
 
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
@@ -73,26 +73,28 @@ class Searches:
         self.contradiction: Disagreement | None = None
         self.due = 0.0  # time from which on the worker is asked again [s]
         self._n = 0     # number of measurements from which on a contradiction is searched again
-        self._asked: Future[tuple[Sequence[ConstraintEnergy], Disagreement | None]] | None = None
 
     def update(self, worker: Worker) -> None:
         """Search every 5 s; while measurements fit badly, when there are twice as many."""
-        now, reports = time.monotonic(), worker.status.sources.values()
-        if self._asked is not None and self._asked.done():
-            if not self._asked.cancelled() and self._asked.exception() is None:
-                self.energies, self.contradiction = self._asked.result()
-            self._asked = None
-        if not any(report.fits_badly for report in reports):
+        reports = worker.status.sources.values()
+        badly, n = any(report.fits_badly for report in reports), sum(each.n for each in reports)
+        if not badly:
             self.contradiction, self._n = None, 0
-        if self._asked is not None or not worker.prepared or now < self.due:
+        if not worker.prepared or time.monotonic() < self.due:
             return
-        self.due, n, known = now + 5.0, sum(report.n for report in reports), self.contradiction
-        badly = any(report.fits_badly for report in reports)
         is_new = badly and n >= self._n
-        self._n = 2 * n if is_new else self._n
-        self._asked = worker.call(lambda backend: (
-            backend.largest_energies(3), backend.disagreement() if is_new else known),
-            'the largest energies')
+        if is_new:
+            self._n = 2 * n
+
+        def search(backend: PoseGraphBackend) -> None:
+            try:
+                self.energies = backend.largest_energies(3)
+                if is_new:
+                    self.contradiction = backend.disagreement()
+            finally:
+                self.due = time.monotonic() + 5.0
+        self.due = math.inf  # one search at a time
+        worker.call(search, 'the largest energies')
 
 
 def memory() -> int:

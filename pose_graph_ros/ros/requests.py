@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.adapters.conversions import frame, Message, PLANAR, planar_pose, stamp_ns
+from pose_graph_ros.adapters.conversions import frame, global_pose, Message
 from pose_graph_ros.adapters.fixes import datum_of
 from pose_graph_ros.adapters.sources import JUDGE, SET_POSE
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -51,21 +51,18 @@ class SetPoseInput:
 
     def receive(self, message: Message, *, early: bool = False) -> Answer | None:
         """Return why a message cannot be used; None if it can and is kept for `pop`."""
-        named = frame(message.header.frame_id)
-        if named not in ('', *self._frames):
-            return rejected('wrong_frame', f'expected {", ".join(self._frames)}, got {named!r}')
-        pose = planar_pose(message.pose.pose)
-        if pose is None:
-            return rejected('not_finite', 'expected a finite position and a quaternion')
-        if (broken := value_defect(pose)) is not None:
-            return rejected(broken, f'pose {pose.tolist()}')
-        cov = np.asarray(message.pose.covariance, dtype=float).reshape(6, 6)[PLANAR]
-        variance = np.diagonal(cov)
+        given = global_pose(message, self._frames)
+        if isinstance(given, Answer):
+            return given
+        if (broken := value_defect(given.pose)) is not None:
+            return rejected(broken, f'pose {given.pose.tolist()}')
+        cov, variance = given.covariance, np.diagonal(given.covariance)
         if not (np.all(np.isfinite(cov)) and np.all(variance > 0.0)
                 and np.all(variance <= covariance.LARGEST_VARIANCE)):
             cov = np.diag((0.5, 0.5, 0.26)) ** 2    # what RViz sends [m, m, rad]
-        stamp = FIRST if early else stamp_ns(message)
-        self._waiting = named, GlobalPose(stamp if stamp > 0 else NEWEST, pose, cov)
+        stamp = FIRST if early else given.stamp_ns
+        self._waiting = frame(message.header.frame_id), GlobalPose(
+            stamp if stamp > 0 else NEWEST, given.pose, cov)
         return None
 
     def pop(self, estimate: Estimate) -> GlobalPose | None:

@@ -30,7 +30,8 @@ def test_odometry_is_read_whatever_the_length_of_its_quaternion() -> None:
 
 @pytest.mark.parametrize('frame', ['map', '/map', ''])
 def test_a_global_pose_in_the_map_is_taken(frame: str) -> None:
-    assert isinstance(conversions.global_pose(pose(1.0, 0.0, 0.0, 0.0, frame), 'map'), GlobalPose)
+    given = conversions.global_pose(pose(1.0, 0.0, 0.0, 0.0, frame), ('map',))
+    assert isinstance(given, GlobalPose)
 
 
 @pytest.mark.parametrize(('frame', 'node', 'time'), [
