@@ -96,12 +96,9 @@ def _missing_input(session: 'Session') -> Iterator[Concern]:
             f'a graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
         yield Concern(WARN, f'{state}: {why}')
     if received.quiet > 0.0:
-        final = session.final
-        ended = (final is not None and final.done() and not final.cancelled()
-                 and final.exception() is None and final.result().status is Status.CONVERGED)
         yield Concern(WARN, f'nothing has been received for {received.quiet:.0f} s: the drivers '
                       'have stopped, or a bag has ended'
-                      + ('; the graph has been optimised' if ended else ''),
+                      + ('; the graph has been optimised' if session.worker.is_optimal else ''),
                       logged=True)
     if len(refused) > 0:
         yield Concern(WARN, '; '.join(refused.values()))

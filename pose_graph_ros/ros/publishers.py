@@ -56,6 +56,7 @@ from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
 from pose_graph_ros.ros.transforms import (
     message_class,
+    Slew,
     TF_QOS,
     TF_TYPE,
     TFMessage,
@@ -200,7 +201,7 @@ class Publishers:
     def jump(self) -> None:
         """Let the next transform be published without limits: the robot was put elsewhere."""
         if self.transforms is not None:
-            self.transforms.slew.forget()
+            self.transforms.slew = Slew()
 
     def publish_views(
         self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,

@@ -94,7 +94,6 @@ class Session:
             name: PoseContinuity(source.maximum_speed, resumes=resumes)
             for name, source in self._config.odometry.items()}
         self.is_loaded = resumes  # whether the graph began as one that was loaded
-        self.final: Future[UpdateReport] | None = None  # optimisation at the end of the stream
         # of this graph, so that the answer of an earlier worker is nobody's
         self.searches = diagnostics.Searches()
         graph = self.out.graph
@@ -309,7 +308,7 @@ class Session:
         silence = time.monotonic() - self.input.posted_at
         if self.input.is_streaming and 0.0 < self.values['closing_silence'] < silence:
             self.input.is_streaming = False
-            self.final = self.optimize()
+            self.optimize()
 
     def _on_views_timer(self) -> None:
         """Make the worker's thread publish path and markers that are due."""

@@ -77,7 +77,7 @@ class TransformPublisher:
         if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
             # the map frame itself has moved, which is no correction of the pose
             self._aligned = not self._aligned
-            self.slew.forget()
+            self.slew = Slew()
         T_map_odom = self.slew.limited(
             sample.stamp_ns, estimate.T_map_odom, sample.pose, *limits)
         at_ns = sample.stamp_ns + offset_ns
@@ -147,10 +147,6 @@ class Slew:
     def __init__(self) -> None:
         self._last: FloatArray | None = None
         self._stamp_ns = 0
-
-    def forget(self) -> None:
-        """Let the next transform be published without limits."""
-        self._last = None
 
     def limited(
         self, stamp_ns: int, T_map_odom: FloatArray, T_odom_base: FloatArray, linear: float,

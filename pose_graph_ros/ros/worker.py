@@ -18,6 +18,7 @@ import time
 from typing import TypeVar
 
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
@@ -75,6 +76,7 @@ class Worker:
     ) -> None:
         self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
         self.prepared = False  # whether the preparation has ended
+        self.is_optimal = False  # whether the whole graph was optimised since the last update
         self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
         self._update_wanted = False
         self._jobs: list[tuple[str, Job[object], Future[object]]] = []
@@ -185,6 +187,8 @@ class Worker:
             if self._stopping:
                 return
             self._add(source, measurement)
+        if wanted:
+            self.is_optimal = False
         report = self._update(self._backend.update) if wanted else None
         # after a jump of the odometry the old estimate cannot be propagated
         stale = self._revision != self._backend.revision
@@ -220,6 +224,7 @@ class Worker:
     def optimize_fully(self, backend: PoseGraphBackend) -> UpdateReport:
         """Optimise the whole graph; a job for `call`."""
         report = self._update(backend.optimize)
+        self.is_optimal = report.status is Status.CONVERGED
         self._publish()
         self._report(report, 0)
         return report

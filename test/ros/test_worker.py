@@ -59,6 +59,7 @@ def test_all_that_is_posted_is_processed_and_one_estimate_follows_the_other(star
         worker.request_update()
     report = worker.call(worker.optimize_fully).result(PATIENCE)
     assert report.status is Status.CONVERGED
+    assert worker.is_optimal
     wait_until(lambda: worker.status.processed == 200)
     assert worker.status.counts['pose', 'accepted'] == 100
     assert worker.estimate.stamp_ns == estimates[-1].stamp_ns
@@ -171,6 +172,7 @@ def test_between_updates_the_estimate_is_refined_until_nothing_is_left(start: St
                 [0.3 * step, 0.0, 0.0]) + 0.3 * rng.normal(size=3), 0.01 * np.eye(3)))
     worker.request_update()
     wait_until(lambda: len(backend.refinements) > 0 and backend.refinements[-1].finished)
+    assert not worker.is_optimal
     path = worker.call(lambda backend: backend.estimate().path).result(PATIENCE)
     assert sum(refinement.moved for refinement in backend.refinements) > 0.001
     np.testing.assert_allclose(estimates[-1].path.poses, path.poses, atol=0.002)
