@@ -18,8 +18,6 @@ import numpy as np
 from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose, wrap_one
-from pose_graph_ros.core.judgement.texts import Key, nanoseconds
-from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import (
     Answer,
     GlobalPose,
@@ -222,14 +220,3 @@ def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
         [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
         [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])
-
-
-def states_in(message: Message) -> dict[Key, State]:
-    """Return the states of measurements in a message, by their sources and stamps."""
-    found: dict[Key, State] = {}
-    for status in message.status[1:]:
-        values = {item.key: item.value for item in status.values}
-        reference = values['reference_stamp']
-        found[status.hardware_id, nanoseconds(values['stamp']),
-              None if reference == '' else nanoseconds(reference)] = State(values['state'])
-    return found

@@ -32,7 +32,8 @@ from pose_graph_ros.offline.drawing.views import Role, Sort
 
 N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
 INK, GREY = '#111111', '#7a828c'
-COLOURS = {     # after Okabe and Ito, but for grey
+COLOURS = {     # after Okabe and Ito, but for grey; without a sort, arcs of several terms
+    None: GREY,
     Sort.ODOMETRY: GREY, Sort.LOOP_CLOSURE: '#2F8FD0', Sort.TURN: '#B9A51C',
     Sort.LANDMARK: '#009E73', Sort.OBSERVED: '#E69F00', Sort.BIAS: '#B583A4',
     Sort.PRIOR: '#D55E00'}
@@ -58,11 +59,6 @@ class Panel:
     view: Any
     at: dict[int, FloatArray]
     pattern: Pattern | None
-
-    @property
-    def arcs(self) -> list[tuple[int, int, dict[str, Any]]]:
-        """Ends and attributes of all arcs."""
-        return list(self.view.edges(data=True))
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -159,7 +155,7 @@ def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> d
         diagrams.append({'title': panel.title, 'vertices': vertices, 'arcs': [
             {'start': place[start], 'end': place[end], 'directed': arc['directed'],
              'sort': None if arc['sort'] is None else arc['sort'].name.lower(),
-             'used': arc['used']} for start, end, arc in panel.arcs]})
+             'used': arc['used']} for start, end, arc in panel.view.edges(data=True)]})
     return {'view': view, 'file': str(out), 'notes': notes, 'diagrams': diagrams}
 
 
@@ -216,20 +212,19 @@ def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None
              if 'term' in data and data['role'] not in FILLS}
     groups: dict[Any, Any] = defaultdict(nx.DiGraph)  # arcs that look alike
     drawn = set[tuple[int, int]]()
-    for start, end, arc in panel.arcs:
+    for start, end, arc in panel.view.edges(data=True):
         # of several between the same vertices, all but the first are bent
         bend = 0.25 * (not drawn.isdisjoint({(start, end), (end, start)}))
         drawn.add((start, end))
         groups[arc['sort'], bend, arc['used'], arc['directed']].add_edge(start, end)
     for (sort, bend, used, directed), alike in groups.items():
-        colour = GREY if sort is None else COLOURS[sort]
         nx.draw_networkx_edges(
-            alike, panel.at, ax=axes, edge_color=colour, width=0.05 * diameter,
+            alike, panel.at, ax=axes, edge_color=COLOURS[sort], width=0.05 * diameter,
             connectionstyle=f'arc3,rad={bend}', style='solid' if used else 'dashed', arrows=True,
             arrowsize=0.45 * diameter, arrowstyle='-|>' if directed else '-',
             nodelist=list(alike), node_size=[area[node] for node in alike])
         if sort not in named:
-            axes.plot([], [], color=colour,
+            axes.plot([], [], color=COLOURS[sort],
                       label='in a term together' if sort is None else sort.value)
     longest = max((len(data['name']) for data in vertices.values()), default=1)
     nx.draw_networkx_labels(
@@ -290,11 +285,10 @@ def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
                 f'  n{n}_{node} [label={name}, shape={shape}, '
                 f'width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
                 f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
-        for start, end, arc in panel.arcs:
+        for start, end, arc in panel.view.edges(data=True):
             style = ('' if arc['directed'] else ', dir=none') + (
                 '' if arc['used'] else ', style=dashed')
-            colour = GREY if arc['sort'] is None else COLOURS[arc['sort']]
-            lines.append(f'  n{n}_{start} -> n{n}_{end} [color="{colour}"{style}];')
+            lines.append(f'  n{n}_{start} -> n{n}_{end} [color="{COLOURS[arc["sort"]]}"{style}];')
         if len(panels) > 1:
             lines.append('  }')
     return '\n'.join([*lines, '}']) + '\n'

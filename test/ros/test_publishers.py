@@ -18,7 +18,6 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
-from pose_graph_ros.adapters.conversions import states_in
 from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -27,7 +26,7 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
-from pose_graph_ros.core.judgement.texts import details, sentence, states_by_stamps
+from pose_graph_ros.core.judgement.texts import details, sentence
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     Judged,
@@ -280,7 +279,6 @@ def test_the_message_of_verdicts_has_one_status_for_each_and_one_for_all() -> No
         assert (status.name, status.hardware_id, status.message) == (
             each.id, 'loop', sentence(each))
         assert {item.key: item.value for item in status.values} == details(each)
-    assert states_in(message) == states_by_stamps(verdicts)
     assert 'nothing is judged yet' in verdicts_message([], {}, Header()).status[0].message
 
 

@@ -14,9 +14,7 @@ from rcl_interfaces.msg import Log
 from rclpy.publisher import Publisher
 from visualization_msgs.msg import MarkerArray
 
-from pose_graph_ros.adapters.conversions import states_in
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.judgement.verdicts import State
 
 LAP = 20.0 * math.pi
 """Duration of a round of the circle [s]."""
@@ -104,7 +102,8 @@ def test_closures_are_told_of_with_reasons_and_a_person_decides_on_them(
         assert float(values['distance']) > 4.0
         assert abs(float(values['residual'].strip('[]').split(',')[1])) > 7.0
     assert float(verdicts.values(3)['stamp']) == pytest.approx(START + 64.5)
-    assert sum(state is State.BELIEVED for state in states_in(verdicts.messages[-1]).values()) == 3
+    assert sum((item.key, item.value) == ('state', 'believed')
+               for status in verdicts.statuses.values() for item in status.values) == 3
     client.wait_values({'loop_closure.believed': '3'})
     client.spin_until(lambda: any(
         'loop_closures' in names and names & {'doubted', 'waiting_closures'}

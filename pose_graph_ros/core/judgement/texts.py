@@ -43,12 +43,6 @@ def short(value: float, digits: int = 2) -> str:
     return text.rstrip('0').rstrip('.') if '.' in text else text
 
 
-def nanoseconds(text: str) -> int:
-    """Return the stamp that `seconds` was given, if it was asked for all digits [ns]."""
-    whole, _, rest = text.partition('.')
-    return int(whole) * NANOSECONDS + int(rest)
-
-
 def number_of(n: int, kind: Judged) -> str:
     """Return `1 closure` or `2 closures`."""
     return f'{n} {NOUNS[kind] if n == 1 else PLURALS[kind]}'

@@ -8,15 +8,17 @@ order of time, and the factor R is that of the smoother, in its order of elimina
 clique have a block for each later frontal node and each separator node.
 """
 
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
+import networkx as nx
 import numpy as np
 
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.offline.drawing.views import hidden, terms
+from pose_graph_ros.offline.drawing.views import hidden, markov_random_field, terms
 
 MOST_BINS = 120
 
@@ -68,15 +70,10 @@ def elimination_order(graph: Any) -> list[int]:
     nodes last, which in a small graph leaves little to order; here none is put anywhere.
     """
     rows = hidden(graph)
-    place = {row: n for n, row in enumerate(rows)}
-    near: list[set[int]] = [set() for _ in rows]
-    for term in terms(graph):
-        for node in term.nodes if term.used else ():
-            near[place[node]].update(place[other] for other in term.nodes if other != node)
-    start = np.concatenate(([0], np.cumsum([len(others) for others in near])))
-    adjacency = np.array([row for others in near for row in sorted(others)], dtype=np.int32)
+    near = nx.to_scipy_sparse_array(nx.Graph(markov_random_field(graph)), nodelist=rows)
+    near.sort_indices()
     n_cliques, first, n_frontal, _, nodes = minimum_degree(
-        len(rows), 0, 0, 0, start.astype(np.int32), adjacency)
+        len(rows), 0, 0, 0, near.indptr.astype(np.int32), near.indices.astype(np.int32))
     return [rows[node] for k in range(n_cliques)
             for node in nodes[first[k]:first[k] + n_frontal[k]].tolist()]
 
@@ -113,7 +110,8 @@ def hessian(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
     blocks = place[blocks[np.all(blocks >= 0, axis=1)]]
     blocks = blocks[np.all(blocks >= 0, axis=1)]
     numbers = np.unique(blocks[:, 0] * len(order) + blocks[:, 1])
-    return _binned(np.column_stack(np.divmod(numbers, max(len(order), 1))), len(order), most_bins)
+    blocks = np.column_stack(np.divmod(numbers, max(len(order), 1)))
+    return _binned([blocks], len(order), most_bins)
 
 
 def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
@@ -130,21 +128,16 @@ def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
         own = own[~fixed[own]]
         place[own] = np.arange(n, n + len(own))
         n += len(own)
-    bins = min(most_bins, n)
-    counts = np.zeros((bins, bins), dtype=np.int64)
-    total = 0
-    for c in order:
-        at = place[nodes[first[c]:first[c] + frontal[c] + separator[c]]]
-        own, rest = at[:frontal[c]], at[frontal[c]:]
-        own, rest = np.sort(own[own >= 0]), rest[rest >= 0]
-        rows, columns = np.triu_indices(len(own))
-        blocks = np.concatenate((
-            np.column_stack((own[rows], own[columns])),
-            np.column_stack((np.repeat(own, len(rest)), np.tile(rest, len(own))))))
-        total += len(blocks)
-        np.add.at(counts, tuple((blocks * bins // max(n, 1)).T), 1)
-    filled = np.argwhere(counts > 0)
-    return BinnedPattern(n, total, bins, np.column_stack((filled, counts[tuple(filled.T)])))
+
+    def blocks() -> Iterator[IntArray]:
+        for c in order:
+            at = place[nodes[first[c]:first[c] + frontal[c] + separator[c]]]
+            own, rest = at[:frontal[c]], at[frontal[c]:]
+            own, rest = np.sort(own[own >= 0]), rest[rest >= 0]
+            rows, columns = np.triu_indices(len(own))
+            yield np.column_stack((own[rows], own[columns]))
+            yield np.column_stack((np.repeat(own, len(rest)), np.tile(rest, len(own))))
+    return _binned(blocks(), n, most_bins)
 
 
 def _children_first(cliques: IntArray) -> list[int]:
@@ -166,16 +159,12 @@ def _children_first(cliques: IntArray) -> list[int]:
     return found[::-1]
 
 
-def _binned(blocks: IntArray, size: int, most_bins: int) -> BinnedPattern:
-    """
-    Count blocks in cells.
-
-    Parameters
-    ----------
-    blocks : ndarray of int, shape (B, 2), rows and columns
-    size, most_bins : int
-
-    """
+def _binned(blocks: Iterable[IntArray], size: int, most_bins: int) -> BinnedPattern:
+    """Count blocks in cells; they come in parts, rows and columns of each, shape (B, 2)."""
     bins = min(most_bins, size)
-    cells, counts = np.unique(blocks * bins // max(size, 1), axis=0, return_counts=True)
-    return BinnedPattern(size, len(blocks), bins, np.column_stack((cells, counts)))
+    counts = np.zeros((bins, bins), dtype=np.int64)
+    for some in blocks:
+        np.add.at(counts, tuple((some * bins // max(size, 1)).T), 1)
+    cells = np.argwhere(counts > 0)
+    return BinnedPattern(size, int(np.sum(counts)), bins,
+                         np.column_stack((cells, counts[tuple(cells.T)])))
