@@ -8,12 +8,13 @@ What takes long to load, such as compiled kernels, is imported where it is used.
 # ruff: noqa: PLC0415
 
 import argparse
+from collections.abc import Iterable, Mapping
 import json
 import math
 from pathlib import Path
 import sys
 import time
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -60,8 +61,7 @@ def execute(options: argparse.Namespace) -> int:
     problem = Problem(file, plain=(
         options.robust is None and which is None and options.start == 'chordal'))
     rows = None if which is None else _chosen(problem, which)
-    held = problem.hold_parts()
-    graph = problem.graph
+    held, graph = problem.held, problem.graph
     before = graph.energies().chi2
     say(f'{graph.n_nodes} hidden nodes, {len(graph.edges)} edges, '
         f'{len(graph.observed)} observed nodes; chi2 {before:.9g} as read')
@@ -86,11 +86,10 @@ def execute(options: argparse.Namespace) -> int:
         solution, certificate = with_certificate(problem, solution, eigenvalue=options.json)
     say('\n'.join([*_lines(problem, solution, seconds, doubted),
                    *([] if certificate is None else certificate.lines())]))
-    table = None if rows is None else _marginals(problem, solution, rows)
+    table, error = ([], 0.0) if rows is None else _marginals(problem, solution, rows)
     for path in options.out:
         if path in tables:
-            assert table is not None
-            path.write_text('\n'.join(table.lines()) + '\n', encoding='ascii')
+            path.write_text(_csv(table), encoding='ascii')
         else:
             from pose_graph_ros.core.io.g2o_writing import write_g2o
 
@@ -99,12 +98,12 @@ def execute(options: argparse.Namespace) -> int:
         values = _values(problem, solution, doubted, file.ids[held]) | {
             'chi2_start': before, 'seconds': seconds, 'edge2': order, 'robust': decision,
             'certificate': None if certificate is None else certificate.values()}
-        if table is not None:
-            values |= {'marginals_relative_error': table.relative_error,
-                       **({} if len(tables) > 0 else {'marginals': table.rows})}
+        if rows is not None:
+            values |= {'marginals_relative_error': error,
+                       **({} if len(tables) > 0 else {'marginals': table})}
         print(json.dumps(_finite(values), indent=2, allow_nan=False))
-    elif table is not None and len(tables) == 0:
-        print('\n'.join(table.lines()))
+    elif rows is not None and len(tables) == 0:
+        print(_csv(table), end='')
     return 0 if solution.result.status is Status.CONVERGED else 1
 
 
@@ -162,21 +161,20 @@ def _chosen(problem: Problem, which: str) -> IntArray:
     return rows_of(problem.ids, which, '--marginals')
 
 
-class _Marginals(NamedTuple):
-    """Poses and covariances in map axes of some nodes."""
-
-    rows: list[dict[str, float | None]]  # by `COLUMNS`; None for the heading of a point
-    relative_error: float  # that rounding may make: the condition number times epsilon
-
-    def lines(self) -> list[str]:
-        """Return lines of CSV."""
-        return [','.join(COLUMNS), *(','.join(
-            '' if value is None else repr(value) for value in row.values())
-            for row in self.rows)]
+def _csv(table: Iterable[Mapping[str, float | None]]) -> str:
+    return '\n'.join([','.join(COLUMNS), *(','.join(
+        '' if value is None else repr(value) for value in row.values()) for row in table), ''])
 
 
-def _marginals(problem: Problem, solution: Solution, rows: IntArray) -> _Marginals:
-    """Return the covariances of nodes of a graph that the batch optimiser has solved."""
+def _marginals(
+    problem: Problem, solution: Solution, rows: IntArray,
+) -> tuple[list[dict[str, float | None]], float]:
+    """
+    Return poses and covariances in map axes of some nodes by `COLUMNS`, after the optimisation.
+
+    The heading of a point is None. With them comes the relative error that rounding may make: the
+    condition number times epsilon.
+    """
     from pose_graph_ros.core.batch.optimizer import optimize
     from pose_graph_ros.core.graph.constraints import upper
     from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -198,7 +196,7 @@ def _marginals(problem: Problem, solution: Solution, rows: IntArray) -> _Margina
     if error > 1e-6:
         print(f'warning: by rounding, covariances may be off by {error:.1g} of themselves',
               file=sys.stderr)
-    return _Marginals(table, error)
+    return table, error
 
 
 def _condition(graph: 'Graph', covariances: Covariances) -> float:

@@ -28,6 +28,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph_update import GraphUpdate
 from pose_graph_ros.core.io.g2o import compose_missing, GraphFile
+from pose_graph_ros.core.sparse import components
 from pose_graph_ros.offline.certificate.certify import Certificate, certify, NearHessian, Verdict
 from pose_graph_ros.offline.certificate.objective import formulate, NotCoveredError
 
@@ -51,20 +52,24 @@ class Solution:
 
 class Problem:
     """
-    A graph from a file that is to be optimised.
+    A graph from a file that is to be optimised; parts that nothing holds have a fixed node.
 
     With `plain` compiled kernels are not used if the graph is simple and not large: loading them
     takes longer than to solve such a graph.
     """
 
     def __init__(self, file: GraphFile, *, plain: bool) -> None:
-        self.ids, self.has_start, self._file = file.ids, file.has_start, file
-        self._held: list[int] = []
+        rows, part = file.rows, components(file.rows.edges.i, file.rows.edges.j, len(file.ids))
+        is_held = np.isin(part, part[rows.fixed]) | np.isin(part, part[rows.observed.node])
+        is_first = (part == np.arange(len(part))) & ~is_held
+        self.ids, self.has_start = file.ids, file.has_start
+        self.held = np.flatnonzero(is_first)
+        """First nodes of the parts that had no fixed and no observed one."""
+        self._file = replace(file, rows=rows._replace(fixed=rows.fixed | is_first))
         self.plain: PlainGraph | None = None  # the graph, if no kernels are used
-        rows = file.rows
         if (plain and len(rows.poses) <= MOST_PLAIN_NODES and not np.all(rows.fixed)
                 and PlainGraph.is_covered(rows)):
-            self.plain = PlainGraph(rows)
+            self.plain = PlainGraph(self._file.rows)
 
     @property
     def graph(self) -> 'Graph | PlainGraph':
@@ -76,25 +81,9 @@ class Problem:
         """The graph for the compiled kernels, at its present poses; it is used from now on."""
         graph = self._file.graph
         if self.plain is not None:
-            graph.apply(GraphUpdate(fix=self._held))
             graph.set_poses(self.plain.poses)
             self.plain = None
         return graph
-
-    def hold_parts(self) -> list[int]:
-        """Fix the first node of each part that has no fixed and no observed one; return these."""
-        if self.plain is not None:
-            self._held = self.plain.hold_parts()
-            return self._held
-        from pose_graph_ros.core.batch.optimizer import loose_nodes  # noqa: PLC0415
-        from pose_graph_ros.core.elimination.symbolic import analyse  # noqa: PLC0415
-
-        graph, held = self.engine, []
-        cliques = analyse(graph.memory.head).cliques
-        while len(loose := loose_nodes(graph, cliques)) > 0:
-            held.append(int(loose[0]))
-            graph.apply(GraphUpdate(fix=held[-1:]))
-        return held
 
 
 def solve(problem: Problem, start: str) -> Solution:

@@ -43,7 +43,6 @@ __all__ = [
     'chi2_of',
     'from_linear_start',
     'in_parts',
-    'loose_nodes',
     'optimize',
     'optimize_from_linear_start',
     'optimize_from_two_starts',

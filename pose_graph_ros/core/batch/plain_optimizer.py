@@ -30,7 +30,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Po
 from pose_graph_ros.core.graph.checks import are_definite
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, NodeKind, ObservedNodes
 from pose_graph_ros.core.graph.graph_update import Energies, GraphRows
-from pose_graph_ros.core.sparse import BlockFactors, components
+from pose_graph_ros.core.sparse import BlockFactors
 
 
 class PlainGraph:
@@ -72,15 +72,6 @@ class PlainGraph:
     def set_poses(self, poses: FloatArray) -> None:
         """Set the poses of all hidden nodes, shape (N, 3) [m, m, rad]."""
         self.poses = se2.wrapped(poses)
-
-    def hold_parts(self) -> list[int]:
-        """Fix the first node of each part without a fixed one; return these nodes."""
-        part = components(self.edges.i, self.edges.j, self.n_nodes)
-        is_held = np.zeros(self.n_nodes, dtype=bool)
-        is_held[part[self.fixed]] = True
-        held = np.flatnonzero((part == np.arange(self.n_nodes)) & ~is_held)
-        self.fixed[held] = True
-        return [*map(int, held)]
 
     def edges_at(self, rows: IntArray) -> Edges:
         """Return some of the edges."""
