@@ -99,16 +99,16 @@ class SetSearch:
     """
     Looks for a set of closures that costs less than the present one, part by part on a copy.
 
-    It is the decision of the end of a stream, begun while closures that agree with one another
-    are kept out, or an update diverges.
+    It is begun while closures that agree with one another are kept out, or as an update diverges,
+    but the graph has to grow by a share between two of them, so that all together take a time in
+    proportion to the drive.
     """
 
     def __init__(self, states: ClosureStates) -> None:
         self._states = states
         self._parts: Choosing | None = None
         self._edges = self._nodes = np.empty(0, dtype=np.int64)  # ids of what it decides on
-        self._next = BELIEF.more_corroborated  # so many closures begin the next one
-        self._next_at = 0  # next id of a node from which on a divergence begins one
+        self._next_at = 0  # next id of a node from which on there may be another one
         self._wanted = False
 
     def want(self) -> None:
@@ -117,11 +117,9 @@ class SetSearch:
 
     def _is_due(self, graph: Graph) -> bool:
         states = self._states
-        against = int(np.count_nonzero(states.corroborated & ~states.in_graph & states.judged))
-        if against < self._next and not (
-                self._wanted and graph.next_ids.node >= self._next_at):
+        against = states.corroborated & ~states.in_graph & states.judged
+        if graph.next_ids.node < self._next_at or not (self._wanted or np.any(against)):
             return False
-        self._next = max(against + BELIEF.more_corroborated, math.ceil(1.5 * against))
         self._next_at = graph.next_ids.node + math.ceil(BELIEF.search_again * graph.n_nodes)
         self._wanted = False
         return True

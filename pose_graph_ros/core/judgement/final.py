@@ -5,6 +5,7 @@ The best set of believed loop closures of a whole graph, at the end of a stream 
 
 It is a function of the graph alone, while what is believed before depends on the order in which
 measurements come. `select` believes the surest ones first; `best` compares that with other sets.
+While the robot drives, `decide` looks for a set that is better than the present one.
 """
 
 from collections.abc import Generator
@@ -130,16 +131,16 @@ class _Gates:
         self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
 
 
-def best(problem: TruncatedProblem, *, may_be_all: bool = True) -> Choosing:
+def best(problem: TruncatedProblem) -> Choosing:
     """
     Return the set with the lowest truncated cost; None if the graph cannot be solved.
 
-    All constraints are believed if they contradict nothing, and that may be. Otherwise the sets
-    compared are none, and those of `select` and of graduated non-convexity, each after retests.
+    All constraints are believed if they contradict nothing. Otherwise the sets compared are none,
+    and those of `select` and of graduated non-convexity, each after retests.
     """
     everything = np.ones(len(problem), dtype=bool)
     # with wrong ones among them each iteration can take longer than a part may
-    if may_be_all and problem.factorisation(everything.astype(np.float64)) <= (
+    if problem.factorisation(everything.astype(np.float64)) <= (
             BELIEF.most_numbers * problem.graph.n_nodes):
         choice = yield from problem.choice(everything, ROUGH)
         if choice is not None and np.all(choice.energies <= problem.limits):
@@ -151,6 +152,18 @@ def best(problem: TruncatedProblem, *, may_be_all: bool = True) -> Choosing:
         if choice is not None:
             solved.append((yield from problem.improved(choice)))
     return min(solved, key=lambda each: each.cost, default=None)
+
+
+def surest(problem: TruncatedProblem) -> Choosing:
+    """
+    Return the set of `select` after retests; None if the graph cannot be solved.
+
+    Early in a drive little contradicts a group of wrong constraints that agree, and to believe it
+    can cost less than to doubt each of them. But such a group does not pass the gates.
+    """
+    believed = yield from select(problem)
+    choice = None if believed is None else (yield from problem.choice(believed))
+    return None if choice is None else (yield from problem.improved(choice))
 
 
 # Least reduction of the truncated cost, that of one constraint [sigma^2].
@@ -166,8 +179,9 @@ def decide(
     Return which loop closures to believe, with poses by row; None if the graph cannot be solved.
 
     All closures are taken out, and the rest is solved: with robust weights from initial values, if
-    `losses` are given, else with the present weights. Then the result is None too if the present
-    poses cost as little. With more than `most_at_end` nodes and closures it is `inside`, improved.
+    `losses` are given, else with the present weights. Then, while the robot drives, the result is
+    the surest set, or None if `inside`, the present one, costs as little. With more than
+    `most_at_end` nodes and closures it is `inside`, improved.
     """
     rows, forced = graph.edge_rows(ids), graph.edge_rows(forced)
     copy, present = _copy(graph, np.union1d(rows, forced)), graph.poses.copy()
@@ -190,11 +204,12 @@ def decide(
         if result.status is Status.FAILED:
             return None
         problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
-        choice = yield from best(problem, may_be_all=losses is not None)
-    if choice is None or (
-            losses is None and choice.cost > problem.cost_at(present) - LEAST_GAIN):
-        return None
-    return choice
+        choice = yield from (surest if losses is None else best)(problem)
+    if choice is None or losses is not None:
+        return choice
+    solved = yield from problem.choice(inside)
+    cost = min(problem.cost_at(present), np.inf if solved is None else solved.cost)
+    return choice if choice.cost < cost - LEAST_GAIN else None
 
 
 def _copied_rows(graph: Graph) -> GraphRows:

@@ -23,10 +23,9 @@ class BeliefSettings:
     leaving_rounds: int = 4  # rounds of tests of closures that leave the graph
     most_turns: int = 2  # times that one is thrown out before it waits for the next one to come
     # the graph has to grow by this share, and by so many nodes, before the next test of a closure
-    # that an update has diverged with, and by another one before the next search for a set then
+    # that an update has diverged with
     rest_share: float = 0.1
     least_rest: int = 10
-    search_again: float = 0.1
 
     # --- when a closure is believed
     # least sigmas to decide by, as claimed covariances are mostly too small [m, m, rad]
@@ -49,9 +48,7 @@ class BeliefSettings:
     # --- what is solved on a copy
     pause: float = 0.02  # growth of the graph until the next trial, as a share of it
     small: int = 100  # nodes up to which there is no pause: all is solved for in milliseconds
-    # closures that agree with one another and are kept out begin the search of another set: so
-    # many more, and half more, than at the last one
-    more_corroborated: int = 5
+    search_again: float = 0.1  # growth until the next search of another set
 
     # --- the best set of closures of a whole graph
     most_at_end: int = 30_000  # nodes and closures above which the set is only improved
