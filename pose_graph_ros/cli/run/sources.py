@@ -29,8 +29,7 @@ class SourceAnalysis(NamedTuple):
 
     residuals: SourceResiduals
     kind: Kind
-    at_estimate: ScaleFit
-    fit: ScaleFit  # where all sources are weighed by what their residuals show
+    fit: ScaleFit
     whiteness: Whiteness | None
     in_use: CorrelatedErrors | None  # that the graph is built with; None for white errors
     correlated: bool  # whether its errors are, and the graph takes them for independent
@@ -56,14 +55,14 @@ def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
                'map': Kind.GLOBAL_POSE}
     reports, found = run.backend.reports(), {}
     for source, each in analysis.residuals.items():
-        fit, report = analysis.together[source], reports.get(source)
+        fit, report = analysis.fits[source], reports.get(source)
         # other odometry than the primary one has no sigma_scale that is used
         advice = f'{source}.sigma_scale to {short(fit.ratio)}'
         if source != run.estimate.primary:
             factor = fit.ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
             advice = f'{source}.covariance_scale to {short(factor)}'
         found[source] = SourceAnalysis(
-            each, run.kinds.get(source, guesses[each.kind]), analysis.at_estimate[source], fit,
+            each, run.kinds.get(source, guesses[each.kind]), fit,
             whiteness(each), None if report is None else report.in_use,
             source in analysis.correlated, tuple(sorted(analysis.correlated - {source})), advice)
     return found
@@ -71,16 +70,15 @@ def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
 
 def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     """Return the entry of a source in run.json."""
-    residuals, found, present = analysis.residuals, analysis.fit, analysis.at_estimate
+    residuals, found = analysis.residuals, analysis.fit
     used = residuals.rows(residuals.used)
     unused = residuals.rows(~residuals.used)
     far = unused.distances[np.isfinite(unused.distances)]
-    expected = {row.coordinate: row.expected for row in present.rows}
+    expected = {row.coordinate: row.expected for row in found.rows}
     normalised = np.full((len(used.ids), 3), np.nan)
     for row, size in expected.items():
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
-    rows = [row.coordinate for row in present.rows]
     names = _NAMES['map' if residuals.kind == 'map' else 'edge']
     some = spread(len(used.ids), 2000)
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
@@ -88,13 +86,12 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     return {
         'name': residuals.source, 'kind': analysis.kind.value,
         'count': len(residuals.ids), 'used': len(used.ids),
-        'rows': [_row(*pair, names) for pair in zip(
-            present.rows, found.rows, strict=True)],
-        'energy': {'expected': number(present.energy_expected),
-                   'found': number(present.energy_found),
-                   'quantile95_share': number(present.within)},
+        'rows': [_row(row, names) for row in found.rows],
+        'energy': {'expected': number(found.energy_expected),
+                   'found': number(found.energy_found),
+                   'quantile95_share': number(found.within)},
         'ratio': number(found.ratio), 'low': number(found.low), 'high': number(found.high),
-        'redundancy': number(present.redundancy), 'independent': number(found.independent),
+        'redundancy': number(found.redundancy), 'independent': number(found.independent),
         'verdict': verdict(analysis)[1],
         'unused': {'count': len(unused.ids),
                    'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
@@ -102,18 +99,17 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
             'edges': rounded(edges), 'count': np.histogram(
                 np.clip(values, edges[0] + 1e-9, edges[-1] - 1e-9), edges)[0].tolist()},
         'series': {'t': frame.seconds(used.stamps_ns[some]),
-                   'rows': [rounded(normalised[some, row], 2) for row in rows]},
+                   'rows': [rounded(normalised[some, row], 2) for row in expected]},
         'autocorrelation': _autocorrelation(analysis),
         'scale': number(analysis.scale)}
 
 
-def _row(row: RowFit, together: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
-    """Return what one coordinate shows at the estimate, and together with the other sources."""
+def _row(row: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
+    """Return what one coordinate shows."""
     return {'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
             'count': row.n, 'sigma': number(row.sigma),
             'expected': number(row.expected), 'found': number(row.found),
-            'ratio': number(together.ratio), 'low': number(together.low),
-            'high': number(together.high)}
+            'ratio': number(row.ratio), 'low': number(row.low), 'high': number(row.high)}
 
 
 def _autocorrelation(analysis: SourceAnalysis) -> dict[str, Any] | None:

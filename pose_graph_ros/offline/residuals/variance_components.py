@@ -257,8 +257,7 @@ class Analysis(NamedTuple):
     """The residuals of each source, and how large its true sigmas are."""
 
     residuals: Mapping[str, SourceResiduals]  # at the estimate
-    at_estimate: Mapping[str, ScaleFit]  # how large they are
-    together: Mapping[str, ScaleFit]  # the same, with the factors of all sources in one estimate
+    fits: Mapping[str, ScaleFit]  # how large they are, with the factors of all in one estimate
     # Sources with correlated errors that the graph takes for independent: the residuals do not
     # show how large these are, and what those of other sources show may be because of them.
     correlated: frozenset[str]
@@ -277,17 +276,16 @@ def analyse(parts: Parts) -> Analysis:
         of_odometry = residuals[nodes.primary]
         residuals[nodes.primary] = of_odometry._replace(
             scale=of_odometry.scale * nodes.errors.mean_sigma)
-    at_estimate = {source: fit(each, factors.errors_in_use(source))
-                   for source, each in residuals.items()}
+    fits = {source: fit(each, factors.errors_in_use(source))
+            for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or not np.any(each.is_edge)}
     correlated = frozenset(
         source for source, each in white.items() if each.kind == 'map'
         and (found := whiteness(each)) is not None and found.tau > 0.0)
-    together = dict(at_estimate)
     if len(correlated) == 0:
-        together |= _together(parts, at_estimate, white)
-    return Analysis(residuals, at_estimate, together, correlated)
+        fits |= _together(parts, fits, white)
+    return Analysis(residuals, fits, correlated)
 
 
 def _together(
@@ -350,14 +348,15 @@ def _with_factors(
     present: ScaleFit, claimed: Covariances, found: Found, parts: Mapping[int, int], *,
     in_use: float,
 ) -> ScaleFit:
-    """Return a fit with other factors."""
-    sigmas = np.sqrt(np.mean(np.diagonal(claimed, axis1=1, axis2=2), axis=0)).tolist()
+    """Return a fit with other factors, in place of those that its source alone shows."""
+    sigmas = np.sqrt(np.mean(np.diagonal(claimed, axis1=1, axis2=2), axis=0)) / in_use
     rows = []
     for row in present.rows:
         part = parts.get(row.coordinate // 2)
         ratio, low, high, _ = found.of([] if part is None else [part])
         rows.append(row._replace(
-            sigma=sigmas[row.coordinate], ratio=ratio, low=low, high=high))
+            sigma=float(sigmas[row.coordinate]), ratio=in_use * ratio, low=in_use * low,
+            high=in_use * high))
     ratio, low, high, independent = found.of(list(parts.values()))
     return present._replace(
         rows=tuple(rows), ratio=in_use * ratio, low=in_use * low, high=in_use * high,

@@ -36,8 +36,7 @@ def street_corners(
     streets = np.concatenate(([0.0], np.cumsum(spacing)))
     avenues = np.concatenate(([0.0], np.cumsum(spacing[::-1])))
     cell, facing = np.array([len(streets) // 2, len(avenues) // 2]), 0
-    visits: dict[tuple[int, int, int], int] = {}
-    corners = [cell]
+    corners, visited = [cell], set[tuple[int, int, int]]()
     driven = 0.0
     while driven <= length:
         weights = np.zeros(4)
@@ -45,12 +44,11 @@ def street_corners(
             way = (facing + turn) % 4
             end = cell + DIRECTIONS[way]
             if np.all(end >= 0) and end[0] < len(streets) and end[1] < len(avenues):
-                seen_before = visits.get((*_middle(cell, end), way % 2), 0)
-                weights[way] = likely * (fresh if seen_before == 0 else 1.0)
+                seen = (*_middle(cell, end), way % 2) in visited
+                weights[way] = likely * (1.0 if seen else fresh)
         facing = int(rng.choice(4, p=weights / weights.sum()))
         end = cell + DIRECTIONS[facing]
-        street = (*_middle(cell, end), facing % 2)
-        visits[street] = visits.get(street, 0) + 1
+        visited.add((*_middle(cell, end), facing % 2))
         driven += abs(streets[end[0]] - streets[cell[0]]) + abs(avenues[end[1]] - avenues[cell[1]])
         cell = end
         corners.append(cell)

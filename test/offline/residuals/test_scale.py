@@ -99,12 +99,17 @@ def analysed(settings: dict[str, float], **drive: float) -> Analysis:
 def test_all_sources_together_tell_which_one_is_wrong(wrong: str, ratio: float) -> None:
     found = analysed({'global_pose.correlation_time': 0.0}, **{wrong: ratio}, closures=0)
     source = {'times': 'global_pose', 'odometry_times': 'odom'}[wrong]
-    assert found.together[source].ratio == pytest.approx(ratio, rel=0.25)
+    assert found.fits[source].ratio == pytest.approx(ratio, rel=0.25)
     for other in {'global_pose', 'odom'} - {source}:
-        assert found.together[other].ratio == pytest.approx(1.0, abs=0.2)
+        assert found.fits[other].ratio == pytest.approx(1.0, abs=0.2)
     true = {'global_pose': 1.0, 'odom': 1.0} | {source: ratio}
-    # at the estimate, the other one seems to be wrong as well, or the wrong one better
+    # each by itself, the other one seems to be wrong as well, or the wrong one better
+    alone = {name: fit(each) for name, each in found.residuals.items()}
     together, apart = (sum(abs(math.log(fits[name].ratio / true[name])) for name in true)
-                       for fits in (found.together, found.at_estimate))
+                       for fits in (found.fits, alone))
+    # and both say the same of what is claimed
+    for name, each in alone.items():
+        assert [row.sigma for row in found.fits[name].rows] == pytest.approx(
+            [row.sigma for row in each.rows], rel=1e-3)
     assert together < apart
     assert not found.correlated
