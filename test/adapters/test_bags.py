@@ -20,7 +20,6 @@ from ruamel.yaml import YAML
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
 
-ODOMETRY = 'nav_msgs/msg/Odometry'
 POINT = 'geometry_msgs/msg/Point'
 STRING = 'std_msgs/msg/String'
 TYPES = message_types()

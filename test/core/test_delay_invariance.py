@@ -4,9 +4,11 @@
 
 from collections import Counter
 from dataclasses import dataclass
+import functools
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
+import pytest
 
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -131,10 +133,20 @@ ROBUST = BackendConfig(
     measurements={'beacon': MeasurementSource(loss=Loss.CAUCHY),
                   'gps': MeasurementSource(loss=Loss.HUBER, rejection_threshold=1.5),
                   'scan': MeasurementSource(loss=Loss.CAUCHY), 'walls': MeasurementSource()})
+CORRELATED = BackendConfig(odometry=PLAIN.odometry, measurements={
+    'gps': MeasurementSource(correlation_time=20.0, loss=Loss.HUBER, rejection_threshold=0.7),
+    'beacon': MeasurementSource(loss=Loss.HUBER),
+    'pose': MeasurementSource(correlation_time=5.0),
+    'compass': MeasurementSource(correlation_time=5.0)})
+CONFIGS = {'plain': PLAIN, 'robust': ROBUST, 'correlated': CORRELATED}
 
-# For least squares without outliers, for robust losses with some.
+# For robust losses with outliers.
 DRIVES = {(number, robust): simulated(number, outliers=robust)
           for number in range(3) for robust in (False, True)}
+
+
+def drive(number: int, kind: str) -> tuple[list[Event], list[Event]]:
+    return DRIVES[number, kind == 'robust']
 
 
 def feed(backend: PoseGraphBackend, event: Event) -> str:
@@ -173,16 +185,10 @@ def run(events: list[Event], config: BackendConfig, updates: frozenset[int]) -> 
                   backend.counts, estimate.chi2)
 
 
-REFERENCES: dict[tuple[int, bool], Result] = {}
-
-
-def reference(number: int, *, robust: bool) -> Result:
-    if (number, robust) not in REFERENCES:
-        odometry_, measurements = DRIVES[number, robust]
-        REFERENCES[number, robust] = run(
-            sorted(odometry_ + measurements), ROBUST if robust else PLAIN,
-            frozenset(range(0, 2000, 10)))
-    return REFERENCES[number, robust]
+@functools.cache
+def reference(number: int, kind: str) -> Result:
+    odometry_, measurements = drive(number, kind)
+    return run(sorted(odometry_ + measurements), CONFIGS[kind], frozenset(range(0, 2000, 10)))
 
 
 def assert_same(result: Result, expected: Result) -> None:
@@ -195,22 +201,23 @@ def assert_same(result: Result, expected: Result) -> None:
 
 
 def test_the_drive_is_one_that_asks_for_something() -> None:
-    for number, robust in DRIVES:
-        result = reference(number, robust=robust)
+    for number, kind in ((0, 'plain'), (1, 'robust'), (2, 'correlated')):
+        result = reference(number, kind)
         assert result.counts['wheel', 'jump'] == 1
         expected = np.array([truth((stamp - EPOCH) * 1e-9) for stamp in result.stamps.tolist()])
         off = np.hypot(*(result.path - expected)[:, :2].T)
         assert np.sqrt(np.mean(off**2)) < 0.25
 
 
-@settings(max_examples=6)
-@given(st.integers(0, 2), st.booleans(), st.integers(0, 2**32 - 1),
+@pytest.mark.parametrize('kind', CONFIGS)
+@settings(max_examples=3)
+@given(st.integers(0, 2), st.integers(0, 2**32 - 1),
        st.sampled_from((0.1, 2.0, LONGEST_DELAY)), st.sampled_from((1, 7, 50, 400)))
 def test_delayed_shuffled_and_doubled_messages_give_the_same_path(
-    number: int, robust: bool, seed: int, delay: float, update_every: int,
+    kind: str, number: int, seed: int, delay: float, update_every: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    odometry_, measurements = DRIVES[number, robust]
+    odometry_, measurements = drive(number, kind)
     arrivals = [(event.what.stamp_ns + rng.uniform(0.0, WINDOW * 1e9 - 1.0), event)
                 for event in odometry_]
     doubles: Counter[str] = Counter()
@@ -227,8 +234,8 @@ def test_delayed_shuffled_and_doubled_messages_give_the_same_path(
     arrivals.sort()
     n = len(arrivals)
     updates = frozenset(rng.choice(n, n // update_every, replace=False).tolist())
-    result = run([event for _, event in arrivals], ROBUST if robust else PLAIN, updates)
-    expected = reference(number, robust=robust)
+    result = run([event for _, event in arrivals], CONFIGS[kind], updates)
+    expected = reference(number, kind)
     assert_same(result, expected)
     for source in ('wheel', 'visual', 'gps', 'beacon', 'pose', 'compass', 'scan', 'walls'):
         assert result.counts[source, 'duplicate_stamp'] == doubles[source]
@@ -237,8 +244,7 @@ def test_delayed_shuffled_and_doubled_messages_give_the_same_path(
 
 
 def test_all_measurements_before_and_all_after_the_odometry_give_the_same_path() -> None:
-    for robust in (False, True):
-        odometry_, measurements = DRIVES[0, robust]
+    for kind, config in CONFIGS.items():
+        odometry_, measurements = drive(0, kind)
         for events in (measurements[::-1] + odometry_, odometry_ + measurements[::-1]):
-            result = run(events, ROBUST if robust else PLAIN, frozenset())
-            assert_same(result, reference(0, robust=robust))
+            assert_same(run(events, config, frozenset()), reference(0, kind))

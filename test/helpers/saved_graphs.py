@@ -7,17 +7,14 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
-from test_delay_invariance import Event, feed, PLAIN
+from test_delay_invariance import Event, feed
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
+from pose_graph_ros.core.config import BackendConfig, OdometrySource
 from pose_graph_ros.core.measurements import OdometrySample
 
 SECOND = 1_000_000_000
 
-CORRELATED = BackendConfig(odometry=PLAIN.odometry, measurements={
-    'gps': MeasurementSource(correlation_time=20.0, loss=Loss.HUBER),
-    'beacon': MeasurementSource(loss=Loss.HUBER)})
 LINE_ODOMETRY = BackendConfig(odometry={'odom': OdometrySource()})
 
 

@@ -38,16 +38,11 @@ def test_husky_ends_near_the_fixes_that_it_got_and_those_that_it_did_not(tmp_pat
 
 
 @needs('robot/husky_test1_ros2')
-@pytest.mark.parametrize(('settings', 'source', 'words'), [
-    (('sources:=[odom, fix, gyro]', 'gyro.mounting:=up'), 'gyro', 'does not turn'),
-    (('sources:=[odom, fix, imu]',), 'imu', 'contradicts the other sources')])
-def test_husky_with_its_imu_that_is_not_level_is_told(
-    tmp_path: Path, settings: tuple[str, ...], source: str, words: str,
-) -> None:
-    assert main(['replay', str(HUSKY), '-o', str(tmp_path),
-                 *(word for each in settings for word in ('-p', each))]) == 0
+def test_husky_with_its_imu_that_is_not_level_is_told(tmp_path: Path) -> None:
+    assert main(['replay', str(HUSKY), '-o', str(tmp_path), '-p', 'sources:=[odom, fix, gyro]',
+                 '-p', 'gyro.mounting:=up']) == 0
     findings = json.loads((tmp_path / 'run.json').read_text())['findings']
-    assert any(words in each['text'] and each['anchor'] == f'source-{source}'
+    assert any('does not turn' in each['text'] and each['anchor'] == 'source-gyro'
                and each['level'] == 'warning' for each in findings)
 
 

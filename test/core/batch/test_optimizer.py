@@ -44,7 +44,6 @@ SAME_CHI2 = 1e-9
 # A numeric Jacobian stops the other solver some 1e-8 before the minimum.
 SAME_POSES = 1e-6
 # Relative rounding error of chi2.
-ROUNDING = 1e-12
 # Largest gradient at convergence, from some 1e4 at the start.
 STATIONARY = 1e-6
 

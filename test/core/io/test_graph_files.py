@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 from saved_graphs import (
     assert_same_value,
-    CORRELATED,
     feed_all,
     LINE_ODOMETRY,
     line_sample,
     straight_line,
 )
-from test_delay_invariance import DRIVES
+from test_delay_invariance import CORRELATED, DRIVES
 from tum_files import read_tum
 
 from pose_graph_ros.core.backend import PoseGraphBackend

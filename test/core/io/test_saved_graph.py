@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 from saved_graphs import (
     assert_same_value,
-    CORRELATED,
     feed_all,
     LINE_ODOMETRY,
     line_sample,
     SECOND,
     straight_line,
 )
-from test_delay_invariance import DRIVES, Event, PLAIN, ROBUST, SAME_PATH
+from test_delay_invariance import CONFIGS, drive, Event, PLAIN, SAME_PATH
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
@@ -40,8 +39,6 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.sources.pipeline import WaitingMeasurements
 
-CONFIGS = {'plain': PLAIN, 'robust': ROBUST, 'correlated': CORRELATED}
-
 
 def through_files(saved: SavedGraph) -> SavedGraph:
     with tempfile.TemporaryDirectory() as folder:
@@ -50,7 +47,7 @@ def through_files(saved: SavedGraph) -> SavedGraph:
 
 
 def events(kind: str) -> list[Event]:
-    odometry, measurements = DRIVES[0, kind == 'robust']
+    odometry, measurements = drive(0, kind)
     return sorted(odometry + measurements)
 
 

@@ -118,36 +118,6 @@ def test_between_the_last_that_left_and_the_next_odometry_leads_backwards() -> N
     assert too_old.reason == 'before_window'
 
 
-@settings(max_examples=10, deadline=None)
-@given(SILENCES, st.floats(8.0, 28.0))
-def test_saved_and_restored_nodes_continue_as_they_would_have(
-    silences: list[tuple[str, float, float]], pause: float,
-) -> None:
-    (one, made), (other, made_too) = empty_nodes(), empty_nodes()
-    rest = arrivals(silences)
-    while rest and rest[0][1].stamp_ns < SECOND + pause * 1e9:
-        source, sample = rest.pop(0)
-        one.add_sample(sample, source)
-        one.take_secondary_edges()
-        forget(one)
-    if len(one) == 0:
-        return
-    saved = one.saved()
-    other.restore(saved)
-    assert_same_value(other.saved(), saved)
-    made_too += made
-    for source, sample in rest:
-        edges = []
-        for nodes in (one, other):
-            nodes.add_sample(sample, source)
-            edges.append(tuple(
-                (name, *edge.columns) for name, edge in nodes.take_secondary_edges()))
-            forget(nodes)
-        assert_same_value(*edges)
-    assert made_too == made
-    assert other.n_frozen == one.n_frozen
-
-
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_places_are_passed_on_from_anchor_to_anchor(seed: int) -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The primary source follows from the stamps; the others have edges between its nodes."""
+"""A silence of the primary source is found by the stamps of the others, which have edges too."""
 
 from collections.abc import Iterable
 from itertools import pairwise
@@ -11,7 +11,6 @@ import numpy as np
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.several_sources import (
-    choose_first,
     find_silence,
     SecondaryEdges,
     Silence,
@@ -30,29 +29,6 @@ def stream(stamps_ns: Iterable[int], settled_ns: int = -1) -> OdometryStream:
         one.add(OdometrySample(stamp_ns, np.array([0.02 * stamp_ns, 0.0, 0.0])))
     one.settle_all(settled_ns)
     return one
-
-
-# --- The first primary source ----------------------------------------------------------------
-
-def first(wheel: Iterable[int], visual: Iterable[int], settled_ns: int) -> str | None:
-    streams = {'visual': stream(visual), 'wheel': stream(wheel)}
-    return choose_first(streams, ['wheel', 'visual'], 'wheel', settled_ns, PATIENCE)
-
-
-@given(increasing, increasing, st.integers(1, 250), st.data())
-def test_the_first_choice_is_final_and_does_not_depend_on_what_is_settled(
-    wheel: list[int], visual: list[int], settled_ns: int, data: st.DataObject,
-) -> None:
-    chosen = first(wheel, visual, settled_ns)
-    if chosen is not None:
-        assert first(wheel, visual, settled_ns + data.draw(st.integers(0, 100))) == chosen
-        # samples after the stamp do not matter
-        assert first([k for k in wheel if k <= settled_ns], [k for k in visual if k <= settled_ns],
-                     settled_ns) == chosen
-    streams = {'wheel': stream(wheel, data.draw(st.integers(0, 200))),
-               'visual': stream(visual, data.draw(st.integers(0, 200)))}
-    assert choose_first(
-        streams, ['wheel', 'visual'], 'wheel', settled_ns, PATIENCE) == chosen
 
 
 # --- Silences --------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ import pytest
 from slow_smoother import state
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import tables as tb
@@ -80,22 +79,6 @@ def test_a_refinement_ends_at_the_batch_optimum(seed: int, observed: bool) -> No
     assert abs(excess) < 1e-6
     assert worst < 1e-3
     assert worst < 0.1 * before[1]
-
-
-def test_updates_go_on_from_a_refined_estimate() -> None:
-    smoother, spared = streets(300), streets(300)
-    rng = np.random.default_rng(5)
-    for k in range(300, 340):
-        mean = np.array([1.0, 0.0, 0.0]) + SIGMA * rng.normal(size=3)
-        for each in (smoother, spared):
-            each.extend(mean, INFORMATION)
-            if k % 5 == 0:
-                here = se2.between(each.poses[k - 30], each.poses[k])
-                assert each.update(closure(k - 30, k, here + 0.02)).status is Status.CONVERGED
-        refined(smoother)
-        assert 0.0 <= off(smoother)[0] + 1e-6 < 2e-6
-    # the same to what one can see, as both are within the budget of their optimum
-    assert smoother.chi2() == pytest.approx(spared.chi2(), rel=0.05)
 
 
 def test_a_refinement_costs_what_has_changed_and_a_second_one_nothing() -> None:
