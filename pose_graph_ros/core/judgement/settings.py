@@ -48,7 +48,7 @@ class BeliefSettings:
     # --- what is solved on a copy
     pause: float = 0.02  # growth of the graph until the next trial, as a share of it
     small: int = 100  # nodes up to which there is no pause: all is solved for in milliseconds
-    search_again: float = 0.1  # growth until the next search of another set
+    search_again: float = 0.2  # growth until the next search of another set
 
     # --- the best set of closures of a whole graph
     most_at_end: int = 30_000  # nodes and closures above which the set is only improved
