@@ -4,17 +4,21 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from test_gauss_markov import ERRORS, NO_NOISE, observed, SECOND, TAU
+from test_gauss_markov import position, SECOND, TAU
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
 from pose_graph_ros.core.sources.error_likelihood import no_past
-from pose_graph_ros.core.sources.gauss_markov import Additions, GaussMarkovBias
+from pose_graph_ros.core.sources.gauss_markov import Additions, CorrelatedErrors, GaussMarkovBias
+from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
 from pose_graph_ros.core.sources.settings import SOURCES
+
+NOWHERE = Attachment(0, np.zeros(3), np.zeros((3, 3)))
+ERRORS = CorrelatedErrors(TAU, 1.0, 0.05)
 
 
 class Chain:
@@ -31,7 +35,8 @@ class Chain:
     def add(self, second: int) -> None:
         additions = Additions(self.next)
         self.bias.begin()
-        edge = self.bias.add(second * SECOND, observed(second), NO_NOISE, additions)
+        edge = self.bias.add(second * SECOND, absolute_constraint(
+            position(second), NOWHERE), np.zeros(2), additions)
         for number, one in enumerate(additions.edges, self.next.edge):
             if number == edge:
                 self.bins.setdefault(int(one.j[0]), second)
