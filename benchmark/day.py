@@ -129,7 +129,7 @@ def _hour(
     graph = backend.graph
     head = graph.memory.head
     return Hour(
-        hours, resident(), graph.n_nodes, graph.n_edges, graph.n_observed,
+        hours, resident(), graph.n_nodes, len(graph.factors.edges), len(graph.factors.observed),
         8e-6 * float(head[tb.POOL_F_END]) + 4e-6 * float(head[tb.POOL_I_END]),
         float(np.sqrt(np.mean(squares))),
         means, 1e3 * float(np.percentile(updates, 99)), 1e3 * max(updates),

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmark.worlds import arranged, World
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.g2o import read_g2o
 
@@ -71,18 +71,18 @@ def load(path: Path) -> World:
 
 def online(name: str, graph: Graph, *, has_start: bool) -> World:
     """Put the constraints of a graph into the order of an online run."""
-    edges = graph.edges
+    edges, observed = graph.factors.edges, graph.factors.observed
     later, gap = np.maximum(edges.i, edges.j), np.abs(edges.j - edges.i)
     # of the edges that arrive with a node the one from the node before it comes first, forward
     # ones before backward ones, then in the order of the file
     world = arranged(name, graph.poses, edges.rows(np.lexsort(
-        (edges.i > edges.j, np.minimum(gap, 2), later))), graph.observed)
+        (edges.i > edges.j, np.minimum(gap, 2), later))), observed)
     stops = world.edge_stops
     alone = np.flatnonzero(np.diff(stops) == 0) + 1
     if len(alone) > 0:
         raise ValueError(f'node {alone[0]} has no edge to an earlier one, and {len(alone) - 1} '
                          f'others: no online run')
-    kind = np.full(len(edges), EdgeKind.LOOP_CLOSURE)
-    kind[stops[:-1]] = EdgeKind.ODOMETRY
+    kind = np.full(len(edges), FactorKind.LOOP_CLOSURE)
+    kind[stops[:-1]] = FactorKind.ODOMETRY
     return replace(world, edges=replace(world.edges, kind=kind), truth=None,
                    start=graph.poses.copy() if has_start else None)

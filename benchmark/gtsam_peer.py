@@ -23,7 +23,7 @@ from benchmark.runs import Plan, Run, run
 from benchmark.worlds import World
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Factors
 
 PRIOR_SIGMA = 1e-5
 """Of the pose of node 0 [m, rad]: as good as fixed, and no harder for Cholesky than 1e-3."""
@@ -147,7 +147,7 @@ def step_of(
 
 
 def graph_of(
-    edges: Edges, observed: ObservedNodes, models: Models,
+    edges: Factors, observed: Factors, models: Models,
 ) -> gtsam.NonlinearFactorGraph:
     """Return the factors of constraints; those of observed nodes must have no offset."""
     graph = gtsam.NonlinearFactorGraph()
@@ -155,7 +155,7 @@ def graph_of(
             edges.i.tolist(), edges.j.tolist(), edges.mean, edges.information, strict=True):
         graph.push_back(gtsam.BetweenFactorPose2(i, j, _pose(mean), models.of(information)))
     for node, mean, information in zip(
-            observed.node.tolist(), observed.mean, observed.information, strict=True):
+            observed.i.tolist(), observed.mean, observed.information, strict=True):
         if information[2, 2] == 0.0:
             # the heading of the mean is zero: errors are in map axes, as GTSAM's are
             graph.push_back(gtsam.PoseTranslationPrior2D(

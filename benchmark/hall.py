@@ -65,7 +65,7 @@ def _run(recording: Recording, thinning: ThinningConfig) -> list[Tenth]:
                 claims.append(nees(off, covariance))
         found.append(Tenth(
             float(step[0].stamp_ns - recording.stamps_ns[0]) / 3.6e12,
-            backend.graph.n_nodes, backend.graph.n_edges, float(np.mean(squared)),
+            backend.graph.n_nodes, len(backend.graph.factors.edges), float(np.mean(squared)),
             float(np.mean(claims)), 1e3 * spent / len(part), resident()))
     return found
 

@@ -30,7 +30,7 @@ from pose_graph_ros.core.batch import linear_starts, optimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 
@@ -94,7 +94,7 @@ def fresh_covariances(world: World, step: int, poses: FloatArray) -> FloatArray:
     """Return the covariances of all nodes after a step, all linearized at poses, (N, 3, 3)."""
     edges, observed = world.part(step)
     smoother = IncrementalSmoother()
-    smoother.update(GraphUpdate(hidden=poses, edges=edges, observed=observed, fix=(0,)))
+    smoother.update(GraphUpdate(hidden=poses, factors=Factors.joined([edges, observed]), fix=(0,)))
     return smoother.covariances()
 
 
@@ -172,8 +172,8 @@ class Ours:
         first = self.world.first[None]
         if self.lag == 0:
             return GraphUpdate(hidden=first, fix=(0,))
-        return GraphUpdate(hidden=first, observed=ObservedNodes(
-            [0], None, first, np.eye(3)[None] / FIRST_SIGMA**2, [ObservedKind.GLOBAL_POSE]))
+        return GraphUpdate(hidden=first, factors=Factors.on(
+            [0], None, first, np.eye(3)[None] / FIRST_SIGMA**2, [FactorKind.GLOBAL_POSE]))
 
     def extending(self, smoother: IncrementalSmoother, k: int) -> UpdateResult:
         """Do a step that only adds a node to the end."""
@@ -185,6 +185,7 @@ class Ours:
         if k == 0:
             return smoother.update(self._first())
         changes: dict[str, Any] = {}
+        new: list[Factors] = []
         begin, end = self.edge_stops[k:k + 2]
         if self.ahead[k]:
             smoother.extend(self.mean[begin], self.information[begin])
@@ -193,12 +194,11 @@ class Ours:
             changes['hidden'] = np.array([self._guess(smoother, begin)])
         if end > begin:
             rows, table = slice(begin, end), self.world.edges
-            changes['edges'] = Edges(table.i[rows], table.j[rows], table.mean[rows],
-                                     table.information[rows], table.kind[rows])
+            new.append(table.rows(rows))
         begin, end = self.observed_stops[k:k + 2]
         if end > begin:
-            changes['observed'] = self.world.observed.rows(slice(begin, end))
-        return smoother.update(GraphUpdate(**changes))
+            new.append(self.world.observed.rows(slice(begin, end)))
+        return smoother.update(GraphUpdate(**changes, factors=Factors.joined(new)))
 
     def _guess(self, smoother: IncrementalSmoother, edge: int) -> tuple[float, float, float]:
         """Compose the estimate of the node that the new one hangs on with their edge."""

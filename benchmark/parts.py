@@ -80,7 +80,7 @@ def _drive(world: World) -> dict[str, list[float]]:
                 (k + 1) * PERIOD_NS, poses[k]))
             for m in range(begin, end):
                 timed('add_measurement', backend.add_measurement, GlobalPose(
-                    (int(observed.node[m]) + 1) * PERIOD_NS, observed.mean[m], covariance[m]),
+                    (int(observed.i[m]) + 1) * PERIOD_NS, observed.mean[m], covariance[m]),
                     'pose')
             timed(CALLS[3] if end > begin else CALLS[2], backend.update)
             if end > begin:
@@ -215,7 +215,7 @@ _START = '''
 import time
 begin = time.perf_counter()
 import numpy as np
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.warm_up import warm_up
@@ -227,7 +227,7 @@ smoother = IncrementalSmoother()
 smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), fix=[0]))
 for _ in range(3):
     smoother.extend(mean, information)
-smoother.update(GraphUpdate(edges=Edges([0], [3], mean[None], information[None], [1])))
+smoother.update(GraphUpdate(factors=Factors([0], [3], mean[None], information[None], [1])))
 smoother.newest_covariance()
 print(imported - begin, warm - imported, time.perf_counter() - warm)
 '''

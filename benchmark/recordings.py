@@ -27,7 +27,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.verdicts import Verdict
@@ -55,7 +55,7 @@ class Recording:
     name: str
     stamps_ns: IntArray
     """Shape (N,)."""
-    chain: Edges
+    chain: Factors
     """Odometry from each pose to the next."""
     truth: Trajectory
     twist_variance: FloatArray | None = None
@@ -110,15 +110,15 @@ class Recording:
                    closures[begin:end])
             begin = end
 
-    def loops(self) -> Edges:
+    def loops(self) -> Factors:
         """Return the closures as edges, their information in the axes of the later pose."""
         i, j = np.searchsorted(self.stamps_ns, self.ends).T
         information = [np.linalg.inv(covariance.turned(each, float(pose[2])))
                        for each, pose in zip(self.covariances, self.poses, strict=True)]
-        return Edges(i, j, self.poses, np.array(information),
-                     np.full(len(i), EdgeKind.LOOP_CLOSURE))
+        return Factors(i, j, self.poses, np.array(information),
+                     np.full(len(i), FactorKind.LOOP_CLOSURE))
 
-    def closing(self, loops: Edges) -> 'Recording':
+    def closing(self, loops: Factors) -> 'Recording':
         """Return the recording with further closures, which come when their later node has."""
         ends = np.column_stack((self.stamps_ns[loops.i], self.stamps_ns[loops.j]))
         turned = np.array([
@@ -132,10 +132,10 @@ class Recording:
             ).ordered(arrival)
 
 
-def closures(i: IntArray, j: IntArray, means: FloatArray, information: FloatArray) -> Edges:
+def closures(i: IntArray, j: IntArray, means: FloatArray, information: FloatArray) -> Factors:
     """Return closures between nodes, shape (M,); information of shape (3, 3) or (M, 3, 3)."""
-    return Edges(i, j, means, np.broadcast_to(information, (len(i), 3, 3)),
-                 np.full(len(i), EdgeKind.LOOP_CLOSURE))
+    return Factors(i, j, means, np.broadcast_to(information, (len(i), 3, 3)),
+                 np.full(len(i), FactorKind.LOOP_CLOSURE))
 
 
 @dataclass(slots=True)
@@ -275,21 +275,21 @@ def while_driving(run: Run, recording: Recording) -> tuple[float, float]:
             float(np.max(path / np.maximum(odometry.rms[at], SMALLEST_RMS))))
 
 
-def hidden_graph(run: Run) -> tuple[IntArray, Edges, Edges, BoolArray]:
+def hidden_graph(run: Run) -> tuple[IntArray, Factors, Factors, BoolArray]:
     """
     Return what the peers get of a run.
 
     Returns
     -------
     stamps_ns : ndarray of int, shape (N,), of the hidden nodes
-    chain : Edges, odometry
-    loops : Edges, closures between nodes that are no neighbours
+    chain : Factors, odometry
+    loops : Factors, closures between nodes that are no neighbours
     believed : ndarray of bool, shape (M,), which of them take part at the end
 
     """
-    edges = run.backend.graph.edges
-    chain = edges.rows(edges.kind == EdgeKind.ODOMETRY)
-    loops = edges.rows((edges.kind == EdgeKind.LOOP_CLOSURE) & (np.abs(edges.j - edges.i) > 1))
+    edges = run.backend.graph.factors.edges
+    chain = edges.rows(edges.kind == FactorKind.ODOMETRY)
+    loops = edges.rows((edges.kind == FactorKind.LOOP_CLOSURE) & (np.abs(edges.j - edges.i) > 1))
     loops = forward(loops)
     return run.backend.node_stamps_ns, chain, loops, loops.weight > 0.0
 
@@ -311,7 +311,7 @@ def read_recording(graph: Path, truth: Path, stamps: Path | None = None) -> Reco
 
     """
     content = read_g2o(graph, 'toro')
-    edges, n = content.graph.edges, content.graph.n_nodes
+    edges, n = content.graph.factors.edges, content.graph.n_nodes
     chain = np.flatnonzero(edges.j == edges.i + 1)
     chain = chain[np.unique(edges.i[chain], return_index=True)[1]]
     if len(chain) != n - 1:
@@ -325,7 +325,7 @@ def read_recording(graph: Path, truth: Path, stamps: Path | None = None) -> Reco
         claimed_twist(odometry) if stamps is None else None).closing(loops)
 
 
-def claimed_twist(chain: Edges) -> FloatArray:
+def claimed_twist(chain: Factors) -> FloatArray:
     """Return what odometry with a pose in every second claims, shape (3,) per second."""
     return np.diagonal(np.linalg.inv(chain.information[0])).copy()
 

@@ -404,8 +404,8 @@ def _ours(file: Path) -> Solved:
         assert beliefs is not None
         graph.set_poses(beliefs.poses)
         graph.apply(GraphUpdate(
-            remove_edges=beliefs.closures[~beliefs.believed].tolist(),
-            weigh_edges=dict.fromkeys(
+            remove=beliefs.closures[~beliefs.believed].tolist(),
+            weigh=dict.fromkeys(
                 beliefs.closures[beliefs.believed].tolist(), beliefs.scale**-2.0)))
         optimizer.optimize(graph, CONFIG)
         times.append(time.perf_counter() - begin)

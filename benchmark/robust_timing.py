@@ -158,5 +158,5 @@ def _ms(seconds: float) -> str:
 
 
 def _believed(backend: PoseGraphBackend) -> str:
-    closures = backend.graph.edges.weight[backend.graph.edges.kind != 0]
+    closures = backend.graph.factors.edges.weight[backend.graph.factors.edges.kind != 0]
     return f'{np.count_nonzero(closures)} of {len(closures)}'

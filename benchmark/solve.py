@@ -25,7 +25,7 @@ from benchmark.section import about, Options, Section
 from benchmark.wrong_closures import with_false
 from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
@@ -198,10 +198,10 @@ def _robust(recording: Recording, method: str, limit: float) -> list[str]:
             done.result['certificate']['verdict'], f'{done.wall:.1f}']
 
 
-def write(file: Path, chain: Edges, loops: Edges, poses: np.ndarray) -> None:
+def write(file: Path, chain: Factors, loops: Factors, poses: np.ndarray) -> None:
     """Write odometry and closures as a g2o file, whatever their weights are."""
-    graph, both = Graph(), Edges.joined((chain, loops))
-    graph.apply(GraphUpdate(hidden=poses, edges=Edges(
+    graph, both = Graph(), Factors.joined((chain, loops))
+    graph.apply(GraphUpdate(hidden=poses, factors=Factors(
         both.i, both.j, both.mean, both.information, both.kind)))
     write_g2o(graph, file)
 

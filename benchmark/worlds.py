@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.offline.simulation.graph import composed
 from pose_graph_ros.offline.simulation.streets import street_path
@@ -56,10 +56,10 @@ class World:
     name: str
     first: FloatArray
     """Pose of node 0, shape (3,)."""
-    edges: Edges
+    edges: Factors
     edge_stops: IntArray
     """Number of edges that have arrived after each step, shape (N,)."""
-    observed: ObservedNodes
+    observed: Factors
     observed_stops: IntArray
     """Number of observed nodes that have arrived after each step, shape (N,)."""
     truth: FloatArray | None = None
@@ -76,7 +76,7 @@ class World:
         """Return the number of edges beyond those that introduce a node."""
         return len(self.edges) - (self.n_nodes - 1)
 
-    def part(self, step: int) -> tuple[Edges, ObservedNodes]:
+    def part(self, step: int) -> tuple[Factors, Factors]:
         """Return all constraints that have arrived after a step."""
         return (self.edges.rows(slice(0, int(self.edge_stops[step]))),
                 self.observed.rows(slice(0, int(self.observed_stops[step]))))
@@ -85,7 +85,7 @@ class World:
         """Return the graph after a step (the last by default) with these poses, shape (N, 3)."""
         edges, observed = self.part(self.n_nodes - 1 if step is None else step)
         graph = Graph()
-        graph.apply(GraphUpdate(hidden=poses, edges=edges, observed=observed, fix=[0]))
+        graph.apply(GraphUpdate(hidden=poses, factors=Factors.joined([edges, observed]), fix=[0]))
         return graph
 
     def dead_reckoning(self) -> FloatArray:
@@ -118,10 +118,10 @@ def measured(
 
 
 def between(
-    truth: FloatArray, ends: tuple[IntArray, IntArray], kind: EdgeKind,
+    truth: FloatArray, ends: tuple[IntArray, IntArray], kind: FactorKind,
     sigma: tuple[float, float, float], rng: np.random.Generator, *, pessimism: float = 1.0,
     weight: FloatArray | None = None,
-) -> Edges:
+) -> Factors:
     """
     Return edges from some nodes to others.
 
@@ -129,7 +129,7 @@ def between(
     ----------
     truth : ndarray, shape (N, 3)
     ends : two of ndarray, shape (M,), numbers of nodes
-    kind : EdgeKind
+    kind : FactorKind
     sigma : tuple
         Of the noise [m, m, rad].
     rng : Generator
@@ -141,7 +141,7 @@ def between(
     """
     claimed = information(sigma) / pessimism**2 if weight is None else weight
     i, j = ends
-    return Edges(i, j, measured(se2.between(truth[i], truth[j]), sigma, rng),
+    return Factors(i, j, measured(se2.between(truth[i], truth[j]), sigma, rng),
                  np.tile(claimed, (len(i), 1, 1)), np.full(len(i), kind))
 
 
@@ -149,16 +149,16 @@ def joined(
     truth: FloatArray, loops: tuple[IntArray, IntArray], sigma: tuple[float, float, float],
     rng: np.random.Generator, closing: tuple[float, float, float] | None = None,
     **claims: Any,
-) -> Edges:
+) -> Factors:
     """Return odometry and loop closures, the latter perhaps with sigmas of their own."""
     ahead = np.arange(len(truth) - 1)
-    odometry = between(truth, (ahead, ahead + 1), EdgeKind.ODOMETRY, sigma, rng, **claims)
-    return Edges.joined((odometry, between(
-        truth, loops, EdgeKind.LOOP_CLOSURE, closing or sigma, rng, **claims)))
+    odometry = between(truth, (ahead, ahead + 1), FactorKind.ODOMETRY, sigma, rng, **claims)
+    return Factors.joined((odometry, between(
+        truth, loops, FactorKind.LOOP_CLOSURE, closing or sigma, rng, **claims)))
 
 
 def arranged(
-    name: str, truth: FloatArray, edges: Edges, observed: ObservedNodes | None = None,
+    name: str, truth: FloatArray, edges: Factors, observed: Factors | None = None,
     delay: int = 0,
 ) -> World:
     """
@@ -168,9 +168,9 @@ def arranged(
     ----------
     name : str
     truth : ndarray, shape (N, 3)
-    edges : Edges
+    edges : Factors
         Odometry before the others.
-    observed : ObservedNodes, optional
+    observed : Factors, optional
     delay : int
         Observed nodes arrive this many steps late; what would come after the end is left out.
 
@@ -178,13 +178,13 @@ def arranged(
     steps = np.arange(len(truth))
     later = np.maximum(edges.i, edges.j)
     order = np.argsort(later, kind='stable')
-    observed = ObservedNodes() if observed is None else observed
-    observed = observed.rows(observed.node + delay < len(truth))
-    observed = observed.rows(np.argsort(observed.node, kind='stable'))
+    observed = Factors() if observed is None else observed
+    observed = observed.rows(observed.i + delay < len(truth))
+    observed = observed.rows(np.argsort(observed.i, kind='stable'))
     return World(
         name, truth[0].copy(), edges.rows(order),
         np.searchsorted(later[order], steps, side='right'), observed,
-        np.searchsorted(observed.node + delay, steps, side='right'), truth)
+        np.searchsorted(observed.i + delay, steps, side='right'), truth)
 
 
 def chain(n: int, variant: str = 'prompt', seed: int = SEED) -> World:
@@ -206,7 +206,7 @@ def chain(n: int, variant: str = 'prompt', seed: int = SEED) -> World:
     steps = np.column_stack((1.0 + 0.1 * rng.uniform(-1.0, 1.0, n - 1), np.zeros(n - 1), turn))
     truth = composed(np.zeros(3), steps)
     ahead = np.arange(n - 1)
-    edges = between(truth, (ahead, ahead + 1), EdgeKind.ODOMETRY, CHAIN_SIGMA, rng)
+    edges = between(truth, (ahead, ahead + 1), FactorKind.ODOMETRY, CHAIN_SIGMA, rng)
     nodes = np.arange(GLOBAL_EVERY, n, GLOBAL_EVERY)
     if variant == 'dropped':
         starts = np.arange(500, n, 1000) + rng.integers(-200, 200, len(np.arange(500, n, 1000)))
@@ -221,14 +221,14 @@ def chain(n: int, variant: str = 'prompt', seed: int = SEED) -> World:
 def seen(
     truth: FloatArray, nodes: IntArray, sigma: tuple[float, float, float],
     rng: np.random.Generator, *, heading: bool,
-) -> ObservedNodes:
+) -> Factors:
     """Return global poses of nodes, or only their positions."""
     mean = measured(truth[nodes], sigma, rng)
     weight = information(sigma)
-    kind = ObservedKind.GLOBAL_POSE
+    kind = FactorKind.GLOBAL_POSE
     if not heading:
-        mean[:, 2], weight[2, 2], kind = 0.0, 0.0, ObservedKind.POSITION
-    return ObservedNodes(nodes, None, mean, np.tile(weight, (len(nodes), 1, 1)),
+        mean[:, 2], weight[2, 2], kind = 0.0, 0.0, FactorKind.POSITION
+    return Factors.on(nodes, None, mean, np.tile(weight, (len(nodes), 1, 1)),
                          np.full(len(nodes), kind))
 
 
@@ -239,10 +239,10 @@ def laps(n: int = 1500, per_lap: int = 408, seed: int = SEED) -> World:
     truth = composed(np.zeros(3), np.tile((step, 0.0, turn), (n - 1, 1)))
     ends = np.arange(per_lap, n, 5)
     closing = between(
-        truth, (ends - per_lap, ends), EdgeKind.LOOP_CLOSURE, (0.1, 0.1, 0.05), rng)
+        truth, (ends - per_lap, ends), FactorKind.LOOP_CLOSURE, (0.1, 0.1, 0.05), rng)
     ahead = np.arange(n - 1)
-    edges = between(truth, (ahead, ahead + 1), EdgeKind.ODOMETRY, (0.05, 0.05, 0.02), rng)
-    return arranged('laps', truth, Edges.joined((edges, closing)))
+    edges = between(truth, (ahead, ahead + 1), FactorKind.ODOMETRY, (0.05, 0.05, 0.02), rng)
+    return arranged('laps', truth, Factors.joined((edges, closing)))
 
 
 def grid(n: int = 3500, seed: int = SEED) -> World:

@@ -11,7 +11,7 @@ from benchmark.worlds import World
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.offline.simulation.graph import graph_of, odometry_edges
 from pose_graph_ros.offline.simulation.motion import path_length
 from pose_graph_ros.offline.simulation.recording import course
@@ -36,7 +36,7 @@ GATE_SIGMAS = 0.5, 0.5, 0.04
 def of_world(world: World) -> Recording:
     """Return a world with odometry and closures as a recording, a pose in every second."""
     chain, loops = (world.edges.rows(world.edges.kind == kind)
-                    for kind in (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE))
+                    for kind in (FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE))
     stamps = SECOND * np.arange(1, world.n_nodes + 1)
     assert world.truth is not None
     return Recording(world.name, stamps, chain, Trajectory(stamps, world.truth),
@@ -69,7 +69,7 @@ def simulated(
                        closures=replace(usual.closures, false=wrong),
                        claims=(ClaimedSigma(CLOSURES, claimed),))
     graph = graph_of(course(WORLDS[world], seed, duration_s, change), distance)
-    chain = graph.edges.rows(graph.edges.kind == EdgeKind.ODOMETRY)
+    chain = graph.factors.edges.rows(graph.factors.edges.kind == FactorKind.ODOMETRY)
     return Recording(world, graph.truth.stamps_ns, chain, graph.truth).closing(graph.loops)
 
 

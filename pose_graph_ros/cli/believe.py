@@ -24,7 +24,7 @@ from pose_graph_ros.core.batch.optimizer import (
 from pose_graph_ros.core.batch.truncated import Choosing, CONFIG, Surrogate, TruncatedProblem
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import final
@@ -59,12 +59,12 @@ def believe(
     all poses, some closures are taken as known that do; several such sets are tried. The truncated
     cost is never above that of the minimum with all closures, or of the given poses.
     """
-    edges = forward(graph.edges)
+    edges = forward(graph.factors)
     place = np.cumsum(graph.is_pose)
-    is_motion = edges.kind <= EdgeKind.LOOP_CLOSURE
+    is_motion = edges.kind <= FactorKind.LOOP_CLOSURE
     is_closure = is_motion & (np.abs(place[edges.j] - place[edges.i]) != 1)
-    kind = np.where(is_closure, EdgeKind.LOOP_CLOSURE, np.where(
-        is_motion, EdgeKind.ODOMETRY, edges.kind)).astype(np.uint8)
+    kind = np.where(is_closure, FactorKind.LOOP_CLOSURE, np.where(
+        is_motion, FactorKind.ODOMETRY, edges.kind)).astype(np.uint8)
     edges = replace(edges, kind=kind)
     softened = replace(edges, information=np.where(
         is_closure[:, None, None], floored(edges, sigmas).information, edges.information))
@@ -94,7 +94,7 @@ def believe(
         return None
     believed = ~np.isin(closures, rows[~best.believed])
     copy = _filled(graph, edges)
-    copy.apply(GraphUpdate(remove_edges=closures[~believed].tolist()))
+    copy.apply(GraphUpdate(remove=closures[~believed].tolist()))
     copy.set_poses(best.poses)
     scale = give_scale(copy, closures[believed])
     optimize(copy, CONFIG)
@@ -105,7 +105,7 @@ def believe(
 
 
 def _not_worse(
-    result: BelievedEdges, graph: Graph, edges: Edges, starts: list[FloatArray],
+    result: BelievedEdges, graph: Graph, edges: Factors, starts: list[FloatArray],
     plain: FloatArray | None,
 ) -> BelievedEdges:
     """Return the result, or what is better by the sigmas that it has found, near other poses."""
@@ -125,13 +125,13 @@ def _not_worse(
     return result
 
 
-def _filled(graph: Graph, edges: Edges) -> Graph:
+def _filled(graph: Graph, edges: Factors) -> Graph:
     copy = Graph()
-    copy.fill(graph.rows()._replace(edges=edges))
+    copy.fill(graph.rows()._replace(factors=edges))
     return copy
 
 
-def _minimum_of_all(graph: Graph, edges: Edges, closures: IntArray) -> FloatArray | None:
+def _minimum_of_all(graph: Graph, edges: Factors, closures: IntArray) -> FloatArray | None:
     """
     Return the poses of a minimum of chi2 with all closures from a linear start, shape (N, 3).
 
@@ -146,10 +146,10 @@ def _minimum_of_all(graph: Graph, edges: Edges, closures: IntArray) -> FloatArra
     return copy.poses.copy()
 
 
-def _from_odometry(graph: Graph, edges: Edges, closures: IntArray) -> TruncatedProblem | None:
+def _from_odometry(graph: Graph, edges: Factors, closures: IntArray) -> TruncatedProblem | None:
     """Return the problem with the start that all other constraints give."""
     copy = _filled(graph, edges)
-    copy.apply(GraphUpdate(remove_edges=closures.tolist()))
+    copy.apply(GraphUpdate(remove=closures.tolist()))
     if optimize_from_linear_start(copy, SolverConfig()).status is Status.FAILED:
         return None
     return TruncatedProblem(copy, closures, start=copy.poses.copy())
@@ -163,7 +163,7 @@ SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
 """The lowest truncated cost of several sets, or graduated non-convexity alone."""
 
 
-def _joining(edges: Edges, closures: IntArray, part: IntArray, number: int) -> IntArray:
+def _joining(edges: Factors, closures: IntArray, part: IntArray, number: int) -> IntArray:
     """Return closures that join all parts that can be joined, the most accurate ones first."""
     table = edges.rows(closures)
     order = np.lexsort((table.j, table.i, -np.linalg.det(table.information)))
@@ -207,14 +207,14 @@ def doubt(
         '' if beliefs.cost_of_all is None else
         f'; {beliefs.cost_of_all:.6g} at the minimum of chi2 with all of them'))
     graph.set_poses(beliefs.poses)
-    graph.apply(GraphUpdate(remove_edges=doubted.tolist()))
+    graph.apply(GraphUpdate(remove=doubted.tolist()))
     if beliefs.scale > 1.0:
         lines.append('by their residuals, sigmas of loop closures are '
                      f'{short(beliefs.scale)} times those of the file, and count so')
-        graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(
+        graph.apply(GraphUpdate(weigh=dict.fromkeys(
             beliefs.closures[beliefs.believed].tolist(), beliefs.scale**-2.0)))
-    edges = graph.edges_at(doubted)
-    errors = graph.edge_errors(edges)
+    edges = graph.factors_at(doubted)
+    errors = graph.errors(edges)
     squares = energies_of(errors, edges.information)
     for k in np.argsort(-squares, kind='stable')[:5]:
         x, y, theta = errors[k]

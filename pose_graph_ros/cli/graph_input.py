@@ -21,7 +21,7 @@ import numpy as np
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.io.g2o import GraphFile, Guess, read_g2o, read_guessed
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
@@ -106,7 +106,7 @@ def read_measurements(
     no edge to the next one.
     """
     file, _ = read_file(path, edge2)
-    edges, n = file.graph.edges, file.graph.n_nodes
+    edges, n = file.graph.factors.edges, file.graph.n_nodes
     stamps_ns = SECOND * np.arange(1, n + 1) if stamps is None else _read_stamps(stamps, n)
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)
     # of several edges the first one in the file is odometry
@@ -139,7 +139,7 @@ def _read_stamps(path: Path, n: int) -> IntArray:
     return stamps[:n]
 
 
-def _odometry(edges: Edges, stamps_ns: IntArray) -> Iterator[OdometrySample]:
+def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
     """Yield composed poses at all stamps, given the edge from each vertex to the next."""
     forward = (edges.i < edges.j)[:, None]
     motions = np.where(forward, edges.mean, se2.inverse(edges.mean))
@@ -154,14 +154,14 @@ def _odometry(edges: Edges, stamps_ns: IntArray) -> Iterator[OdometrySample]:
         pose = se2.compose(pose, motions[step])
 
 
-def _closures(edges: Edges, stamps_ns: IntArray) -> Iterator[LoopClosure]:
+def _closures(edges: Factors, stamps_ns: IntArray) -> Iterator[LoopClosure]:
     for i, j, mean, cov in zip(edges.i, edges.j, edges.mean, _covariances(edges), strict=True):
         # from the axes of the measured pose to those of the reference
         yield LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
                           reference_ns=int(stamps_ns[i]))
 
 
-def _covariances(edges: Edges) -> FloatArray:
+def _covariances(edges: Factors) -> FloatArray:
     """Return the inverses of the information, shape (M, 3, 3); zero if there is none."""
     covariances = np.zeros((len(edges), 3, 3))
     regular = np.linalg.det(edges.information) > 0.0

@@ -39,15 +39,17 @@ def execute(options: argparse.Namespace) -> int:
         print(f'warning: {n_biases} biases are left out of the g2o file; measurements with them '
               'are written as if their errors were white', file=sys.stderr)
     write_g2o(graph, options.out, np.delete(ids, leaving))
+    n_edges = len(graph.factors.edges)
+    n_observed = graph.n_factors - n_edges
     facts = {
         'file': str(options.out), 'removed_nodes': len(leaving), 'hidden_nodes': graph.n_nodes,
-        'edges': graph.n_edges, 'observed_nodes': graph.n_observed, 'dense_priors': len(sizes),
+        'edges': n_edges, 'observed_nodes': n_observed, 'dense_priors': len(sizes),
         'largest_dense_prior': max(sizes, default=0), 'chi2_before': before}
     if options.json:
         print(json.dumps(facts, indent=2))
     else:
-        print(f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {graph.n_edges} '
-              f'edges and {graph.n_observed} observed nodes')
+        print(f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {n_edges} '
+              f'edges and {n_observed} observed nodes')
         if len(sizes) > 0:
             print(f'edges stand for {len(sizes)} dense priors, the largest one on {max(sizes)} '
                   'nodes')
@@ -60,10 +62,9 @@ def _with_edges_for_priors(graph: Graph) -> Graph:
     if graph.n_priors == 0:
         return graph
     rows = graph.rows()
-    edges, observed = standing_for(rows)
     without = Graph()
     without.fill(rows._replace(priors=()))
-    without.apply(GraphUpdate(edges=edges, observed=observed))
+    without.apply(GraphUpdate(factors=standing_for(rows)))
     return without
 
 

@@ -190,7 +190,7 @@ def _about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
         'chi2_of_the_truth': simulated.graph(simulated.truth.poses).energies().chi2,
         **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
             (loops.i, loops.j))),
-        'wrong_observed_nodes': observed.node[simulated.wrong].tolist(),
+        'wrong_observed_nodes': observed.i[simulated.wrong].tolist(),
         **_disturbances(way.setup)}
 
 

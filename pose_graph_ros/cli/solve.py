@@ -63,8 +63,8 @@ def execute(options: argparse.Namespace) -> int:
     rows = None if which is None else _chosen(problem, which)
     held, graph = problem.held, problem.graph
     before = graph.energies().chi2
-    say(f'{graph.n_nodes} hidden nodes, {len(graph.edges)} edges, '
-        f'{len(graph.observed)} observed nodes; chi2 {before:.9g} as read')
+    say(f'{graph.n_nodes} hidden nodes, {len(graph.factors.edges)} edges, '
+        f'{len(graph.factors.observed)} observed nodes; chi2 {before:.9g} as read')
     if not file.has_start:
         say('nodes without a pose in the file start at poses composed from the edges')
     if len(held) > 0:
@@ -112,18 +112,19 @@ def _lines(
 ) -> list[str]:
     """Return chi2 with how it was reached, and the largest energies."""
     graph, ids, result = problem.graph, problem.ids, solution.result
-    energies, edges = graph.energies(), graph.edges
-    order = np.argsort(energies.edges)[::-1]
+    energies, factors = graph.energies().factors, graph.factors
+    order = np.argsort(energies)[::-1]
+    is_edge = factors.j[order] >= 0
     return [
         *(f'  from the {name}: chi2 {each.chi2:.9g}, {each.status.value} after '
           f'{each.iterations} iterations' for name, each in solution.tried),
         f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
         f'from the {solution.start}, {seconds:.3f} s'
         f'{": " if result.reason else ""}{result.reason}',
-        *(f'  edge {ids[edges.i[k]]} -> {ids[edges.j[k]]}: energy {energies.edges[k]:.4g}'
-          for k in order[~np.isin(order, doubted)][:N_LARGEST]),
-        *(f'  observed node on {ids[graph.observed.node[k]]}: energy {energies.observed[k]:.4g}'
-          for k in np.argsort(energies.observed)[::-1][:N_LARGEST])]
+        *(f'  edge {ids[factors.i[k]]} -> {ids[factors.j[k]]}: energy {energies[k]:.4g}'
+          for k in order[is_edge & ~np.isin(order, doubted)][:N_LARGEST]),
+        *(f'  observed node on {ids[factors.i[k]]}: energy {energies[k]:.4g}'
+          for k in order[~is_edge][:N_LARGEST])]
 
 
 def _values(
@@ -131,10 +132,10 @@ def _values(
 ) -> dict[str, Any]:
     """Return most of the JSON output."""
     graph, ids, result = problem.graph, problem.ids, solution.result
-    edges = graph.edges_at(doubted)
+    edges = graph.factors_at(doubted)
     return {
-        'hidden_nodes': graph.n_nodes, 'edges': len(graph.edges),
-        'observed_nodes': len(graph.observed), 'chi2': result.chi2,
+        'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
+        'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
         'iterations': result.iterations, 'status': result.status.value, 'reason': result.reason,
         'start': solution.start, 'starts': [
             {'start': name, 'chi2': each.chi2, 'iterations': each.iterations,
@@ -206,8 +207,9 @@ def _condition(graph: 'Graph', covariances: Covariances) -> float:
     The trace of its inverse, each variance times what constraints add to H there.
     """
     added = np.zeros((graph.n_nodes, 3))
-    edges, observed = graph.edges_by_row, graph.observed_by_row
-    for table, ends in ((edges, (edges.i, edges.j)), (observed, (observed.node,))):
+    factors = graph.factors_by_row
+    edges, observed = factors.edges, factors.observed
+    for table, ends in ((edges, (edges.i, edges.j)), (observed, (observed.i,))):
         information = table.weighted_information
         position = information[:, 0, 0] + information[:, 1, 1]
         arm = np.sum(table.mean[:, :2]**2, axis=1) if table is edges else 0.0

@@ -25,7 +25,7 @@ from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, PlainOptimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
-from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph_update import GraphUpdate
 from pose_graph_ros.core.io.g2o import compose_missing, GraphFile
 from pose_graph_ros.core.sparse import components
@@ -59,8 +59,9 @@ class Problem:
     """
 
     def __init__(self, file: GraphFile, *, plain: bool) -> None:
-        rows, part = file.rows, components(file.rows.edges.i, file.rows.edges.j, len(file.ids))
-        is_held = np.isin(part, part[rows.fixed]) | np.isin(part, part[rows.observed.node])
+        rows, edges, observed = file.rows, file.rows.factors.edges, file.rows.factors.observed
+        part = components(edges.i, edges.j, len(file.ids))
+        is_held = np.isin(part, part[rows.fixed]) | np.isin(part, part[observed.i])
         is_first = (part == np.arange(len(part))) & ~is_held
         self.ids, self.has_start = file.ids, file.has_start
         self.held = np.flatnonzero(is_first)
@@ -140,7 +141,7 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
 
 def _composed(graph: 'Graph') -> FloatArray:
     """Return poses composed from odometry if it joins all nodes, else from all edges."""
-    edges, poses, known = graph.edges, graph.poses.copy(), graph.fixed.copy()
+    edges, poses, known = graph.factors.edges, graph.poses.copy(), graph.fixed.copy()
     edges = edges.rows(edges.weight > 0.0)
     steps = edges.rows(np.abs(edges.j - edges.i) == 1)
     joins_all = len(np.unique(np.minimum(steps.i, steps.j))) == graph.n_nodes - 1
@@ -163,13 +164,12 @@ def _held_weakly(
         return result, True
     copy, n = type(graph)(), graph.n_nodes
     copy.fill(graph.rows())
-    typical = np.concatenate([np.einsum('mii->mi', table.weighted_information).ravel()
-                              for table in (graph.edges, graph.observed)])
+    typical = np.einsum('mii->mi', graph.factors.weighted_information)
     weak = 1e-7 * np.median(typical[typical > 0.0]) * (
         np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
-    copy.apply(GraphUpdate(observed=ObservedNodes(
+    copy.apply(GraphUpdate(factors=Factors.on(
         np.arange(n), None, graph.poses.copy(), weak,
-        [ObservedKind.GLOBAL_POSE] * n)))
+        [FactorKind.GLOBAL_POSE] * n)))
     other = optimize(copy, CONFIG)
     if other.status is Status.FAILED:
         return result, False

@@ -189,8 +189,8 @@ class PoseGraphBackend:
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
         settings = self._config.odometry_source(source)
-        edge = self.graph.next_ids.edge - 1
-        self._reweighting.add(edge, settings.loss, settings.rejection_threshold, edge=True)
+        edge = self.graph.next_ids.factor - 1
+        self._reweighting.add(edge, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
 
     def add_measurement(self, measurement: Measurement, source: str) -> Answer:

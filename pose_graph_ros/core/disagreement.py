@@ -17,9 +17,9 @@ from pose_graph_ros.core.batch.optimizer import optimize, optimize_from_two_star
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.graph_view import constraint_tables
+from pose_graph_ros.core.graph.graph_view import factor_table
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
@@ -37,8 +37,7 @@ class _Part(NamedTuple):
     """The constraints of a source, by their ids."""
 
     kind: str
-    edges: IntArray
-    observed: IntArray
+    factors: IntArray
 
 
 def find(
@@ -76,15 +75,14 @@ def find(
 
 
 def _parts(graph: Graph, nodes: HiddenNodes, factors: FactorBuilder) -> dict[str, _Part]:
-    parts, none = {}, np.empty(0, dtype=np.int64)
+    parts = {}
     for source, (_, held) in factors.held().items():
-        edges, observed = held.ids[held.is_edge], held.ids[~held.is_edge]
-        positions = graph.observed_at(observed).information[:, 0, 0] > 0.0
-        kind = 'map' if len(edges) > 0 or np.any(positions) else 'heading'
-        parts[source] = _Part(kind, edges, observed)
+        some = graph.factors_at(held)
+        tells_position = (some.j >= 0) | (some.information[:, 0, 0] > 0.0)
+        parts[source] = _Part('map' if np.any(tells_position) else 'heading', held)
     for (source, kind), ids in edges_by_source(graph, nodes, factors).items():
         if len(ids) > 0:
-            parts.setdefault(source, _Part(kind, ids, none))
+            parts.setdefault(source, _Part(kind, ids))
     return parts
 
 
@@ -92,24 +90,24 @@ def edges_by_source(
     graph: Graph, nodes: HiddenNodes, factors: FactorBuilder,
 ) -> Mapping[tuple[str, str], IntArray]:
     """Return the ids of the edges between poses by source and kind."""
-    ids, edges = graph.edge_ids, graph.edges
+    ids, edges = graph.factor_ids, graph.factors
     others = factors.pose_edges()
     found: dict[tuple[str, str], IntArray] = {}
     known = np.concatenate([np.empty(0, dtype=np.int64), *others.values()])
-    primary = np.flatnonzero((edges.kind == EdgeKind.ODOMETRY) & ~np.isin(ids, known))
+    primary = np.flatnonzero((edges.kind == FactorKind.ODOMETRY) & ~np.isin(ids, known))
     at = np.clip(np.searchsorted(nodes.ids, edges.j[primary]), 0, len(nodes) - 1)
     stamps = nodes.stamps_ns[at].tolist()
     names = np.array([nodes.primary_at(stamp) for stamp in stamps], dtype=str)
     for source in dict.fromkeys(names.tolist()):
         found[source, 'odometry'] = ids[primary[names == source]]
     for source, each in others.items():
-        there = each[graph.edge_rows(each) >= 0]
-        kinds = graph.edges_at(there).kind
-        for kind in (EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY):
+        there = each[graph.factor_rows(each) >= 0]
+        kinds = graph.factors_at(there).kind
+        for kind in (FactorKind.LOOP_CLOSURE, FactorKind.ODOMETRY):
             if np.any(kinds == kind):
                 found.setdefault((source, kind.name.lower()), there[kinds == kind])
     for source, bias in factors.gyros.items():
-        found[source, 'turn'] = bias.edges[graph.edge_rows(bias.edges) >= 0]
+        found[source, 'turn'] = bias.edges[graph.factor_rows(bias.edges) >= 0]
     return found
 
 
@@ -117,12 +115,12 @@ def _strains(
     graph: Graph, factors: FactorBuilder, parts: Mapping[str, _Part],
 ) -> dict[str, float]:
     """Return the mean squared residual of each source, in units of what is known of its errors."""
-    table, strains = constraint_tables(graph)[0], {}
+    table, strains = factor_table(graph), {}
     for source, part in parts.items():
         if part.kind in ('map', 'heading'):
             strains[source] = factors.report(source, graph).strain
         else:
-            rows = graph.edge_rows(part.edges)
+            rows = graph.factor_rows(part.factors)
             used = rows[table.weights[rows] > 0.0]
             energy = float(np.sum(table.weights[used] * table.energies[used]))
             strains[source] = energy / max(int(np.sum(table.freedom[used])), 1)
@@ -138,10 +136,9 @@ def _solved_without(graph: Graph, parts: Mapping[str, _Part], source: str) -> Gr
     first = np.flatnonzero(graph.is_pose)[:0 if 'map' in kinds else 1]
     information = np.tile(np.diag((1.0, 1.0, float('heading' not in kinds))), (len(first), 1, 1))
     copy.apply(GraphUpdate(
-        weigh_edges=dict.fromkeys(part.edges.tolist(), 0.0),
-        weigh_observed=dict.fromkeys(part.observed.tolist(), 0.0),
-        observed=ObservedNodes(graph.node_ids[first], None, graph.poses[first],
-                               information, [ObservedKind.GLOBAL_POSE] * len(first))))
+        weigh=dict.fromkeys(part.factors.tolist(), 0.0),
+        factors=Factors.on(graph.node_ids[first], None, graph.poses[first],
+                               information, [FactorKind.GLOBAL_POSE] * len(first))))
     result = optimize_from_two_starts(copy, SolverConfig(), optimize)
     return None if result.status is Status.FAILED else copy
 
@@ -149,17 +146,17 @@ def _solved_without(graph: Graph, parts: Mapping[str, _Part], source: str) -> Gr
 def _reason(graph: Graph, source: str, part: _Part) -> str:
     """Return what its residuals at the path of the others show, after a colon."""
     if part.kind == 'turn':
-        edges = graph.edges_at(part.edges)
+        edges = graph.factors_at(part.factors)
         turned = edges.mean[:, 2]
-        true = turned + graph.edge_errors(edges)[:, 2]
+        true = turned + graph.errors(edges)[:, 2]
         slope = float(np.sum(turned * true) / max(np.sum(true**2), 1e-12))
         return (': it turns the other way, so check its mounting' if slope < -0.3 else
                 ': it does not turn with the robot, so its z axis is not up (see '
                 f'{source}.mounting and /tf_static), or it is dead' if slope < 0.3 else '')
     if part.kind != 'heading':
         return ''
-    observed = graph.observed_at(part.observed)
-    errors, measured = graph.observed_errors(observed)[:, 2], observed.mean[:, 2]
+    observed = graph.factors_at(part.factors)
+    errors, measured = graph.errors(observed)[:, 2], observed.mean[:, 2]
     off, length = _mean_angle(-errors)
     # from this mean resultant length on, angles are about the same
     if length > 0.9:

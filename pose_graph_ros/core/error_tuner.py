@@ -19,7 +19,7 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status, to_the_end
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Measured
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -83,7 +83,6 @@ class ErrorTuner:
         self._failed: OdometryErrors | None = None  # of odometry, with which the solver failed
         # of each source, its positions that will have left the graph
         self._past: dict[str, PastPath] = {}
-        self._n_bias_edges = 0  # number of edges to biases that are about to leave
 
     def step(self, most_edges: float = math.inf) -> float:
         """
@@ -94,7 +93,9 @@ class ErrorTuner:
         graph = self._smoother.graph
         if graph.has_touched:
             return 0.0  # an update has failed
-        if self._change is not None or (self._odometry_is_due() and graph.n_edges <= most_edges):
+        ends = graph.memory['factor_i'][:graph.n_factors, tb.END_J]
+        if self._change is not None or (
+                self._odometry_is_due() and np.count_nonzero(ends >= 0) <= most_edges):
             before = graph.poses.copy()
             if self._change is not None:
                 self._move(PART)
@@ -155,7 +156,7 @@ class ErrorTuner:
                 self.finish_change()
         self.finish_change()
 
-    def leave(self, edges: IntArray, observed: IntArray, first: int) -> list[int]:
+    def leave(self, factors: IntArray, first: int) -> list[int]:
         """
         Return the ids of the biases that are to leave the graph with constraints.
 
@@ -166,8 +167,8 @@ class ErrorTuner:
         self._past = {}
         for source in self._factors.finding():
             constraints = self._factors.constraints(source)
-            gone = np.flatnonzero(constraints.leaving(edges, observed))
-            used = gone[constraints.held(gone).weights(graph, graph.weights) > 0.0]
+            gone = np.flatnonzero(constraints.leaving(factors))
+            used = gone[constraints.are_used(graph)[gone]]
             stamps_ns, ids = constraints.rows.values[used].T
             self._past[source] = error_estimate.left_behind(
                 graph, self._odometry(AS_CLAIMED), stamps_ns, ids, past=constraints.past,
@@ -175,15 +176,11 @@ class ErrorTuner:
         change = self._change
         model = None if change is None else change.model or change.failed
         others = {} if change is None or model is None else {change.source: model}
-        biases = self._factors.leaving_biases(edges, observed, others)
-        left = np.union1d(edges, graph.constraints_on(np.array(biases, dtype=np.int64))[0])
-        self._n_bias_edges = int(np.count_nonzero(
-            graph.memory['edge_i'][graph.edge_rows(left), tb.EDGE_KIND] == EdgeKind.BIAS))
-        return biases
+        return self._factors.leaving_biases(factors, others)
 
     def stay(self) -> None:
         """Forget about the last `leave`, as nothing has left the graph."""
-        self._past, self._n_bias_edges = {}, 0
+        self._past = {}
 
     @property
     def needed(self) -> list[int]:
@@ -191,10 +188,9 @@ class ErrorTuner:
         every = (self._factors.constraints(source).past for source in self._factors.finding())
         return [past.node for past in every if past is not None]
 
-    def forget(self, nodes: IntArray, edges: IntArray, observed: IntArray) -> None:
+    def forget(self, nodes: IntArray, factors: IntArray) -> None:
         """Forget what has left the graph after `leave`, by ids."""
-        kept, change = self._factors.forget(nodes, edges, observed), self._change
-        self._factors.n_bias_edges -= self._n_bias_edges
+        kept, change = self._factors.forget(nodes, factors), self._change
         for source, past in self._past.items():
             self._factors.constraints(source).past = past
         self.stay()
@@ -216,13 +212,13 @@ class ErrorTuner:
         """
         graph, rows = self._smoother.graph, self._primary_rows()
         # what a loss or the judge has changed has less weight
-        weight = float(np.max(graph.weights[0][rows], initial=0.0))
+        weight = float(np.max(graph.weights[rows], initial=0.0))
         if knows_errors or weight in (0.0, 1.0):
             return
-        ids, edges = graph.edge_ids[rows], graph.edges_at(graph.edge_ids[rows])
+        ids, edges = graph.factor_ids[rows], graph.factors_at(graph.factor_ids[rows])
         graph.apply(GraphUpdate(
-            measure_edges=[Measured(ids, edges.mean, weight * edges.information)],
-            weigh_edges=dict(zip(ids.tolist(), (edges.weight / weight).tolist(), strict=True))))
+            measure=[Measured(ids, edges.mean, weight * edges.information)],
+            weigh=dict(zip(ids.tolist(), (edges.weight / weight).tolist(), strict=True))))
         self._reweighting.scale_base_weights(ids, 1.0 / weight)
         self._nodes.errors = OdometryErrors.scaled(weight**-0.5)
 
@@ -254,14 +250,14 @@ class ErrorTuner:
         graph, before = self._smoother.graph, self._nodes.errors
         if wanted.is_close(before):
             return
-        edges = graph.edges_at(ids := graph.edge_ids[self._primary_rows()])
+        edges = graph.factors_at(ids := graph.factor_ids[self._primary_rows()])
         stamps_ns = (self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, ends)]
                      for ends in (edges.i, edges.j))
         begin_ns, end_ns = stamps_ns
         measured = Measured(ids, *changed(
             edges.mean, edges.information,
             np.asarray((end_ns - begin_ns) * 1e-9, dtype=np.float64), before, wanted))
-        if not self._succeeds(GraphUpdate(measure_edges=[measured])):
+        if not self._succeeds(GraphUpdate(measure=[measured])):
             self.n_failures += 1
             self._failed = wanted
             return
@@ -271,10 +267,10 @@ class ErrorTuner:
     def _primary_rows(self) -> IntArray:
         """Return the rows of the edges that the hidden nodes were made with."""
         graph = self._smoother.graph
-        primary = graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.ODOMETRY
+        primary = graph.memory['factor_i'][:graph.n_factors, tb.FACTOR_KIND] == FactorKind.ODOMETRY
         others = np.concatenate([[], *self._factors.pose_edges().values()]).astype(np.int64)
-        primary[graph.edge_rows(others)] = False
-        ends = graph.node_ids[graph.memory['edge_i'][:graph.n_edges, tb.END_J]]
+        primary[graph.factor_rows(others)] = False
+        ends = graph.node_ids[graph.memory['factor_i'][:graph.n_factors, tb.END_J]]
         primary &= ~np.isin(ends, self._nodes.relocated_ids)
         return np.flatnonzero(primary)
 
@@ -289,12 +285,12 @@ class ErrorTuner:
         return None
 
     def _steps(
-        self, constraints: SourceConstraints, by_row: tuple[FloatArray, FloatArray], *,
+        self, constraints: SourceConstraints, weights: FloatArray, *,
         correlated: bool = False, reference: OdometryErrors = AS_CLAIMED,
     ) -> error_estimate.Search:
-        """Search with the measurements of a source whose edges or observed nodes have a weight."""
+        """Search with the measurements of a source that have a weight, of those given by row."""
         graph = self._smoother.graph
-        used = constraints.rows.values[constraints.held().weights(graph, by_row) > 0.0]
+        used = constraints.rows.values[constraints.are_used(graph, weights)]
         path = yield from error_estimate.measured_path(
             graph, self._odometry(reference), used[:, 0], used[:, 1],
             constraints.past)
@@ -343,40 +339,31 @@ class ErrorTuner:
         """Have others hold some measurements; return whether the solver succeeded."""
         graph, model = self._smoother.graph, change.model
         held = constraints.held(some)
-        weights = held.weights(graph, graph.weights)
+        weights = graph.weights[graph.factor_rows(held)]
         additions = Additions(graph.next_ids)
         added = constraints.rows.values[some]
         new = change.before[some] if change.undoing else np.full(len(some), -1)
         if model is not None:
             model.begin()
-            table = graph.observed_at(added[:, 1])
+            table = graph.factors_at(added[:, 1])
             for k, (stamp_ns, weight) in enumerate(
                     zip(added[:, 0].tolist(), weights.tolist(), strict=True)):
                 one = table.rows(slice(k, k + 1)).weighted(weight)
                 new[k] = model.add(stamp_ns, one, constraints.noise.values[some[k]], additions)
-        weigh_edges = dict.fromkeys(held.ids[held.is_edge].tolist(), 0.0)
-        weigh_observed = dict.fromkeys(held.ids[~held.is_edge].tolist(), 0.0)
+        wanted = dict.fromkeys(held.tolist(), 0.0)
         if model is None:
-            for first, edge, weight in zip(
-                    added[:, 1].tolist(), new.tolist(), weights.tolist(), strict=True):
-                if edge >= 0:
-                    weigh_edges[edge] = weight
-                else:
-                    weigh_observed[first] = weight
-        update = additions.update()._replace(
-            weigh_edges=weigh_edges, weigh_observed=weigh_observed)
+            wanted |= dict(zip(np.where(new >= 0, new, added[:, 1]).tolist(), weights.tolist(),
+                                strict=True))
+        update = additions.update()._replace(weigh=wanted)
         if not self._succeeds(update):
             if model is not None:
                 model.rollback()
             return False
-        self._factors.n_bias_edges += len(additions.edges)
         constraints.edges.values[some] = new
         after = constraints.held(some)
         self._judge.moved(held, after)
-        for one, is_edge, to, to_edge in zip(
-                held.ids.tolist(), held.is_edge.tolist(), after.ids.tolist(),
-                after.is_edge.tolist(), strict=True):
-            self._reweighting.move(one, to, edge=is_edge, to_edge=to_edge)
+        for one, to in zip(held.tolist(), after.tolist(), strict=True):
+            self._reweighting.move(one, to)
         return True
 
     def _succeeds(self, update: GraphUpdate) -> bool:

@@ -131,18 +131,18 @@ class Thinner:
             places, older = places.rows(~inside), older[older >= segment.after]
             yield
         # others leave with their measurements
-        before = places.nodes < first_of(*carriers(parts.graph))
+        before = places.nodes < first_of(carriers(parts.graph))
         places = self._present(places.rows(before), config)
         for chosen in groups(parts.graph, places):
             group = self._present(chosen, config)
             if len(group.nodes) == 0:
                 continue
-            decided = parts.judge.decide_leaving(*parts.graph.constraints_on(group.nodes))
+            decided = parts.judge.decide_leaving(parts.graph.factors_on(group.nodes))
             self._leave(group, sparse_removal(parts.graph, group.nodes), decided)
             yield
         nobody = places.rows(np.zeros(len(places.nodes), dtype=bool))
         while len(closures := old_closures(parts.graph, config.newest, LIMITS.old_closures)) > 0:
-            decided = parts.judge.decide_leaving(closures, NONE)
+            decided = parts.judge.decide_leaving(closures)
             if not self._leave(
                     nobody, sparse_removal(parts.graph, NONE, closures), decided):
                 break
@@ -166,16 +166,13 @@ class Thinner:
         Let the measurements of a stretch leave, and a group of its nodes; tell whether they did.
         """
         graph = self._parts.graph
-        edges, observed = graph.constraints_on(group.nodes)
-        edges = np.union1d(edges, segment.edges)
-        observed = np.union1d(observed, segment.observed)
+        factors = np.union1d(graph.factors_on(group.nodes), segment.factors)
         # what is decided may have another weight
-        decided = self._parts.judge.decide_leaving(edges, observed)
-        biases = np.array(self._tuner.leave(edges, observed, segment.after), dtype=np.int64)
+        decided = self._parts.judge.decide_leaving(factors)
+        biases = np.array(self._tuner.leave(factors, segment.after), dtype=np.int64)
         cuts = cut_chains(graph, biases)
         update = None if cuts is None else sparse_removal(
-            graph, np.sort(np.concatenate((group.nodes, biases))), segment.edges,
-            segment.observed, cuts)
+            graph, np.sort(np.concatenate((group.nodes, biases))), segment.factors, cuts)
         return self._leave(group, update, decided)
 
     def _leave(self, group: Places, update: GraphUpdate | None, decided: Leaving) -> bool:
@@ -201,9 +198,9 @@ def forget(
     gone: Left, parts: Parts, tuner: ErrorTuner, decided: Leaving | None,
 ) -> None:
     """Let judge, reweighting, tuner and factors forget what has left the graph."""
-    parts.judge.forget(gone.nodes, gone.edges, gone.observed, decided)
-    parts.reweighting.forget(gone.edges, gone.observed)
-    tuner.forget(gone.nodes, gone.edges, gone.observed)
+    parts.judge.forget(gone.nodes, gone.factors, decided)
+    parts.reweighting.forget(gone.factors)
+    tuner.forget(gone.nodes, gone.factors)
 
 
 class Forgetting:
@@ -255,10 +252,10 @@ class Forgetting:
         self._follow_alignment()
         stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
         biases = np.array(self._tuner.leave(
-            *graph.constraints_on(leaving), int(graph.node_ids[np.argmax(stays)])),
+            graph.factors_on(leaving), int(graph.node_ids[np.argmax(stays)])),
             dtype=np.int64)
         leaving = np.sort(np.concatenate((leaving, biases)))
-        decided = parts.judge.decide_leaving(*graph.constraints_on(leaving))
+        decided = parts.judge.decide_leaving(graph.factors_on(leaving))
         self._parts.smoother.linearize(leaving)
         poses = nodes.recent_poses(graph)
         anchors = self._other_anchors(first)

@@ -22,7 +22,7 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.measurements import Absolute, Fix, LoopClosure, Position, value_defect
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.parts import Parts
@@ -67,7 +67,7 @@ def estimate(
             math.sqrt(cov[2, 2]) if state is AlignmentState.ALIGNED else sigma),
         n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_thinned=len(nodes.thinned),
         n_priors=graph.n_priors,
-        n_edges=graph.n_edges - factors.n_bias_edges,
+        n_edges=graph.n_edges,
         n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
         primary=nodes.primary, odometry=source, odometry_errors=nodes.errors,
         trajectory=None if not with_path else Trajectory(
@@ -143,7 +143,7 @@ def corrected(parts: Parts, node: Corrected) -> Corrected:
     return Corrected(se2.wrapped(state[0]), 0.5 * (joint[:3, :3] + joint[:3, :3].T))
 
 
-def _passed(parts: Parts) -> list[tuple[Edges, bool]]:
+def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
     """
     Return what waits for odometry to be settled only, in the order of stamps, and if it is gated.
     """
@@ -167,7 +167,7 @@ def _passed(parts: Parts) -> list[tuple[Edges, bool]]:
 
 def _edge(
     measurement: Absolute, attachment: Attachment, model: GaussMarkovBias | None,
-) -> Edges:
+) -> Factors:
     """Return a measurement as an edge to the last state of the bias before it, or to none, -1."""
     observed = absolute_constraint(measurement, attachment)
     noise = motion_noise(measurement, attachment)
@@ -189,12 +189,12 @@ def _joint(smoother: IncrementalSmoother, ids: Sequence[int]) -> FloatArray:
 
 
 def _linearized(
-    edge: Edges, state: FloatArray, ids: Sequence[int],
+    edge: Factors, state: FloatArray, ids: Sequence[int],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what was measured less what is expected, its Jacobian, and its covariance."""
     information = edge.weighted_information[0]
     used = np.flatnonzero(np.diagonal(information) > 0.0)
-    x, y, factor, factor_heading = edge.bias[0].tolist()
+    x, y, factor, factor_heading = edge.constants[0].tolist()
     arm = se2.rotation(state[0, 2]) @ (x, y)
     jacobian = np.zeros((3, 3 * len(ids)))
     jacobian[:, :3] = np.eye(3)

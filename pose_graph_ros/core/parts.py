@@ -18,7 +18,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.exceptions import FileFormatError, NothingToSaveError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, full, upper
+from pose_graph_ros.core.graph.constraints import Factors, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.json_values import MISMATCHES
@@ -86,11 +86,10 @@ def capture(
     for name, (stamps, references) in seen.items():
         sources[name] = replace(
             added.get(name, _NO_CONSTRAINTS), seen_ns=stamps, seen_references=references)
-    edge_losses, observed_losses = parts.reweighting.saved()
     return SavedGraph(
         rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=sources,
-        edge_losses=edge_losses, observed_losses=observed_losses,
-        alignment=parts.alignment.saved(), waiting=_saved_edges(parts.pipeline.queue),
+        losses=parts.reweighting.saved(), alignment=parts.alignment.saved(),
+        waiting=_saved_edges(parts.pipeline.queue),
         set_aside=_saved_edges(parts.quarantine), judgement=parts.judge.saved(),
         verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
                   if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
@@ -121,18 +120,17 @@ def _restore(parts: Parts, saved: SavedGraph) -> None:
     for name, source in saved.sources.items():
         parts.pipeline.seen.restore(name, source.seen_ns, source.seen_references)
         parts.factors.restore(name, source)
-    parts.factors.n_bias_edges = int(np.sum(saved.rows.edges.kind == EdgeKind.BIAS))
     for name, gyro in saved.gyros.items():
         parts.pipeline.gyros.restore(name, gyro)
         parts.pipeline.queue.turns += gyro.waiting
     for name, bias in saved.gyro_biases.items():
         parts.factors.gyro_bias(name).restore(bias)
-    parts.reweighting.restore(saved.edge_losses, saved.observed_losses)
+    parts.reweighting.restore(saved.losses)
     parts.alignment.load(saved.alignment)
     parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
     for queue, edges in (
             (parts.pipeline.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
-        table = Edges(edges.i, edges.j, edges.mean, full(edges.information), edges.kind)
+        table = Factors(edges.i, edges.j, edges.mean, full(edges.information), edges.kind)
         queue.edges += [
             QueuedEdge(name, table.rows(slice(k, k + 1)), *stamps)
             for k, (name, stamps) in enumerate(zip(
@@ -140,7 +138,7 @@ def _restore(parts: Parts, saved: SavedGraph) -> None:
 
 
 def _saved_edges(queue: Queue) -> SavedEdges:
-    table = Edges.joined([queued.edge for queued in queue.edges])
+    table = Factors.joined([queued.edge for queued in queue.edges])
     stamps = np.array([(queued.stamp_ns, queued.reference_ns) for queued in queue.edges],
                       dtype=np.int64).reshape(-1, 2)
     return SavedEdges(tuple(queued.source for queued in queue.edges), table.i, table.j,

@@ -53,12 +53,12 @@ class Refiner:
         settled = result.status is Status.CONVERGED
         # the rest is done by `refine`
         for _ in range(3 if self._may_reweight else 0):
-            edges, observed = self._reweighting.changes(self._smoother.graph)
-            if len(edges) + len(observed) == 0:
+            weights = self._reweighting.changes(self._smoother.graph)
+            if len(weights) == 0:
                 break
             settled = False
             with begin() as transaction:
-                transaction.solved(self._weigh(edges, observed))
+                transaction.solved(self._weigh(weights))
             if transaction.failure != '':
                 break
             result = transaction.result
@@ -68,19 +68,19 @@ class Refiner:
     def _may_reweight(self) -> bool:
         return len(self._reweighting) > 0 and not self._judge.solves_later
 
-    def _weigh(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> UpdateResult:
+    def _weigh(self, weights: Mapping[int, float]) -> UpdateResult:
         """
         Return the result of an update with new weights.
 
         If its iterations diverge, a small graph is solved at once, but not again and again; else
         the graph keeps the old ones, and is solved as a copy later.
         """
-        update = GraphUpdate(weigh_edges=edges, weigh_observed=observed)
+        update = GraphUpdate(weigh=weights)
         result = self._smoother.update(update, fall_back=False)
         if result.reason == DIVERGED and self._judge.may_solve():
             return self._smoother.update(update)
         if result.reason == DIVERGED:
-            self._judge.solve_later(edges, observed)
+            self._judge.solve_later(weights)
         return result
 
     def refine(self) -> Refinement:
@@ -115,11 +115,11 @@ class Refiner:
         graph, size = self._smoother.graph, len(self._reweighting)
         while (self._may_reweight and self._unchanged < min(size, LOOKED_AT)
                and self._reweightings < 100):
-            edges, observed = self._reweighting.changes_of_part(graph, self._cursor)
-            if len(edges) + len(observed) > 0:
+            weights = self._reweighting.changes_of_part(graph, self._cursor)
+            if len(weights) > 0:
                 self._unchanged, self._reweightings = 0, self._reweightings + 1
                 before = graph.poses.copy()
-                result = self._weigh(edges, observed)
+                result = self._weigh(weights)
                 self.finished = result.status is Status.FAILED and result.reason != DIVERGED
                 by_weights = np.max(np.abs(graph.poses - before)[graph.is_pose, :2], initial=0.0)
                 return Refinement(finished=self.finished, moved=max(moved, float(by_weights)))

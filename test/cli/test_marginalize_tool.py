@@ -85,7 +85,7 @@ def test_dense_priors_are_refused_or_become_conservative_edges(tmp_path, capsys)
     assert facts['dense_priors'] == 1
     assert facts['largest_dense_prior'] == 3
     before, after = read_g2o(path), read_g2o(out)
-    assert facts['edges'] == len(after.graph.edges)
+    assert facts['edges'] == len(after.graph.factors.edges)
     # no covariance is smaller than it was
     more = covariance_of_poses(after.graph) - covariance_of_poses(before.graph)
     assert np.linalg.eigvalsh(more)[0] > -1e-9

@@ -130,13 +130,14 @@ def test_a_graph_and_its_truth_have_the_same_ids_and_constraints(tmp_path) -> No
              '0.3', '--false-groups', '2:5', '--fix-sigma', '0.5', '--tum')
     start, truth = read_g2o(path), read_g2o(tmp_path / 'graph_truth.g2o')
     np.testing.assert_array_equal(start.ids, truth.ids)
-    np.testing.assert_array_equal(start.graph.edges.mean, truth.graph.edges.mean)
+    np.testing.assert_array_equal(start.graph.factors.edges.mean, truth.graph.factors.edges.mean)
     said = about(path)
     assert truth.graph.energies().chi2 == pytest.approx(said['chi2_of_the_truth'])
     assert len(truth.ids) == said['nodes']
-    assert len(truth.graph.edges) == said['edges']
-    assert len(truth.graph.observed) == said['observed_nodes'] > 100
-    pairs = set(zip(truth.graph.edges.i.tolist(), truth.graph.edges.j.tolist(), strict=True))
+    assert len(truth.graph.factors.edges) == said['edges']
+    assert len(truth.graph.factors.observed) == said['observed_nodes'] > 100
+    factors = truth.graph.factors
+    pairs = set(zip(factors.i.tolist(), factors.j.tolist(), strict=True))
     false = [tuple(each['ids']) for each in said['false_closures']]
     assert set(false) <= pairs
     assert len(set(false)) == len(false)

@@ -64,9 +64,10 @@ def test_a_graph_is_solved_to_its_optimum(name, start, tmp_path, capsys) -> None
     np.testing.assert_array_equal(after.ids, before.ids)
     np.testing.assert_array_equal(after.graph.fixed, before.graph.fixed)
     # constraints of the same tag keep their order, and no number of them is changed
-    assert after.graph.edges.mean.tobytes() == before.graph.edges.mean.tobytes()
-    assert after.graph.edges.information.tobytes() == before.graph.edges.information.tobytes()
-    assert len(after.graph.observed) == len(before.graph.observed)
+    after, before = after.graph.factors, before.graph.factors
+    assert after.edges.mean.tobytes() == before.edges.mean.tobytes()
+    assert after.edges.information.tobytes() == before.edges.information.tobytes()
+    assert len(after) == len(before)
 
 
 def test_the_start_is_that_of_the_file_only_if_asked_for(tmp_path, capsys) -> None:
@@ -130,7 +131,7 @@ def test_there_is_an_answer_wherever_there_is_a_graph(name, start, tmp_path, cap
     assert captured.err == ''
     assert re.search(said, captured.out, re.MULTILINE)
     before, after = read_g2o(path).graph, read_g2o(out).graph
-    assert (len(after.edges), len(after.observed)) == (len(before.edges), len(before.observed))
+    assert after.factors.j.tolist() == before.factors.j.tolist()
     if name != 'all_fixed':
         assert after.energies().chi2 == pytest.approx(0.0, abs=1e-6)
 
@@ -145,13 +146,13 @@ def test_the_constraints_with_the_largest_energies_are_named(tmp_path, capsys) -
     assert len(named) == 5
     assert named[0][:2] == ('20', '22')
     graph = read_g2o(out).graph
-    energies = graph.energies()
+    energies, is_edge = graph.energies().factors, graph.factors.j >= 0
     assert [float(energy) for _, _, energy in named] == pytest.approx(
-        sorted(energies.edges.tolist(), reverse=True), rel=1e-3)
+        sorted(energies[is_edge].tolist(), reverse=True), rel=1e-3)
     named = re.findall(r'(?m)^  observed node on (\d+): energy (\S+)$', '\n'.join(lines))
     assert [name for name, _ in named] == ['23', '20']
     assert [float(energy) for _, energy in named] == pytest.approx(
-        sorted(energies.observed.tolist(), reverse=True), rel=1e-3)
+        sorted(energies[~is_edge].tolist(), reverse=True), rel=1e-3)
 
 
 # --- Wrong loop closures ---------------------------------------------------------------------
@@ -174,7 +175,7 @@ def test_wrong_closures_are_found_and_left_out(order, tmp_path, capsys) -> None:
     assert main(['solve', str(path), '--robust', '-o', str(out)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1] == '31 loop closures: 20 believed, 11 doubted'
-    wrong = drive.graph.edges_at(drive.closures[~drive.right])
+    wrong = drive.graph.factors_at(drive.closures[~drive.right])
     ends = {(7 + 10 * i, 7 + 10 * j) for i, j in zip(wrong.i, wrong.j, strict=True)}
     named = re.findall(
         r'(?m)^  doubted edge (\d+) -> (\d+): (\S+) m and (\S+) rad off, (\S+) sigma$',
@@ -185,7 +186,7 @@ def test_wrong_closures_are_found_and_left_out(order, tmp_path, capsys) -> None:
     assert sigmas == sorted(sigmas, reverse=True)
     # other programs read a graph without them
     file = read_g2o(out)
-    assert len(file.graph.edges) == len(drive.graph.edges) - 11
+    assert len(file.graph.factors.edges) == len(drive.graph.factors.edges) - 11
     assert drive.error(file.graph.poses) < 0.5
     comments = re.findall(
         r'(?m)^# not used EDGE_SE2 (\d+) (\d+) ', out.read_text(encoding='ascii'))
@@ -199,10 +200,10 @@ def test_wrong_closures_are_found_and_left_out(order, tmp_path, capsys) -> None:
 def test_closures_join_what_odometry_does_not(tmp_path, capsys) -> None:
     drive = laps(2, n_laps=4, n_wrong=6)
     graph, cut = drive.graph, 60
-    gone = np.flatnonzero((graph.edges.i == cut) & (graph.edges.j == cut + 1))
+    gone = (graph.factors.i == cut) & (graph.factors.j == cut + 1)
     path, out = tmp_path / 'parts.g2o', tmp_path / 'out.g2o'
     rows, parts = graph.rows(), Graph()
-    parts.fill(rows.with_edges(rows.edges.rows(np.setdiff1d(np.arange(len(rows.edges)), gone))))
+    parts.fill(rows.with_factors(rows.factors.rows(~gone)))
     write_g2o(parts, path)
     assert main(['solve', str(path), '--robust', '-o', str(out)]) == 0
     printed = capsys.readouterr().out
@@ -269,7 +270,7 @@ def test_each_method_finds_single_wrong_closures(method, tmp_path, capsys) -> No
     write_g2o(drive.graph, path)
     assert main(['solve', str(path), '--robust', method, '-o', str(out), '--json']) == 0
     values = json.loads(capsys.readouterr().out)
-    wrong = drive.graph.edges_at(drive.closures[~drive.right])
+    wrong = drive.graph.factors_at(drive.closures[~drive.right])
     assert set(map(tuple, values['doubted'])) == set(zip(
         wrong.i.tolist(), wrong.j.tolist(), strict=True))
     robust = values['robust']

@@ -48,15 +48,15 @@ def drive(
 
 
 def closures_of(path: Path) -> IntArray:
-    edges = read_g2o(path).graph.edges
+    edges = read_g2o(path).graph.factors.edges
     return np.flatnonzero(np.abs(edges.j - edges.i) != 1)
 
 
 def truncated(path: Path, poses: FloatArray, scale: float) -> float:
     graph = read_g2o(path).graph
     graph.set_poses(poses)
-    edges = graph.edges
-    squares = energies(graph.edge_errors(edges), edges.information)
+    edges = graph.factors.edges
+    squares = energies(graph.errors(edges), edges.information)
     rows = closures_of(path)
     squares[rows] = np.minimum(squares[rows] / scale**2, LIMIT)
     return float(np.sum(squares))
@@ -117,7 +117,7 @@ def test_landmarks_between_poses_do_not_make_odometry_a_closure(tmp_path, capsys
         file.writelines(f'EDGE_SE2_XY {2 * k} {2 * k + 1} 1 2 4 0 4\n' for k in range(n))
     assert main(['solve', str(path), '--robust', '--json']) == 0
     values = json.loads(capsys.readouterr().out)
-    wrong = drive_of.graph.edges_at(drive_of.closures[~drive_of.right])
+    wrong = drive_of.graph.factors_at(drive_of.closures[~drive_of.right])
     assert values['robust']['closures'] == len(drive_of.closures)
     assert sorted(values['doubted']) == sorted([2 * i, 2 * j] for i, j in zip(
         wrong.i.tolist(), wrong.j.tolist(), strict=True))

@@ -67,7 +67,7 @@ def test_all_is_solved_for_now_and_then_where_every_update_diverges(
     # and nothing is lost: all fixes are in the graph at the end
     assert backend.optimize().status is Status.CONVERGED
     assert backend.counts['fix', 'accepted'] == N
-    assert np.count_nonzero(backend.graph.observed.weight > 0.0) == N
+    assert np.count_nonzero(backend.graph.factors.observed.weight > 0.0) == N
 
 
 def test_what_waits_is_solved_for_also_where_nobody_refines() -> None:
@@ -79,4 +79,4 @@ def test_what_waits_is_solved_for_also_where_nobody_refines() -> None:
         backend.add_measurement(fix, 'fix')
         backend.update()
     # some of the newest may wait; it was 450 for ever where they waited from one pause to the next
-    assert np.count_nonzero(backend.graph.observed.weight > 0.0) > 460
+    assert np.count_nonzero(backend.graph.factors.observed.weight > 0.0) > 460

@@ -18,7 +18,7 @@ from pose_graph_ros.core.config import (
     POSITIONS,
 )
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.smoother.incremental import UpdateResult
@@ -78,16 +78,15 @@ def path(backend: PoseGraphBackend) -> np.ndarray:
 def assert_each_held_once(backend: PoseGraphBackend) -> None:
     """Each fix counts once: as an edge to a bias, or as an observed node."""
     constraints = backend._factors.constraints('fix')
-    edges, observed = backend.graph.weights
-    as_edges = constraints.edges.values
-    weights = observed[constraints.rows.values[:, 1]]
+    every, as_edges = backend.graph.weights, constraints.edges.values
+    weights = every[constraints.rows.values[:, 1]]
     np.testing.assert_array_equal(weights > 0.0, as_edges < 0)
-    assert np.all(edges[as_edges[as_edges >= 0]] > 0.0)
-    held = np.zeros(len(edges), dtype=bool)
+    assert np.all(every[as_edges[as_edges >= 0]] > 0.0)
+    held = np.zeros(len(every), dtype=bool)
     held[as_edges[as_edges >= 0]] = True
-    table = backend.graph.edges
-    to_pose = (table.kind == EdgeKind.BIAS) & ~backend.graph.is_bias[table.i]
-    assert np.all(edges[to_pose & ~held] == 0.0)
+    table = backend.graph.factors
+    to_pose = (table.kind == FactorKind.BIAS) & ~backend.graph.is_bias[table.i]
+    assert np.all(every[to_pose & ~held] == 0.0)
 
 
 def test_correlated_errors_are_found_online_and_the_whole_past_is_changed() -> None:
@@ -133,10 +132,10 @@ def test_the_final_path_does_not_depend_on_the_order_of_arrival(seed: int) -> No
     assert in_use(backends[0]) == in_use(backends[1])
     np.testing.assert_allclose(*map(path, backends), atol=1e-9)
     again = path(backends[0])
-    n_edges = backends[0].graph.n_edges
+    n_factors = backends[0].graph.n_factors
     backends[0].optimize()
     np.testing.assert_allclose(path(backends[0]), again, atol=1e-9)
-    assert backends[0].graph.n_edges == n_edges
+    assert backends[0].graph.n_factors == n_factors
 
 
 def test_what_is_saved_goes_on_as_if_it_had_not_been() -> None:
@@ -190,21 +189,21 @@ def test_a_change_that_fails_is_undone_as_a_whole(
 
 def sigmas_of_odometry(backend: PoseGraphBackend) -> np.ndarray:
     """Return those of the position along each edge, relative to what is claimed by default."""
-    edges = backend.graph.edges
-    rows = edges.kind == EdgeKind.ODOMETRY
+    edges = backend.graph.factors.edges
+    rows = edges.kind == FactorKind.ODOMETRY
     assert set(edges.weight[rows]) == {1.0}
     return np.sqrt(np.linalg.inv(edges.information[rows])[:, 0, 0]) / np.sqrt(
         np.linalg.inv(fed_once().information[rows])[:, 0, 0])
 
 
 @functools.cache
-def fed_once() -> Edges:
+def fed_once() -> Factors:
     """Return the edges of a drive as odometry claims them."""
     claimed = PoseGraphBackend(BackendConfig(
         measurements={'fix': SOURCE}, odometry={'odom': OdometrySource(sigma_scale=1.0)}))
     go_on(claimed, drive(8, 1e-3, drift=4.0))
     claimed.finish()
-    return claimed.graph.edges
+    return claimed.graph.factors.edges
 
 
 def test_an_odometry_that_drifts_more_than_it_claims_gets_more_noise() -> None:

@@ -140,11 +140,12 @@ def test_where_a_person_has_put_the_robot_is_not_changed_by_errors_of_odometry()
     assert backend.estimate().odometry_errors.turn < 1.0
     placed = GlobalPose(120 * SECOND, truth[600] + (5.0, 0.0, 0.0), np.diag((0.25, 0.25, 0.01)))
     assert backend.set_pose(placed, 'initialpose').status is AnswerStatus.ACCEPTED
-    edge, before = backend.graph.edges.rows(slice(-1, None)), backend.estimate().odometry_errors
+    edge = backend.graph.factors.edges.rows(slice(-1, None))
+    before = backend.estimate().odometry_errors
     again = PoseGraphBackend.restored(None, backend.saved())
     for each in (backend, again):
         each._tuner._correct_odometry(OdometryErrors(2.0, 3.0, 0.001, 0.01))
         assert each.estimate().odometry_errors != before
-        last = each.graph.edges.rows(slice(-1, None))
+        last = each.graph.factors.edges.rows(slice(-1, None))
         np.testing.assert_array_equal(last.information, edge.information)
         np.testing.assert_array_equal(last.mean, edge.mean)

@@ -107,6 +107,6 @@ def test_a_graph_that_is_saved_between_two_primary_odometries_goes_on_as_without
         feed(each, EVENTS[cut:]).optimize()
     assert len(backend.node_stamps_ns) > n
     np.testing.assert_array_equal(restored.node_stamps_ns, backend.node_stamps_ns)
-    assert_same_value(restored.graph.edges, backend.graph.edges)
+    assert_same_value(restored.graph.factors.edges, backend.graph.factors.edges)
     np.testing.assert_allclose(
         restored.estimate().path.poses, backend.estimate().path.poses, atol=1e-9)

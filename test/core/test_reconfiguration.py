@@ -109,11 +109,11 @@ def with_fix(**changes: object) -> BackendConfig:
 
 
 def edges(backend: PoseGraphBackend) -> FloatArray:
-    return backend.graph.edges_at(np.arange(backend.graph.n_edges)).information
+    return backend.graph.factors.edges.information
 
 
 def observed(backend: PoseGraphBackend) -> FloatArray:
-    return backend.graph.observed_at(np.arange(backend.graph.n_observed)).information
+    return backend.graph.factors.observed.information
 
 
 # --- What does not change ------------------------------------------------------------------------
@@ -169,7 +169,7 @@ def test_edges_have_the_noise_that_is_set_when_they_are_made(wanted: BackendConf
     old = edges(feed(PoseGraphBackend(CONFIG), samples))
     new = edges(feed(PoseGraphBackend(wanted), samples))
     backend = feed(PoseGraphBackend(CONFIG), samples[:150])
-    made = backend.graph.n_edges
+    made = len(backend.graph.factors.edges)
     assert 10 < made < len(old) - 10
     anchor = backend.estimate().covariance
     backend.configure(wanted)
@@ -228,16 +228,16 @@ def test_a_loss_counts_for_what_joins_from_then_on() -> None:
               for k, (source, event) in enumerate(only(DRIVE, 'odom', 'fix', 'global_pose'))]
     backend = feed(PoseGraphBackend(CONFIG), events[:len(events) // 2], 20)
     backend.update()
-    made = backend.graph.n_observed
+    made = len(backend.graph.factors.observed)
     backend.configure(with_fix(loss=Loss.CAUCHY, rejection_threshold=2.0))
     feed(backend, events[len(events) // 2:], 20)
     backend.optimize()
-    weights = backend.graph.weights[1]
+    table, energies = backend.graph.factors, backend.graph.energies().factors
+    weights, energies = table.observed.weight, energies[table.j < 0]
     assert np.all(weights[:made] == 1.0)
     assert np.min(weights[made:]) < 0.1
-    table = backend.graph.observed_at(np.arange(made, backend.graph.n_observed))
-    energies = backend.graph.energies().observed[made:] / weights[made:]
-    positions = table.information[:, 2, 2] == 0.0
+    energies = energies[made:] / weights[made:]
+    positions = table.observed.information[made:, 2, 2] == 0.0
     np.testing.assert_allclose(
         weights[made:][positions],
         costs_and_weights(Loss.CAUCHY, energies[positions], 2.0)[1], rtol=1e-6)
@@ -245,6 +245,6 @@ def test_a_loss_counts_for_what_joins_from_then_on() -> None:
     # and back: what has one keeps it
     backend.configure(CONFIG)
     before = ended(backend)
-    np.testing.assert_array_equal(backend.graph.weights[1][:made], 1.0)
-    assert np.min(backend.graph.weights[1][made:]) < 0.1
+    np.testing.assert_array_equal(backend.graph.factors.observed.weight[:made], 1.0)
+    assert np.min(backend.graph.factors.observed.weight[made:]) < 0.1
     np.testing.assert_allclose(ended(backend), before, atol=1e-9)

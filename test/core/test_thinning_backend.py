@@ -17,7 +17,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     LoopClosure,
@@ -140,8 +140,8 @@ def test_fixes_with_correlated_errors_leave_with_their_biases() -> None:
     most = 8 * config.thinning.newest
     assert np.count_nonzero(~graph.is_pose) < most
     assert graph.n_nodes < 2 * PER_LAP + 2 * most
-    assert graph.n_observed < PER_LAP + most
-    assert graph.n_edges < 8 * PER_LAP
+    assert len(graph.factors.observed) < PER_LAP + most
+    assert len(graph.factors.edges) < 8 * PER_LAP
     assert errors[1] < 1.5 * errors[0]
     # samples behind what has left are gone; late fixes and closures there are taken all the same
     assert len(thinned.saved().nodes.streams['odom'].stamps_ns) < 60
@@ -175,9 +175,9 @@ def test_neither_nodes_nor_edges_grow_with_the_laps() -> None:
         if k % 3 == 0:
             backend.update()
         if k % PER_LAP == PER_LAP - 1:
-            kinds = backend.graph.edges.kind
+            kinds = backend.graph.factors.edges.kind
             sizes.append((backend.graph.n_nodes, len(kinds),
-                          np.count_nonzero(kinds == EdgeKind.LOOP_CLOSURE)))
+                          np.count_nonzero(kinds == FactorKind.LOOP_CLOSURE)))
     earlier, later = np.max(sizes[5:10], axis=0), np.max(sizes[15:], axis=0)
     assert np.all(later <= 1.1 * earlier)
     off = se2.between(backend.graph.poses[-1], truth[len(truth) - 2])

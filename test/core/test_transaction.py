@@ -17,7 +17,7 @@ from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
@@ -132,14 +132,13 @@ class Picky(IncrementalSmoother):
 
     def update(self, update: GraphUpdate, **options: bool) -> UpdateResult:
         self.asked += 1
-        means = np.concatenate((update.edges.mean, update.observed.mean))
-        if self.picky and np.any(means[:, 0] == POISON):
+        if self.picky and np.any(update.factors.mean[:, 0] == POISON):
             return UpdateResult(Status.FAILED, 'broken on purpose', 0, 0, 0, 0)
         return super().update(update, **options)
 
 
 def queue_of(numbers: range) -> Queue:
-    return Queue([QueuedEdge(str(k), Edges()) for k in numbers], [])
+    return Queue([QueuedEdge(str(k), Factors()) for k in numbers], [])
 
 
 def names(queue: Queue) -> list[int]:
@@ -210,15 +209,15 @@ def test_one_bad_fix_of_many_is_set_aside_by_its_name(aligned: bool) -> None:
     assert smoother.asked - before <= 4 * 14
     for _ in range(3):
         backend.update()
-    assert backend.graph.n_observed == 119 + aligned
+    assert len(backend.graph.factors.observed) == 119 + aligned
     assert backend.estimate().alignment is AlignmentState.ALIGNED
     assert backend.n_quarantined == 1
     # it is tried again with the next full optimisation, and once it is good it gets in
     assert backend.optimize().status is Status.FAILED
-    assert (backend.n_quarantined, backend.graph.n_observed) == (1, 119 + aligned)
+    assert (backend.n_quarantined, len(backend.graph.factors.observed)) == (1, 119 + aligned)
     smoother.picky = False
     assert backend.optimize().status is Status.CONVERGED
-    assert (backend.n_quarantined, backend.graph.n_observed) == (0, 120 + aligned)
+    assert (backend.n_quarantined, len(backend.graph.factors.observed)) == (0, 120 + aligned)
     whole = driven(1, Picky(), aligned=aligned)
     whole._smoother.picky = False
     whole.optimize()
@@ -229,7 +228,7 @@ def test_one_bad_fix_of_many_is_set_aside_by_its_name(aligned: bool) -> None:
 def test_a_stream_ends_with_all_good_ones_in_the_graph() -> None:
     backend = driven(20, Picky())
     assert backend.optimize().status is Status.FAILED
-    assert (backend.n_quarantined, backend.graph.n_observed) == (20, 101)
+    assert (backend.n_quarantined, len(backend.graph.factors.observed)) == (20, 101)
 
 
 def test_a_solver_that_always_fails_is_not_asked_for_each_constraint(
@@ -245,4 +244,4 @@ def test_a_solver_that_always_fails_is_not_asked_for_each_constraint(
         assert smoother.asked == before + 2
     assert backend.n_quarantined == 121
     assert backend.optimize().status is Status.CONVERGED
-    assert backend.graph.n_observed == 121
+    assert len(backend.graph.factors.observed) == 121

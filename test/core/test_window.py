@@ -111,8 +111,8 @@ def test_the_newest_pose_is_that_of_the_whole_graph_but_the_graph_is_small(
     assert other.n_hidden == one.n_hidden > 170
     assert other.n_frozen > 60
     assert part.graph.n_nodes - other.n_biases <= 115 + 1
-    assert part.graph.n_edges < 300
-    assert part.graph.n_observed < 150
+    assert len(part.graph.factors.edges) < 300
+    assert len(part.graph.factors.observed) < 150
     assert len(part.graph.priors) == (window.prior is WindowPrior.DENSE)
 
 
@@ -146,7 +146,7 @@ def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:
             np.testing.assert_array_equal(now[:len(frozen)], frozen)
             frozen = now.copy()
             graph, stream = backend.graph, backend._nodes.streams['odom']
-            sizes.append((graph.n_nodes, graph.n_edges, graph.n_observed, len(stream.timeline),
+            sizes.append((graph.n_nodes, graph.n_edges, graph.n_factors, len(stream.timeline),
                           len(backend._pipeline.seen._stamps.get('fix', ())),
                           len(backend._reweighting), len(backend._pipeline.queue)))
     at = len(sizes) // 3

@@ -44,9 +44,9 @@ def call_all_kernels(n_samples: int, max_iterations: int = 10) -> None:
         backend.estimate()
     smoother = backend._smoother
     for update in (
-            GraphUpdate(remove_edges=(50,)), GraphUpdate(),
-            GraphUpdate(weigh_observed={3: 0.1}, weigh_edges={5: 2.0}),
-            GraphUpdate(fix=(7,)), GraphUpdate(free=(7,)), GraphUpdate(remove_observed=(4,))):
+            GraphUpdate(remove=(50,)), GraphUpdate(),
+            GraphUpdate(weigh={3: 0.1, 17: 2.0}),
+            GraphUpdate(fix=(7,)), GraphUpdate(free=(7,)), GraphUpdate(remove=(4,))):
         smoother.update(update)
     smoother.covariances()
     smoother.covariance(30)

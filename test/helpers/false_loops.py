@@ -8,7 +8,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Sigmas of an odometry edge and of a closure [m, m, rad].
@@ -82,17 +82,17 @@ def laps(  # noqa: PLR0917
     graph = Graph()
     graph.apply(GraphUpdate(
         hidden=se2.wrapped(np.array(poses)), fix=(0,),
-        edges=Edges.joined((
+        factors=Factors.joined((
             _edges(np.arange(len(moved)), np.arange(1, len(true)), moved, ODOMETRY,
-                   EdgeKind.ODOMETRY),
+                   FactorKind.ODOMETRY),
             _edges(np.append(i, wrong_i).astype(np.int64), np.append(j, wrong_j).astype(np.int64),
                    np.vstack((mean, np.reshape(wrong, (-1, 3)))), CLOSURE,
-                   EdgeKind.LOOP_CLOSURE)))))
+                   FactorKind.LOOP_CLOSURE)))))
     return Drive(graph, len(moved) + np.arange(len(right)), right, true)
 
 
 def _edges(
-    i: IntArray, j: IntArray, mean: FloatArray, sigmas: tuple[float, ...], kind: EdgeKind,
-) -> Edges:
+    i: IntArray, j: IntArray, mean: FloatArray, sigmas: tuple[float, ...], kind: FactorKind,
+) -> Factors:
     information = np.tile(np.diag(1.0 / np.square(sigmas)), (len(i), 1, 1))
-    return Edges(i, j, se2.wrapped(mean), information, [kind] * len(i))
+    return Factors(i, j, se2.wrapped(mean), information, [kind] * len(i))

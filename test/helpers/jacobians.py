@@ -8,8 +8,8 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedNodes
-from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.graph.error_functions import errors
 
 
 class EdgeLinearization(NamedTuple):
@@ -27,13 +27,13 @@ class ObservedLinearization(NamedTuple):
     jacobian: FloatArray
 
 
-def linearize_edges(poses: FloatArray, edges: Edges) -> EdgeLinearization:
+def linearize_edges(poses: FloatArray, edges: Factors) -> EdgeLinearization:
     """
     Return the errors (3.48) of edges with their Jacobians (3.49) and (3.50).
 
-    Parameters and frames are those of `edge_errors`.
+    Parameters and frames are those of `errors`.
     """
-    error = edge_errors(poses, edges)
+    error = errors(poses, edges)
     start, end = poses[edges.i], poses[edges.j]
     # R_z^T R_i^T is the inverse rotation by the sum of both angles
     heading = start[:, 2] + edges.mean[:, 2]
@@ -46,24 +46,24 @@ def linearize_edges(poses: FloatArray, edges: Edges) -> EdgeLinearization:
     # d(R_i^T)/dth_i v is R_i^T v rotated by -90 degrees, and rotations commute
     jacobian_i[:, 0, 2] = difference[:, 1]
     jacobian_i[:, 1, 2] = -difference[:, 0]
-    rows = np.flatnonzero(edges.kind == EdgeKind.BIAS)
+    rows = np.flatnonzero(edges.kind == FactorKind.BIAS)
     if len(rows) > 0:
         jacobian_i[rows], jacobian_j[rows] = -np.eye(3), 0.0
-        arm = _unrotate(-start[rows, 2], edges.bias[rows, :2])
+        arm = _unrotate(-start[rows, 2], edges.constants[rows, :2])
         jacobian_i[rows, 0, 2], jacobian_i[rows, 1, 2] = arm[:, 1], -arm[:, 0]
         for k in range(3):
-            jacobian_j[rows, k, k] = edges.bias[rows[:, None], [2, 2, 3]][:, k]
+            jacobian_j[rows, k, k] = edges.constants[rows[:, None], [2, 2, 3]][:, k]
     return EdgeLinearization(error, jacobian_i, jacobian_j)
 
 
-def linearize_observed(poses: FloatArray, observed: ObservedNodes) -> ObservedLinearization:
+def linearize_observed(poses: FloatArray, observed: Factors) -> ObservedLinearization:
     """
     Return the errors (3.52) of observed nodes with their Jacobians (3.53).
 
     The offset adds the third column: the derivative of R_i t_o by the heading.
     """
-    error = observed_errors(poses, observed)
-    heading, mean = poses[observed.node][:, 2], observed.mean
+    error = errors(poses, observed)
+    heading, mean = poses[observed.i][:, 2], observed.mean
     jacobian = np.zeros((len(observed), 3, 3))
     jacobian[:, :2, :2] = np.swapaxes(se2.rotation(mean[:, 2]), 1, 2)
     arm = _unrotate(mean[:, 2] - heading, observed.offset[:, :2])

@@ -11,7 +11,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 
@@ -27,24 +27,24 @@ def random_information(rng: np.random.Generator, n: int) -> FloatArray:
     return root @ np.swapaxes(root, 1, 2) * rng.uniform(0.5, 20.0, (n, 1, 1))
 
 
-def random_edges(rng: np.random.Generator, i: list[int], j: list[int]) -> Edges:
+def random_edges(rng: np.random.Generator, i: list[int], j: list[int]) -> Factors:
     """Return edges with random means: their errors are large."""
-    return Edges(i, j, random_poses(rng, len(i)), random_information(rng, len(i)),
-                 [EdgeKind.LOOP_CLOSURE] * len(i))
+    return Factors(i, j, random_poses(rng, len(i)), random_information(rng, len(i)),
+                 [FactorKind.LOOP_CLOSURE] * len(i))
 
 
 def random_observed(
     rng: np.random.Generator, node: list[int], *, offset: bool = True,
-) -> ObservedNodes:
+) -> Factors:
     """Return observed nodes with random means; every third has no information on the heading."""
     information = random_information(rng, len(node))
     mean = random_poses(rng, len(node))
     information[::3, 2, :] = information[::3, :, 2] = 0.0
     mean[::3, 2] = 0.0
-    kind = np.full(len(node), ObservedKind.GLOBAL_POSE)
-    kind[::3] = ObservedKind.POSITION
+    kind = np.full(len(node), FactorKind.GLOBAL_POSE)
+    kind[::3] = FactorKind.POSITION
     offsets = random_poses(rng, len(node), 2.0) if offset else np.zeros((len(node), 3))
-    return ObservedNodes(node, offsets, mean, information, kind)
+    return Factors.on(node, offsets, mean, information, kind)
 
 
 def random_graph(  # noqa: PLR0917
@@ -64,25 +64,26 @@ def random_graph(  # noqa: PLR0917
     i, j = [*i, i[0], j[0], j[-1]], [*j, j[0], i[0], i[-1]]
     graph = Graph()
     graph.apply(GraphUpdate(
-        hidden=random_poses(rng, n_nodes), edges=random_edges(rng, i, j),
-        observed=random_observed(rng, rng.integers(0, n_nodes, n_observed).tolist()), fix=fix))
+        hidden=random_poses(rng, n_nodes), fix=fix, factors=Factors.joined([
+            random_edges(rng, i, j),
+            random_observed(rng, rng.integers(0, n_nodes, n_observed).tolist())])))
     if n_biases > 0:
         biases = np.arange(n_nodes, n_nodes + n_biases)
         graph.apply(GraphUpdate(
-            biases=random_poses(rng, n_biases), observed=random_observed(rng, [0, n_nodes]).rows(
-                slice(1, 2)), edges=Edges.joined([
-                    random_edges_to_biases(rng, biases[1:], biases[:-1]),
-                    random_edges_to_biases(rng, rng.integers(0, n_nodes, 3 * n_biases),
-                                           rng.choice(biases, 3 * n_biases))])))
+            biases=random_poses(rng, n_biases), factors=Factors.joined([
+                random_edges_to_biases(rng, biases[1:], biases[:-1]),
+                random_edges_to_biases(rng, rng.integers(0, n_nodes, 3 * n_biases),
+                                       rng.choice(biases, 3 * n_biases)),
+                random_observed(rng, [0, n_nodes]).rows(slice(1, 2))])))
     return graph
 
 
-def random_edges_to_biases(rng: np.random.Generator, i: FloatArray, j: FloatArray) -> Edges:
+def random_edges_to_biases(rng: np.random.Generator, i: FloatArray, j: FloatArray) -> Factors:
     """Return edges to biases with large errors; every third has no information on the heading."""
     edges, n = random_edges(rng, i, j), len(i)
     edges.information[::3, 2, :] = edges.information[::3, :, 2] = 0.0
     bias = np.column_stack((random_poses(rng, n, 2.0)[:, :2], rng.uniform(0.3, 1.5, (n, 2))))
-    return Edges(i, j, edges.mean, edges.information, [EdgeKind.BIAS] * n, bias=bias)
+    return Factors(i, j, edges.mean, edges.information, [FactorKind.BIAS] * n, constants=bias)
 
 
 def consistent_graph(seed: int, noise: float = 0.0, n_nodes: int = 8) -> Graph:
@@ -104,15 +105,15 @@ def consistent_graph(seed: int, noise: float = 0.0, n_nodes: int = 8) -> Graph:
     graph = Graph()
     graph.apply(GraphUpdate(
         hidden=poses, fix=(0,),
-        edges=Edges(i, j, mean, random_information(rng, len(i)), [EdgeKind.ODOMETRY] * len(i))))
+        factors=Factors(i, j, mean, random_information(rng, len(i)),
+                        [FactorKind.ODOMETRY] * len(i))))
     return graph
 
 
 def snapshot(graph: Graph) -> tuple[bytes, ...]:
     """Return all numbers of a graph as bytes, for comparison bit by bit."""
-    tables = (graph.edges, graph.observed)
-    columns = [getattr(table, name) for table in tables for name in table.__dataclass_fields__]
-    return tuple(column.tobytes() for column in (graph.poses, graph.fixed, *columns))
+    columns = graph.poses, graph.fixed, *graph.factors.columns
+    return tuple(column.tobytes() for column in columns)
 
 
 def matrix(pose: FloatArray) -> FloatArray:
@@ -175,18 +176,18 @@ def slow_observed(
 def dense_system(graph: Graph) -> tuple[FloatArray, FloatArray]:
     """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes, fixed or not."""
     H, b = np.zeros((3 * graph.n_nodes,) * 2), np.zeros(3 * graph.n_nodes)
-    edges, observed = graph.edges, graph.observed
+    edges, observed = graph.factors.edges, graph.factors.observed
     of_edges, of_observed = edges.weighted_information, observed.weighted_information
     for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
         ends = graph.poses[i], graph.poses[j], edges.mean[k]
-        e, A, B = (slow_to_bias(*ends, edges.bias[k]) if edges.kind[k] == EdgeKind.BIAS
+        e, A, B = (slow_to_bias(*ends, edges.constants[k]) if edges.kind[k] == FactorKind.BIAS
                    else slow_edge(*ends))
         for row, J_row in ((i, A), (j, B)):
             b[3 * row:3 * row + 3] += J_row.T @ of_edges[k] @ e
             for column, J_column in ((i, A), (j, B)):
                 H[3 * row:3 * row + 3, 3 * column:3 * column + 3] += (
                     J_row.T @ of_edges[k] @ J_column)
-    for k, i in enumerate(observed.node):
+    for k, i in enumerate(observed.i):
         e, J = slow_observed(graph.poses[i], observed.offset[k], observed.mean[k])
         b[3 * i:3 * i + 3] += J.T @ of_observed[k] @ e
         H[3 * i:3 * i + 3, 3 * i:3 * i + 3] += J.T @ of_observed[k] @ J
@@ -217,8 +218,8 @@ def corridor_graph(seed: int, sigma: float, length: int = 150, width: int = 3) -
     sigmas = np.array([0.15, 0.15, sigma])
     mean = se2.wrapped(se2.between(truth[i], truth[j]) + sigmas * rng.standard_normal((len(i), 3)))
     information = np.tile(np.diag(sigmas**-2), (len(i), 1, 1))
-    kind = np.where(j - i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    kind = np.where(j - i == 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     graph = Graph()
     graph.apply(GraphUpdate(
-        hidden=truth, edges=Edges(i, j, mean, information, kind), fix=[0]))
+        hidden=truth, factors=Factors(i, j, mean, information, kind), fix=[0]))
     return graph

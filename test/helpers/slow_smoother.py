@@ -19,7 +19,7 @@ from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions, tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -38,30 +38,22 @@ class SlowGraph:
 
     poses: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     fixed: Any = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    edges: Edges = field(default_factory=Edges)
-    observed: ObservedNodes = field(default_factory=ObservedNodes)
+    factors: Factors = field(default_factory=Factors)
     gone: frozenset[int] = frozenset()
     """Nodes that have left."""
-    dropped_edges: frozenset[int] = frozenset()
+    dropped: frozenset[int] = frozenset()
     """Edges that have left without their nodes."""
-    dropped_observed: frozenset[int] = frozenset()
 
     @property
     def present(self) -> Any:
         """Which nodes have not left."""
         return ~np.isin(np.arange(len(self.poses)), list(self.gone))
 
-    def has_edges(self) -> Any:
-        """Return the edges that have not left."""
+    def has_factors(self) -> Any:
+        """Return the factors that have not left."""
         return np.flatnonzero(
-            self.present[self.edges.i] & self.present[self.edges.j]
-            & ~np.isin(np.arange(len(self.edges)), list(self.dropped_edges)))
-
-    def has_observed(self) -> Any:
-        """Return the observed nodes that have not left."""
-        return np.flatnonzero(
-            self.present[self.observed.node]
-            & ~np.isin(np.arange(len(self.observed)), list(self.dropped_observed)))
+            self.present[self.factors.i] & (self.present[self.factors.j] | (self.factors.j < 0))
+            & ~np.isin(np.arange(len(self.factors)), list(self.dropped)))
 
     def edited(self, update: GraphUpdate) -> 'SlowGraph':
         poses = np.vstack((self.poses, se2.wrapped(update.hidden), se2.wrapped(update.biases)))
@@ -69,18 +61,12 @@ class SlowGraph:
         fixed[list(update.fix)] = True
         fixed[list(update.free)] = False
         gone = list(self.gone.union(update.remove_nodes))
-        edges, observed = (table.joined([before, new]) for table, before, new in (
-            (Edges, self.edges, update.edges), (ObservedNodes, self.observed, update.observed)))
-        without = [np.flatnonzero(np.isin(edges.i, gone) | np.isin(edges.j, gone)),
-                   np.flatnonzero(np.isin(observed.node, gone))]
+        factors = Factors.joined([self.factors, update.factors])
+        without = np.flatnonzero(np.isin(factors.i, gone) | np.isin(factors.j, gone))
         return SlowGraph(
             poses, fixed,
-            _weighed(_weighed(edges, update.remove_edges, update.weigh_edges),
-                     [*update.drop_edges, *without[0]], {}),
-            _weighed(_weighed(observed, update.remove_observed, update.weigh_observed),
-                     [*update.drop_observed, *without[1]], {}),
-            frozenset(gone), self.dropped_edges.union(update.drop_edges),
-            self.dropped_observed.union(update.drop_observed))
+            _weighed(_weighed(factors, update.remove, update.weigh), [*update.drop, *without], {}),
+            frozenset(gone), self.dropped.union(update.drop))
 
     def at(self, poses: FloatArray) -> 'SlowGraph':
         """Return the graph with other poses of the nodes that have not left."""
@@ -89,21 +75,19 @@ class SlowGraph:
         return replace(self, poses=moved)
 
     def chi2(self) -> float:
-        errors = (error_functions.edge_errors(self.poses, self.edges),
-                  error_functions.observed_errors(self.poses, self.observed))
-        return float(sum(
-            np.sum(error_functions.energies(error, table.weighted_information))
-            for error, table in zip(errors, (self.edges, self.observed), strict=True)))
+        error = error_functions.errors(self.poses, self.factors)
+        return float(np.sum(
+            error_functions.energies(error, self.factors.weighted_information)))
 
     def system(self) -> tuple[FloatArray, FloatArray]:
         """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes, fixed or not."""
-        edge = jacobians.linearize_edges(self.poses, self.edges)
-        unary = jacobians.linearize_observed(self.poses, self.observed)
+        edges, observed = self.factors.edges, self.factors.observed
+        edge = jacobians.linearize_edges(self.poses, edges)
+        unary = jacobians.linearize_observed(self.poses, observed)
         return _normal_equations(len(self.poses), (
-            (self.edges.weighted_information, edge.error,
-             ((self.edges.i, edge.jacobian_i), (self.edges.j, edge.jacobian_j))),
-            (self.observed.weighted_information, unary.error,
-             ((self.observed.node, unary.jacobian),))))
+            (edges.weighted_information, edge.error,
+             ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j))),
+            (observed.weighted_information, unary.error, ((observed.i, unary.jacobian),))))
 
     @property
     def unknown(self) -> Any:
@@ -190,34 +174,37 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
 
     Each constraint has its own linearization point in the tables, so it gets its own nodes here.
     """
-    edges, observed = graph.edges_by_row, graph.observed_by_row
+    edges, observed = graph.factors_by_row.edges, graph.factors_by_row.observed
     if nodes is not None:
         edges = _with_weight(edges, edges.weight * (
             np.isin(edges.i, nodes) | np.isin(edges.j, nodes)))
-        observed = _with_weight(observed, observed.weight * np.isin(observed.node, nodes))
+        observed = _with_weight(observed, observed.weight * np.isin(observed.i, nodes))
     m, k = len(edges), len(observed)
-    rows, unary = graph.memory['edge_f'][:m], graph.memory['observed_f'][:k]
+    is_edge = graph.factors_by_row.j >= 0
+    table = graph.memory['factor_f'][:m + k]
+    rows, unary = table[is_edge], table[~is_edge]
     ends, hidden = np.zeros((2 * m, 3)), np.zeros((k, 3))
     # the constraints of a clique turn with its frame
-    turn = np.array([frame_turn(graph, c) for c in graph.memory['edge_i'][:m, tb.OWNER]])
+    owners = graph.memory['factor_i'][:m + k][is_edge, tb.OWNER]
+    turn = np.array([frame_turn(graph, c) for c in owners])
     ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
     # an edge to a bias has the factors in place of a frame
-    to_bias = edges.kind == EdgeKind.BIAS
+    to_bias = edges.kind == FactorKind.BIAS
     assert np.all(turn[to_bias & (edges.weight > 0.0)] == 0.0)
     ends[:m][to_bias, 2] = (graph.memory['node_f'][edges.i, tb.REF + 2] + rows[:, tb.LIN_TH])[
         to_bias]
     difference = rows[:, tb.LIN_ARM:tb.LIN_ARM + 2]
     ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
-    hidden[:, 2] = graph.memory['node_f'][observed.node, tb.REF + 2] + unary[:, tb.LIN_TH]
-    edge = jacobians.linearize_edges(ends, Edges(
+    hidden[:, 2] = graph.memory['node_f'][observed.i, tb.REF + 2] + unary[:, tb.LIN_TH]
+    edge = jacobians.linearize_edges(ends, Factors(
         np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind,
-        bias=edges.bias))
-    single = jacobians.linearize_observed(hidden, ObservedNodes(
+        constants=edges.constants))
+    single = jacobians.linearize_observed(hidden, Factors.on(
         np.arange(k), observed.offset, observed.mean, observed.information, observed.kind))
     return _normal_equations(graph.n_nodes, (
         (edges.weighted_information, edge.error,
          ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j))),
-        (observed.weighted_information, single.error, ((observed.node, single.jacobian),))))[0]
+        (observed.weighted_information, single.error, ((observed.i, single.jacobian),))))[0]
 
 
 def _normal_equations(n: int, constraints: Any) -> tuple[FloatArray, FloatArray]:
@@ -273,17 +260,17 @@ class World:
     def disturbed(self, pose: FloatArray, sigma: tuple[float, float, float]) -> FloatArray:
         return se2.wrapped(pose + self.rng.normal(size=3) * sigma)
 
-    def edges(self, pairs: list[tuple[int, int]]) -> Edges:
-        return Edges(
+    def edges(self, pairs: list[tuple[int, int]]) -> Factors:
+        return Factors(
             [i for i, _ in pairs], [j for _, j in pairs],
             np.reshape([self.disturbed(se2.between(self.truth[i], self.truth[j]), self.noise)
                         for i, j in pairs], (-1, 3)),
             np.reshape([self.informative() for _ in pairs], (-1, 3, 3)),
-            [EdgeKind.LOOP_CLOSURE] * len(pairs))
+            [FactorKind.LOOP_CLOSURE] * len(pairs))
 
     def observed(
         self, nodes: list[int], *, position: bool = False, offset: bool = False,
-    ) -> ObservedNodes:
+    ) -> Factors:
         offsets = self.rng.normal(size=(len(nodes), 3)) * offset
         mean = np.reshape([
             self.disturbed(se2.compose(self.truth[node], shift), self.noise)
@@ -291,8 +278,8 @@ class World:
         information = np.reshape([self.informative() for _ in nodes], (-1, 3, 3))
         if position:
             information[:, 2, :] = information[:, :, 2] = mean[:, 2] = 0.0
-        kind = ObservedKind.POSITION if position else ObservedKind.GLOBAL_POSE
-        return ObservedNodes(nodes, offsets, mean, information, [kind] * len(nodes))
+        kind = FactorKind.POSITION if position else FactorKind.GLOBAL_POSE
+        return Factors.on(nodes, offsets, mean, information, [kind] * len(nodes))
 
     def new_nodes(self, count: int) -> GraphUpdate:
         """Return nodes that branch off random nodes, with edges in both directions."""
@@ -303,7 +290,7 @@ class World:
             start = poses[self.rng.integers(max(0, n - 4) if self.rng.random() < 0.8 else 0, n)]
             hidden.append(self.drive(start))
             pairs.append((start, node) if self.rng.random() < 0.7 else (node, start))
-        return GraphUpdate(hidden=np.reshape(hidden, (-1, 3)), edges=self.edges(pairs))
+        return GraphUpdate(hidden=np.reshape(hidden, (-1, 3)), factors=self.edges(pairs))
 
     def new_part(self, anchor: str) -> GraphUpdate:
         """Return a node without edges, which its anchor determines, in part, or not at all."""
@@ -312,13 +299,13 @@ class World:
         if anchor == 'fixed':
             return GraphUpdate(hidden=hidden, fix=[node])
         if anchor == 'pose':
-            return GraphUpdate(hidden=hidden, observed=self.observed([node], offset=True))
+            return GraphUpdate(hidden=hidden, factors=self.observed([node], offset=True))
         if anchor == 'positions':
-            return GraphUpdate(hidden=hidden, observed=ObservedNodes.joined([
+            return GraphUpdate(hidden=hidden, factors=Factors.joined([
                 self.observed([node], position=True),
                 self.observed([node], position=True, offset=True)]))
         if anchor == 'position':
-            return GraphUpdate(hidden=hidden, observed=self.observed([node], position=True))
+            return GraphUpdate(hidden=hidden, factors=self.observed([node], position=True))
         return GraphUpdate(hidden=hidden)
 
     def pairs(self, count: int) -> list[tuple[int, int]]:
@@ -341,22 +328,22 @@ class World:
                     0.3, 0.98)
                 left = np.sqrt(1.0 - phi * phi) * spread
                 truth = phi * self.truth[before] + left * rng.normal(size=3)
-                edges.append(Edges([node], [before], np.zeros((1, 3)), [np.diag(left**-2.0)],
-                                   [EdgeKind.BIAS], bias=[[0.0, 0.0, phi, phi]]))
+                edges.append(Factors([node], [before], np.zeros((1, 3)), [np.diag(left**-2.0)],
+                                   [FactorKind.BIAS], constants=[[0.0, 0.0, phi, phi]]))
             else:
                 truth = spread * rng.normal(size=3)
-                priors.append(ObservedNodes([node], None, np.zeros((1, 3)),
-                                            [np.diag(spread**-2.0)], [ObservedKind.GLOBAL_POSE]))
+                priors.append(Factors.on([node], None, np.zeros((1, 3)),
+                                         [np.diag(spread**-2.0)], [FactorKind.GLOBAL_POSE]))
             self.biases.add(node)
             self.truth.append(truth)
             values.append(truth + 0.3 * spread * rng.normal(size=3))
         biases = sorted(bias for bias in self.biases - self.gone if bias < len(self.truth))
         edges += [self.biased(int(rng.choice(self.poses)), int(rng.choice(biases[-3:])))
                   for _ in range(measurements if len(biases) > 0 else 0)]
-        return GraphUpdate(biases=np.reshape(values, (-1, 3)), edges=Edges.joined(edges),
-                           observed=ObservedNodes.joined(priors))
+        return GraphUpdate(
+            biases=np.reshape(values, (-1, 3)), factors=Factors.joined(edges + priors))
 
-    def biased(self, node: int, bias: int) -> Edges:
+    def biased(self, node: int, bias: int) -> Factors:
         """Return a measured position or pose with a bias."""
         offset, factors = self.rng.normal(size=2) * (self.rng.random() < 0.6), self.rng.uniform(
             0.2, 1.0, 2)
@@ -365,14 +352,13 @@ class World:
         information = self.informative()
         if self.rng.random() < 0.5:
             information[2] = information[:, 2] = 0.0
-        return Edges([node], [bias], [mean], [information], [EdgeKind.BIAS],
-                     bias=[[*offset, *factors]])
+        return Factors([node], [bias], [mean], [information], [FactorKind.BIAS],
+                     constants=[[*offset, *factors]])
 
     def joined(self, first: GraphUpdate, **more: Any) -> GraphUpdate:
         """Return an update with more parts; constraints are appended to its own."""
-        for name, table in (('edges', Edges), ('observed', ObservedNodes)):
-            if name in more:
-                more[name] = table.joined([getattr(first, name), more[name]])
+        if 'factors' in more:
+            more['factors'] = Factors.joined([first.factors, more['factors']])
         return first._replace(**more)
 
     def mixture(self, graph: SlowGraph) -> GraphUpdate:
@@ -382,21 +368,21 @@ class World:
         if rng.random() < 0.4:
             more = self.new_biases(int(rng.integers(0, 3)), int(rng.integers(0, 3)))
             update = self.joined(
-                update, biases=more.biases, edges=more.edges, observed=more.observed)
+                update, biases=more.biases, factors=more.factors)
         poses = self.poses
         nodes = [poses[k] for k in rng.integers(0, len(poses), int(rng.integers(0, 3)))]
         update = self.joined(
-            update, edges=self.edges(self.pairs(int(rng.integers(0, 3)))),
-            observed=self.observed(nodes, position=bool(rng.random() < 0.4),
-                                   offset=bool(rng.random() < 0.5)))
-        for rows, remove, weigh in (
-                (graph.has_edges(), 'remove_edges', 'weigh_edges'),
-                (graph.has_observed(), 'remove_observed', 'weigh_observed')):
-            if len(rows) > 0 and rng.random() < 0.3:
-                update = update._replace(**{remove: [int(rng.choice(rows))]})
-            if len(rows) > 0 and rng.random() < 0.4:
-                update = update._replace(**{weigh: {
-                    int(rng.choice(rows)): float(rng.choice([0.0, 1.0, rng.uniform()]))}})
+            update, factors=Factors.joined([
+                self.edges(self.pairs(int(rng.integers(0, 3)))),
+                self.observed(nodes, position=bool(rng.random() < 0.4),
+                              offset=bool(rng.random() < 0.5))]))
+        rows = graph.has_factors()
+        for _ in range(2 if len(rows) > 0 else 0):
+            if rng.random() < 0.3:
+                update = update._replace(remove=[*update.remove, int(rng.choice(rows))])
+            if rng.random() < 0.4:
+                update = update._replace(weigh={**update.weigh, int(rng.choice(rows)): float(
+                    rng.choice([0.0, 1.0, rng.uniform()]))})
         nodes = [node for node in range(len(self.truth)) if node not in self.gone]
         if rng.random() < 0.15:
             update = update._replace(fix=[int(rng.choice(nodes))])
@@ -412,10 +398,10 @@ class World:
         if rng.random() < 0.8:
             chosen = rng.choice(nodes, min(int(rng.integers(1, 5)), len(nodes)), replace=False)
             update = update._replace(remove_nodes=[v for v in chosen.tolist() if v != kept])
-        for rows, drop in ((graph.has_edges(), 'drop_edges'),
-                           (graph.has_observed(), 'drop_observed')):
-            if len(rows) > 0 and rng.random() < 0.3:
-                update = update._replace(**{drop: [int(rng.choice(rows))]})
+        rows = graph.has_factors()
+        for _ in range(2 if len(rows) > 0 else 0):
+            if rng.random() < 0.3:
+                update = update._replace(drop=[*update.drop, int(rng.choice(rows))])
         return update
 
 
@@ -441,10 +427,9 @@ def driven(
 
 # --- the tables ---------------------------------------------------------------------------------
 
-_USED = {'node_f': tb.N_NODES, 'node_i': tb.N_NODES, 'edge_f': tb.N_EDGES, 'edge_i': tb.N_EDGES,
-         'observed_f': tb.N_OBSERVED, 'observed_i': tb.N_OBSERVED, 'touched': tb.N_TOUCHED,
-         'waiting': tb.N_WAITING, 'node_id': tb.N_NODES, 'edge_id': tb.N_EDGES,
-         'observed_id': tb.N_OBSERVED}
+_USED = {'node_f': tb.N_NODES, 'node_i': tb.N_NODES, 'factor_f': tb.N_FACTORS,
+         'factor_i': tb.N_FACTORS, 'touched': tb.N_TOUCHED, 'waiting': tb.N_WAITING,
+         'node_id': tb.N_NODES, 'factor_id': tb.N_FACTORS}
 
 
 @dataclass(frozen=True)

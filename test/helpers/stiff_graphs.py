@@ -16,7 +16,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Sigmas of an ordinary edge [m, m, rad].
@@ -28,12 +28,12 @@ class StiffGraph:
     """A drive in circles, node 0 fixed; the poses are those by odometry, the edges the truth's."""
 
     poses: FloatArray
-    edges: Edges
+    edges: Factors
     truth: FloatArray
 
     def graph(self) -> Graph:
         graph = Graph()
-        graph.apply(GraphUpdate(hidden=self.poses, edges=self.edges, fix=[0]))
+        graph.apply(GraphUpdate(hidden=self.poses, factors=self.edges, fix=[0]))
         return graph
 
     def optimum(self) -> tuple[FloatArray, float, FloatArray]:
@@ -97,11 +97,11 @@ def stiff_graph(seed: int, decades: float, n_nodes: int = 30, share: float = 0.4
     information = 0.5 * (information + np.swapaxes(information, 1, 2))
     noise = (turned @ (sigmas * rng.standard_normal(sigmas.shape))[:, :, None])[:, :, 0]
     mean = se2.compose(se2.between(truth[ends[:, 0]], truth[ends[:, 1]]), noise)
-    kind = np.where(np.diff(ends, axis=1)[:, 0] == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    kind = np.where(np.diff(ends, axis=1)[:, 0] == 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     poses = np.zeros((n_nodes, 3))
     for k in range(1, n_nodes):
         poses[k] = se2.compose(poses[k - 1], mean[k - 1])
-    return StiffGraph(poses, Edges(*ends.T, mean, information, kind), truth)
+    return StiffGraph(poses, Factors(*ends.T, mean, information, kind), truth)
 
 
 def _cholesky(matrices: FloatArray) -> FloatArray:

@@ -267,7 +267,7 @@ def test_frozen_poses_that_are_shown_begin_with_the_first(frozen: int, others: i
 def test_the_message_of_verdicts_has_one_status_for_each_and_one_for_all() -> None:
     verdicts = [Verdict(
         f'loop/{k}', Judged.LOOP_CLOSURE, 'loop', k * SECOND, None, state, SECOND, Decision.AUTO,
-        np.array([1.0, 2.0, np.nan]), 3.0, ('loop/1', 'loop/2'), (), edge=True, number=7)
+        np.array([1.0, 2.0, np.nan]), 3.0, ('loop/1', 'loop/2'), (), number=7)
         for k, state in enumerate(State)]
     totals = {'loop': SourceVerdicts({State.DOUBTED: 1, State.BELIEVED: 9}, 2.0, doubting=True)}
     message = verdicts_message(verdicts, totals, Header(frame_id='map'))

@@ -125,10 +125,8 @@ def _facts(run: Run) -> list[dict[str, str]]:
 
 def _freedom(graph: Graph) -> int:
     """Return the number of measured coordinates with a weight, less that of unknowns."""
-    measured = 0
-    for table in (graph.edges_by_row, graph.observed_by_row):
-        rank = np.count_nonzero(np.diagonal(table.information, axis1=1, axis2=2) > 0.0, axis=1)
-        measured += int(np.sum(rank[table.weight > 0.0]))
+    information = graph.factors_by_row.information[graph.weights > 0.0]
+    measured = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0))
     return measured - int(np.sum(graph.dimension[~graph.fixed]))
 
 

@@ -179,7 +179,7 @@ def springs(
     run: Run, residuals: Mapping[str, SourceResiduals], frame: Frame,
 ) -> list[dict[str, Any]]:
     """Return the constraints with the largest weighted energies, in descending order."""
-    names = {(each.edge, each.number): each.id for each in run.verdicts}
+    names = {each.number: each.id for each in run.verdicts}
     stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []
 
     def place(stamp_ns: StampNs, position: FloatArray) -> dict[str, float]:
@@ -189,8 +189,7 @@ def springs(
     for rank, each in enumerate(run.backend.largest_energies(10), 1):
         residual, expected = None, math.nan
         source = residuals.get(each.source)
-        at = np.zeros(0, dtype=bool) if source is None else (
-            (source.ids == each.number) & (source.is_edge == each.edge))
+        at = np.zeros(0, dtype=bool) if source is None else source.ids == each.number
         if source is not None and np.count_nonzero(at) == 1:
             one = source.rows(at)
             residual, expected = one.errors[0], float(one.redundancies[0])
@@ -206,7 +205,7 @@ def springs(
             ends = [*ends, place(stamps[node], path.poses[node, :2] + residual[:2])]
         found.append({
             'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
-            'name': names.get((each.edge, each.number), _name(each, frame.start_ns)),
+            'name': names.get(each.number, _name(each, frame.start_ns)),
             'energy': number(each.energy), 'expected': number(
                 expected if math.isfinite(expected) else float(each.freedom)),
             'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,

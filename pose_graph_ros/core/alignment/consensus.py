@@ -23,7 +23,7 @@ import numpy as np
 from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,30 +122,30 @@ class TimeCorrelation(NamedTuple):
 
 
 def positions_along(
-    poses: Poses, observed: ObservedNodes, noise: OdometryNoise,
+    poses: Poses, observed: Factors, noise: OdometryNoise,
     correlation: TimeCorrelation,
 ) -> Positions:
     """Return the positions of observed nodes in the order of the drive."""
     stamp, tau = correlation
     # by all columns, so that the order of the result does not depend on that of the input
     order = np.lexsort((tau, *observed.information.reshape(-1, 9).T, *observed.mean.T,
-                        *observed.offset.T, stamp, observed.node))
+                        *observed.offset.T, stamp, observed.i))
     table = observed.rows(order)
-    predicted = se2.compose(poses[table.node], table.offset)
-    first = int(table.node[0])
-    steps = np.diff(poses[first:table.node[-1] + 1], axis=0)
+    predicted = se2.compose(poses[table.i], table.offset)
+    first = int(table.i[0])
+    steps = np.diff(poses[first:table.i[-1] + 1], axis=0)
     length, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(se2.wrap(steps[:, 2]))
     walk = noise.sigma_heading_distance**2 * length + noise.sigma_heading_turn**2 * turn
     # the heading of a global pose is marginalised; that of a position has no information
     information = table.information.copy()
-    information[:, 2, 2] += table.kind == ObservedKind.POSITION
+    information[:, 2, 2] += table.kind == FactorKind.POSITION
     axes = se2.rotation(table.mean[:, 2])
     covariance = axes @ np.linalg.inv(information)[:, :2, :2] @ np.swapaxes(axes, 1, 2)
-    rows = table.node - first
+    rows = table.i - first
     return Positions(
         odometry=_points(predicted), observed=_points(table.mean),
         root=np.asarray(np.linalg.cholesky(covariance), dtype=np.float64),
-        direction=np.exp(1j * predicted[:, 2]), node=table.node,
+        direction=np.exp(1j * predicted[:, 2]), node=table.i,
         path=np.append(0.0, np.cumsum(length))[rows], walk=np.append(0.0, np.cumsum(walk))[rows],
         stamp=stamp[order], correlation_time=tau[order])
 

@@ -25,8 +25,8 @@ from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, Poses, PoseVector
-from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
-from pose_graph_ros.core.graph.error_functions import observed_errors
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.graph.error_functions import errors
 from pose_graph_ros.core.quantities import Radians
 
 
@@ -40,7 +40,7 @@ class GraphAlignment(NamedTuple):
 
 
 def find_alignment(
-    poses: FloatArray, observed: ObservedNodes, policy: AlignmentPolicy, noise: OdometryNoise,
+    poses: FloatArray, observed: Factors, policy: AlignmentPolicy, noise: OdometryNoise,
     correlation: TimeCorrelation,
 ) -> GraphAlignment:
     """
@@ -49,7 +49,7 @@ def find_alignment(
     It is found from what was observed on its hidden nodes, in any order; at least one of these is
     a position or a global pose.
     """
-    placed = observed.kind != ObservedKind.HEADING
+    placed = observed.kind != FactorKind.HEADING
     by_heading = _by_heading(poses, observed, placed)
     stamps, times = correlation
     by_positions = _from_positions(
@@ -60,14 +60,14 @@ def find_alignment(
 
 
 def _by_heading(
-    poses: FloatArray, observed: ObservedNodes, placed: BoolArray,
+    poses: FloatArray, observed: Factors, placed: BoolArray,
 ) -> GraphAlignment:
     """Return the alignment by the most certain heading, at its position or at those of others."""
-    sigma, full = np.full(len(observed), np.inf), observed.kind == ObservedKind.GLOBAL_POSE
+    sigma, full = np.full(len(observed), np.inf), observed.kind == FactorKind.GLOBAL_POSE
     sigma[full] = np.sqrt(np.linalg.inv(observed.information[full])[:, 2, 2])
     sigma[~placed] = observed.information[~placed, 2, 2]**-0.5
     best = int(np.argmin(sigma))
-    predicted = se2.compose(poses[observed.node], observed.offset)
+    predicted = se2.compose(poses[observed.i], observed.offset)
     theta = float(se2.wrap(observed.mean[best, 2] - predicted[best, 2]))
     used = np.array([best]) if full[best] else np.flatnonzero(placed)
     weight = np.trace(observed.information[used, :2, :2], axis1=1, axis2=2)
@@ -75,11 +75,11 @@ def _by_heading(
         observed.mean[used, :2] - predicted[used, :2] @ se2.rotation(theta).T, axis=0,
         weights=weight)
     return GraphAlignment(
-        np.array((*shift, theta)), float(sigma[best]), int(observed.node[best]))
+        np.array((*shift, theta)), float(sigma[best]), int(observed.i[best]))
 
 
 def recheck(
-    solved: Poses, odometry: Poses, observed: ObservedNodes, policy: AlignmentPolicy,
+    solved: Poses, odometry: Poses, observed: Factors, policy: AlignmentPolicy,
     noise: OdometryNoise, *, correlation: TimeCorrelation, sigma: Radians = 0.0,
 ) -> GraphAlignment | None:
     """
@@ -178,7 +178,7 @@ def _supported(
 
 
 def guess(
-    poses: Poses, newest: PoseVector, observed: ObservedNodes,
+    poses: Poses, newest: PoseVector, observed: Factors,
 ) -> tuple[FloatArray, FloatArray]:
     """
     Return a shift of the graph into the map and a covariance while the angle is not known.
@@ -193,8 +193,8 @@ def guess(
     first = observed.rows(slice(best, best + 1))
     turn = np.eye(3)
     turn[:2, :2] = se2.rotation(first.mean[0, 2])
-    shift = -(turn @ observed_errors(poses, first)[0])
+    shift = -(turn @ errors(poses, first)[0])
     shift[2] = 0.0
-    where = se2.compose(poses[first.node], first.offset)[0]
+    where = se2.compose(poses[first.i], first.offset)[0]
     variance = float(np.sum((newest[:2] - where[:2])**2) + 2.0 / certainty[best])
     return shift, np.diag((variance, variance, UNKNOWN_HEADING_VARIANCE))

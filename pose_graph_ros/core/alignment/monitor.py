@@ -16,10 +16,10 @@ from pose_graph_ros.core.config import BackendConfig, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import (
+    FactorKind,
+    FactorKinds,
+    Factors,
     full,
-    ObservedKind,
-    ObservedKinds,
-    ObservedNodes,
     upper,
 )
 from pose_graph_ros.core.graph.graph import Graph
@@ -47,11 +47,11 @@ class SavedAlignment:
     sources: tuple[str, ...]
     source: Integers  # index of each measurement's source, shape (M,)
     stamps_ns: Integers
-    node: Integers  # columns of `ObservedNodes`, as the four below; shape (M,)
+    node: Integers  # columns of `Factors`, as the four below; shape (M,)
     offset: Rows3
     mean: Rows3
     information: Rows6  # upper triangles, shape (M, 6)
-    kind: ObservedKinds
+    kind: FactorKinds
 
 
 class Evidence(NamedTuple):
@@ -59,7 +59,7 @@ class Evidence(NamedTuple):
 
     source: str
     stamp_ns: int
-    observed: ObservedNodes
+    observed: Factors
 
 
 class AlignmentMonitor:
@@ -112,7 +112,7 @@ class AlignmentMonitor:
 
     def forget(self, node: int) -> None:
         """Drop the stored measurements on hidden nodes before one, by its id."""
-        self._evidence = [each for each in self._evidence if each.observed.node[0] >= node]
+        self._evidence = [each for each in self._evidence if each.observed.i[0] >= node]
 
     def recheck(self, graph: Graph, nodes: HiddenNodes) -> FloatArray | None:
         """
@@ -166,7 +166,7 @@ class AlignmentMonitor:
             [each.stamp_ns for each in self._evidence]))
         return SavedAlignment(
             self.state.value, float(self.sigma) if np.isfinite(self.sigma) else None,
-            self._next_recheck, names, source, stamps, table.node, table.offset, table.mean,
+            self._next_recheck, names, source, stamps, table.i, table.offset, table.mean,
             upper(table.information), table.kind.astype(np.int64))
 
     def load(self, saved: SavedAlignment) -> None:
@@ -174,7 +174,7 @@ class AlignmentMonitor:
         self.state = AlignmentState(saved.state)
         self.sigma = np.inf if saved.sigma is None else saved.sigma
         self._next_recheck = saved.next_verdict
-        table = ObservedNodes(saved.node, saved.offset, saved.mean, full(saved.information),
+        table = Factors.on(saved.node, saved.offset, saved.mean, full(saved.information),
                               saved.kind)
         self._evidence = [
             Evidence(saved.sources[source], stamp_ns, table.rows(slice(k, k + 1)))
@@ -184,15 +184,15 @@ class AlignmentMonitor:
 
 def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
     """Return the measurements that contain a position: all but headings."""
-    return [each for each in attached if each.observed.kind[0] != ObservedKind.HEADING]
+    return [each for each in attached if each.observed.kind[0] != FactorKind.HEADING]
 
 
-def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> ObservedNodes:
+def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> Factors:
     """Return the observed nodes of measurements, with the rows of their hidden nodes."""
     return _table(measurements).renumbered(graph.node_rows)
 
 
-def _numbered(nodes: HiddenNodes, table: ObservedNodes) -> ObservedNodes:
+def _numbered(nodes: HiddenNodes, table: Factors) -> Factors:
     """Return observed nodes by the rows of `HiddenNodes.recent_poses`, which has no biases."""
     ids = nodes.ids[nodes.n_frozen:]
     return table.renumbered(lambda some: np.searchsorted(ids, some))
@@ -208,5 +208,5 @@ def _evidence_of(attached: AttachedMeasurement) -> Evidence:
     return Evidence(attached.source, attached.measurement.stamp_ns, attached.observed)
 
 
-def _table(measurements: Sequence[AttachedMeasurement | Evidence]) -> ObservedNodes:
-    return ObservedNodes.joined([each.observed for each in measurements])
+def _table(measurements: Sequence[AttachedMeasurement | Evidence]) -> Factors:
+    return Factors.joined([each.observed for each in measurements])

@@ -86,7 +86,7 @@ def _optimize_robustly(
     """
     best, poses, weights = None, graph.poses, graph.weights
     for weight, widened in ((1.0, TUNING.widened), (TUNING.small_weight, ())):
-        _set_weights(graph, *reweighting.all_alike(weight))
+        graph.apply(GraphUpdate(weigh=reweighting.all_alike(weight)))
         result = optimize_from_two_starts(graph, config, solve)
         for factor in widened:
             if result.status is not Status.FAILED:
@@ -123,8 +123,7 @@ def _reweighted(
         if found is None:
             largest = 1.0
             break
-        largest = max(float(np.max(np.abs(new - old), initial=0.0))
-                      for new, old in zip(graph.weights, before, strict=True))
+        largest = float(np.max(np.abs(graph.weights - before), initial=0.0))
         result = found
         iterations += result.iterations
         cost = result.chi2 + reweighting.cost(graph)
@@ -142,8 +141,7 @@ def _reweighted(
 
 
 def _solved_with(
-    graph: Graph, changes: tuple[Mapping[int, float], Mapping[int, float]], config: SolverConfig,
-    solve: Solve,
+    graph: Graph, weights: Mapping[int, float], config: SolverConfig, solve: Solve,
 ) -> BatchResult | None:
     """
     Return the result of solving with other weights.
@@ -151,14 +149,10 @@ def _solved_with(
     It is None, with the old weights, if they leave too little to determine all nodes.
     """
     before = graph.weights
-    _set_weights(graph, *changes)
+    graph.apply(GraphUpdate(weigh=weights))
     result = solve(graph, config)
-    smallest = min(min(new.values(), default=1.0) for new in changes)
-    if result.status is not Status.FAILED or smallest > TUNING.small_weight:
+    if result.status is not Status.FAILED or (
+            min(weights.values(), default=1.0) > TUNING.small_weight):
         return result
     graph.set_weights(before)
     return None
-
-
-def _set_weights(graph: Graph, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
-    graph.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))

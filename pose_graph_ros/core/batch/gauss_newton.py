@@ -3,7 +3,7 @@
 """
 The parts of a Gauss-Newton iteration over all cliques of a graph: linearize, eliminate, solve.
 
-The reference of each node is set to its pose before all constraints are linearized at the poses,
+The reference of each node is set to its pose before all factors are linearized at the poses,
 so the solution of the linear system is the step itself.
 
 A chord step reuses the factorisation of an earlier iteration, so it only needs the
@@ -39,12 +39,12 @@ def put_poses(memory: tb.Memory, poses: Poses) -> None:
 
 @kernel(signature=(tb.HEAD,))
 def linearize(head):  # type: ignore[no-untyped-def]
-    """Make the poses the references and linearize all constraints there."""
+    """Make the poses the references and linearize all factors there."""
     for v in range(head[tb.N_NODES]):
         factors.refer_to_pose(tb.node_f(head)[v])
-    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
-        if factors.is_used(head, entry):
-            factors.linearize(head, entry)
+    for e in range(head[tb.N_FACTORS]):
+        if tb.factor_f(head)[e, tb.WEIGHT] > 0.0:
+            factors.linearize(head, e)
 
 
 @kernel(signature=(tb.HEAD, NUMBER, INTEGER))
@@ -145,9 +145,9 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     node_f = tb.node_f(head)
     right[:] = 0.0
     chi2 = gradient_sum = cancelled = reach = 0.0
-    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
-        if factors.is_used(head, entry):
-            energy, size, terms = normal_equations.gradient(head, entry, right)
+    for e in range(head[tb.N_FACTORS]):
+        if tb.factor_f(head)[e, tb.WEIGHT] > 0.0:
+            energy, size, terms = normal_equations.gradient(head, e, right)
             chi2 += energy
             gradient_sum += size
             cancelled += terms
@@ -191,9 +191,9 @@ def _add_priors(head, right):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD,))
 def settle(head):  # type: ignore[no-untyped-def]
     """
-    Evaluate all constraints and bring the tables into the state after a step of the smoother.
+    Evaluate all factors and bring the tables into the state after a step of the smoother.
 
-    If the sum of the squared linearization errors exceeds the smoother's budget, the constraints
+    If the sum of the squared linearization errors exceeds the smoother's budget, the factors
     with large errors are listed in `waiting`, to be linearized again in its next step.
     """
     node_f, scalars, waiting = tb.node_f(head), tb.scalars(head), tb.waiting(head)
@@ -201,11 +201,12 @@ def settle(head):  # type: ignore[no-untyped-def]
         for k in range(3):
             node_f[v, tb.SEEN + k] = node_f[v, tb.DELTA + k]
     chi2 = error2 = 0.0
-    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
-        f, row = factors.rows_of(head, entry)
-        row[tb.EDGE_WAITS] = 0
+    factor_f, factor_i = tb.factor_f(head), tb.factor_i(head)
+    for e in range(head[tb.N_FACTORS]):
+        f = factor_f[e]
+        factor_i[e, tb.FACTOR_WAITS] = 0
         if f[tb.WEIGHT] > 0.0:
-            factors.check(head, entry, factors.NO_TURN)
+            factors.check(head, e, factors.NO_TURN)
             chi2 += f[tb.ENERGY]
             error2 += f[tb.ERROR2]
     scalars[tb.CHI2] = chi2
@@ -214,11 +215,10 @@ def settle(head):  # type: ignore[no-untyped-def]
     if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
         return
     threshold = factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
-    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
-        f, row = factors.rows_of(head, entry)
-        if f[tb.ERROR2] > threshold:
-            row[tb.EDGE_WAITS] = 1
-            waiting[head[tb.N_WAITING]] = entry
+    for e in range(head[tb.N_FACTORS]):
+        if factor_f[e, tb.ERROR2] > threshold:
+            factor_i[e, tb.FACTOR_WAITS] = 1
+            waiting[head[tb.N_WAITING]] = e
             head[tb.N_WAITING] += 1
 
 

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, ComplexArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, FACTORS, NodeKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
 from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, order_of
 
 if TYPE_CHECKING:
@@ -56,9 +56,7 @@ class Constrained(Protocol):
     @property
     def fixed(self) -> BoolArray: ...
     @property
-    def edges_by_row(self) -> Edges: ...  # all edges, with rows for ends
-    @property
-    def observed_by_row(self) -> ObservedNodes: ...
+    def factors_by_row(self) -> Factors: ...  # with rows for ends
 
 
 class Terms(NamedTuple):
@@ -94,11 +92,13 @@ class Terms(NamedTuple):
         return Terms(*(column[says] for column in self))
 
     @classmethod
-    def of_both(cls, edges: Edges, observed: ObservedNodes, n: int) -> 'tuple[Terms, Terms]':
+    def of_factors(cls, factors: Factors, n: int) -> 'Terms':
         """Return the terms of edges and of observed nodes, with rows for their ends."""
-        return (cls.of(edges.i, edges.j, edges.mean, 0.0, edges.weighted_information),
-                cls.of(np.full(len(observed), n), observed.node, observed.mean, observed.offset,
-                       observed.weighted_information))
+        observed = factors.j < 0
+        return cls.of(
+            np.where(observed, n, factors.i), np.where(observed, factors.i, factors.j),
+            factors.mean, np.where(observed[:, None], factors.offset, 0.0),
+            factors.weighted_information)
 
 
 class NodeSystem:
@@ -198,8 +198,8 @@ class SparseChordal:
     """The `ChordalSystem` that is not compiled; `nodes` is that of the edges."""
 
     def __init__(self, graph: Constrained, nodes: NodeSystem | None = None) -> None:
-        self._terms = terms = Terms.joined(*Terms.of_both(
-            graph.edges_by_row, graph.observed_by_row, len(graph.poses))).informative()
+        self._terms = terms = Terms.of_factors(
+            graph.factors_by_row, len(graph.poses)).informative()
         self._nodes = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
 
     def headings(self, known: ComplexArray) -> ComplexArray:
@@ -253,8 +253,9 @@ def joint(graph: 'Graph', *, unit: bool = False) -> Poses:
     includes that of the bias, a prior as observed nodes or edges at its references. Raises
     LinearSolveError if the poses are not determined.
     """
-    terms, is_pose, edges = _joint_terms(graph).informative(), graph.is_pose, graph.edges_by_row
-    seen = edges.j[np.isin(edges.kind, _PLACING)]
+    terms, is_pose = _joint_terms(graph).informative(), graph.is_pose
+    factors = graph.factors_by_row
+    seen = factors.j[np.isin(factors.kind, _PLACING)]
     free = is_pose | np.isin(np.arange(len(is_pose)), seen)   # landmarks that are seen
     system = NodeSystem(terms.i, terms.j, free & ~graph.fixed)
     root_t, root_u = np.sqrt((terms.tau, terms.kappa))
@@ -307,18 +308,17 @@ def complex_of(poses: FloatArray) -> ComplexArray:
 def _joint_terms(graph: 'Graph') -> Terms:
     """Return the terms of all constraints, without biases, and of the priors."""
     n, is_bias = graph.n_nodes, graph.is_bias
-    edges, observed = graph.edges_by_row, graph.observed_by_row
-    to_bias = edges.kind == EdgeKind.BIAS
-    biased = edges.rows(to_bias & ~is_bias[edges.i])
+    factors = graph.factors_by_row
+    biased = factors.rows((factors.kind == FactorKind.BIAS) & ~is_bias[factors.i])
     of_biased = Terms.of(
         np.full(len(biased), n), biased.i, biased.mean,
-        biased.bias[:, :2] @ np.eye(2, 3), biased.weighted_information)
+        biased.constants[:, :2] @ np.eye(2, 3), biased.weighted_information)
+    linear = np.isin(factors.kind, _LINEAR) | ((factors.j < 0) & ~is_bias[factors.i])
     return Terms.joined(
-        *Terms.of_both(edges.rows(~to_bias & np.isin(edges.kind, _LINEAR)),
-                       observed.rows(~is_bias[observed.node]), n),
+        Terms.of_factors(factors.rows(linear), n),
         of_biased._replace(
-            tau=of_biased.tau / (1.0 + of_biased.tau * biased.bias[:, 2]**2),
-            kappa=of_biased.kappa / (1.0 + of_biased.kappa * biased.bias[:, 3]**2)),
+            tau=of_biased.tau / (1.0 + of_biased.tau * biased.constants[:, 2]**2),
+            kappa=of_biased.kappa / (1.0 + of_biased.kappa * biased.constants[:, 3]**2)),
         *(_of_prior(prior, graph.node_rows(prior.nodes), graph.is_pose) for prior in graph.priors))
 
 

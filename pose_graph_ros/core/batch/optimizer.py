@@ -159,7 +159,7 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
 
 def _is_observed(graph: Graph) -> bool:
     """Tell whether the graph has an observed node, or a prior in their place."""
-    return graph.n_observed > 0 or any(prior.anchored for prior in graph.priors)
+    return bool(np.any(graph.factors.j < 0)) or any(prior.anchored for prior in graph.priors)
 
 
 def _start(graph: Graph, start: Start) -> FloatArray:
@@ -210,9 +210,9 @@ def loose_nodes(graph: Graph, cliques: symbolic.Cliques) -> IntArray:
     part = symbolic.trees(cliques, graph.n_nodes)
     held = np.zeros(len(cliques.n_frontal), dtype=bool)
     held[part[graph.fixed]] = True
-    memory, n_observed = graph.memory, graph.memory.head[tb.N_OBSERVED]
-    used = memory['observed_f'][:n_observed, tb.WEIGHT] > 0.0
-    held[part[memory['observed_i'][:n_observed, tb.OBS_NODE][used]]] = True
+    table = graph.memory['factor_i'][:graph.n_factors]
+    holds = (table[:, tb.END_J] < 0) & (graph.weights > 0.0)
+    held[part[table[holds, tb.END_I]]] = True
     for prior in graph.priors if graph.n_priors > 0 else ():
         held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
     return graph.node_ids[~held[part]]

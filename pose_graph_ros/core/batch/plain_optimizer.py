@@ -28,7 +28,7 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.checks import are_definite
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, NodeKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import Energies, GraphRows
 from pose_graph_ros.core.sparse import BlockFactors
 
@@ -42,10 +42,8 @@ class PlainGraph:
         """Of the hidden nodes in the map, shape (N, 3) [m, m, rad]."""
         self.fixed: BoolArray = rows.fixed.copy()
         """Whether hidden nodes keep their pose, shape (N,)."""
-        self.edges = self.edges_by_row = rows.edges
+        self.factors = self.factors_by_row = rows.factors
         """All edges; ids are rows."""
-        self.observed = self.observed_by_row = ObservedNodes()
-        """There are none."""
         self.n_nodes, self.n_priors = len(rows.poses), 0
         self.node_kind: npt.NDArray[np.uint8] = np.zeros(self.n_nodes, dtype=np.uint8)
 
@@ -57,11 +55,11 @@ class PlainGraph:
         Each edge has to measure all coordinates. Otherwise a pose may not be determined, and the
         factors of H, without pivoting, need not show that it is singular.
         """
-        return (len(rows.observed) == len(rows.priors) == 0
+        return (len(rows.priors) == 0
                 and bool(np.all(rows.node_kind == NodeKind.POSE))
-                and bool(np.all(rows.edges.kind <= EdgeKind.LOOP_CLOSURE))
-                and bool(np.all(rows.edges.weight == 1.0))
-                and bool(np.all(are_definite(rows.edges.information)))
+                and bool(np.all(rows.factors.kind <= FactorKind.LOOP_CLOSURE))
+                and bool(np.all(rows.factors.weight == 1.0))
+                and bool(np.all(are_definite(rows.factors.information)))
                 and np.array_equal(rows.node_ids, np.arange(len(rows.poses))))
 
     @property
@@ -73,24 +71,24 @@ class PlainGraph:
         """Set the poses of all hidden nodes, shape (N, 3) [m, m, rad]."""
         self.poses = se2.wrapped(poses)
 
-    def edges_at(self, rows: IntArray) -> Edges:
+    def factors_at(self, rows: IntArray) -> Factors:
         """Return some of the edges."""
-        return self.edges.rows(rows)
+        return self.factors.rows(rows)
 
     def energies(self) -> Energies:
         """Return the energies of all edges."""
         # what overflows is infinite
         with np.errstate(over='ignore', invalid='ignore'):
-            error = linearized(self.poses, self.edges)[0]
-            return Energies(np.einsum('mi,mij,mj->m', error, self.edges.information, error),
-                            np.empty(0), np.empty(0))
+            error = linearized(self.poses, self.factors)[0]
+            return Energies(np.einsum('mi,mij,mj->m', error, self.factors.information, error),
+                            np.empty(0))
 
     def rows(self) -> GraphRows:
         """Return the graph with the present poses."""
         return self._rows._replace(poses=self.poses.copy(), fixed=self.fixed.copy())
 
 
-def linearized(poses: Poses, edges: Edges) -> tuple[FloatArray, FloatArray, FloatArray]:
+def linearized(poses: Poses, edges: Factors) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return the errors (3.48) of edges, shape (M, 3), and their Jacobians by both ends, (M, 3, 3).
 
@@ -121,7 +119,7 @@ class PlainOptimizer:
 
     def __init__(self, graph: PlainGraph, config: SolverConfig) -> None:
         self._graph, self._config = graph, config
-        self._nodes = NodeSystem(graph.edges.i, graph.edges.j, ~graph.fixed)
+        self._nodes = NodeSystem(graph.factors.i, graph.factors.j, ~graph.fixed)
         self.places = self._nodes.places
         """Place of each node that is not fixed in the order of elimination."""
         self._factors: BlockFactors | None = None
@@ -170,8 +168,8 @@ class PlainOptimizer:
 
     def evaluate(self) -> tuple[float, float]:
         graph = self._graph
-        error, by_i, by_j = linearized(graph.poses, graph.edges)
-        weighted = np.einsum('mij,mj->mi', graph.edges.information, error)
+        error, by_i, by_j = linearized(graph.poses, graph.factors)
+        weighted = np.einsum('mij,mj->mi', graph.factors.information, error)
         self._by = by_i, by_j
         self._right = -self._nodes.gathered(self._by, weighted)
         chi2 = float(np.einsum('mi,mi->', weighted, error))
@@ -182,7 +180,7 @@ class PlainOptimizer:
             raise LinearSolveError('left to the compiled optimiser: it needs damping')
         graph, (by_i, by_j) = self._graph, self._by
         if not chord or self._factors is None:
-            information = graph.edges.information
+            information = graph.factors.information
             self._factors = self._nodes.factors(
                 self._by, (information @ by_i, information @ by_j))
         self._step = self._factors.solve(self._right.ravel()).reshape(-1, 3)

@@ -107,7 +107,7 @@ class TruncatedProblem:
         self, graph: Graph, rows: IntArray, start: FloatArray | None = None,
     ) -> None:
         self.graph, self.rows = graph, rows
-        self.edges = graph.edges_at(rows)
+        self.edges = graph.factors_at(rows)
         """What may be wrong; their weights have no meaning."""
         self.limits = LIMITS[_ranks(self.edges.information)]
         """c^2 of each, shape (M,)."""
@@ -138,7 +138,7 @@ class TruncatedProblem:
 
     def energies(self) -> FloatArray:
         """Return r^2 at the present poses, shape (M,)."""
-        return energies(self.graph.edge_errors(self.edges), self.edges.information)
+        return energies(self.graph.errors(self.edges), self.edges.information)
 
     def shares(self) -> FloatArray:
         """Return r^2 / c^2 at the present poses, shape (M,)."""
@@ -146,7 +146,7 @@ class TruncatedProblem:
 
     def errors(self, numbers: IntArray) -> FloatArray:
         """Return the errors of some of the edges at the present poses, shape (K, 3)."""
-        return self.graph.edge_errors(self.edges.rows(numbers))
+        return self.graph.errors(self.edges.rows(numbers))
 
     def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choosing:
         """Return a set with its cost; None if it leaves a node undetermined."""
@@ -230,7 +230,7 @@ class TruncatedProblem:
 
     def _weigh(self, weights: FloatArray) -> None:
         changed = np.flatnonzero(weights != self._weights)
-        self.graph.apply(GraphUpdate(weigh_edges=dict(zip(
+        self.graph.apply(GraphUpdate(weigh=dict(zip(
             self.rows[changed].tolist(), weights[changed].tolist(), strict=True))))
         self._weights = weights.copy()
 

@@ -8,7 +8,6 @@ from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
 from pose_graph_ros.core.graph import (
     factors,
-    incidence,
     normal_equations,
     prior_rows,
     tables as tb,
@@ -17,12 +16,12 @@ from pose_graph_ros.core.graph import (
 from pose_graph_ros.core.graph.factors import anchors, dimension_of
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
-# Where constraints are stiff in one direction and weak in another, as those of a turn on the spot,
-# small pivots are expected: the smallest one, as a fraction of what the constraints of its node
+# Where factors are stiff in one direction and weak in another, as those of a turn on the spot,
+# small pivots are expected: the smallest one, as a fraction of what the factors of its node
 # add in their weakest direction, and, because of rounding, of all that they add.
 LEAST_WEAK_PIVOT = 1e-9
 LEAST_STIFF_PIVOT = 1e-15
-# What constraints add to the equations: their linearization, the same after they were logged and
+# What factors add to the equations: their linearization, the same after they were logged and
 # linearized at the present estimate, as the frame in which they were may have turned since, or
 # the equations of headings or of positions of a linear start.
 LINEARIZED, RELINEARIZED, HEADINGS, POSITIONS = range(4)
@@ -34,7 +33,7 @@ def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
     Return a node with a bad pivot, or -1, after the elimination of a clique.
 
     Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
-    a pivot is small, it is judged again by the weakest direction of the constraints of its node.
+    a pivot is small, it is judged again by the weakest direction of the factors of its node.
     """
     by_weakest = False
     while True:     # one call, as the compiler then inlines it
@@ -49,7 +48,7 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
     """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
     node_f = tb.node_f(head)
     pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
-    node_i, edge_i, pool_i = tb.node_i(head), tb.edge_i(head), tb.pool_i(head)
+    node_i, factor_i, pool_i = tb.node_i(head), tb.factor_i(head), tb.pool_i(head)
     clique_f, clique_i = tb.clique_f(head), tb.clique_i(head)
     row = clique_i[c]
     n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
@@ -68,31 +67,27 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
     any_fixed, any_padded, anchored = False, False, 0
     for k in range(n_frontal):
         v = nodes[k]
-        at = incidence.first(head, v)
-        while at != incidence.END:
-            entry, side = incidence.entry_of(at), at & 3
-            at = incidence.following(head, v, at)
-            at_i, at_j, at_k = 3 * k, -1, -1
-            if entry >= 0:
-                ends = edge_i[entry]
-                at_i, at_j = _place(head, ends[tb.END_I]), _place(head, ends[tb.END_J])
-                if ends[tb.END_K] >= 0:
-                    at_k = _place(head, ends[tb.END_K])
-                # one between frontal nodes is in all their lists: added from the first of its ends
-                if (min(at_i, at_j) < 0 or (ends[tb.END_K] >= 0 and at_k < 0)
-                        or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
-                    continue
+        at = node_i[v, tb.FACTOR_LIST]
+        while at >= 0:
+            e, side = at >> 2, at & 3
+            ends = factor_i[e]
+            at = ends[tb.NEXT_I + side]
+            at_i, at_j = _place(head, ends[tb.END_I]), _place(head, ends[tb.END_J])
+            at_k = _place(head, ends[tb.END_K])
+            # one between frontal nodes is in all their lists: added from the first of its ends
+            if (at_i < 0 or (ends[tb.END_J] >= 0 and at_j < 0)
+                    or (ends[tb.END_K] >= 0 and at_k < 0)
+                    or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
+                continue
             if terms > RELINEARIZED:
-                normal_equations.add_complex(
-                    head, entry, terms == HEADINGS, at_i, at_j, front, ld)
+                normal_equations.add_complex(head, e, terms == HEADINGS, at_i, at_j, front, ld)
                 continue
             if terms == RELINEARIZED:
-                transaction_log.log_constraint(head, entry)
-                factors.linearize(head, entry)
-            if entry >= 0:
-                edge_i[entry, tb.OWNER] = c
-            anchored |= entry < 0 or anchors(edge_i[entry, tb.EDGE_KIND])
-            normal_equations.add(head, entry, at_i, at_j, at_k, front, ld)
+                transaction_log.log_factor(head, e)
+                factors.linearize(head, e)
+            ends[tb.OWNER] = c
+            anchored |= anchors(ends[tb.FACTOR_KIND])
+            normal_equations.add(head, e, at_i, at_j, at_k, front, ld)
         scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
         scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
         least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
@@ -149,19 +144,20 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
 def _place(head, v):  # type: ignore[no-untyped-def]
     """Return the row of the present front at which the block of a node begins, or -1."""
     node_i = tb.node_i(head)
+    if v < 0:
+        return -1
     return node_i[v, tb.INDEX] if node_i[v, tb.FRONT] == head[tb.FRONT_SERIAL] else -1
 
 
 @kernel
 def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
-    """Lower the bounds of a node's pivots, shape (3,), where its constraints are weak."""
-    clique_i, at = tb.clique_i(head), incidence.first(head, v)
+    """Lower the bounds of a node's pivots, shape (3,), where its factors are weak."""
+    clique_i, at = tb.clique_i(head), tb.node_i(head)[v, tb.FACTOR_LIST]
     weak_t = weak_r = 0.0
-    while at != incidence.END:
-        f = factors.parts(head, incidence.entry_of(at))[0]
-        t, r = normal_equations.weakest(f)
+    while at >= 0:
+        t, r = normal_equations.weakest(tb.factor_f(head)[at >> 2])
         weak_t, weak_r = weak_t + t, weak_r + r
-        at = incidence.following(head, v, at)
+        at = tb.factor_i(head)[at >> 2, tb.NEXT_I + (at & 3)]
     c = clique_i[tb.node_i(head)[v, tb.CLIQUE], tb.CHILD]
     while c >= 0:
         if clique_i[c, tb.N_FRONTAL] == 0:

@@ -77,10 +77,10 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _other_ends(edge_i, e, side):  # type: ignore[no-untyped-def]
-    """Return the nodes at the other ends of an edge; the second is -1 where there is but one."""
-    return (edge_i[e, tb.END_J if side == 0 else tb.END_I],
-            edge_i[e, tb.END_J if side == 2 else tb.END_K])
+def _other_ends(factor_i, e, side):  # type: ignore[no-untyped-def]
+    """Return the nodes at the other ends of a factor; -1 where there is none."""
+    return (factor_i[e, tb.END_J if side == 0 else tb.END_I],
+            factor_i[e, tb.END_J if side == 2 else tb.END_K])
 
 
 @kernel(allocates=True)
@@ -92,7 +92,7 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     Marked cliques have FRONT_SERIAL of the head in their column MARKED. The graph is given as
     `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
     """
-    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
+    node_i, factor_i = tb.node_i(head), tb.factor_i(head)
     clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
     n = len(affected)
     serial = head[tb.FRONT_SERIAL] + 1
@@ -131,10 +131,10 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             n_entries += 2
     for k in range(n):
         first[k + 1] += first[k]
-        entry = node_i[affected[k], tb.EDGE_LIST]
+        entry = node_i[affected[k], tb.FACTOR_LIST]
         while entry >= 0:
             n_entries += 2
-            entry = edge_i[entry >> 2, tb.NEXT_I + (entry & 3)]
+            entry = factor_i[entry >> 2, tb.NEXT_I + (entry & 3)]
     orphans_of, filled = np.empty(first[n], np.int32), first.copy()
     for k in range(n_orphans):
         row = clique_i[orphans[k]]
@@ -152,17 +152,17 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
         for m in range(first[k], first[k + 1]):
             adjacency[end] = orphans_of[m]
             end += 1
-        entry = node_i[affected[k], tb.EDGE_LIST]
+        entry = node_i[affected[k], tb.FACTOR_LIST]
         while entry >= 0:
             e, side = entry >> 2, entry & 3
-            for other in _other_ends(edge_i, e, side):
+            for other in _other_ends(factor_i, e, side):
                 if other >= 0 and node_i[other, tb.FRONT] == serial:
                     i = node_i[other, tb.INDEX]
                     if last_seen[i] != k:   # each neighbour once
                         last_seen[i] = k
                         adjacency[end] = i
                         end += 1
-            entry = edge_i[e, tb.NEXT_I + side]
+            entry = factor_i[e, tb.NEXT_I + side]
     for k in range(n_orphans):
         start[n + k] = end
         row = clique_i[orphans[k]]

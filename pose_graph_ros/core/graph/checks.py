@@ -11,20 +11,13 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
-    Edges,
-    FACTORS,
-    NodeKind,
-    ObservedKind,
-    ObservedNodes,
-)
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
 SEMIDEFINITE_TOLERANCE = 1e-5
 # Shapes of the rows of columns that are not of numbers.
-_ROW_SHAPES = {'mean': (3,), 'offset': (3,), 'information': (3, 3), 'bias': (4,)}
+_ROW_SHAPES = {'mean': (3,), 'information': (3, 3), 'constants': (4,)}
 
 
 class RowError(GraphUpdateError):
@@ -36,7 +29,7 @@ class RowError(GraphUpdateError):
 
 
 class Ids(NamedTuple):
-    """Which permanent ids of nodes, edges or observed nodes are in use."""
+    """Which permanent ids of nodes or factors are in use."""
 
     end: int                            # id of the next new row
     present: IntArray | None = None     # by row, ascending; None where they are 0..end - 1
@@ -75,72 +68,69 @@ class Ids(NamedTuple):
         return Ids(self.end + n, np.append(self.present, self.end + np.arange(n)))
 
 
-# --- tables of constraints ----------------------------------------------------------------------
+# --- tables of factors ----------------------------------------------------------------------
 
 def check(
-    table: Edges | ObservedNodes, kind: npt.NDArray[Any], dimension: IntArray | None = None,
+    table: Factors, kind: npt.NDArray[Any], dimension: IntArray | None = None,
     nodes: Ids | None = None,
 ) -> None:
     """
-    Raise for invalid constraints, with the row, what was expected and the value.
+    Raise for invalid factors, with the row, what was expected and the value.
 
-    Invalid are wrong shapes, kinds or nodes, negative weights, an edge from a node to itself, a
-    node of a kind that the kind of edge does not have for this end, numbers that are not finite,
+    Invalid are wrong shapes, kinds or nodes, negative weights, a factor from a node to itself, a
+    node of a kind that the kind of factor does not have for this end, numbers that are not finite,
     numbers in rows that an error has not, an information matrix that is zero, not symmetric or not
     positive semidefinite. `kind` has the `NodeKind` of the hidden nodes, by row; by default
     `dimension` is 2 for landmarks and 3 for others, and ids are rows.
     """
-    name, ids = type(table).__name__, Ids(len(kind)) if nodes is None else nodes
+    ids = Ids(len(kind)) if nodes is None else nodes
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     for key, column in columns.items():
         expected = (len(table), *_ROW_SHAPES.get(key, ()))
         if column.shape != expected:
             raise GraphUpdateError(
-                f'{name}.{key}: expected shape {expected}, got {column.shape}')
+                f'Factors.{key}: expected shape {expected}, got {column.shape}')
     for key, column in columns.items():
-        _refuse_rows(~np.isfinite(column), f'{name}.{key} is not finite', column)
-    ends = ((table.i, table.j, table.k[table.k != -1])
-            if isinstance(table, Edges) else (table.node,))
-    for end in ends:
-        _refuse_rows((end < 0) | (end >= ids.end),
-                     f'{name}: expected a hidden node in 0..{ids.end - 1}', end)
-        gone = np.flatnonzero(ids.rows(end) < 0)
+        _refuse_rows(~np.isfinite(column), f'Factors.{key} is not finite', column)
+    for end, least in ((table.i, 0), (table.j, -1), (table.k, -1)):
+        _refuse_rows((end < least) | (end >= ids.end),
+                     f'Factors: expected a hidden node in 0..{ids.end - 1}', end)
+        gone = np.flatnonzero((ids.rows(end) < 0) & (end >= 0))
         if len(gone) > 0:
             raise GraphUpdateError(
-                f'{name}: hidden node {end[gone[0]]} has left the graph; row {gone[0]}')
-    known = tuple(FACTORS) if isinstance(table, Edges) else tuple(ObservedKind)
-    _refuse_rows(~np.isin(table.kind, known),
-                 f'{name}.kind is none of {", ".join(each.name for each in known)}', table.kind)
-    _refuse_rows(table.weight < 0.0, f'{name}.weight is negative', table.weight)
+                f'Factors: hidden node {end[gone[0]]} has left the graph; row {gone[0]}')
+    _refuse_rows(~np.isin(table.kind, tuple(FACTORS)), 'Factors.kind is none of '
+                 f'{", ".join(each.name for each in FACTORS)}', table.kind)
+    _refuse_rows(table.weight < 0.0, 'Factors.weight is negative', table.weight)
     if dimension is None:
         dimension = np.where(kind == NodeKind.LANDMARK, 2, 3)
-    if isinstance(table, Edges):
-        _refuse_rows(table.i == table.j, f'{name}: an edge leads from a node to itself', table.i)
-        _check_ends(table, kind, ids)
-        rows = np.array([np.isin(range(3), factor.rows) for factor in FACTORS.values()])
-        missing = ~rows[table.kind]
-        _refuse_rows(missing & (table.mean != 0.0),
-                     f'{name}.mean: expected 0 in rows that the error has not', table.mean)
-        least = np.where(table.kind == EdgeKind.BIAS, np.minimum(
-            dimension[ids.rows(table.i)], dimension[ids.rows(table.j)]), 3)
-    else:
-        least, missing = dimension[ids.rows(table.node)], np.zeros((len(table), 3), dtype=bool)
-    missing = missing | (np.arange(3) >= least[:, None])
+    _refuse_rows(table.i == table.j, 'Factors: an edge leads from a node to itself', table.i)
+    _check_ends(table, kind, ids)
+    rows = np.array([np.isin(range(3), factor.rows) for factor in FACTORS.values()])
+    missing = ~rows[table.kind]
+    _refuse_rows(missing & (table.mean != 0.0),
+                 'Factors.mean: expected 0 in rows that the error has not', table.mean)
+    # of one on a bias, or on a single node, the rows that the node has
+    of_i = dimension[ids.rows(table.i)]
+    of_j = np.where(table.j >= 0, dimension[ids.rows(table.j)], of_i)
+    has_few = (table.kind == FactorKind.BIAS) | (table.j < 0)
+    missing = missing | (np.arange(3) >= np.where(has_few, np.minimum(of_i, of_j), 3)[:, None])
     diagonal = np.diagonal(table.information, axis1=1, axis2=2)
-    _refuse_rows(missing & (diagonal != 0.0), f'{name}.information: expected 0 in rows that the '
+    _refuse_rows(missing & (diagonal != 0.0), 'Factors.information: expected 0 in rows that the '
                  'error or the node has not', diagonal)
-    _check_information(f'{name}.information', table.information)
+    _check_information('Factors.information', table.information)
 
 
-def _check_ends(edges: Edges, kind: npt.NDArray[Any], ids: Ids) -> None:
-    """Raise if an edge has a node of the wrong kind for an end."""
+def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
+    """Raise if a factor has a node of the wrong kind for an end, or lacks one."""
     for each, factor in FACTORS.items():
-        rows = edges.kind == each
+        rows = factors.kind == each
         for end, allowed in (('i', factor.i), ('j', factor.j), ('k', factor.k)):
-            node = getattr(edges, end)
-            wrong = rows & (node >= 0) & ~np.isin(kind[ids.rows(node)], allowed)
+            node = getattr(factors, end)
+            wrong = rows & np.where(
+                node >= 0, ~np.isin(kind[ids.rows(node)], allowed), end == 'j' and allowed != ())
             expected = ' or '.join(item.name.lower() for item in allowed) or 'none'
-            _refuse_rows(wrong, f'Edges.{end}: expected an edge of kind {each.name} to have '
+            _refuse_rows(wrong, f'Factors.{end}: expected a factor of kind {each.name} to have '
                          f'{expected} for this end', node)
 
 

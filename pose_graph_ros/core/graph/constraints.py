@@ -1,12 +1,13 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The kinds of nodes, and the two types of constraints as struct of arrays: edges, observed nodes.
+The kinds of nodes, and the factors (constraints) as struct of arrays.
 
-An *edge* leads from hidden node i to hidden node j and has the measured pose of j in i. An
-*observed node* is a pose measured in the map; it constrains one hidden node. A position is an
-observed node whose information on the heading and whose mean heading are zero, so its error lies
-in map axes. A heading is an observed node whose information on the position is zero.
+A factor has one, two or three hidden nodes for ends. One with two ends, an *edge*, leads from node
+i to node j and has the measured pose of j in i. One with a single end, an *observed node*, has a
+pose of i that was measured in the map. A position is an observed node whose information on the
+heading and whose mean heading are zero, so its error lies in map axes. A heading is one whose
+information on the position is zero.
 
 A *bias* is a hidden node that is not a pose but the time-correlated error of a source of
 measurements, in units of its sigma. Edges of the kind `BIAS` lead to it. `factors` has the errors
@@ -18,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from operator import attrgetter
-from typing import Annotated, Any, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,8 +37,8 @@ class NodeKind(IntEnum):
     LANDMARK = 2    # a point in the map, of dimension 2
 
 
-class EdgeKind(IntEnum):
-    """Where an edge comes from."""
+class FactorKind(IntEnum):
+    """What was measured; the kinds from GLOBAL_POSE on have one end, and the same error."""
 
     ODOMETRY = 0
     LOOP_CLOSURE = 1
@@ -48,27 +49,22 @@ class EdgeKind(IntEnum):
     POINT = 4   # position of landmark j in the frame of i
     PRIOR = 5   # what marginalisation leaves of edges between poses; the error is that of odometry
     RANGE = 6   # distance of landmark j from a point of the robot i
-
-
-class ObservedKind(IntEnum):
-    """What was measured of an observed node; the error is the same for all kinds."""
-
-    GLOBAL_POSE = 0
-    POSITION = 1
-    HEADING = 2
-    PRIOR = 3   # what marginalisation leaves
+    GLOBAL_POSE = 7
+    POSITION = 8
+    HEADING = 9
+    NODE_PRIOR = 10     # what marginalisation leaves on a single node
 
 
 class FactorType(NamedTuple):
-    """What checks, files and pictures need to know of a kind of edges."""
+    """What checks, files and pictures need to know of a kind of factors."""
 
     name: str
-    i: tuple[NodeKind, ...]         # kinds of nodes that the edge may start from
-    j: tuple[NodeKind, ...]
+    i: tuple[NodeKind, ...]         # kinds of nodes that it may start from
+    j: tuple[NodeKind, ...] = ()    # none where it has one end
     k: tuple[NodeKind, ...] = ()    # of the third node, which may be missing
     # rows that the error has; mean and information are zero in the others
     rows: tuple[int, ...] = (0, 1, 2)
-    bias: tuple[int, ...] = ()      # columns of `Edges.bias` that it uses
+    constants: tuple[int, ...] = ()     # columns of `Factors.constants` that it uses
     # tag in g2o files, followed by i, j and, of the rows that it has, mean and upper triangle of
     # the information
     tag: str = ''
@@ -76,67 +72,27 @@ class FactorType(NamedTuple):
     @property
     def places(self) -> bool:
         """Whether its mean is a position of j in the frame of i."""
-        return self.rows[:2] == (0, 1) and self.j != (NodeKind.BIAS,)
+        return self.rows[:2] == (0, 1) and self.j not in {(), (NodeKind.BIAS,)}
 
 
 _POSE, _BIAS, _LANDMARK = (NodeKind.POSE,), (NodeKind.BIAS,), (NodeKind.LANDMARK,)
 FACTORS = {
-    EdgeKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS, bias=(0, 1, 2, 3)),
-    EdgeKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,), bias=(3,)),
-    EdgeKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
-    EdgeKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
-    EdgeKind.RANGE: FactorType(
-        'range', _POSE, _LANDMARK, rows=(0,), bias=(0, 1), tag='EDGE_RANGE_SE2_XY'),
+    FactorKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
+    FactorKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
+    FactorKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS, constants=(0, 1, 2, 3)),
+    FactorKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,), constants=(3,)),
+    FactorKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
+    FactorKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
+    FactorKind.RANGE: FactorType(
+        'range', _POSE, _LANDMARK, rows=(0,), constants=(0, 1), tag='EDGE_RANGE_SE2_XY'),
+    **{kind: FactorType(kind.name.lower().replace('_', ' '), tuple(NodeKind), constants=(0, 1, 2))
+       for kind in FactorKind if kind >= FactorKind.GLOBAL_POSE},
 }
 
 KindArray = npt.NDArray[np.uint8]
-EdgeKinds = Annotated[IntArray, Choices(EdgeKind)]
-ObservedKinds = Annotated[IntArray, Choices(ObservedKind)]
+FactorKinds = Annotated[IntArray, Choices(FactorKind)]
 
-
-@dataclass(frozen=True, slots=True)
-class _Table:
-    """A table of constraints: columns of equal length."""
-
-    @classmethod
-    def joined(cls, tables: Sequence[Self]) -> Self:
-        """Return one table with the rows of several, in order."""
-        if len(tables) == 0:
-            return cls()
-        return cls(*map(np.concatenate, zip(*(table.columns for table in tables), strict=True)))
-
-    @property
-    def columns(self) -> tuple[npt.NDArray[Any], ...]:
-        """All columns, in the order of the constructor's arguments."""
-        columns: tuple[npt.NDArray[Any], ...] = _COLUMNS[type(self)](self)
-        return columns
-
-    @property
-    def weighted_information(self) -> FloatArray:
-        """Information times weight, shape (M, 3, 3)."""
-        information, weight = getattr(self, 'information'), getattr(self, 'weight')  # noqa: B009
-        return np.asarray(weight[:, None, None] * information)
-
-    def rows(self, index: IntArray | BoolArray | slice) -> Self:
-        """Return a table of some rows."""
-        return type(self)(*(column[index] for column in self.columns))
-
-    def renumbered(self, number: Callable[[IntArray], IntArray]) -> Self:
-        """Return the same constraints with other numbers for their nodes, e.g. rows for ids."""
-        changed = {name: number(getattr(self, name))
-                   for name in ('i', 'j', 'node') if hasattr(self, name)}
-        third: IntArray | None = getattr(self, 'k', None)
-        if third is not None and np.any(third >= 0):
-            changed['k'] = third.copy()
-            changed['k'][third >= 0] = number(third[third >= 0])
-        return replace(self, **changed)
-
-
-Constraints = TypeVar('Constraints', bound=_Table)
-
-# The constructors of the frozen tables set columns by this.
+# The constructor of the frozen table sets columns by this.
 _set = object.__setattr__
 _NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
 _FLOAT, _INT, _KIND = (np.dtype(kind) for kind in (np.float64, np.int64, np.uint8))
@@ -166,92 +122,114 @@ def _filled(size: int, value: float, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Edges(_Table):
-    """M directed edges; raises GraphUpdateError for ends and kinds that are no integers."""
+class Factors:
+    """M factors; raises GraphUpdateError for ends and kinds that are no integers."""
 
-    i: IntArray     # nodes that they start from
-    j: IntArray     # nodes that they lead to
-    # measured poses of j in i, shape (M, 3) [m, m, rad]; of edges to a bias those of i in the map,
-    # of ranges the distance (r, 0, 0)
+    i: IntArray     # nodes that they start from, or that are observed
+    j: IntArray     # nodes that they lead to; -1 for one end, in the map
+    # measured poses of j in i, shape (M, 3) [m, m, rad]; with one end and of edges to a bias those
+    # of i in the map, of ranges the distance (r, 0, 0)
     mean: FloatArray
-    # inverse covariances of the errors (3.48), shape (M, 3, 3), in the frames of the measured
-    # poses; of edges to a bias in map axes; zero in rows that the error of the kind has not
+    # inverse covariances of the errors, shape (M, 3, 3), in the frames of the measured poses; of
+    # edges to a bias in map axes; zero in rows that the error of the kind has not
     information: FloatArray
     kind: KindArray
-    weight: FloatArray  # factors on the information: 0 removed, by default 1
-    # measured offset in i and factors of the bias, (o_x, o_y, f_t, f_th), shape (M, 4)
-    # [m, m, m, rad]: of edges to a bias, of a range (o_x, o_y), of a turn f_th, the duration [s]
-    bias: FloatArray
+    weight: FloatArray  # what the information is multiplied by: 0 removed, by default 1
+    # what else the error depends on, shape (M, 4): with one end the offset (o_x, o_y, o_th, 0)
+    # [m, m, rad], that is, motion by odometry since the node, then the lever arm; of edges to a
+    # bias the offset in i and the factors of the bias, (o_x, o_y, f_t, f_th) [m, m, m, rad]; of a
+    # range (o_x, o_y), of a turn f_th, the duration [s]
+    constants: FloatArray
     k: IntArray     # third nodes: of turns the bias; -1, the default, for none
 
     def __init__(
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,
         information: npt.ArrayLike = _NO_MATRICES, kind: npt.ArrayLike = (),
-        weight: npt.ArrayLike | None = None, bias: npt.ArrayLike | None = None,
+        weight: npt.ArrayLike | None = None, constants: npt.ArrayLike | None = None,
         k: npt.ArrayLike | None = None,
     ) -> None:
         i = _integers(i, _INT)
+        n = len(i)
         _set(self, 'i', i)
         _set(self, 'j', _integers(j, _INT))
         _set(self, 'mean', _numbers(mean))
         _set(self, 'information', _numbers(information))
         _set(self, 'kind', _integers(kind, _KIND))
-        _set(self, 'weight', _filled(len(i), 1.0, _FLOAT) if weight is None else _numbers(weight))
-        _set(self, 'bias', np.zeros((len(i), 4)) if bias is None else _numbers(bias))
-        _set(self, 'k', _filled(len(i), -1, _INT) if k is None else _integers(k, _INT))
+        _set(self, 'weight', _filled(n, 1.0, _FLOAT) if weight is None else _numbers(weight))
+        _set(self, 'constants', np.zeros((n, 4)) if constants is None else _numbers(constants))
+        _set(self, 'k', _filled(n, -1, _INT) if k is None else _integers(k, _INT))
+
+    @classmethod
+    def on(
+        cls, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
+        mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
+        kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
+    ) -> 'Factors':
+        """Return observed nodes; the offset is the identity by default."""
+        node = _integers(node, _INT)
+        constants = np.zeros((len(node), 4))
+        if offset is not None:
+            constants[:, :3] = offset
+        return cls(node, _filled(len(node), -1, _INT), mean, information, kind, weight, constants)
 
     def __len__(self) -> int:
         return len(self.i)
 
-
-@dataclass(frozen=True, slots=True)
-class ObservedNodes(_Table):
-    """K observed nodes, each with one constraint; raises GraphUpdateError as `Edges`."""
-
-    node: IntArray  # hidden nodes that are observed
-    # poses of the observed frames in the hidden nodes, shape (K, 3) [m, m, rad]: motion by
-    # odometry since the hidden node, then the lever arm; the identity, which is the default, makes
-    # the error that of (3.52)
-    offset: FloatArray
-    mean: FloatArray    # observed poses in the map, shape (K, 3) [m, m, rad]
-    # inverse covariances of the errors (3.52), shape (K, 3, 3), in the observed frames
-    information: FloatArray
-    kind: KindArray
-    weight: FloatArray  # factors on the information: 0 removed, by default 1
-
-    def __init__(
-        self, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
-        mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
-        kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
-    ) -> None:
-        node = _integers(node, _INT)
-        n = len(node)
-        _set(self, 'node', node)
-        _set(self, 'offset', np.zeros((n, 3)) if offset is None else _numbers(offset))
-        _set(self, 'mean', _numbers(mean))
-        _set(self, 'information', _numbers(information))
-        _set(self, 'kind', _integers(kind, _KIND))
-        _set(self, 'weight', _filled(n, 1.0, _FLOAT) if weight is None else _numbers(weight))
-
-    def __len__(self) -> int:
-        return len(self.node)
+    @classmethod
+    def joined(cls, tables: 'Sequence[Factors]') -> 'Factors':
+        """Return one table with the rows of several, in order."""
+        if len(tables) == 0:
+            return cls()
+        return cls(*map(np.concatenate, zip(*(table.columns for table in tables), strict=True)))
 
     @property
-    def as_edges(self) -> Edges:
-        """The same as edges to the map, -1, whose column `bias` begins with the offset."""
-        n = len(self)
-        bias = np.zeros((n, 4))
-        bias[:, :3] = self.offset
-        return Edges(self.node, _filled(n, -1, _INT), self.mean, self.information, self.kind,
-                     self.weight, bias)
+    def columns(self) -> tuple[npt.NDArray[Any], ...]:
+        """All columns, in the order of the constructor's arguments."""
+        columns: tuple[npt.NDArray[Any], ...] = _COLUMNS(self)
+        return columns
 
-    def weighted(self, weight: float) -> 'ObservedNodes':
-        """Return the same observed nodes with another weight."""
-        return replace(self, weight=np.full(len(self), weight))
+    @property
+    def offset(self) -> FloatArray:
+        """Offsets of observed nodes, shape (M, 3) [m, m, rad]."""
+        return self.constants[:, :3]
+
+    @property
+    def edges(self) -> 'Factors':
+        """Those between nodes."""
+        return self.rows(self.j >= 0)
+
+    @property
+    def observed(self) -> 'Factors':
+        """Those with one end."""
+        return self.rows(self.j < 0)
+
+    @property
+    def weighted_information(self) -> FloatArray:
+        """Information times weight, shape (M, 3, 3)."""
+        return np.asarray(self.weight[:, None, None] * self.information)
+
+    def rows(self, index: IntArray | BoolArray | slice) -> 'Factors':
+        """Return a table of some rows."""
+        return Factors(*(column[index] for column in self.columns))
+
+    def weighted(self, weight: npt.ArrayLike) -> 'Factors':
+        """Return the same factors with other weights, or all with the same one."""
+        return replace(self, weight=np.broadcast_to(weight, (len(self),)).astype(np.float64))
+
+    def renumbered(self, number: Callable[[IntArray], IntArray]) -> 'Factors':
+        """Return the same factors with other numbers for their nodes, e.g. rows for ids."""
+        def of(end: IntArray) -> IntArray:
+            present = end >= 0
+            if np.all(present):
+                return number(end)
+            changed = end.copy()
+            changed[present] = number(end[present])
+            return changed
+
+        return replace(self, i=number(self.i), j=of(self.j), k=of(self.k))
 
 
-_COLUMNS: dict[type, Any] = {
-    table: attrgetter(*(item.name for item in fields(table))) for table in (Edges, ObservedNodes)}
+_COLUMNS = attrgetter(*(item.name for item in fields(Factors)))
 
 
 def full(triangles: FloatArray) -> FloatArray:

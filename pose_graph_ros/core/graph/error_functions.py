@@ -16,31 +16,23 @@ from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
-from pose_graph_ros.core.graph.factors import model, OBSERVED, prepare
+from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.factors import model, prepare
 
 
-def edge_errors(poses: Poses, edges: Edges) -> FloatArray:
+def errors(poses: Poses, factors: Factors) -> FloatArray:
     """
-    Return the errors (3.48) of edges, shape (M, 3) [m, m, rad], theta in [-pi, pi).
+    Return the errors (3.48), (3.52) of factors, shape (M, 3) [m, m, rad], theta in [-pi, pi).
 
     They are in the frames of the measured poses, those of edges to a bias in map axes.
     """
-    return _errors(poses, edges.i, edges.j, edges.k, edges.mean, edges.kind, edges.bias)
-
-
-def observed_errors(poses: Poses, observed: ObservedNodes) -> FloatArray:
-    """Return the errors (3.52) of observed nodes, in their frames, as `edge_errors`."""
-    edges = observed.as_edges
-    error = -_errors(poses, edges.i, edges.i, edges.k, edges.mean,
-                     np.full(len(edges), OBSERVED, np.uint8), edges.bias)
-    error[:, 2] = se2.wrap(error[:, 2])
-    return error
-
-
-def _errors(*columns: npt.NDArray[Any]) -> FloatArray:
-    error = np.empty((len(columns[1]), 3))
-    _write_errors(*map(_writable, columns), error)
+    error = np.empty((len(factors), 3))
+    _write_errors(*map(_writable, (poses, *(getattr(factors, name) for name in (
+        'i', 'j', 'k', 'mean', 'kind', 'constants')))), error)
+    observed = factors.j < 0    # of which (3.52) has the other sign
+    if np.any(observed):
+        error[observed] *= -1.0
+        error[observed, 2] = se2.wrap(error[observed, 2])
     return error
 
 
@@ -50,22 +42,22 @@ def _writable(column: Any) -> npt.NDArray[Any]:
 
 
 @kernel
-def write_data(f, kind, mean, bias):  # type: ignore[no-untyped-def]
-    """Write what the error of an edge depends on into a row as of `edge_f`."""
+def write_data(f, kind, mean, constants):  # type: ignore[no-untyped-def]
+    """Write what the error of a factor depends on into a row as of `factor_f`."""
     f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2] = mean[0], mean[1], mean[2]
-    f[tb.OFFSET], f[tb.OFFSET + 1] = bias[0], bias[1]
-    f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[2], bias[3]
+    for m in range(4):
+        f[tb.OFFSET + m] = constants[m]
     prepare(f, kind)
 
 
 @kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS), allocates=True)
-def _write_errors(poses, i, j, k, mean, kind, bias, error):  # type: ignore[no-untyped-def]
-    f = np.empty(tb.EDGE_F)
+def _write_errors(poses, i, j, k, mean, kind, constants, error):  # type: ignore[no-untyped-def]
+    f = np.empty(tb.FACTOR_F)
     for e in range(len(i)):
-        write_data(f, kind[e], mean[e], bias[e])
-        third = bias[e, 3] * poses[k[e], 0] if k[e] >= 0 else 0.0
+        write_data(f, kind[e], mean[e], constants[e])
+        third = constants[e, 3] * poses[k[e], 0] if k[e] >= 0 else 0.0
         error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
-            f, kind[e], poses[i[e]], poses[j[e]], third)
+            f, kind[e], poses[i[e]], poses[j[e] if j[e] >= 0 else i[e]], third)
 
 
 def energies(error: FloatArray, information: FloatArray) -> FloatArray:

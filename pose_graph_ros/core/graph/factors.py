@@ -1,9 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The types of constraints (factors): the error of each, and what solvers derive from it.
+The types of factors: the error of each, and what solvers derive from it.
 
-`constraints.FACTORS` says which nodes a kind of edge has for ends, which rows its error has, and
+`constraints.FACTORS` says which nodes a kind of factor has for ends, which rows its error has, and
 its tag in g2o files. `error` has the errors with their Jacobians, each defined here and nowhere
 else. Numbers in parentheses are equations of C. Merfels, "Sensor fusion for localization of
 automated vehicles", section 3.4.6. A node is x = (t, th), its theta wrapped; R_i and R_z are the
@@ -26,7 +26,7 @@ for small changes, S = ((0, -1), (1, 0)). Frame and *arm* a are all that a type 
 Jacobians; with them `R e_t = d + constant`. Of the heading of i only the rotation by th_i enters,
 which is given as (c, s).
 
-Solvers need the linearization of a constraint, its linearization error, and its energy. The
+Solvers need the linearization of a factor, its linearization error, and its energy. The
 unknown of a node is its pose minus a constant reference, delta = x - x_ref, in map axes.
 Translation and heading are added as plain numbers, so every constraint may be linearized at a
 point of its own; a bar marks values there. In map axes an error is
@@ -46,24 +46,19 @@ rotates, which changes the gradient by the relative change c of the Jacobian tim
 linearization error, `r^T W r + c^2 e^T W e` [sigma^2], decides what is linearized again (fluid
 relinearization, M. Kaess et al., "iSAM2", IJRR 2012, with whitened errors). Its sum over all
 constraints is about the distance of chi2 from its minimum.
-
-In the kernels of this package a constraint is given by its *entry*, as in the table `waiting`: e
-for the edge in row e, -1 - k for the observed node in row k.
 """
 
 import math
 
-import numpy as np
-
 from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 
-# Numbers of the definitions: kinds of edges, then observed nodes.
-ODOMETRY, BIAS, TURN, PRIOR, RANGE = (int(kind) for kind in (
-    EdgeKind.ODOMETRY, EdgeKind.BIAS, EdgeKind.TURN, EdgeKind.PRIOR, EdgeKind.RANGE))
-OBSERVED = len(EdgeKind)
-# Smallest squared linearization error for which a constraint is linearized again, as a fraction of
+# Numbers of the definitions; all kinds from OBSERVED on have one end.
+ODOMETRY, BIAS, TURN, PRIOR, RANGE, OBSERVED = (int(kind) for kind in (
+    FactorKind.ODOMETRY, FactorKind.BIAS, FactorKind.TURN, FactorKind.PRIOR, FactorKind.RANGE,
+    FactorKind.GLOBAL_POSE))
+# Smallest squared linearization error for which a factor is linearized again, as a fraction of
 # `SmootherConfig.budget_share`.
 LEAST_FRACTION = 0.01
 # Squared relative change of the arm of a Jacobian above which it is added to the squared
@@ -87,7 +82,7 @@ def frame_moves(kind):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def anchors(kind):  # type: ignore[no-untyped-def]
-    """Tell whether axes of an edge's errors or unknowns do not turn with its clique."""
+    """Tell whether axes of a factor's errors or unknowns do not turn with its clique."""
     return kind >= BIAS and kind != PRIOR
 
 
@@ -99,7 +94,7 @@ def dimension_of(row):  # type: ignore[no-untyped-def]
 
 @kernel
 def prepare(f, kind):  # type: ignore[no-untyped-def]
-    """Set what a row of `edge_f` needs of its mean: `R_z^T t_z`."""
+    """Set what a row of `factor_f` needs of its mean: `R_z^T t_z`."""
     if is_relative(kind):
         c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
         f[tb.OWN] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
@@ -117,33 +112,18 @@ def rotation(f, kind, heading):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def rows_of(head, entry):  # type: ignore[no-untyped-def]
-    """Return the rows of floats and of integers of a constraint."""
-    if entry >= 0:
-        return tb.edge_f(head)[entry], tb.edge_i(head)[entry]
-    return tb.observed_f(head)[-1 - entry], tb.observed_i(head)[-1 - entry]
-
-
-@kernel(forceinline=True)
-def is_used(head, entry):  # type: ignore[no-untyped-def]
-    """Tell whether a constraint has a weight."""
-    return rows_of(head, entry)[0][tb.WEIGHT] > 0.0
-
-
-@kernel(forceinline=True)
-def parts(head, entry):  # type: ignore[no-untyped-def]
-    """Return row, kind, and ends i, j and k of a constraint; i = j where a node is observed."""
-    f, row = rows_of(head, entry)
-    if entry >= 0:
-        return f, row[tb.EDGE_KIND], row[tb.END_I], row[tb.END_J], row[tb.END_K]
-    return f, np.int32(OBSERVED), row[tb.END_I], row[tb.END_I], np.int32(-1)
+def parts(head, e):  # type: ignore[no-untyped-def]
+    """Return row, kind, and ends i, j and k of a factor; i = j where a node is observed."""
+    row = tb.factor_i(head)[e]
+    i, j = row[tb.END_I], row[tb.END_J]
+    return tb.factor_f(head)[e], row[tb.FACTOR_KIND], i, j if j >= 0 else i, row[tb.END_K]
 
 
 @kernel(forceinline=True)
 def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
     """Return f_t and f_th of node j."""
     if kind == BIAS:
-        return f[tb.FACTOR_T], f[tb.FACTOR_TH]
+        return f[tb.BIAS_T], f[tb.BIAS_TH]
     return (1.0, 1.0) if kind < OBSERVED else (0.0, 0.0)
 
 
@@ -195,7 +175,7 @@ def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
         length = math.sqrt(vx * vx + vy * vy)
         if length > 0.0:
             c, s = vx / length, vy / length
-    elif kind == OBSERVED and f[tb.MEAN + 2] != 0.0:
+    elif kind >= OBSERVED and f[tb.MEAN + 2] != 0.0:
         c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
     kx, ky = constant(f, kind, c, s, ax, ay)
     ex, ey = dx + kx, dy + ky
@@ -222,7 +202,7 @@ def refer_to_pose(f):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
-    """Return the error of a constraint, the cosine and sine of its frame, and its arm."""
+    """Return the error of a factor, the cosine and sine of its frame, and its arm."""
     ft, fth = factors_of_end(f, kind)
     c, s = rotation(f, kind, start[tb.POSE + 2])
     ex, ey, c, s, ax, ay = error(
@@ -234,7 +214,7 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped-def]
-    """Linearize a constraint; the last two are f_th times POSE and DELTA of the third node."""
+    """Linearize a factor; the last two are f_th times POSE and DELTA of the third node."""
     _, _, eth, c, s, ax, ay = model(f, kind, start, end, pose_k)
     _, fth = factors_of_end(f, kind)
     if frame_moves(kind):
@@ -314,16 +294,16 @@ def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untype
 @kernel(forceinline=True)
 def third(node_f, f, k, column):  # type: ignore[no-untyped-def]
     """Return f_th times a number of the third node k, 0 without one."""
-    return f[tb.FACTOR_TH] * node_f[k, column] if k >= 0 else 0.0
+    return f[tb.BIAS_TH] * node_f[k, column] if k >= 0 else 0.0
 
 
 # Nearly all constraints have the error of odometry. What is derived from errors is compiled into
 # its callers, once for the constant ODOMETRY and once for all kinds: this takes a fifth less time.
 
 @kernel
-def linearize(head, entry):  # type: ignore[no-untyped-def]
-    """Linearize a constraint at the present estimate; the caller has logged its row."""
-    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, entry)
+def linearize(head, e):  # type: ignore[no-untyped-def]
+    """Linearize a factor at the present estimate; the caller has logged its row."""
+    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, e)
     if kind < BIAS:
         _linearize(f, ODOMETRY, node_f[i], node_f[j], 0.0, 0.0)
     else:
@@ -332,15 +312,15 @@ def linearize(head, entry):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def check(head, entry, clique_turn):  # type: ignore[no-untyped-def]
+def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
     """
-    Set squared linearization error and energy of a constraint; the caller has logged them.
+    Set squared linearization error and energy of a factor; the caller has logged them.
 
     `clique_turn` is the turn of its clique's frame since the linearization [rad], see
     `clique_frames`, with its cosine and sine; `NO_TURN` at the linearization, in anchored cliques
     and for observed nodes.
     """
-    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, entry)
+    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, e)
     if kind < BIAS:
         _check(f, ODOMETRY, node_f[i], node_f[j], 0.0, clique_turn)
     else:
@@ -355,15 +335,12 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
             + y * (f[i + 3] * y + 2.0 * f[i + 4] * th) + th * f[i + 5] * th)
 
 
-@kernel(signature=(tb.HEAD, NUMBERS, NUMBERS))
-def energies(head, edges, observed):  # type: ignore[no-untyped-def]
-    """Write the unweighted energies of all constraints at the present poses [sigma^2]."""
+@kernel(signature=(tb.HEAD, NUMBERS))
+def energies(head, out):  # type: ignore[no-untyped-def]
+    """Write the unweighted energies of all factors at the present poses [sigma^2]."""
     node_f = tb.node_f(head)
-    for entry in range(-head[tb.N_OBSERVED], head[tb.N_EDGES]):
-        f, kind, i, j, k = parts(head, entry)
+    for e in range(head[tb.N_FACTORS]):
+        f, kind, i, j, k = parts(head, e)
         ex, ey, eth, _, _, _, _ = model(
             f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.POSE))
-        if entry >= 0:
-            edges[entry] = _form(f, ex, ey, eth)
-        else:
-            observed[-1 - entry] = _form(f, ex, ey, eth)
+        out[e] = _form(f, ex, ey, eth)

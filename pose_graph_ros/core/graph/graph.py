@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph: hidden nodes, edges and observed nodes, as struct of arrays."""
+"""The pose graph: hidden nodes and factors, as struct of arrays."""
 
 from collections.abc import Collection
 from typing import Any
@@ -21,8 +21,7 @@ from pose_graph_ros.core.graph.graph_update import (
     GraphUpdate,
     Left,
     NextIds,
-    NO_EDGES,
-    NOTHING_OBSERVED,
+    NO_FACTORS,
 )
 from pose_graph_ros.core.graph.prior_rows import add_priors
 
@@ -44,14 +43,11 @@ class Graph(GraphContents):
         self.n_moves = 0    # how often `set_poses` or new measurements have moved the nodes
         self._updating = False
 
-    def set_weights(self, weights: tuple[npt.NDArray[Any], npt.NDArray[Any]]) -> None:
-        """Set the weights of all edges and observed nodes to what `weights` has returned."""
-        edges, observed = (
-            dict(zip(ids[changed].tolist(), wanted[changed].tolist(), strict=True))
-            for ids, wanted, present in zip(
-                (self.edge_ids, self.observed_ids), weights, self.weights, strict=True)
-            for changed in (np.flatnonzero(wanted != present),))
-        self.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
+    def set_weights(self, weights: npt.NDArray[Any]) -> None:
+        """Set the weights of all factors to what `weights` has returned."""
+        changed = np.flatnonzero(weights != self.weights)
+        self.apply(GraphUpdate(weigh=dict(zip(
+            self.factor_ids[changed].tolist(), weights[changed].tolist(), strict=True))))
 
     def apply(self, update: GraphUpdate) -> None:
         """
@@ -67,16 +63,14 @@ class Graph(GraphContents):
         columns: tuple[npt.NDArray[Any], ...] = ()
         checked = False
         try:
-            columns = (update.hidden, *others, *update.edges.columns,
-                       *update.observed.as_edges.columns)
+            columns = update.hidden, *others, *update.factors.columns
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
             code = editing.UNSOUND  # arrays of types that the kernel is not compiled for
         while code != editing.ADDED:
             if code == editing.NO_ROOM:
-                self.ensure(
-                    self.n_nodes + len(update.hidden) + len(others[0]),
-                    self.n_edges + len(update.edges), self.n_observed + len(update.observed))
+                self.ensure(self.n_nodes + len(update.hidden) + len(others[0]),
+                            self.n_factors + len(update.factors))
             else:
                 columns, checked = self._checked_columns(update, others), True
             code = editing.add_rows(self.memory.head, *columns, checked)
@@ -87,34 +81,28 @@ class Graph(GraphContents):
         """Raise GraphUpdateError for unknown ids or invalid weights; new rows may be edited."""
         nodes = self._ids('node').extended(
             len(update.hidden) + len(update.biases) + len(update.landmarks))
-        edges = self._ids('edge').extended(len(update.edges))
-        observed = self._ids('observed').extended(len(update.observed))
-        for what, known, parts in (
-                ('hidden node', nodes, ('fix', 'free', 'remove_nodes')),
-                ('edge', edges, ('remove_edges', 'drop_edges')),
-                ('observed node', observed, ('remove_observed', 'drop_observed'))):
+        factors = self._ids('factor').extended(len(update.factors))
+        for what, known, parts in (('hidden node', nodes, ('fix', 'free', 'remove_nodes')),
+                                   ('factor', factors, ('remove', 'drop'))):
             for part in parts:
                 checks.check_ids(part, getattr(update, part), what, known)
-        checks.check_weights('weigh_edges', update.weigh_edges, 'edge', edges)
-        checks.check_weights('weigh_observed', update.weigh_observed, 'observed node', observed)
-        for measured in update.measure_edges:
-            checks.check_ids('measure_edges', measured.ids.tolist(), 'edge', edges)
+        checks.check_weights('weigh', update.weigh, 'factor', factors)
+        for measured in update.measure:
+            checks.check_ids('measure', measured.ids.tolist(), 'factor', factors)
         for n, prior in enumerate(update.priors):
             checks.check_ids(f'priors[{n}].nodes', prior.nodes, 'hidden node', nodes)
 
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
         head = self.memory.head
-        for of_edges, removed, weights, dropped in (
-                (True, update.remove_edges, update.weigh_edges, update.drop_edges),
-                (False, update.remove_observed, update.weigh_observed, update.drop_observed)):
-            for ids, values in ((removed, [0.0] * len(removed)), (weights, weights.values()),
-                                (dropped, [editing.DROPPED] * len(dropped))):
-                if len(ids) > 0:
-                    editing.set_weights(
-                        head, _integers(ids), np.fromiter(values, np.float64, len(ids)), of_edges)
-        for measured in update.measure_edges:
-            editing.measure_edges(head, _integers(measured.ids), *map(
+        for ids, values in ((update.remove, [0.0] * len(update.remove)),
+                            (update.weigh, update.weigh.values()),
+                            (update.drop, [editing.DROPPED] * len(update.drop))):
+            if len(ids) > 0:
+                editing.set_weights(
+                    head, _integers(ids), np.fromiter(values, np.float64, len(ids)))
+        for measured in update.measure:
+            editing.measure(head, _integers(measured.ids), *map(
                 np.ascontiguousarray, (measured.mean, measured.information)))
             self.n_moves += 1
         for nodes, fixed in ((update.fix, True), (update.free, False)):
@@ -123,7 +111,7 @@ class Graph(GraphContents):
         if len(update.remove_nodes) > 0:
             removal.remove_nodes(head, _integers(update.remove_nodes))
         if len(update.priors) > 0:
-            self.ensure(self.n_nodes + len(update.priors), self.n_edges, self.n_observed)
+            self.ensure(self.n_nodes + len(update.priors), self.n_factors)
             add_priors(self.memory, update.priors, [
                 self.node_rows(prior.nodes) for prior in update.priors])
         if not self._updating:
@@ -140,44 +128,39 @@ class Graph(GraphContents):
                                (self.node_kind, 0, others[1] & 3),
                                (self.dimension, 3, 3 - (others[1] >> 2))))
         nodes = self._ids('node').extended(len(hidden) + len(others[0]))
-        edges = update.edges if len(update.edges) > 0 else NO_EDGES
-        observed = update.observed if len(update.observed) > 0 else NOTHING_OBSERVED
-        for table in (edges, observed):
-            checks.check(table, kind, dimension, nodes)
+        factors = update.factors if len(update.factors) > 0 else NO_FACTORS
+        checks.check(factors, kind, dimension, nodes)
         return tuple(np.array(column, order='C')
-                     for column in (
-                         hidden, *others, *edges.columns, *observed.as_edges.columns))
+                     for column in (hidden, *others, *factors.columns))
 
-    def ensure(self, n_nodes: int, n_edges: int, n_observed: int) -> None:
+    def ensure(self, n_nodes: int, n_factors: int) -> None:
         """Make the tables and the transaction log large enough for a graph of this size."""
         memory, head = self.memory, self.memory.head
         n_nodes += int(head[tb.N_PRIORS])   # of which there is as much space as of nodes
-        if (n_nodes <= head[tb.NODE_ROOM] and n_edges <= head[tb.EDGE_ROOM]
-                and n_observed <= head[tb.OBSERVED_ROOM]):
+        if n_nodes <= head[tb.NODE_ROOM] and n_factors <= head[tb.FACTOR_ROOM]:
             return
-        for name, needed in (('node', n_nodes), ('edge', n_edges), ('observed', n_observed)):
+        for name, needed in (('node', n_nodes), ('factor', n_factors)):
             for suffix in ('_f', '_i', '_id'):
                 memory.ensure(name + suffix, needed, keep=int(head[COUNTERS[name][0]]))
-        nodes, edges, observed = (
-            len(memory[name]) for name in ('node_f', 'edge_f', 'observed_f'))
+        nodes, factors = (len(memory[name]) for name in ('node_f', 'factor_f'))
         # the rest costs address space: little of the log and the work space is ever written to
         for name, needed, used in (
                 ('clique_f', 2 * nodes, tb.N_CLIQUES), ('clique_i', 2 * nodes, tb.N_CLIQUES),
                 ('touched', nodes, tb.N_TOUCHED), ('freed', 4 * nodes, tb.N_FREED),
-                ('waiting', edges + observed, tb.N_WAITING),
+                ('waiting', factors, tb.N_WAITING),
                 ('log_f', nodes * (tb.NODE_F + tb.SCALE_T + tb.CLIQUE_F)
-                 + edges * (tb.EDGE_F + 2) + observed * tb.OBS_F + tb.N_SCALARS, tb.LOG_F_END),
-                ('log_i', nodes * (tb.NODE_I + tb.CLIQUE_I + 16)
-                 + edges * (tb.EDGE_I + 6) + observed * (tb.OBS_I + 3), tb.LOG_I_END)):
+                 + factors * (tb.FACTOR_F + 2) + tb.N_SCALARS, tb.LOG_F_END),
+                ('log_i', nodes * (tb.NODE_I + tb.CLIQUE_I + 16) + factors * (tb.FACTOR_I + 6),
+                 tb.LOG_I_END)):
             memory.ensure(name, needed, keep=int(head[used]))
         memory.ensure('work_i', 4 * nodes)
-        head[tb.NODE_ROOM], head[tb.EDGE_ROOM], head[tb.OBSERVED_ROOM] = nodes, edges, observed
+        head[tb.NODE_ROOM], head[tb.FACTOR_ROOM] = nodes, factors
 
     def set_poses(self, poses: Poses) -> None:
         """
         Set the estimates of all hidden nodes; headings are wrapped.
 
-        All constraints are linearized there, and the next step eliminates all nodes. A wrong shape
+        All factors are linearized there, and the next step eliminates all nodes. A wrong shape
         or a number that is not finite raises GraphUpdateError.
         """
         if poses.shape != (self.n_nodes, 3) or not np.all(np.isfinite(poses)):
@@ -203,9 +186,8 @@ class Graph(GraphContents):
                 rows.node_kind == NodeKind.LANDMARK, 2, 3))
         poses = np.flatnonzero(self.is_pose)
         memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
-        self._append('edge', GraphUpdate(edges=rows.edges), rows.edge_ids, rows.next_ids.edge)
-        self._append('observed', GraphUpdate(observed=rows.observed), rows.observed_ids,
-                     rows.next_ids.observed)
+        self._append('factor', GraphUpdate(factors=rows.factors), rows.factor_ids,
+                     rows.next_ids.factor)
         self.apply(GraphUpdate(
             fix=self.node_ids[begin:][rows.fixed].tolist(), priors=rows.priors))
 

@@ -10,19 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import Edges, NodeKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Factors, NodeKind
 from pose_graph_ros.core.graph.priors import Prior
 
 # Empty parts of updates.
 NO_POSES: Final[FloatArray] = np.empty((0, 3))
 NO_POINTS: Final[FloatArray] = np.empty((0, 2))
-NO_EDGES: Final = Edges()
-NOTHING_OBSERVED: Final = ObservedNodes()
+NO_FACTORS: Final = Factors()
 NO_WEIGHTS: Final[Mapping[int, float]] = MappingProxyType({})
 
 
 class Measured(NamedTuple):
-    """Other measurements of edges that there are."""
+    """Other measurements of factors that there are."""
 
     ids: IntArray
     mean: Poses
@@ -31,82 +30,72 @@ class Measured(NamedTuple):
 
 class GraphUpdate(NamedTuple):
     """
-    An edit of a graph; all nodes and constraints in it are given by their ids.
+    An edit of a graph; all nodes and factors in it are given by their ids.
 
-    New hidden nodes, edges and observed nodes get the next ids (`Graph.next_ids`), in order: first
-    `hidden`, then `biases`, then `landmarks`. New constraints and edits may be on new nodes.
+    New hidden nodes and factors get the next ids (`Graph.next_ids`), in order: first `hidden`,
+    then `biases`, then `landmarks`. New factors and edits may be on new nodes.
     """
 
     hidden: Poses = NO_POSES    # initial poses of new hidden nodes in the map
-    edges: Edges = NO_EDGES
-    observed: ObservedNodes = NOTHING_OBSERVED
+    factors: Factors = NO_FACTORS
     biases: FloatArray = NO_POSES   # initial values of new ones, shape (S, 3) [sigma, sigma, rad]
     dimensions: Sequence[int] = ()  # of the new biases, by default 3; other coordinates stay 0
     landmarks: FloatArray = NO_POINTS   # initial positions of new ones, shape (L, 2) [m]
     fix: Sequence[int] = ()     # hidden nodes that keep their pose from now on (the gauge)
     free: Sequence[int] = ()    # hidden nodes that are no longer fixed
-    # constraints whose weight becomes 0: they keep row and id, and may get a new weight
-    remove_edges: Sequence[int] = ()
-    remove_observed: Sequence[int] = ()
-    # new weights (factors on the information) of constraints, removed ones included, by id
-    weigh_edges: Mapping[int, float] = NO_WEIGHTS
-    weigh_observed: Mapping[int, float] = NO_WEIGHTS
-    # hidden nodes that leave the graph for good, with all constraints on them, those with weight 0
+    # factors whose weight becomes 0: they keep row and id, and may get a new weight
+    remove: Sequence[int] = ()
+    # new weights (what the information is multiplied by) of factors, removed ones included, by id
+    weigh: Mapping[int, float] = NO_WEIGHTS
+    # hidden nodes that leave the graph for good, with all factors on them, those with weight 0
     # included; what they told about the others is lost, see `marginalization`
     remove_nodes: Sequence[int] = ()
-    # constraints that leave the graph for good
-    drop_edges: Sequence[int] = ()
-    drop_observed: Sequence[int] = ()
+    drop: Sequence[int] = ()    # factors that leave the graph for good
     priors: Sequence[Prior] = ()    # new dense ones
-    measure_edges: Sequence[Measured] = ()  # new mean and information; edges keep their weights
+    measure: Sequence[Measured] = ()    # new mean and information; factors keep their weights
 
 
 class Left(NamedTuple):
     """Ids of what has left a graph, ascending."""
 
     nodes: IntArray
-    edges: IntArray     # with those that were on these nodes, whatever their weight
-    observed: IntArray
+    factors: IntArray   # with those that were on these nodes, whatever their weight
 
 
-NOTHING_LEFT: Final = Left(*(np.empty(0, dtype=np.int64) for _ in range(3)))
+NOTHING_LEFT: Final = Left(*(np.empty(0, dtype=np.int64) for _ in range(2)))
 
 # Index of the first part of an update that edits what there is.
 FIRST_EDIT: Final = GraphUpdate._fields.index('fix')
 
 
 class Energies(NamedTuple):
-    """Energies of all constraints: weighted squared errors [sigma^2]."""
+    """Energies of all factors: weighted squared errors [sigma^2]."""
 
-    edges: FloatArray
-    observed: FloatArray
+    factors: FloatArray
     priors: FloatArray
 
     @property
     def chi2(self) -> float:
         """Sum of the energies, without a factor 1/2."""
-        return float(np.sum(self.edges) + np.sum(self.observed) + np.sum(self.priors))
+        return float(np.sum(self.factors) + np.sum(self.priors))
 
 
 class NextIds(NamedTuple):
-    """Ids of the next new hidden node (or bias), edge and observed node."""
+    """Ids of the next new hidden node (or bias) and factor."""
 
     node: int
-    edge: int
-    observed: int
+    factor: int
 
 
 class GraphRows(NamedTuple):
-    """Copies of all rows of a graph; nodes of constraints are ids."""
+    """Copies of all rows of a graph; nodes of factors are ids."""
 
     poses: Poses        # estimates of all hidden nodes, biases included
     node_kind: npt.NDArray[Any]     # `NodeKind` of the hidden nodes
     fixed: BoolArray
-    edges: Edges
-    observed: ObservedNodes
+    factors: Factors
     node_ids: IntArray      # ascending
-    edge_ids: IntArray
-    observed_ids: IntArray
+    factor_ids: IntArray
     next_ids: NextIds       # at least 1 more than the last ones
     # numbers of coordinates of the hidden nodes; by default those usual for their kinds
     dimension: IntArray | None = None
@@ -128,16 +117,15 @@ class GraphRows(NamedTuple):
 
     def since(self, first: NextIds) -> 'GraphRows':
         """Return the rows that are new since the next ids were these; priors have no ids."""
-        nodes, edges, observed = (
+        nodes, factors = (
             slice(int(np.searchsorted(ids, begin)), None) for ids, begin in zip(
-                (self.node_ids, self.edge_ids, self.observed_ids), first, strict=True))
+                (self.node_ids, self.factor_ids), first, strict=True))
         return GraphRows(
-            self.poses[nodes], self.node_kind[nodes], self.fixed[nodes], self.edges.rows(edges),
-            self.observed.rows(observed), self.node_ids[nodes], self.edge_ids[edges],
-            self.observed_ids[observed], self.next_ids,
-            None if self.dimension is None else self.dimension[nodes])
+            self.poses[nodes], self.node_kind[nodes], self.fixed[nodes],
+            self.factors.rows(factors), self.node_ids[nodes], self.factor_ids[factors],
+            self.next_ids, None if self.dimension is None else self.dimension[nodes])
 
-    def with_edges(self, edges: Edges) -> Self:
-        """Return the same rows with other edges, which get the ids 0, 1 and so on."""
-        return self._replace(edges=edges, edge_ids=np.arange(len(edges)),
-                             next_ids=self.next_ids._replace(edge=len(edges)))
+    def with_factors(self, factors: Factors) -> Self:
+        """Return the same rows with other factors, which get the ids 0, 1 and so on."""
+        return self._replace(factors=factors, factor_ids=np.arange(len(factors)),
+                             next_ids=self.next_ids._replace(factor=len(factors)))

@@ -1,9 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What constraints add to the normal equations: to the front of a clique, or to a gradient.
+What factors add to the normal equations: to the front of a clique, or to a gradient.
 
-Symbols are those of `factors`. With G = (0, 0, f_th) the column of a third node, an edge adds the
+Symbols are those of `factors`. With G = (0, 0, f_th) the column of a third node, a factor adds the
 blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 """
 
@@ -27,7 +27,7 @@ from pose_graph_ros.core.graph.factors import (
 @kernel
 def weakest(f):  # type: ignore[no-untyped-def]
     """
-    Return the weighted information of a constraint in its weakest direction and on its heading.
+    Return the weighted information of a factor in its weakest direction and on its heading.
 
     The first is the smaller eigenvalue of the information on the position, the second that on the
     heading if the position is unknown; both are lower bounds, to rounding.
@@ -67,7 +67,7 @@ def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-def]
-    """Add a constraint to a front; parameters as for `add`, rows as for `model`."""
+    """Add a factor to a front; parameters as for `add`, rows as for `model`."""
     c, s = frame(f, kind)
     xx, xy, xt, yy, yt, tt = _turned(f, c, s)
     ft, fth = factors_of_end(f, kind)
@@ -97,7 +97,7 @@ def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-de
     front[(b + 1) * ld + right] -= ft * gy
     front[(b + 2) * ld + right] -= fth * gth
     if k >= 0:
-        _add_third(front, ld, (a, b, k), f[tb.FACTOR_TH], (xt, yt, wt), (xt, yt, tt), gth)
+        _add_third(front, ld, (a, b, k), f[tb.BIAS_TH], (xt, yt, wt), (xt, yt, tt), gth)
     # from here on with the columns of j multiplied by F
     xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
     wx, wy, wt = ft * wx, ft * wy, fth * wt
@@ -131,14 +131,14 @@ def _add_third(front, ld, at, factor, of_i, of_j, gth):  # type: ignore[no-untyp
 
 
 @kernel
-def add(head, entry, a, b, k, front, ld):  # type: ignore[no-untyped-def]
+def add(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
     """
-    Add a constraint to a front, in which the blocks of its ends i, j and k begin at a, b and k.
+    Add a factor to a front, in which the blocks of its ends i, j and k begin at a, b and k.
 
     b and k may be -1. The front is an upper triangle, stored by rows of `ld` numbers, the last of
     which is the right-hand side.
     """
-    node_f, (f, kind, i, j, _) = tb.node_f(head), parts(head, entry)
+    node_f, (f, kind, i, j, _) = tb.node_f(head), parts(head, e)
     if kind < BIAS:
         _add(f, ODOMETRY, node_f[i], node_f[j], a, b, -1, front, ld)
     else:
@@ -146,14 +146,14 @@ def add(head, entry, a, b, k, front, ld):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_complex(head, entry, headings, a, b, front, ld):  # type: ignore[no-untyped-def]
+def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-def]
     """
     Add an equation of a linear start to a front, as `add` does: of headings, or of positions.
 
     It is `v_j - f v_i = s`, or `v_i = s` where a node is observed, of complex numbers: v is u or t
     of `batch.linear_starts`. The third unknown of each node is 0.
     """
-    node_f, (f, _, i, _, _) = tb.node_f(head), parts(head, entry)
+    node_f, (f, _, i, _, _) = tb.node_f(head), parts(head, e)
     kappa = weight = f[tb.WEIGHT] * f[tb.INFO + 5]
     fx, fy, sx, sy = 1.0, 0.0, 0.0, 0.0
     if headings:
@@ -193,7 +193,7 @@ def add_complex(head, entry, headings, a, b, front, ld):  # type: ignore[no-unty
 @kernel(forceinline=True)
 def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-def]
     """
-    Add -b of a constraint to `right`, shape (N, 3); return its energy and two sums of magnitudes.
+    Add -b of a factor to `right`, shape (N, 3); return its energy and two sums of magnitudes.
 
     These are of the gradient's coordinates of a position, and of the diagonal terms of the
     energy, which cancel each other where W is nearly singular.
@@ -219,16 +219,16 @@ def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-
 
 
 @kernel(forceinline=True)
-def gradient(head, entry, right):  # type: ignore[no-untyped-def]
+def gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
-    Return energy and the sums of `_gradient` of a constraint after adding -b to `right`, (N, 3).
+    Return energy and the sums of `_gradient` of a factor after adding -b to `right`, (N, 3).
     """
-    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, entry)
+    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, e)
     if kind < BIAS:
         energy, total, terms, _ = _gradient(f, ODOMETRY, (i, j), node_f, 0.0, right)
         return energy, total, terms
     energy, total, terms, gth = _gradient(
         f, kind, (i, j), node_f, third(node_f, f, k, tb.POSE), right)
     if k >= 0:
-        right[k, 0] -= f[tb.FACTOR_TH] * gth
+        right[k, 0] -= f[tb.BIAS_TH] * gth
     return energy, total, terms

@@ -1,12 +1,12 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Removal of nodes and constraints for good, in two steps.
+Removal of nodes and factors for good, in two steps.
 
 Within an update they leave all lists, and with it the tree, but keep their rows, which are logged
 as any other edit; so a rollback brings them back. After the update `compact` takes the rows out:
-those that stay move up, in their order, and all that refers to a row is rewritten. An edge leaves
-with any of its nodes, an observed node with its hidden node. Cliques keep their rows.
+those that stay move up, in their order, and all that refers to a row is rewritten. A factor leaves
+with any of its nodes. Cliques keep their rows.
 """
 
 import numpy as np
@@ -51,28 +51,26 @@ def _forget_newest(head):  # type: ignore[no-untyped-def]
     """Let the newest pose be the last one that does not leave."""
     node_i = tb.node_i(head)
     v = head[tb.NEWEST]
-    while v >= 0 and (node_i[v, tb.EDGE_LIST] == tb.LEAVES or node_i[v, tb.NODE_TYPE] != 0):
+    while v >= 0 and (node_i[v, tb.FACTOR_LIST] == tb.LEAVES or node_i[v, tb.NODE_TYPE] != 0):
         v -= 1
     head[tb.NEWEST] = v
 
 
 @kernel(signature=(tb.HEAD, INTEGERS))
 def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
-    """Take hidden nodes, by id, out of the graph with all their constraints; rows leave later."""
+    """Take hidden nodes, by id, out of the graph with all their factors; rows leave later."""
     node_i = tb.node_i(head)
     for node in nodes:
         v = rows.node_row(head, node)
         prior_rows.remove_of_node(head, v)
-        if node_i[v, tb.EDGE_LIST] == tb.LEAVES:
+        if node_i[v, tb.FACTOR_LIST] == tb.LEAVES:
             continue
         transaction_log.log_node(head, v)
-        while node_i[v, tb.EDGE_LIST] >= 0:
-            weigh(head, node_i[v, tb.EDGE_LIST] >> 2, 0.0)
-        while node_i[v, tb.OBSERVED_LIST] >= 0:
-            weigh(head, -1 - node_i[v, tb.OBSERVED_LIST], 0.0)
+        while node_i[v, tb.FACTOR_LIST] >= 0:
+            weigh(head, node_i[v, tb.FACTOR_LIST] >> 2, 0.0)
         _touch_cliques_with(head, v)
         touch(head, v)
-        node_i[v, tb.EDGE_LIST] = tb.LEAVES
+        node_i[v, tb.FACTOR_LIST] = tb.LEAVES
         head[tb.N_LEAVING] += 1
         head[tb.STRUCTURE] = 1
     _forget_newest(head)
@@ -83,23 +81,22 @@ def compact(memory: tb.Memory) -> Left:
     head = memory.head
     if head[tb.N_LEAVING] == 0:
         return NOTHING_LEFT
-    node_i, *tables = _rows_in_use(memory)
-    stays = node_i[:, tb.EDGE_LIST] != tb.LEAVES
+    node_i, factor_i = _rows_in_use(memory)
+    stays = node_i[:, tb.FACTOR_LIST] != tb.LEAVES
     with_ends = np.append(stays, True)  # -1: no such end
-    gone, moved = zip(*(_moved_up(memory, name, counter, which) for name, counter, which in (
-        ('node', tb.N_NODES, stays), *((name, counter, (table[:, tb.NEXT_I] != tb.LEAVES) & np.all(
-            with_ends[table[:, tb.END_I:tb.END_K + 1]], axis=1)) for name, counter, table in zip(
-                ('edge', 'observed'), (tb.N_EDGES, tb.N_OBSERVED), tables, strict=True)))),
-        strict=True)
-    _rewrite_rows(memory, *moved)
-    _rewrite_lists(memory, *moved)
+    factor_stays = (factor_i[:, tb.NEXT_I] != tb.LEAVES) & np.all(
+        with_ends[factor_i[:, tb.END_I:tb.END_K + 1]], axis=1)
+    nodes, moved = _moved_up(memory, 'node', tb.N_NODES, stays)
+    gone, factors_moved = _moved_up(memory, 'factor', tb.N_FACTORS, factor_stays)
+    _rewrite_rows(memory, moved, factors_moved)
+    _rewrite_lists(memory, moved, factors_moved)
     head[tb.N_LEAVING] = 0
-    return Left(*gone)
+    return Left(nodes, gone)
 
 
-def _rows_in_use(memory: tb.Memory) -> tuple[npt.NDArray[np.int32], ...]:
-    return tuple(memory[name][:memory.head[counter]] for name, counter in (
-        ('node_i', tb.N_NODES), ('edge_i', tb.N_EDGES), ('observed_i', tb.N_OBSERVED)))
+def _rows_in_use(memory: tb.Memory) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    return (memory['node_i'][:memory.head[tb.N_NODES]],
+            memory['factor_i'][:memory.head[tb.N_FACTORS]])
 
 
 def _moved_up(
@@ -117,29 +114,23 @@ def _moved_up(
     return gone, np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)
 
 
-def _rewrite_rows(
-    memory: tb.Memory, nodes: IntArray, edges: IntArray, observed: IntArray,
-) -> None:
-    """Rewrite ends of constraints and the lists of the constraints of each node."""
-    node_i, edge_i, observed_i = _rows_in_use(memory)
+def _rewrite_rows(memory: tb.Memory, nodes: IntArray, factors: IntArray) -> None:
+    """Rewrite ends of factors and the lists of the factors of each node."""
+    node_i, factor_i = _rows_in_use(memory)
 
     def entries(old: npt.NDArray[np.int32]) -> IntArray:
-        return np.where(old >= 0, 4 * edges[old >> 2] + (old & 3), -1)
+        return np.where(old >= 0, 4 * factors[old >> 2] + (old & 3), -1)
 
-    for column, name, table, renumbered in (
-            (tb.EDGE_LIST, 'edge_f', edge_i, entries),
-            (tb.OBSERVED_LIST, 'observed_f', observed_i, observed.__getitem__)):
-        node_i[:, column] = renumbered(node_i[:, column])
-        ends, after = table[:, tb.END_I:tb.END_K + 1], table[:, tb.NEXT_I:tb.NEXT_K + 1]
-        ends[:] = nodes[ends]
-        # those without a weight are in no list
-        listed = (memory[name][:len(ends), tb.WEIGHT] > 0.0)[:, None] & (ends >= 0)
-        after[listed] = renumbered(after[listed])
+    node_i[:, tb.FACTOR_LIST] = entries(node_i[:, tb.FACTOR_LIST])
+    ends, after = (factor_i[:, first:first + 3] for first in (tb.END_I, tb.NEXT_I))
+    ends[:] = nodes[ends]
+    # those without a weight are in no list
+    has_weight = memory['factor_f'][:len(ends), tb.WEIGHT] > 0.0
+    listed = has_weight[:, None] & (ends >= 0)
+    after[listed] = entries(after[listed])
 
 
-def _rewrite_lists(
-    memory: tb.Memory, nodes: IntArray, edges: IntArray, observed: IntArray,
-) -> None:
+def _rewrite_lists(memory: tb.Memory, nodes: IntArray, factors: IntArray) -> None:
     """Rewrite the nodes of cliques, what is touched or waits, and the newest pose."""
     head, pool_i = memory.head, memory['pool_i']
     cliques = memory['clique_i'][:head[tb.N_CLIQUES]].astype(np.int64)
@@ -148,12 +139,10 @@ def _rewrite_lists(
     at = np.arange(np.sum(sizes)) + np.repeat(cliques[:, tb.NODES] - begins, sizes)
     pool_i[at] = nodes[pool_i[at]]
     touched = nodes[memory['touched'][:head[tb.N_TOUCHED]]]
-    waiting = memory['waiting'][:head[tb.N_WAITING]]
-    rows = np.where(waiting >= 0, edges[np.maximum(waiting, -1)],
-                    observed[np.maximum(-1 - waiting, -1)])
+    waiting = factors[memory['waiting'][:head[tb.N_WAITING]]]
     for name, counter, entries in (
             ('touched', tb.N_TOUCHED, touched[touched >= 0]),
-            ('waiting', tb.N_WAITING, np.where(waiting >= 0, rows, -1 - rows)[rows >= 0])):
+            ('waiting', tb.N_WAITING, waiting[waiting >= 0])):
         memory[name][:len(entries)] = entries
         head[counter] = len(entries)
     head[tb.NEWEST] = nodes[head[tb.NEWEST]]

@@ -1,10 +1,10 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Robust losses, and iteratively reweighted least squares over the constraints that have one.
+Robust losses, and iteratively reweighted least squares over the factors that have one.
 
 With E = e^T information e the energy, k the threshold of the loss [sigma] and z = E / k^2, the
-cost of a constraint is k^2 rho(z) instead of E, and its weight in H and b is w(z) = rho'(z):
+cost of a factor is k^2 rho(z) instead of E, and its weight in H and b is w(z) = rho'(z):
 
     none                     rho = z                               w = 1
     Huber                    rho = z up to 1, 2 sqrt(z) - 1        w = 1, then 1 / sqrt(z)
@@ -15,21 +15,21 @@ cost of a constraint is k^2 rho(z) instead of E, and its weight in H and b is w(
     truncated least squares  rho = z up to 1, 1                    w = 1, then 0
 
 All are concave in z, so each reweighted solution lowers the cost. The last four are bounded: a
-wrong constraint has the same cost however wrong it is, but the result depends on the start.
+wrong factor has the same cost however wrong it is, but the result depends on the start.
 
 DCS (dynamic covariance scaling, P. Agarwal et al., ICRA 2013) multiplies the information by s^2,
 s = min(1, 2 k^2 / (k^2 + E)). Its cost is the integral of that weight; the cost of switchable
 constraints, s^2 E + k^2 (1 - s)^2, is constant beyond k for this s.
 
 The weights depend on the estimate and the estimate on the weights, so both are computed in turn.
-At each update the weights of the newest constraints and of some older ones in turn are computed
+At each update the weights of the newest factors and of some older ones in turn are computed
 anew, so that the work does not grow with the graph. The final optimisation computes all of them
 repeatedly, starting from weights that do not depend on earlier updates. The *base weight* of a
-constraint is its weight without the loss: 1, or less where the errors of several measurements are
+factor is its weight without the loss: 1, or less where the errors of several measurements are
 correlated.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, assert_never, Final
 
@@ -39,13 +39,9 @@ import numpy.typing as npt
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
-
-# New weights of edges and of observed nodes, by id.
-Changes = tuple[Mapping[int, float], Mapping[int, float]]
 
 _LOSSES = tuple(Loss)
 
@@ -54,9 +50,9 @@ _LOSSES = tuple(Loss)
 class _Tuning:
     """How much work reweighting is."""
 
-    window: int = 200           # the newest constraints of each kind, and as many older, at a time
+    window: int = 200           # the newest factors, and as many older, at a time
     least_change: float = 0.005     # smallest relative change of a weight that an update applies
-    part: int = 2000            # constraints of each kind that a refinement looks at at a time
+    part: int = 2000            # factors that a refinement looks at at a time
     least_refined: float = 1e-4     # smallest relative change of a weight that it applies
 
 
@@ -99,216 +95,172 @@ def _normalized(loss: Loss, z: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True)
 class SavedLosses:
-    """Saved state of the constraints of one table that have a robust loss."""
+    """Saved state of the factors that have a robust loss."""
 
     rows: Integers      # ids
     losses: Annotated[IntArray, Choices(Loss)]
     thresholds: Numbers     # [sigma]
     shares: Numbers     # base weights
-    cursor: int         # index of the older constraint that is reweighted next
+    cursor: int         # index of the older factor that is reweighted next
 
 
-# Id of a constraint, index of its loss in `Loss`, its threshold [sigma], and its base weight.
+# Id of a factor, index of its loss in `Loss`, its threshold [sigma], and its base weight.
 _ROW = np.dtype([('id', 'i8'), ('loss', 'i8'), ('threshold', 'f8'), ('base', 'f8')])
 
 
-class _Rows:
-    """Constraints of one table that have a robust loss, in the order in which they were added."""
+class Reweighting:
+    """Computes the weights of factors with a robust loss, which are in the order of their ids."""
 
-    def __init__(self, *, edges: bool) -> None:
-        self._edges = edges     # else they are observed nodes
-        self.table = GrowingArray((), _ROW)     # ids ascend
-        self.cursor = 0     # index of the older constraint that is reweighted next
+    def __init__(self) -> None:
+        self._table = GrowingArray((), _ROW)
+        self._cursor = 0    # index of the older factor that is reweighted next
 
     def __len__(self) -> int:
-        return len(self.table)
+        return len(self._table)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        column: npt.NDArray[Any] = self.table.values[name]
+        column: npt.NDArray[Any] = self._table.values[name]
         return column
 
     def saved(self) -> SavedLosses:
+        """Return the state."""
         ids, losses, thresholds, base = (
             self[name].copy() for name in ('id', 'loss', 'threshold', 'base'))
-        return SavedLosses(ids, losses, thresholds, base, self.cursor)
+        return SavedLosses(ids, losses, thresholds, base, self._cursor)
 
     def restore(self, saved: SavedLosses) -> None:
+        """Restore what `saved` returned; nothing may have been added before."""
         rows = np.empty(len(saved.rows), _ROW)
         rows['id'], rows['loss'] = saved.rows, saved.losses
         rows['threshold'], rows['base'] = saved.thresholds, saved.shares
-        self.table.append(rows)
-        self.cursor = saved.cursor
+        self._table.append(rows)
+        self._cursor = saved.cursor
 
-    def index(self, number: int) -> int:
-        """Return the index of a constraint by its id, -1 if it was not added."""
+    def forget(self, ids: IntArray) -> None:
+        """Forget factors that have left the graph."""
+        gone = np.isin(self['id'], ids)
+        if np.any(gone):
+            self._cursor -= int(np.count_nonzero(gone[:self._cursor]))
+            self._table.select(np.flatnonzero(~gone))
+
+    def add(self, number: int, loss: Loss, threshold: float) -> None:
+        """
+        Add a factor with the base weight 1; one without a loss is ignored.
+
+        Its id must be above those that were added before.
+        """
+        if loss is not Loss.NONE:
+            self._table.append_one((number, _LOSSES.index(loss), threshold, 1.0))
+
+    def move(self, number: int, to: int) -> None:
+        """
+        Give the loss and the base weight of a factor to another one that replaces it.
+
+        The base weight of the old one becomes 0. Nothing happens if it has no loss.
+        """
+        at, at_new = self._index(number), self._index(to)
+        if at < 0:
+            return
+        if at_new < 0:
+            at_new = len(self)
+            self._table.append_one((to, self['loss'][at], self['threshold'][at], 0.0))
+        self['base'][at_new] = self['base'][at]
+        self['base'][at] = 0.0
+
+    def scale_base_weights(self, ids: IntArray, factor: float) -> None:
+        """Multiply the base weights of factors, where they have a loss."""
+        self['base'][np.isin(self['id'], ids)] *= factor
+
+    def knows(self, number: int) -> bool:
+        """Tell whether a factor has a loss."""
+        return self._index(number) >= 0
+
+    def base_weight(self, number: int) -> float | None:
+        """Return the base weight of a factor, by its id; None without a loss."""
+        at = self._index(number)
+        return float(self['base'][at]) if at >= 0 else None
+
+    def set_base_weight(self, number: int, weight: float) -> None:
+        """Set the base weight of a factor, if it was added."""
+        at = self._index(number)
+        if at >= 0:
+            self['base'][at] = weight
+
+    def base_weights(self) -> FloatArray:
+        """Return a copy of the base weights."""
+        return self['base'].copy()
+
+    def set_base_weights(self, weights: FloatArray) -> None:
+        """Set what `base_weights` has returned; nothing may have been added in between."""
+        self['base'][:] = weights
+
+    def _index(self, number: int) -> int:
+        """Return the index of a factor by its id, -1 if it was not added."""
         at = int(np.searchsorted(self['id'], number))
         return at if at < len(self) and self['id'][at] == number else -1
 
-    def forget(self, ids: IntArray) -> None:
-        gone = np.isin(self['id'], ids)
-        if np.any(gone):
-            self.cursor -= int(np.count_nonzero(gone[:self.cursor]))
-            self.table.select(np.flatnonzero(~gone))
-
-    def some(self) -> IntArray:
+    def _some(self) -> IntArray:
         """Return the indices of the newest ones and, in turn, of some older ones."""
         size = len(self)
         begin = max(size - TUNING.window, 0)
         if begin == 0:
             return np.arange(size)
-        older = (self.cursor + np.arange(min(TUNING.window, begin))) % begin
-        self.cursor = int(older[-1] + 1) % begin
+        older = (self._cursor + np.arange(min(TUNING.window, begin))) % begin
+        self._cursor = int(older[-1] + 1) % begin
         return np.concatenate((older, np.arange(begin, size)))
 
-    def changes(
+    def changes(self, graph: Graph) -> Mapping[int, float]:
+        """Return new weights of some factors, by id, where they change, for the next update."""
+        return self._changes(graph, self._some(), least=TUNING.least_change)
+
+    def changes_of_part(self, graph: Graph, begin: int) -> Mapping[int, float]:
+        """Return new weights for a refinement, of the factors from an index on."""
+        size = len(self)
+        part = (begin + np.arange(min(TUNING.part, size))) % max(size, 1)
+        return self._changes(graph, part, least=TUNING.least_refined)
+
+    def all_changes(self, graph: Graph, widened: float = 1.0) -> Mapping[int, float]:
+        """Return the new weights of all factors whose weight changes."""
+        return self._changes(graph, np.arange(len(self)), widened=widened)
+
+    def all_alike(self, weight: float) -> Mapping[int, float]:
+        """Return the base weights of all times a weight; 1 makes it plain least squares."""
+        return dict(zip(self['id'].tolist(), (weight * self['base']).tolist(), strict=True))
+
+    def _changes(
         self, graph: Graph, index: IntArray, *, least: float = 0.0, widened: float = 1.0,
     ) -> Mapping[int, float]:
-        """Return the new weights of indexed constraints that change by more than `least`."""
+        """Return the new weights of indexed factors that change by more than `least`."""
         if len(index) == 0:
             return {}
         ids = self['id'][index]
-        energy, weight = self.energies(graph, ids)
+        energy, weight = _energies(graph, ids)
         wanted = np.empty(len(index))
-        for loss, threshold, chosen in self.groups(index):
+        for loss, threshold, chosen in self._groups(index):
             _, wanted[chosen] = costs_and_weights(loss, energy[chosen], widened * threshold)
         wanted *= self['base'][index]
         changed = np.abs(wanted - weight) > least * np.minimum(wanted, weight)
         return dict(zip(ids[changed].tolist(), wanted[changed].tolist(), strict=True))
 
-    def groups(self, index: IntArray) -> list[tuple[Loss, float, IntArray]]:
+    def _groups(self, index: IntArray) -> list[tuple[Loss, float, IntArray]]:
         """Return each pair of loss and threshold with the positions in `index` that have it."""
         kinds, which = np.unique(
-            self.table.values[['loss', 'threshold']][index], return_inverse=True)
+            self._table.values[['loss', 'threshold']][index], return_inverse=True)
         return [(_LOSSES[kind], threshold, np.flatnonzero(which == k))
                 for k, (kind, threshold) in enumerate(kinds.tolist())]
-
-    def energies(self, graph: Graph, ids: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return unweighted energies and weights of constraints."""
-        some: Edges | ObservedNodes
-        if self._edges:
-            some = graph.edges_at(ids)
-            errors = graph.edge_errors(some)
-        else:
-            some = graph.observed_at(ids)
-            errors = graph.observed_errors(some)
-        return energies(errors, some.information), some.weight
-
-
-class Reweighting:
-    """Computes the weights of constraints with a robust loss."""
-
-    def __init__(self) -> None:
-        self._edges, self._observed = self._tables = _Rows(edges=True), _Rows(edges=False)
-
-    def __len__(self) -> int:
-        return sum(map(len, self._tables))
-
-    def forget(self, edges: IntArray, observed: IntArray) -> None:
-        """Forget constraints that have left the graph."""
-        self._edges.forget(edges)
-        self._observed.forget(observed)
-
-    def _table(self, *, edge: bool) -> _Rows:
-        return self._edges if edge else self._observed
-
-    def add(self, number: int, loss: Loss, threshold: float, *, edge: bool) -> None:
-        """
-        Add an edge or an observed node with the base weight 1; one without a loss is ignored.
-
-        Its id must be above those of its kind that were added before.
-        """
-        if loss is not Loss.NONE:
-            self._table(edge=edge).table.append_one((number, _LOSSES.index(loss), threshold, 1.0))
-
-    def move(self, number: int, to: int, *, edge: bool, to_edge: bool) -> None:
-        """
-        Give the loss and the base weight of a constraint to another one that replaces it.
-
-        The base weight of the old one becomes 0. Nothing happens if it has no loss.
-        """
-        old, new = self._table(edge=edge), self._table(edge=to_edge)
-        at, at_new = old.index(number), new.index(to)
-        if at < 0:
-            return
-        if at_new < 0:
-            at_new = len(new)
-            new.table.append_one((to, old['loss'][at], old['threshold'][at], 0.0))
-        new['base'][at_new] = old['base'][at]
-        old['base'][at] = 0.0
-
-    def scale_base_weights(self, ids: IntArray, factor: float) -> None:
-        """Multiply the base weights of edges, where they have a loss."""
-        self._edges['base'][np.isin(self._edges['id'], ids)] *= factor
-
-    def knows(self, number: int, *, edge: bool) -> bool:
-        """Tell whether a constraint has a loss."""
-        return self._table(edge=edge).index(number) >= 0
-
-    def base_weight(self, number: int) -> float | None:
-        """Return the base weight of an observed node, by its id; None without a loss."""
-        at = self._observed.index(number)
-        return float(self._observed['base'][at]) if at >= 0 else None
-
-    def set_base_weight(self, number: int, weight: float, *, edge: bool = False) -> None:
-        """Set the base weight of a constraint, if it was added."""
-        table = self._table(edge=edge)
-        at = table.index(number)
-        if at >= 0:
-            table['base'][at] = weight
-
-    def base_weights(self) -> tuple[FloatArray, FloatArray]:
-        """Return copies of the base weights of edges and of observed nodes."""
-        edges, observed = (table['base'].copy() for table in self._tables)
-        return edges, observed
-
-    def set_base_weights(self, weights: tuple[FloatArray, FloatArray]) -> None:
-        """Set what `base_weights` has returned; nothing may have been added in between."""
-        for table, values in zip(self._tables, weights, strict=True):
-            table['base'][:] = values
-
-    def saved(self) -> tuple[SavedLosses, SavedLosses]:
-        """Return the state of the edges and of the observed nodes."""
-        return self._edges.saved(), self._observed.saved()
-
-    def restore(self, edges: SavedLosses, observed: SavedLosses) -> None:
-        """Restore what `saved` returned; nothing may have been added before."""
-        self._edges.restore(edges)
-        self._observed.restore(observed)
-
-    def _each(self, changes: Callable[[_Rows], Mapping[int, float]]) -> Changes:
-        return changes(self._edges), changes(self._observed)
-
-    def changes(self, graph: Graph) -> Changes:
-        """Return new weights of some constraints, where they change, for the next update."""
-        return self._each(
-            lambda table: table.changes(graph, table.some(), least=TUNING.least_change))
-
-    def changes_of_part(self, graph: Graph, begin: int) -> Changes:
-        """Return new weights for a refinement, of the constraints from an index on."""
-        def of(table: _Rows) -> Mapping[int, float]:
-            size = len(table)
-            part = (begin + np.arange(min(TUNING.part, size))) % max(size, 1)
-            return table.changes(graph, part, least=TUNING.least_refined)
-
-        return self._each(of)
-
-    def all_changes(self, graph: Graph, widened: float = 1.0) -> Changes:
-        """Return the new weights of all constraints whose weight changes."""
-        return self._each(lambda table: table.changes(
-            graph, np.arange(len(table)), widened=widened))
-
-    def all_alike(self, weight: float) -> Changes:
-        """Return the base weights of all times a weight; 1 makes it plain least squares."""
-        return self._each(lambda table: dict(zip(
-            table['id'].tolist(), (weight * table['base']).tolist(), strict=True)))
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""
         total = 0.0
-        for table in self._tables:
-            energy, weight = table.energies(graph, table['id'])
-            for loss, threshold, chosen in table.groups(np.arange(len(table))):
-                costs, _ = costs_and_weights(loss, energy[chosen], threshold)
-                total += float(np.sum(table['base'][chosen] * costs
-                                      - weight[chosen] * energy[chosen]))
+        energy, weight = _energies(graph, self['id'])
+        for loss, threshold, chosen in self._groups(np.arange(len(self))):
+            costs, _ = costs_and_weights(loss, energy[chosen], threshold)
+            total += float(np.sum(self['base'][chosen] * costs
+                                  - weight[chosen] * energy[chosen]))
         return total
+
+
+def _energies(graph: Graph, ids: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return unweighted energies and weights of factors."""
+    some = graph.factors_at(ids)
+    return energies(graph.errors(some), some.information), some.weight

@@ -14,15 +14,14 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors, tables as tb
-from pose_graph_ros.core.graph.constraints import FACTORS, NodeKind, ObservedKind
+from pose_graph_ros.core.graph.constraints import FACTORS, NodeKind
 
-# By kind of edges: bits of the kinds of nodes (1 << kind) that its ends may be, END_K also none,
-# and of the rows that its error has.
+# By kind of factors: bits of the kinds of nodes (1 << kind) that its ends may be, END_J also none
+# where it has one end, END_K also none, and of the rows that its error has.
 _NO_NODE = len(NodeKind)
-_ENDS = np.array([[sum(1 << kind for kind in kinds) for kinds in (factor.i, factor.j, (
-    *factor.k, _NO_NODE))] for factor in FACTORS.values()])
+_ENDS = np.array([[sum(1 << kind for kind in kinds) for kinds in (
+    factor.i, factor.j or (_NO_NODE,), (*factor.k, _NO_NODE))] for factor in FACTORS.values()])
 _ROWS = np.array([sum(1 << row for row in factor.rows) for factor in FACTORS.values()])
-_OBSERVED_KINDS = tuple(map(int, ObservedKind))
 
 
 @kernel
@@ -54,12 +53,9 @@ def node_row(head, node):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def entry_of(head, number, is_edge):  # type: ignore[no-untyped-def]
-    """Return the entry of an edge or an observed node that is in the graph, by its id."""
-    if is_edge:
-        return _row(number, tb.edge_id(head), head[tb.N_EDGES], head[tb.NEXT_EDGE])
-    return -1 - _row(
-        number, tb.observed_id(head), head[tb.N_OBSERVED], head[tb.NEXT_OBSERVED])
+def factor_row(head, number):  # type: ignore[no-untyped-def]
+    """Return the row of a factor that is in the graph, by its id."""
+    return _row(number, tb.factor_id(head), head[tb.N_FACTORS], head[tb.NEXT_FACTOR])
 
 
 @kernel
@@ -83,19 +79,20 @@ def add_to_scale(head, v, position, heading):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def scale_by(head, entry, weight):  # type: ignore[no-untyped-def]
-    """Add the information of a constraint with a weight to the diagonal scales of its ends."""
-    f, kind, i, j, k = factors.parts(head, entry)
+def scale_by(head, e, weight):  # type: ignore[no-untyped-def]
+    """Add the information of a factor with a weight to the diagonal scales of its ends."""
+    f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
     position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
     heading = weight * f[tb.INFO + 5]
     # of a relative error the length of the mean, of others that of the offset
     arm2 = f[tb.OWN] * f[tb.OWN] + f[tb.OWN + 1] * f[tb.OWN + 1]
-    add_to_scale(head, i, position, heading + position * arm2)
-    if entry >= 0:
-        ft, fth = factors.factors_of_end(f, kind)
-        add_to_scale(head, j, ft * ft * position, fth * fth * heading)
-    if k >= 0:
-        add_to_scale(head, k, heading * (f[tb.FACTOR_TH] * f[tb.FACTOR_TH]), 0.0)
+    add_to_scale(head, row[tb.END_I], position, heading + position * arm2)
+    if row[tb.END_J] >= 0:
+        ft, fth = factors.factors_of_end(f, row[tb.FACTOR_KIND])
+        add_to_scale(head, row[tb.END_J], ft * ft * position, fth * fth * heading)
+    if row[tb.END_K] >= 0:
+        third = heading * (f[tb.BIAS_TH] * f[tb.BIAS_TH])
+        add_to_scale(head, row[tb.END_K], third, 0.0)
 
 
 # --- new rows -----------------------------------------------------------------------------------
@@ -109,7 +106,7 @@ def _is_finite(x):  # type: ignore[no-untyped-def]
 @kernel
 def _pack_information(to, w):  # type: ignore[no-untyped-def]
     """
-    Write the upper triangle of an information matrix to a row of edge_f or observed_f.
+    Write the upper triangle of an information matrix to a row of factor_f.
 
     Return whether the matrix is finite, symmetric, positive semidefinite and not zero.
     """
@@ -153,10 +150,10 @@ def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_row(head, entry, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
-    """Write a constraint; return whether it is valid, its nodes, kind and offset apart."""
-    f, row = factors.rows_of(head, entry)
-    row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.EDGE_KIND] = i, j, -1, kind
+def write_row(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
+    """Write a factor; return whether it is valid, its nodes, kind and constants apart."""
+    f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
+    row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.FACTOR_KIND] = i, j, -1, kind
     f[tb.WEIGHT] = weight
     valid = _is_finite(weight) and weight >= 0.0 and i != j
     return write_measurement(f, mean, information) and valid
@@ -196,34 +193,25 @@ def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_rows(head, of_edges, n_nodes, first_other, types, columns):  # type: ignore[no-untyped-def]
+def write_rows(head, n_nodes, first_other, types, columns):  # type: ignore[no-untyped-def]
     """
-    Write new constraints, columns of `Edges`, behind the last row; return whether all are valid.
+    Write new factors, columns of `Factors`, behind the last row; return whether all are valid.
 
-    Observed nodes are edges to -1, with their own kinds. The graph will have n_nodes nodes, those
-    from row `first_other` on with these NODE_TYPEs.
+    The graph will have n_nodes nodes, those from row `first_other` on with these NODE_TYPEs.
     """
-    i, j, mean, information, kind, weight, bias, third = columns
+    i, j, mean, information, kind, weight, constants, third = columns
     valid = True
     for k in range(len(i)):
-        entry = head[tb.N_EDGES] + k if of_edges else -1 - head[tb.N_OBSERVED] - k
-        a, b, c = node_row(head, i[k]), node_row(head, j[k]), node_row(head, third[k])
-        valid = write_row(
-            head, entry, a, b, mean[k], information[k], kind[k], weight[k]) and valid
-        f, row = factors.rows_of(head, entry)
+        e = head[tb.N_FACTORS] + k
+        a, b, c = node_row(head, i[k]), _end_row(head, j[k]), _end_row(head, third[k])
+        valid = write_row(head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
+        f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
         row[tb.END_K] = c
-        f[tb.OFFSET], f[tb.OFFSET + 1] = bias[k, 0], bias[k, 1]
-        f[tb.FACTOR_T], f[tb.FACTOR_TH] = bias[k, 2], bias[k, 3]
         for m in range(4):
-            valid = _is_finite(bias[k, m]) and valid
-        valid = (valid and 0 <= a < n_nodes and b < n_nodes and c < n_nodes
-                 and (c >= 0 or third[k] == -1))
-        if not of_edges:
-            dimension = _node(head, a, first_other, types)[1] if valid else 0
-            valid = valid and kind[k] in _OBSERVED_KINDS and (
-                dimension == 3 or _has_rows_only(f, (1 << dimension) - 1, False))
-            continue
-        valid = valid and b >= 0 and kind[k] < len(_ROWS)
+            f[tb.OFFSET + m] = constants[k, m]
+            valid = _is_finite(constants[k, m]) and valid
+        valid = (valid and 0 <= a < n_nodes and -1 <= b < n_nodes and -1 <= c < n_nodes
+                 and kind[k] < len(_ROWS))
         if valid:
             ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
                     _node(head, c, first_other, types))
@@ -232,6 +220,17 @@ def write_rows(head, of_edges, n_nodes, first_other, types, columns):  # type: i
             if kind[k] == factors.BIAS:     # of the rows that both nodes have
                 valid = valid and _has_rows_only(
                     f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
+            elif kind[k] >= factors.OBSERVED:
+                valid = valid and _has_rows_only(f, (1 << ends[0][1]) - 1, False)
             elif kind[k] > factors.BIAS:
                 valid = valid and _has_rows_only(f, _ROWS[kind[k]], True)
     return valid
+
+
+@kernel
+def _end_row(head, node):  # type: ignore[no-untyped-def]
+    """Return the row of a node that is an end; -1 for none, -2 if it is not in the graph."""
+    if node == -1:
+        return -1
+    row = node_row(head, node)
+    return row if row >= 0 else -2

@@ -3,7 +3,7 @@
 """
 The memory of the engine: flat tables that grow, and how kernels access them.
 
-Nodes, edges, observed nodes and cliques are rows of 2-D arrays, one of floats (`node_f`) and one
+Nodes, factors and cliques are rows of 2-D arrays, one of floats (`node_f`) and one
 of integers (`node_i`) each, so that what a step needs of a row lies on two or three cache lines.
 The values of a clique (its rows of R and its update matrix) lie in one pool, its list of nodes in
 another.
@@ -48,9 +48,9 @@ HEAD = INTEGERS     # the type of the head, in signatures of kernels
 POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10, 11, 12, 15
 # node_i
 #   CLIQUE: row of the clique that the node is frontal in
-#   EDGE_LIST: head of the list of its edges with a weight above 0; an entry is 4 * edge + side
-#       (0: END_I, 1: END_J, 2: END_K); LEAVES if `removal.compact` takes the node out later
-#   OBSERVED_LIST: head of the list of its observed nodes with a weight above 0
+#   FACTOR_LIST: head of the list of its factors with a weight above 0; an entry is
+#       4 * factor + side (0: END_I, 1: END_J, 2: END_K); LEAVES if `removal.compact` takes the
+#       node out later
 #   FIXED: 1 if the node keeps its pose
 #   TOUCHED: 1 if the node is in the table `touched`
 #   INDEX: place of the node in the present front; work space
@@ -60,48 +60,40 @@ POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10,
 #       before SCALE_T alone
 #   NODE_TYPE: `NodeKind` + 4 * number of coordinates less than three, which are and stay 0; so 0
 #       for a pose
-(CLIQUE, EDGE_LIST, OBSERVED_LIST, FIXED, TOUCHED, INDEX, FRONT, CHANGED, NODE_LOGGED,
- SOLUTION_LOGGED, NODE_TYPE, NODE_I) = range(12)
+(CLIQUE, FACTOR_LIST, FIXED, TOUCHED, INDEX, FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED,
+ NODE_TYPE, NODE_I) = range(11)
 
-# edge_f; th is the DELTA of a heading, and "linearized" means at the last linearization.
-#   MEAN (3): measured pose of j in i [m, m, rad]
+# factor_f; th is the DELTA of a heading, and "linearized" means at the last linearization.
+#   MEAN (3): measured pose of j in i, or of i in the map [m, m, rad]
 #   INFO (6): information xx, xy, xt, yy, yt, tt [1/m^2, 1/(m rad), 1/rad^2]
-#   WEIGHT: factor on the information, 0 for a removed edge
+#   WEIGHT: what the information is multiplied by, 0 for a removed factor
 #   OWN (2): translation of the mean in its own axes, R_z^T t_z [m], or the column OFFSET
-#   OFFSET: measured position in the frame of i [m], where an error has one
+#   OFFSET (2, 3 with one end): measured position, or pose, in the frame of i [m, m, rad], where an
+#       error has one; its heading shares the column of LIN_COS
 #   LIN_COS, LIN_SIN: of the linearized frame of the error, where it moves with the nodes
-#   FACTOR_T, FACTOR_TH: factors of a bias that is the end j; FACTOR_TH: of the third node; share
-#       the columns of LIN_COS and LIN_SIN
+#   BIAS_T, BIAS_TH: what a bias that is the end j is multiplied by; BIAS_TH: of the third node;
+#       share the columns of LIN_COS and LIN_SIN
 #   LIN_ARM (2): linearized arm of the Jacobian [m]
 #   LIN_TH: linearized th of i [rad]
 #   LIN_K: linearized heading error without th of the nodes [rad]
 #   ERROR2: squared linearization error, weighted [sigma^2]
 #   ENERGY: e^T information e, weighted [sigma^2]
-(MEAN, INFO, WEIGHT, OWN, LIN_COS, LIN_SIN, LIN_ARM, LIN_TH, LIN_K, ERROR2, ENERGY, EDGE_F) = (
+(MEAN, INFO, WEIGHT, OWN, LIN_COS, LIN_SIN, LIN_ARM, LIN_TH, LIN_K, ERROR2, ENERGY, FACTOR_F) = (
     0, 3, 9, 10, 12, 13, 14, 16, 17, 18, 19, 20)
-OFFSET, FACTOR_T, FACTOR_TH = OWN, LIN_COS, LIN_SIN
-# edge_i
-#   END_I, END_J: nodes that the edge starts from and leads to
+OFFSET, BIAS_T, BIAS_TH = OWN, LIN_COS, LIN_SIN
+# factor_i
+#   END_I, END_J: nodes that it starts from and leads to; END_J: -1 for one end, in the map
 #   END_K: third node, or -1
-#   NEXT_I, NEXT_J, NEXT_K: next entries of the edge lists of END_I, END_J and END_K; NEXT_I:
-#       LEAVES if `removal.compact` takes the edge out, as it does all edges of nodes that leave
-#   EDGE_KIND: `EdgeKind`
-#   EDGE_CHECKED: stamp (ITERATION) of the last check of the linearization
-#   EDGE_WAITS: 1 if the edge is in the table `waiting`
-#   EDGE_LOGGED, ENERGY_LOGGED: stamps (UPDATE) of the last log of the row, and of ERROR2, ENERGY
-#       and EDGE_WAITS alone
-#   OWNER: row of the clique that the edge was assembled in
-(END_I, END_J, END_K, NEXT_I, NEXT_J, NEXT_K, EDGE_KIND, EDGE_CHECKED, EDGE_WAITS, EDGE_LOGGED,
- ENERGY_LOGGED, OWNER, EDGE_I) = range(13)
-
-# observed_f has the columns of edge_f, with the observed pose in the map for a mean, and
-#   OFFSET (3): pose of the observed frame in the hidden node [m, m, rad]; it has no LIN_COS
-OBS_F = EDGE_F
-# observed_i has the columns of edge_i: the observed node is the only end, and
-#   OBS_NEXT: next row of its list of observed nodes
-#   OBS_KIND: `ObservedKind`
-OBS_NODE, OBS_NEXT, OBS_KIND, OBS_WAITS, OBS_LOGGED, OBS_I = (
-    END_I, NEXT_I, EDGE_KIND, EDGE_WAITS, EDGE_LOGGED, EDGE_I)
+#   NEXT_I, NEXT_J, NEXT_K: next entries of the lists of END_I, END_J and END_K; NEXT_I: LEAVES if
+#       `removal.compact` takes the factor out, as it does all factors of nodes that leave
+#   FACTOR_KIND: `FactorKind`
+#   FACTOR_CHECKED: stamp (ITERATION) of the last check of the linearization
+#   FACTOR_WAITS: 1 if the factor is in the table `waiting`
+#   FACTOR_LOGGED, ENERGY_LOGGED: stamps (UPDATE) of the last log of the row, and of ERROR2, ENERGY
+#       and FACTOR_WAITS alone
+#   OWNER: row of the clique that the factor was assembled in
+(END_I, END_J, END_K, NEXT_I, NEXT_J, NEXT_K, FACTOR_KIND, FACTOR_CHECKED, FACTOR_WAITS,
+ FACTOR_LOGGED, ENERGY_LOGGED, OWNER, FACTOR_I) = range(13)
 # In place of a list's head or next entry: the row leaves the graph, and is in no list.
 LEAVES = -2
 
@@ -117,8 +109,8 @@ LEAVES = -2
 #   BUILT: stamp (ITERATION) of the last elimination or solution
 #   BORN, VALUES_BORN, CLIQUE_LOGGED: stamps (UPDATE) of taking the row, of taking the values, and
 #       of the last log of the row
-#   ANCHORED: 1 if a node at or below it is fixed, observed or has an edge to a node that is no
-#       pose
+#   ANCHORED: 1 if a node at or below it is fixed or has a factor whose axes do not turn with
+#       its clique
 (PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
  CLIQUE_LOGGED, ANCHORED, CLIQUE_I) = range(14)
 # clique_f; see `clique_frames`.
@@ -135,24 +127,24 @@ TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, CLIQUE_F = range(6)
 TURN, PRIOR_ENERGY = SLIP_ERROR2, TURN_ZERO
 
 # Tables by name, with their numbers of columns. Those with one column are 1-D:
-#   node_id, edge_id, observed_id: ids of the rows, ascending
+#   node_id, factor_id: ids of the rows, ascending
 #   pool_f, pool_i: values and node lists of cliques
 #   log_f, log_i: transaction log
 #   work_f, work_i: work space of kernels
 #   scalars: sums and settings
 #   touched: nodes to eliminate again in the next iteration
 #   freed: pairs (clique, index in pool_f) to release on commit; index -1: the whole clique
-#   waiting: constraints to relinearize, e for an edge, -1 - k for an observed node
-FLOAT_TABLES: Final = {'node_f': NODE_F, 'edge_f': EDGE_F, 'observed_f': OBS_F, 'pool_f': 1,
-                       'log_f': 1, 'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
-INT_TABLES: Final = {'node_i': NODE_I, 'edge_i': EDGE_I, 'observed_i': OBS_I,
-                     'clique_i': CLIQUE_I, 'pool_i': 1, 'log_i': 1, 'work_i': 1, 'touched': 1,
-                     'freed': 1, 'waiting': 1, 'node_id': 1, 'edge_id': 1, 'observed_id': 1}
+#   waiting: factors to relinearize
+FLOAT_TABLES: Final = {'node_f': NODE_F, 'factor_f': FACTOR_F, 'pool_f': 1, 'log_f': 1,
+                       'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
+INT_TABLES: Final = {'node_i': NODE_I, 'factor_i': FACTOR_I, 'clique_i': CLIQUE_I, 'pool_i': 1,
+                     'log_i': 1, 'work_i': 1, 'touched': 1, 'freed': 1, 'waiting': 1,
+                     'node_id': 1, 'factor_id': 1}
 NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
 
-#   N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES: rows in use; of cliques, unused rows included
+#   N_NODES, N_FACTORS, N_CLIQUES: rows in use; of cliques, unused rows included
 #   FREE_CLIQUE: first unused row of the cliques
 #   POOL_F_END, POOL_I_END: ends of what has ever been taken from the pools
 #   N_TOUCHED, N_FREED, N_WAITING: numbers of entries of `touched`, `freed` and `waiting`
@@ -166,23 +158,23 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #   N_ROOTS: number of root cliques that back-substitution begins with
 #   N_CHECKS, N_CHANGED, N_TURNED: numbers of nodes with constraints to check, of nodes that moved
 #       by more than alpha sigmas, and of cliques whose frames turned; their lists are in work_i
-#   NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM: capacity of all tables in nodes, edges and observed nodes
+#   NODE_ROOM, FACTOR_ROOM: capacity of all tables in nodes and factors
 #   NEWEST: newest node that is a pose, or -1
 #   SINCE: first stamp BUILT of the cliques that back-substitution has to solve for
 #   REFINED: first ITERATION after the last refinement; cliques BUILT before it are at the optimum
 #   LISTED: UPDATE that has listed all that the next iteration of a refinement linearizes again
 #   ROUND: number of iterations of the refinement so far
 #   INTERRUPT: set to 1 by another thread to end a refinement
-#   NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED: ids of the next new rows
+#   NEXT_NODE, NEXT_FACTOR: ids of the next new rows
 #   N_LEAVING: number of rows that `removal.compact` takes out after the update, without those that
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
-(N_NODES, N_EDGES, N_OBSERVED, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
+(N_NODES, N_FACTORS, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
  N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
- N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, EDGE_ROOM, OBSERVED_ROOM, NEWEST, SINCE, REFINED,
- LISTED, ROUND, INTERRUPT, NEXT_NODE, NEXT_EDGE, NEXT_OBSERVED, N_LEAVING, N_PRIORS, LOOSE,
- COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 44)
+ N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, NEWEST, SINCE, REFINED, LISTED, ROUND,
+ INTERRUPT, NEXT_NODE, NEXT_FACTOR, N_LEAVING, N_PRIORS, LOOSE, COUNTERS_END) = range(
+     2 * len(NAMES), 2 * len(NAMES) + 41)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -211,8 +203,7 @@ LAST_STAMP: Final = 2**30
 COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LISTED)
 STAMPS: Final = {
     'node_i': (FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED),
-    'edge_i': (EDGE_CHECKED, EDGE_LOGGED, ENERGY_LOGGED),
-    'observed_i': (EDGE_CHECKED, EDGE_LOGGED, ENERGY_LOGGED),
+    'factor_i': (FACTOR_CHECKED, FACTOR_LOGGED, ENERGY_LOGGED),
     'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_LOGGED),
 }
 
@@ -252,16 +243,14 @@ def _table(name: str) -> Callable[[Any], Any]:
 
 
 node_f = _table('node_f')
-edge_f = _table('edge_f')
-observed_f = _table('observed_f')
+factor_f = _table('factor_f')
 pool_f = _table('pool_f')
 log_f = _table('log_f')
 work_f = _table('work_f')
 scalars = _table('scalars')
 clique_f = _table('clique_f')
 node_i = _table('node_i')
-edge_i = _table('edge_i')
-observed_i = _table('observed_i')
+factor_i = _table('factor_i')
 clique_i = _table('clique_i')
 pool_i = _table('pool_i')
 log_i = _table('log_i')
@@ -270,8 +259,7 @@ touched = _table('touched')
 freed = _table('freed')
 waiting = _table('waiting')
 node_id = _table('node_id')
-edge_id = _table('edge_id')
-observed_id = _table('observed_id')
+factor_id = _table('factor_id')
 
 
 def _pages(shape: int | tuple[int, int], dtype: type[np.generic]) -> npt.NDArray[Any]:

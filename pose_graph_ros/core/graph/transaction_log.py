@@ -12,18 +12,16 @@ the update began.
 
 from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.graph import pools, tables as tb
-from pose_graph_ros.core.graph.factors import rows_of
 
-# Kinds of entries of the log; an entry ends with its row (of constraints the entry, see `factors`;
-# none of START) and its kind in log_i.
-NODE, CONSTRAINT, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
+# Kinds of entries of the log; an entry ends with its row (none of START) and its kind in log_i.
+NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
 # Numbers of floats and of integers in the entries of each kind, but for START.
-_FLOATS = (tb.NODE_F, tb.EDGE_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
-_INTEGERS = (tb.NODE_I, tb.EDGE_I, tb.CLIQUE_I, 0, 0, 1)
+_FLOATS = (tb.NODE_F, tb.FACTOR_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
+_INTEGERS = (tb.NODE_I, tb.FACTOR_I, tb.CLIQUE_I, 0, 0, 1)
 # Counters in the first entry.
 STARTED_WITH = (
-    tb.N_NODES, tb.N_EDGES, tb.N_OBSERVED, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST,
-    tb.NEXT_NODE, tb.NEXT_EDGE, tb.NEXT_OBSERVED, tb.N_LEAVING, tb.N_PRIORS, tb.LOOSE)
+    tb.N_NODES, tb.N_FACTORS, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST, tb.NEXT_NODE,
+    tb.NEXT_FACTOR, tb.N_LEAVING, tb.N_PRIORS, tb.LOOSE)
 
 
 @kernel
@@ -69,19 +67,18 @@ def log_solution(head, v):  # type: ignore[no-untyped-def]
 
 @kernel
 def log_energy(head, e):  # type: ignore[no-untyped-def]
-    """Log the linearization error and the energy of an edge, before they change."""
-    row = tb.edge_i(head)[e]
-    if row[tb.EDGE_LOGGED] != head[tb.UPDATE] and row[tb.ENERGY_LOGGED] != head[tb.UPDATE]:
+    """Log the linearization error and the energy of a factor, before they change."""
+    row = tb.factor_i(head)[e]
+    if row[tb.FACTOR_LOGGED] != head[tb.UPDATE] and row[tb.ENERGY_LOGGED] != head[tb.UPDATE]:
         row[tb.ENERGY_LOGGED] = head[tb.UPDATE]
-        _append(head, ENERGY, e, tb.edge_f(head)[e, tb.ERROR2:tb.ENERGY + 1],
-                row[tb.EDGE_WAITS:tb.EDGE_WAITS + 1])
+        _append(head, ENERGY, e, tb.factor_f(head)[e, tb.ERROR2:tb.ENERGY + 1],
+                row[tb.FACTOR_WAITS:tb.FACTOR_WAITS + 1])
 
 
 @kernel
-def log_constraint(head, entry):  # type: ignore[no-untyped-def]
-    """Log the row of a constraint, before it changes."""
-    f, row = rows_of(head, entry)
-    _log_row(head, CONSTRAINT, entry, f, row, tb.EDGE_LOGGED)
+def log_factor(head, e):  # type: ignore[no-untyped-def]
+    """Log the row of a factor, before it changes."""
+    _log_row(head, FACTOR, e, tb.factor_f(head)[e], tb.factor_i(head)[e], tb.FACTOR_LOGGED)
 
 
 @kernel
@@ -240,11 +237,11 @@ def rollback(head):  # type: ignore[no-untyped-def]
             numbers, integers = tb.node_f(head)[row], tb.node_i(head)[row]
         elif code == SOLUTION:
             numbers = tb.node_f(head)[row, :tb.SCALE_T]
-        elif code == CONSTRAINT:
-            numbers, integers = rows_of(head, row)
+        elif code == FACTOR:
+            numbers, integers = tb.factor_f(head)[row], tb.factor_i(head)[row]
         elif code == ENERGY:
-            numbers = tb.edge_f(head)[row, tb.ERROR2:tb.ENERGY + 1]
-            integers = tb.edge_i(head)[row, tb.EDGE_WAITS:tb.EDGE_WAITS + 1]
+            numbers = tb.factor_f(head)[row, tb.ERROR2:tb.ENERGY + 1]
+            integers = tb.factor_i(head)[row, tb.FACTOR_WAITS:tb.FACTOR_WAITS + 1]
         else:
             _restore_values(head, row, log_i[end_i + tb.VALUES])
             numbers, integers = tb.clique_f(head)[row], clique_i[row]

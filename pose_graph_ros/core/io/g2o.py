@@ -58,13 +58,10 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.checks import check, RowError, scaled
 from pose_graph_ros.core.graph.constraints import (
-    Constraints,
-    EdgeKind,
-    Edges,
+    FactorKind,
     FACTORS,
+    Factors,
     NodeKind,
-    ObservedKind,
-    ObservedNodes,
 )
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
 from pose_graph_ros.core.io.g2o_text import (
@@ -85,7 +82,7 @@ _TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 # Kinds of edges to landmarks, that tell where the other end is.
 _TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKind.LANDMARK,)]
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
-_POINT = OWN_TAGS[EdgeKind.POINT]
+_POINT = OWN_TAGS[FactorKind.POINT]
 _EDGES = ('EDGE_SE2', 'EDGE', *AMBIGUOUS, *OWN_TAGS.values())
 OBSERVED = ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET')
 
@@ -151,30 +148,29 @@ def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
     is_landmark = np.isin(ids, np.concatenate((
         points.ids[:, 0], *(rows[FACTORS[kind].tag].ids[:, 1] for kind in _TO_LANDMARKS))))
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
-    edges = _with_rows(Edges.joined(
-        [edges_of(tag, rows[tag], edge2_order) for tag in _EDGES]), ids)
-    observed = _with_rows(ObservedNodes.joined(
-        [observed_of(tag, rows[tag]) for tag in OBSERVED]), ids)
-    for table, tags in ((edges, _EDGES), (observed, OBSERVED)):
-        try:
-            check(table, kind)
-        except RowError as error:
-            line = np.concatenate([rows[tag].lines for tag in tags])[error.row]
-            raise FileFormatError(f'{text.where(line)}: {error}') from error
+    factors = Factors.joined([
+        _with_rows(Factors.joined(tables), ids, ends) for tables, ends in (
+            ([edges_of(tag, rows[tag], edge2_order) for tag in _EDGES], 'ij'),
+            ([observed_of(tag, rows[tag]) for tag in OBSERVED], 'i'))])
+    try:
+        check(factors, kind)
+    except RowError as error:
+        line = np.concatenate([rows[tag].lines for tag in (*_EDGES, *OBSERVED)])[error.row]
+        raise FileFormatError(f'{text.where(line)}: {error}') from error
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
     poses[known] = vertices.numbers[first]
     if not np.all(known):
-        compose_missing(poses, known, edges)
+        compose_missing(poses, known, factors)
         poses[is_landmark, 2] = 0.0
     if not np.all(np.isfinite(poses)):
         raise FileFormatError(f'{text.path}: poses composed from edges are not finite')
     fixed = _fixed(text, ids)
-    if not np.any(fixed) and len(observed) == 0:
+    if not np.any(fixed) and np.all(factors.j >= 0):
         fixed[np.argmin(is_landmark)] = True
     n = len(ids)
     graph = GraphRows(
-        se2.wrapped(poses), kind, fixed, edges, observed, np.arange(n), np.arange(len(edges)),
-        np.arange(len(observed)), NextIds(n, len(edges), len(observed)))
+        se2.wrapped(poses), kind, fixed, factors, np.arange(n), np.arange(len(factors)),
+        NextIds(n, len(factors)))
     return GraphFile(graph, ids, bool(len(given) == n), text.skipped, notes)
 
 
@@ -214,27 +210,27 @@ def _with_landmarks(
     return Lines.joined((rows[_POINT], Lines(ids, numbers, seen.lines))), notes
 
 
-def edges_of(tag: str, lines: Lines, edge2_order: str | None = None) -> Edges:
+def edges_of(tag: str, lines: Lines, edge2_order: str | None = None) -> Factors:
     """Return the edges of a tag; their ends are ids of the file."""
     i, j = lines.ids.T
     order = {'EDGE': 'toro'}.get(tag, edge2_order if tag in AMBIGUOUS else None)
     # the next id; a difference could overflow
-    kind = np.where(j == i + 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    kind = np.where(j == i + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     for own, own_tag in OWN_TAGS.items():
         if tag == own_tag:
             kind[:] = own
-    return Edges(i, j, *_measured(lines.numbers, order), kind)
+    return Factors(i, j, *_measured(lines.numbers, order), kind)
 
 
-def observed_of(tag: str, lines: Lines) -> ObservedNodes:
+def observed_of(tag: str, lines: Lines) -> Factors:
     """Return the observed nodes of a tag; their nodes are ids of the file."""
     numbers, offset = lines.numbers, None
     if tag == 'OBSERVED_SE2_OFFSET':
         offset, numbers = numbers[:, :3], numbers[:, 3:]
     mean, information = _measured(numbers)
     kind = np.where(
-        information[:, 2, 2] == 0.0, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE)
-    return ObservedNodes(lines.ids[:, 0], offset, mean, information, kind)
+        information[:, 2, 2] == 0.0, FactorKind.POSITION, FactorKind.GLOBAL_POSE)
+    return Factors.on(lines.ids[:, 0], offset, mean, information, kind)
 
 
 def _measured(numbers: FloatArray, order: str | None = None) -> tuple[FloatArray, FloatArray]:
@@ -250,21 +246,21 @@ def _measured(numbers: FloatArray, order: str | None = None) -> tuple[FloatArray
     return mean, matrix
 
 
-def _with_rows(table: Constraints, ids: IntArray) -> Constraints:
-    """Return constraints with rows in place of ids of the file, and headings wrapped."""
-    table = table.renumbered(lambda names: np.searchsorted(ids, names).astype(np.int64))
-    columns = {'mean': se2.wrapped(getattr(table, 'mean'))}  # noqa: B009
-    return replace(table, **columns)
+def _with_rows(table: Factors, ids: IntArray, ends: str) -> Factors:
+    """Return factors with rows in place of ids of the file, and headings wrapped."""
+    # these ids may be negative
+    columns = {end: np.searchsorted(ids, getattr(table, end)).astype(np.int64) for end in ends}
+    return replace(table, mean=se2.wrapped(table.mean), **columns)
 
 
-def compose_missing(poses: FloatArray, known: BoolArray, edges: Edges) -> None:
+def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> None:
     """
     Set the poses of the nodes that are not known by composing edges, breadth-first.
 
     In a part without any that is known, its first node stays.
     """
     neighbours: dict[int, list[tuple[int, list[float]]]] = {}
-    placing = edges.rows(np.isin(edges.kind, _PLACING))
+    placing = factors.rows(np.isin(factors.kind, _PLACING))
     for i, j, forward, backward, kind in zip(
             placing.i.tolist(), placing.j.tolist(), placing.mean.tolist(),
             se2.inverse(placing.mean).tolist(), placing.kind.tolist(), strict=True):
@@ -361,7 +357,7 @@ def read_guessed(path: Path) -> Guess:
 
 def _smallest(rows: GraphRows) -> float:
     """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
-    return float(np.min(np.linalg.eigvalsh(scaled(rows.edges.information)), initial=1.0))
+    return float(np.min(np.linalg.eigvalsh(scaled(rows.factors.edges.information)), initial=1.0))
 
 
 def _spread(rows: GraphRows) -> float:
@@ -373,6 +369,6 @@ def _spread(rows: GraphRows) -> float:
     copy = Graph()
     copy.fill(rows)
     optimize_from_linear_start(copy, SolverConfig())
-    energies = copy.energies().edges
+    energies = copy.energies().factors[rows.factors.j >= 0]
     median = float(np.median(energies))
     return float(np.mean(energies)) / median if median > 0.0 else np.inf

@@ -17,12 +17,12 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, FACTORS
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS
 
 # Tags with the format that the caller names, see `edge2_order`.
 AMBIGUOUS = ('EDGE2', 'ODOMETRY')
 # Tags of kinds of edges that have one of their own.
-OWN_TAGS: dict[EdgeKind, str] = {kind: factor.tag for kind, factor in FACTORS.items()
+OWN_TAGS: dict[FactorKind, str] = {kind: factor.tag for kind, factor in FACTORS.items()
                                  if factor.tag not in {'', 'EDGE_SE2'}}
 # Numbers of ids and of values behind each tag; FIX is followed by any number of ids.
 LAYOUT = {

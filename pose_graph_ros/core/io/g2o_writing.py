@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, FACTORS, ObservedNodes, upper
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, upper
 from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.graph.priors import model
 
@@ -39,18 +39,20 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     numbers of the hidden nodes, by default their ids.
     """
     ids = rows.node_ids if ids is None else ids
-    edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
+    factors = rows.factors.renumbered(rows.rows_of)
+    edges, observed = factors.edges, factors.observed
+    n_edges, n_observed = len(edges), len(observed)
     is_pose = rows.is_pose
     used = _is_used(observed, edges)
     lines = []
     if not np.all(is_pose):
-        used = used[~rows.is_bias[observed.node]]
+        used = used[~rows.is_bias[observed.i]]
         edges = edges.rows(np.isin(edges.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
-                           & ~np.any(edges.bias, axis=1))
-        observed = observed.rows(~rows.is_bias[observed.node])
-    if len(edges) < len(rows.edges) or np.any(rows.is_bias):
-        lines.append(f'# left out: {np.sum(rows.is_bias)} biases, {len(rows.edges) - len(edges)} '
-                     f'edges to them and {len(rows.observed) - len(observed)} observed ones')
+                           & ~np.any(edges.constants, axis=1))
+        observed = observed.rows(~rows.is_bias[observed.i])
+    if len(edges) < n_edges or np.any(rows.is_bias):
+        lines.append(f'# left out: {np.sum(rows.is_bias)} biases, {n_edges - len(edges)} '
+                     f'edges to them and {n_observed - len(observed)} observed ones')
     lines += [f'VERTEX_SE2 {name} {numbers}' for name, numbers in zip(
         ids[is_pose].tolist(), _texts(rows.poses[is_pose]), strict=True)]
     is_landmark = ~is_pose & ~rows.is_bias
@@ -64,29 +66,29 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
 
 
 def _lines_for_priors(rows: GraphRows, ids: IntArray) -> list[str]:
-    edges, observed = standing_for(rows)
-    edges, observed = edges.renumbered(rows.rows_of), observed.renumbered(rows.rows_of)
-    lines = [*_edge_lines(edges, ids),
+    factors = standing_for(rows).renumbered(rows.rows_of)
+    observed = factors.observed
+    lines = [*_edge_lines(factors.edges, ids),
              *_observed_lines(observed, ids, np.ones(len(observed), dtype=bool))]
     return [f'{STANDING_FOR_PRIORS}of which there are {len(rows.priors)}: {len(lines)} lines',
             *lines]
 
 
-def _is_used(observed: ObservedNodes, edges: Edges) -> BoolArray:
+def _is_used(observed: Factors, edges: Factors) -> BoolArray:
     """
     Return which measurements are used, shape (K,).
 
     One with a correlated error has weight 0; an edge from its node to a bias holds it instead.
     """
-    to_bias = edges.rows((edges.kind == EdgeKind.BIAS) & (edges.weight > 0.0))
+    to_bias = edges.rows((edges.kind == FactorKind.BIAS) & (edges.weight > 0.0))
     held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
     used = observed.weight > 0.0
     for k in np.flatnonzero(~used).tolist() if len(held) > 0 else ():
-        used[k] = (int(observed.node[k]), *observed.mean[k, :2].tolist()) in held
+        used[k] = (int(observed.i[k]), *observed.mean[k, :2].tolist()) in held
     return np.asarray(used)
 
 
-def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
+def _edge_lines(edges: Factors, ids: IntArray) -> list[str]:
     lines, triangles = np.empty(len(edges), dtype=object), upper(edges.information)
     for kind, factor in FACTORS.items():
         chosen = np.flatnonzero(edges.kind == kind)
@@ -100,9 +102,7 @@ def _edge_lines(edges: Edges, ids: IntArray) -> list[str]:
     return list(lines)
 
 
-def _observed_lines(
-    observed: ObservedNodes, ids: IntArray, used: BoolArray,
-) -> list[str]:
+def _observed_lines(observed: Factors, ids: IntArray, used: BoolArray) -> list[str]:
     triangles = upper(observed.information)
     moved = np.any(observed.offset != 0.0, axis=1)
     placed = np.all(observed.information[:, 2] == 0.0, axis=1) & (observed.mean[:, 2] == 0.0)
@@ -117,7 +117,7 @@ def _observed_lines(
     for tag, columns in numbers.items():
         rows = np.flatnonzero(tags == tag)
         lines[rows] = [f'{begin}{tag} {name} {text}' for begin, name, text in zip(
-            _begins(used[rows]), ids[observed.node[rows]].tolist(),
+            _begins(used[rows]), ids[observed.i[rows]].tolist(),
             _texts(np.hstack(columns)[rows]), strict=True)]
     return list(lines)
 
@@ -133,7 +133,7 @@ def _texts(rows: FloatArray) -> list[str]:
     return [repr(row)[1:-1].replace(',', '') for row in rows.tolist()]
 
 
-def standing_for(rows: GraphRows) -> tuple[Edges, ObservedNodes]:
+def standing_for(rows: GraphRows) -> Factors:
     """
     Return edges and observed nodes that tell no more of the poses than the priors of a graph.
 
@@ -144,7 +144,7 @@ def standing_for(rows: GraphRows) -> tuple[Edges, ObservedNodes]:
     from pose_graph_ros.core.marginalization.marginalize import schur_complement  # noqa: PLC0415
     from pose_graph_ros.core.marginalization.sparsification import sparsify  # noqa: PLC0415
 
-    edges, observed = [], []
+    factors = []
     for prior in rows.priors:
         at = rows.rows_of(prior.nodes)
         is_pose = rows.is_pose[at]
@@ -155,6 +155,5 @@ def standing_for(rows: GraphRows) -> tuple[Edges, ObservedNodes]:
             linear.information, -linear.gradient, np.repeat(~is_pose, 3))
         sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
                           anchored=prior.anchored)
-        edges.append(sparse.edges)
-        observed.append(sparse.observed)
-    return Edges.joined(edges), ObservedNodes.joined(observed)
+        factors.append(sparse.factors)
+    return Factors.joined(factors)

@@ -25,13 +25,11 @@ from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import (
-    EdgeKinds,
-    Edges,
+    FactorKinds,
     FACTORS,
+    Factors,
     full,
     NodeKind,
-    ObservedKinds,
-    ObservedNodes,
     upper,
 )
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
@@ -76,27 +74,22 @@ class SavedRows:
     fixed: Integers  # ids of the fixed hidden nodes
     biases: Integers  # ids of the hidden nodes that are no poses; poses are in the g2o file
     bias_values: Rows3
-    edge_kind: EdgeKinds  # of all edges; those of `IN_G2O` are in the g2o file, others here
-    edge_weight: Numbers
-    bias_edge_i: Integers
-    bias_edge_j: Integers
-    bias_edge_mean: Rows3
-    bias_edge_information: Rows6
-    bias_edge_bias: Rows4
-    observed_kind: ObservedKinds  # of all; those on biases are given here, others in the g2o file
-    observed_weight: Numbers
-    observed_on_bias: Integers  # rows of the observed nodes on biases
-    bias_observed_node: Integers
-    bias_observed_offset: Rows3
-    bias_observed_mean: Rows3
-    bias_observed_information: Rows6
+    factor_kind: FactorKinds  # of all factors
+    factor_weight: Numbers
+    # rows of the factors that are given here; edges of `IN_G2O` and observed nodes on no bias
+    # are in the g2o file
+    others: Integers
+    other_i: Integers
+    other_j: Integers
+    other_mean: Rows3
+    other_information: Rows6
+    other_constants: Rows4
+    other_k: Integers
     # ids of all, in order; None where they are 0, 1 and so on, without a gap
     node_ids: Integers | None = None
-    edge_ids: Integers | None = None
-    observed_ids: Integers | None = None
+    factor_ids: Integers | None = None
     next_ids: NextIds | None = None  # of the next new rows; None where they follow on the last
     priors: SavedPriors = field(default_factory=SavedPriors)
-    bias_edge_k: Integers | None = None  # third nodes of the edges given here, -1 without one
     bias_dimensions: Integers | None = None  # of `biases`; None if all have 3 coordinates
     landmarks: Integers | None = None  # ids of those of `biases` that are landmarks
 
@@ -230,21 +223,21 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:
-    edges = rows.edges.rows(~np.isin(rows.edges.kind, IN_G2O))
-    on_bias = np.flatnonzero(np.isin(rows.observed.node, rows.node_ids[rows.is_bias]))
-    observed, others = rows.observed.rows(on_bias), ~rows.is_pose
-    node_ids, edge_ids, observed_ids = (
+    factors, others = rows.factors, ~rows.is_pose
+    in_json = np.flatnonzero(np.where(
+        factors.j < 0, np.isin(factors.i, rows.node_ids[rows.is_bias]),
+        ~np.isin(factors.kind, IN_G2O)))
+    given = factors.rows(in_json)
+    node_ids, factor_ids = (
         None if len(ids) == end else ids for ids, end in zip(
-            (rows.node_ids, rows.edge_ids, rows.observed_ids), rows.next_ids, strict=True))
+            (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
     dimensions = None if rows.dimension is None else rows.dimension[others].astype(np.int64)
     landmarks = rows.node_ids[rows.node_kind == NodeKind.LANDMARK]
     return SavedRows(
         rows.node_ids[rows.fixed], rows.node_ids[others], rows.poses[others],
-        rows.edges.kind.astype(np.int64), rows.edges.weight, edges.i, edges.j, edges.mean,
-        upper(edges.information), edges.bias, rows.observed.kind.astype(np.int64),
-        rows.observed.weight, on_bias, observed.node, observed.offset, observed.mean,
-        upper(observed.information), node_ids, edge_ids, observed_ids, rows.next_ids,
-        _saved_priors(rows.priors), edges.k if np.any(edges.k >= 0) else None,
+        factors.kind.astype(np.int64), factors.weight, in_json, given.i, given.j, given.mean,
+        upper(given.information), given.constants, given.k, node_ids, factor_ids, rows.next_ids,
+        _saved_priors(rows.priors),
         None if dimensions is None or np.all(dimensions == 3) else dimensions,
         landmarks if len(landmarks) > 0 else None)
 
@@ -252,10 +245,9 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
 def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
     """Return the rows of a graph from both files."""
     vertices = text.rows['VERTEX_SE2']
-    n = len(vertices) + len(rows.biases), len(rows.edge_kind), len(rows.observed_kind)
-    node_ids, edge_ids, observed_ids = (
-        np.arange(size) if ids is None else ids for size, ids in zip(
-            n, (rows.node_ids, rows.edge_ids, rows.observed_ids), strict=True))
+    n = len(vertices) + len(rows.biases), len(rows.factor_kind)
+    node_ids, factor_ids = (np.arange(size) if ids is None else ids for size, ids in zip(
+        n, (rows.node_ids, rows.factor_ids), strict=True))
     is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
     poses = np.zeros((len(node_ids), 3))
     poses[is_pose], poses[~is_pose] = vertices.numbers, rows.bias_values
@@ -266,34 +258,26 @@ def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
     if rows.bias_dimensions is not None:
         dimension[~is_pose] = rows.bias_dimensions
     return GraphRows(
-        poses, kind, fixed, _edges(rows, text), _observed(rows, text), node_ids, edge_ids,
-        observed_ids, NextIds(*n) if rows.next_ids is None else rows.next_ids, dimension,
+        poses, kind, fixed, _factors(rows, text), node_ids, factor_ids,
+        NextIds(*n) if rows.next_ids is None else rows.next_ids, dimension,
         _restored_priors(rows.priors))
 
 
-def _edges(rows: SavedRows, text: GraphText) -> Edges:
-    in_json = Edges(
-        rows.bias_edge_i, rows.bias_edge_j, rows.bias_edge_mean, full(rows.bias_edge_information),
-        np.zeros(len(rows.bias_edge_i), np.uint8), None, rows.bias_edge_bias, rows.bias_edge_k)
-    both = Edges.joined((edges_of('EDGE_SE2', text.rows['EDGE_SE2']), in_json))
-    # those of the g2o file come first
-    order = np.argsort(np.argsort(~np.isin(rows.edge_kind, IN_G2O), kind='stable'))
-    return replace(both.rows(order), kind=rows.edge_kind.astype(np.uint8),
-                   weight=rows.edge_weight)
-
-
-def _observed(rows: SavedRows, text: GraphText) -> ObservedNodes:
-    in_json = ObservedNodes(
-        rows.bias_observed_node, rows.bias_observed_offset, rows.bias_observed_mean,
-        full(rows.bias_observed_information), np.zeros(len(rows.bias_observed_node), np.uint8))
-    both = ObservedNodes.joined([*(observed_of(tag, text.rows[tag]) for tag in OBSERVED), in_json])
-    row = np.arange(len(both))
-    in_g2o = np.argsort(np.concatenate([text.rows[tag].lines for tag in OBSERVED]))
-    order = np.empty(len(both), dtype=np.int64)
-    order[np.setdiff1d(row, rows.observed_on_bias)] = in_g2o
-    order[rows.observed_on_bias] = row[len(in_g2o):]
-    return replace(both.rows(order), kind=rows.observed_kind.astype(np.uint8),
-                   weight=rows.observed_weight)
+def _factors(rows: SavedRows, text: GraphText) -> Factors:
+    """Return the factors from both files."""
+    in_json = Factors(
+        rows.other_i, rows.other_j, rows.other_mean, full(rows.other_information),
+        np.zeros(len(rows.others), np.uint8), None, rows.other_constants, rows.other_k)
+    observed = Factors.joined([observed_of(tag, text.rows[tag]) for tag in OBSERVED])
+    lines = np.concatenate([text.rows[tag].lines for tag in OBSERVED])
+    table = Factors.joined([edges_of('EDGE_SE2', text.rows['EDGE_SE2']),
+                            observed.rows(np.argsort(lines)), in_json])
+    in_g2o, is_edge = np.ones(len(table), dtype=bool), np.isin(rows.factor_kind, IN_G2O)
+    in_g2o[rows.others] = False
+    place = np.concatenate((np.flatnonzero(is_edge), np.flatnonzero(in_g2o & ~is_edge),
+                            rows.others))
+    return replace(table.rows(np.argsort(place)), kind=rows.factor_kind.astype(np.uint8),
+                   weight=rows.factor_weight)
 
 
 def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:

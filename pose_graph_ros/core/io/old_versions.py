@@ -5,12 +5,13 @@ Saved graphs of older versions.
 
 Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has judgements. In
 version 3 the ids of hidden nodes are `rows`. In version 4 loop closures may have doubted odometry.
-Up to version 5 closures and fixes have columns of their own in judgements, and samples that wait
-are columns as well.
+Up to version 5 closures and fixes have columns of their own in judgements, samples that wait are
+columns as well, and edges and observed nodes have ids of their own; those of observed nodes follow
+here on those of the edges.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
 
@@ -24,6 +25,9 @@ NUMBERED = {
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
 TURN = ('source', 'i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate',
         'rest_variance')
+_EDGES_IN_G2O = ('odometry', 'loop_closure', 'prior')
+# Columns of the graph that version 5 has as well.
+_KEPT = ('fixed', 'biases', 'bias_values', 'node_ids', 'priors', 'bias_dimensions', 'landmarks')
 _NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
 _NOTHING: dict[str, Any] = {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
     'sources', 'scales', 'left', 'held', 'edge', 'observed', 'source', 'number', 'stamps_ns',
@@ -59,7 +63,7 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
                 gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
     if 3 <= version < 6:
         members['judgement'] = _judgement(**members['judgement'])
-    return members
+    return _with_one_table(members) if version < 6 else members
 
 
 def _list_samples(stream: dict[str, Any]) -> None:
@@ -113,3 +117,83 @@ def _common(old: dict[str, Any], left: list[list[int]]) -> dict[str, Any]:
         **{name: old[name] for name in ('sources', 'source', 'since_ns', 'decision', 'distance')},
         'held': old['rows'], 'left': left or [[0] * 4] * len(old['sources']),
         'number': old.get('numbers') or [next(counted[source]) for source in old['source']]}
+
+
+def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
+    """Return members in which edges and observed nodes have the same ids."""
+    rows = members['graph']
+    n_edges, n_observed = (len(rows[f'{name}_weight']) for name in ('edge', 'observed'))
+    end = rows.get('next_ids') or {
+        'node': None, 'edge': n_edges, 'observed': n_observed}
+    first = end['edge']
+
+    def moved(ids: list[int]) -> list[int]:
+        return [first + number if number >= 0 else number for number in ids]
+
+    edge_ids, observed_ids = (
+        rows.get(f'{name}_ids') or list(range(n))
+        for name, n in (('edge', n_edges), ('observed', n_observed)))
+    kinds = [rows['edge_kind']['names'][k] for k in rows['edge_kind']['of']]
+    given = [row for row, kind in enumerate(kinds) if kind not in {*_EDGES_IN_G2O}]
+    n_given, n_on_bias = len(given), len(rows['bias_observed_node'])
+    losses = members['observed_losses']
+    members = {name: members[name] for name in members
+               if name not in {'edge_losses', 'observed_losses'}} | {
+        'graph': {name: rows[name] for name in _KEPT if name in rows} | {
+            'factor_kind': _joined(rows['edge_kind'], _renamed(rows['observed_kind'])),
+            'factor_weight': rows['edge_weight'] + rows['observed_weight'],
+            'others': given + [n_edges + row for row in rows['observed_on_bias']],
+            'other_i': rows['bias_edge_i'] + rows['bias_observed_node'],
+            'other_j': rows['bias_edge_j'] + [-1] * n_on_bias,
+            'other_mean': rows['bias_edge_mean'] + rows['bias_observed_mean'],
+            'other_information':
+                rows['bias_edge_information'] + rows['bias_observed_information'],
+            'other_constants': rows['bias_edge_bias'] + [
+                [*offset, 0.0] for offset in rows['bias_observed_offset']],
+            'other_k': (rows.get('bias_edge_k') or [-1] * n_given) + [-1] * n_on_bias,
+            'factor_ids': edge_ids + moved(observed_ids)},
+        'losses': {
+            'losses': _joined(members['edge_losses']['losses'], losses['losses']),
+            'rows': members['edge_losses']['rows'] + moved(losses['rows']),
+            **{name: members['edge_losses'][name] + losses[name]
+               for name in ('thresholds', 'shares')}, 'cursor': 0},
+        'judgement': {**members['judgement'], **{
+            name: _with_ids(members['judgement'][name], moved) for name in ('closures', 'fixes')}},
+        'sources': {name: _of_source(source, moved)
+                    for name, source in members['sources'].items()}}
+    if end['node'] is not None:
+        members['graph']['next_ids'] = {'node': end['node'], 'factor': first + end['observed']}
+    return members
+
+
+def _with_ids(
+    table: dict[str, Any], moved: Callable[[list[int]], list[int]],
+) -> dict[str, Any]:
+    """Return the columns of judged constraints with the new ids of observed nodes."""
+    held = [number if is_edge else moved([number])[0]
+            for number, is_edge in zip(table['held'], table['edge'], strict=True)]
+    return {name: table[name] for name in table if name not in {'edge', 'observed'}} | {
+        'held': held, 'added': [number if seen < 0 else moved([seen])[0] for number, seen in zip(
+            held, table['observed'], strict=True)]}
+
+
+def _of_source(source: dict[str, Any], moved: Callable[[list[int]], list[int]]) -> dict[str, Any]:
+    """Return the saved state of a source with the new ids of its observed nodes."""
+    bins, stamps_and_ids = source['bins'], source['rows']
+    # with a given correlation time measurements are edges
+    if bins is None or source.get('errors') is not None:
+        stamps_and_ids = [[stamp_ns, *moved([number])] for stamp_ns, number in stamps_and_ids]
+    if bins is not None and len(bins['ties']) > 0 and -1 not in bins['ties']:
+        bins = {**bins, 'ties': moved(bins['ties'][:1]) + bins['ties'][1:]}
+    return {**source, 'rows': stamps_and_ids, 'bins': bins}
+
+
+def _joined(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    """Return one column of names for two."""
+    n = len(one['names'])
+    return {'names': one['names'] + other['names'], 'of': one['of'] + [n + k for k in other['of']]}
+
+
+def _renamed(kinds: dict[str, Any]) -> dict[str, Any]:
+    return {**kinds, 'names': [
+        'node_prior' if name == 'prior' else name for name in kinds['names']]}

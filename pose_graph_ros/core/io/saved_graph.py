@@ -38,8 +38,7 @@ class SavedGraph:
     rows: GraphRows
     nodes: SavedNodes
     sources: Mapping[str, SavedSource]
-    edge_losses: SavedLosses
-    observed_losses: SavedLosses
+    losses: SavedLosses
     alignment: SavedAlignment
     waiting: SavedEdges  # edges for the next update
     set_aside: SavedEdges  # after a failed solve, for the next full optimisation

@@ -146,12 +146,12 @@ class Beliefs:
     def set_base_weights(self, numbers: IntArray) -> None:
         """Tell robust losses the weights of closures, which the graph has already."""
         for number, weight in zip(numbers.tolist(), self.weights(numbers).tolist(), strict=True):
-            self._reweighting.set_base_weight(int(self._states.held[number]), weight, edge=True)
+            self._reweighting.set_base_weight(int(self._states.held[number]), weight)
 
     def apply(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
         """Tell whether states and weights were changed; if not, they may be tried later."""
         weights = self.weights_with(changes)
-        result = self._smoother.update(GraphUpdate(weigh_edges=weights), fall_back=at_once)
+        result = self._smoother.update(GraphUpdate(weigh=weights), fall_back=at_once)
         if result.status is Status.FAILED:
             return False
         self._keep(changes)

@@ -15,7 +15,7 @@ import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import closures, final
 from pose_graph_ros.core.judgement.beliefs import BeliefRule, Beliefs, Retests, ScaleLeft
@@ -53,14 +53,14 @@ class ClosureJudge:
         self.reports = ClosureReports(self._states, self._table)
         self._retests = Retests(self._states)
         self._rule = BeliefRule(self._states, self._table)
-        self._final = (0, 0, 0, -1)  # next ids of the graph and round at the last final decision
+        self._final = (0, 0, -1)  # next ids of the graph and round at the last final decision
         self._n_staged = 0
         self._search = SetSearch(self._states)
         self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
         self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
 
     def before(
-        self, new: Sequence[NewConstraint], edges: Edges, now_ns: int,
+        self, new: Sequence[NewConstraint], edges: Factors, now_ns: int,
     ) -> FloatArray:
         """Return the weights with which closures are to be added, shape (M,)."""
         begin, n = len(self._states), len(new)
@@ -116,7 +116,7 @@ class ClosureJudge:
     def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
         """Test closures that are not in the graph; return those that pass, and their chances."""
         some, n = self._table.rows(numbers), len(numbers)
-        errors, spread = self._smoother.edge_innovations(closures.as_edges(some))
+        errors, spread = self._smoother.innovations(closures.as_edges(some))
         total, distance = spread + some.noise, np.empty(n)
         closures.distances(errors, total, distance)
         self._table.spread[numbers] = spread
@@ -296,7 +296,7 @@ class ClosureJudge:
     def restore(self, saved: SavedVerdicts, now_ns: int) -> None:
         self._beliefs.now_ns = now_ns
         self._chain.extend(self._smoother.graph)
-        self._table.append(claims(self._smoother.graph.edges_at(saved.held)))
+        self._table.append(claims(self._smoother.graph.factors_at(saved.held)))
         self._states.restore(saved)
         self._scales.set_state(saved.scales.tolist(), [0] * len(saved.scales))
         self._beliefs.scales_left[:] = map(

@@ -100,8 +100,8 @@ class ClosureReports:
 
     def of(self, graph: Graph, numbers: Sequence[int]) -> list[Verdict]:
         states, verdicts = self._states, []
-        edges = graph.edges_at(states.held[list(numbers)])
-        for number, residual in zip(numbers, graph.edge_errors(edges), strict=True):
+        edges = graph.factors_at(states.held[list(numbers)])
+        for number, residual in zip(numbers, graph.errors(edges), strict=True):
             agree, against = self._neighbours(number)
             contradicted = [states.name(other) for other in against if USED[states.state[other]]]
             if states.distance[number] > math.sqrt(GATE):

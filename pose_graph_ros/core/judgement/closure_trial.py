@@ -45,21 +45,20 @@ class ClosureTrial:
         self._smoother = smoother
         self._trial: Trial | None = None
         self.found: Found | None = None  # the set that is tried
-        self.weights: dict[int, float] = {}  # the weights of its closures, by the ids of edges
+        self.weights: dict[int, float] = {}  # the weights of its closures, by the ids of factors
         self._next_at = 0  # next id of a node from which on there may be another trial
 
     def begin(self, found: Found, weights: Mapping[int, float], poses: FloatArray) -> None:
         """Try a set of closures, unless a trial goes on."""
         if self._trial is None:
             self.found, self.weights = found, dict(weights)
-            self._trial = self._smoother.trial(GraphUpdate(weigh_edges=weights), poses)
+            self._trial = self._smoother.trial(GraphUpdate(weigh=weights), poses)
 
-    def solve_later(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
+    def solve_later(self, weights: Mapping[int, float]) -> None:
         """Solve for weights, by id, with which an update diverges, but during a pause."""
         if self.may_solve():
             self.found, self.weights = None, {}
-            self._trial = self._smoother.trial(
-                GraphUpdate(weigh_edges=edges, weigh_observed=observed))
+            self._trial = self._smoother.trial(GraphUpdate(weigh=weights))
 
     def may_solve(self) -> bool:
         """Tell whether all may be solved for now that an update has diverged; else in a pause."""

@@ -21,7 +21,7 @@ from pose_graph_ros.core.compiled.jit import INTEGERS, kernel, MATRICES, NUMBERS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.odometry_chain import composed, inverted, OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
@@ -175,7 +175,7 @@ def _squared_distance(  # type: ignore[no-untyped-def]
     return solved_form(part, error)
 
 
-def floored(edges: Edges, sigmas: FloatArray = FLOORS) -> Edges:
+def floored(edges: Factors, sigmas: FloatArray = FLOORS) -> Factors:
     """Return edges with the variances of their errors raised; what is not measured stays so."""
     information = edges.information
     most = np.max(np.abs(information), axis=(1, 2), initial=0.0)
@@ -188,9 +188,9 @@ def floored(edges: Edges, sigmas: FloatArray = FLOORS) -> Edges:
     return replace(edges, information=softer)
 
 
-def forward(edges: Edges) -> Edges:
+def forward(edges: Factors) -> Factors:
     """Return edges that all lead to the later node, in whichever direction each was measured."""
-    back = np.flatnonzero((edges.i > edges.j) & (edges.kind <= EdgeKind.LOOP_CLOSURE))
+    back = np.flatnonzero((edges.i > edges.j) & (edges.kind <= FactorKind.LOOP_CLOSURE))
     if len(back) == 0:
         return edges
     i, j = edges.i.copy(), edges.j.copy()
@@ -210,15 +210,15 @@ def distances(errors, covariances, out):  # type: ignore[no-untyped-def]
         out[k] = solved_form(covariances[k], errors[k])
 
 
-def as_edges(some: Closures) -> Edges:
+def as_edges(some: Closures) -> Factors:
     """Return closures as a table; its information is not that of the closures."""
-    return Edges(some.i, some.j, some.mean, some.noise,
-                 np.full(len(some.i), int(EdgeKind.LOOP_CLOSURE)))
+    return Factors(some.i, some.j, some.mean, some.noise,
+                 np.full(len(some.i), int(FactorKind.LOOP_CLOSURE)))
 
 
 def errors_of(graph: Graph, some: Closures) -> FloatArray:
     """Return the errors of closures at the estimate of a graph, shape (M, 3) [m, m, rad]."""
-    return graph.edge_errors(as_edges(some))
+    return graph.errors(as_edges(some))
 
 
 def residuals(graph: Graph, some: Closures) -> FloatArray:
@@ -232,7 +232,7 @@ def residuals(graph: Graph, some: Closures) -> FloatArray:
 
 def are_above(graph: Graph, edges: IntArray, limit: float) -> BoolArray:
     """Tell which squared residuals of edges, by their own covariances, are above a limit."""
-    rows, table = graph.edge_rows(edges), graph.memory['edge_f']
+    rows, table = graph.factor_rows(edges), graph.memory['factor_f']
     return np.asarray(table[rows, tb.ENERGY] > limit * table[rows, tb.WEIGHT])
 
 
@@ -242,7 +242,7 @@ class Support(NamedTuple):
     travel: float
 
 
-def claims(edges: Edges, floors: FloatArray = FLOORS) -> Closures:
+def claims(edges: Factors, floors: FloatArray = FLOORS) -> Closures:
     """Return closures from the earlier to the later node, with covariances to decide by."""
     own = floored(forward(edges), floors)
     # it may be singular: at least that of a sigma of 1 km

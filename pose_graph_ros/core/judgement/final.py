@@ -24,7 +24,7 @@ from pose_graph_ros.core.batch.truncated import (
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate, NextIds
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closures import floored, forward, GATE
@@ -183,7 +183,7 @@ def decide(
     the surest set, or None if `inside`, the present one, costs as little. With more than
     `most_at_end` nodes and closures it is `inside`, improved.
     """
-    rows, forced = graph.edge_rows(ids), graph.edge_rows(forced)
+    rows, forced = graph.factor_rows(ids), graph.factor_rows(forced)
     copy, present = _copy(graph, np.union1d(rows, forced)), graph.poses.copy()
     others = None if losses is None else _losses_in_rows(graph, losses)
     yield
@@ -194,12 +194,12 @@ def decide(
             choice = yield from problem.improved(choice, BELIEF.retests_at_end)
     else:
         weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
-        copy.apply(GraphUpdate(weigh_edges=weights))
+        copy.apply(GraphUpdate(weigh=weights))
         starts = (Start.CHORDAL, Start.JOINT, Start.PRESENT)
         result = yield from optimizer.from_linear_start(copy, CONFIG, starts)
         if result.status is not Status.FAILED and others is not None and len(others) > 0:
             for row, weight in weights.items():
-                others.set_base_weight(row, weight, edge=True)
+                others.set_base_weight(row, weight)
             result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
         if result.status is Status.FAILED:
             return None
@@ -215,33 +215,29 @@ def decide(
 def _copied_rows(graph: Graph) -> GraphRows:
     """Return copies of all rows of a graph, with rows in place of ids."""
     rows = graph.rows()
-    observed = rows.observed
-    n_nodes, n_edges, n_observed = len(rows.poses), len(rows.edges), len(observed)
+    n_nodes, n_factors = len(rows.poses), len(rows.factors)
     return rows._replace(
-        edges=rows.edges.renumbered(graph.node_rows), observed=ObservedNodes(
-            graph.node_rows(observed.node), *observed.columns[1:]),
-        node_ids=np.arange(n_nodes), edge_ids=np.arange(n_edges),
-        observed_ids=np.arange(n_observed), next_ids=NextIds(n_nodes, n_edges, n_observed),
+        factors=rows.factors.renumbered(graph.node_rows), node_ids=np.arange(n_nodes),
+        factor_ids=np.arange(n_factors), next_ids=NextIds(n_nodes, n_factors),
         priors=[replace(prior, nodes=graph.node_rows(prior.nodes)) for prior in rows.priors])
 
 
 def _losses_in_rows(graph: Graph, reweighting: Reweighting) -> Reweighting:
     """Return a copy of the losses of a graph, by row instead of by id."""
-    edges, observed = reweighting.saved()
-    copy = Reweighting()
-    copy.restore(replace(edges, rows=graph.edge_rows(edges.rows)),
-                 replace(observed, rows=graph.observed_rows(observed.rows)))
+    saved, copy = reweighting.saved(), Reweighting()
+    copy.restore(replace(saved, rows=graph.factor_rows(saved.rows)))
     return copy
 
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:
     """Return a copy of a graph in which closures have the information to decide by; by row."""
     rows, copy = _copied_rows(graph), Graph()
-    edges = rows.edges
-    columns = edges.i.copy(), edges.j.copy(), edges.mean.copy(), edges.information.copy()
-    own = floored(forward(edges.rows(closures)))
+    factors = rows.factors
+    columns = factors.i.copy(), factors.j.copy(), factors.mean.copy(), factors.information.copy()
+    own = floored(forward(factors.rows(closures)))
     for column, values in zip(
             columns, (own.i, own.j, own.mean, own.information), strict=True):
         column[closures] = values
-    copy.fill(rows._replace(edges=Edges(*columns, edges.kind, edges.weight, edges.bias, edges.k)))
+    copy.fill(rows._replace(factors=Factors(
+        *columns, factors.kind, factors.weight, factors.constants, factors.k)))
     return copy

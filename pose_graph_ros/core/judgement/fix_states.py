@@ -20,7 +20,6 @@ from pose_graph_ros.core.judgement.verdicts import (
     ODOMETRY,
     Verdict,
 )
-from pose_graph_ros.core.sources.source_constraints import Held
 
 # Run of a measurement that is in none.
 LONE = -1
@@ -39,15 +38,13 @@ class FixStates(Judgements):
         return np.asarray(self.state == BELIEVED)
 
     @property
-    def unused(self) -> Held:
-        unused = self.records[~self.believed]
-        return Held(unused['held'], unused['edge'])
+    def unused(self) -> IntArray:
+        """Ids of what holds those that are not believed."""
+        return np.asarray(self.held[~self.believed])
 
-    def leaving(self, edges: IntArray, observed: IntArray) -> BoolArray:
-        """Return which records leave with constraints, shape (M,)."""
-        return np.asarray(
-            np.where(self.edge, np.isin(self.held, edges), np.isin(self.held, observed))
-            | np.isin(self.observed, observed))
+    def leaving(self, factors: IntArray) -> BoolArray:
+        """Return which records leave with factors, shape (M,)."""
+        return np.isin(self.held, factors) | np.isin(self.added, factors)
 
     def by_stamp(self) -> IntArray:
         """Return the numbers of all records, by stamp, then by the name of the source."""
@@ -58,22 +55,18 @@ class FixStates(Judgements):
         """Believe or doubt some records, but not those that a person has decided on."""
         self.state[which[self.decision[which] == AUTO]] = BELIEVED if believed else DOUBTED
 
-    def weights(
-        self, before: IntArray, reweighting: Reweighting,
-    ) -> tuple[dict[int, float], dict[int, float]]:
-        """Return weights that change, of edges and of observed nodes, by id."""
-        weights: tuple[dict[int, float], dict[int, float]] = {}, {}
+    def weights(self, before: IntArray, reweighting: Reweighting) -> dict[int, float]:
+        """Return weights that change, by the ids of factors."""
         changed = self.changed(before)
         doubted = np.flatnonzero(~self.believed[len(before):]) + len(before)
         # losses have lowered the weights of the believed ones since one that returns
         again = self.stamps_ns[changed[self.believed[changed]], 0]
         since = np.min(again) if len(again) > 0 else np.inf
         later = np.flatnonzero((self.stamps_ns[:, 0] >= since) & self.believed)
-        for number in (*doubted.tolist(), *later.tolist(), *changed.tolist()):
-            held, edge, state = self.records[number][['held', 'edge', 'state']].tolist()
-            weights[0 if edge else 1][held] = (
-                self._base_weight(number, changed, reweighting) if state == BELIEVED else 0.0)
-        return weights
+        return {
+            int(self.held[number]): self._base_weight(number, changed, reweighting)
+            if self.state[number] == BELIEVED else 0.0
+            for number in (*doubted.tolist(), *later.tolist(), *changed.tolist())}
 
     def changed(self, before: IntArray) -> IntArray:
         """Return the numbers of records that had another state, given all that there were."""
@@ -83,39 +76,34 @@ class FixStates(Judgements):
         """Tell what is not believed any more, or again."""
         changed = self.changed(before)
         for number in (*range(len(before), len(self)), *changed.tolist()):
-            held, edge, state = self.records[number][['held', 'edge', 'state']].tolist()
-            if state == DOUBTED:
-                reweighting.set_base_weight(held, 0.0, edge=edge)
+            held = int(self.held[number])
+            if self.state[number] == DOUBTED:
+                reweighting.set_base_weight(held, 0.0)
             elif number < len(before):
-                base = self._base_weight(number, changed, reweighting)
-                reweighting.set_base_weight(held, base, edge=edge)
+                reweighting.set_base_weight(
+                    held, self._base_weight(number, changed, reweighting))
 
     def _base_weight(self, number: int, changed: IntArray, reweighting: Reweighting) -> float:
         """Return the base weight of a believed record, or else that of one next to it."""
-        held, edge, source = self.records[number][['held', 'edge', 'source']].tolist()
-        if edge:
-            return 1.0
+        held, source = self.records[number][['held', 'source']].tolist()
         own = reweighting.base_weight(held)
         if own:
             return own
         first = max(number - BELIEF.records_near, 0)
         near = slice(first, number + BELIEF.records_near)
         alike = first + np.flatnonzero(
-            self.believed[near] & ~self.edge[near] & (self.source[near] == source))
+            self.believed[near] & (self.source[near] == source))
         alike = np.setdiff1d(alike, changed)
         if len(alike) == 0:
             return 1.0
         nearest = int(alike[np.argmin(np.abs(alike - number))])
         return reweighting.base_weight(int(self.held[nearest])) or 1.0
 
-    def moved(self, before: Held, after: Held) -> None:
-        """Have records follow measurements that others hold now."""
-        held = 2 * self.held + self.edge
-        wanted = 2 * before.ids + before.is_edge
-        numbers = np.flatnonzero(np.isin(held, wanted))
-        order = np.argsort(wanted)
-        at = order[np.searchsorted(wanted, held[numbers], sorter=order)]
-        self.held[numbers], self.edge[numbers] = after.ids[at], after.is_edge[at]
+    def moved(self, before: IntArray, after: IntArray) -> None:
+        """Have records follow measurements that other factors hold now; by ids."""
+        numbers, order = np.flatnonzero(np.isin(self.held, before)), np.argsort(before)
+        at = order[np.searchsorted(before, self.held[numbers], sorter=order)]
+        self.held[numbers] = after[at]
 
     def believed_after(self, stamp_ns: int) -> tuple[str, ...]:
         """Return the ids of the first believed measurements from a stamp on."""
@@ -124,7 +112,7 @@ class FixStates(Judgements):
         return tuple(map(self.name, first.tolist()))
 
     def verdicts(self, graph: Graph, numbers: IntArray) -> list[Verdict]:
-        verdicts, residuals = [], _residuals(graph, self.held[numbers], self.edge[numbers])
+        verdicts, residuals = [], _residuals(graph, self.held[numbers])
         for number, residual in zip(numbers.tolist(), residuals, strict=True):
             # a person may force out what fits, and force in what does not
             contradicted = (self.state[number] == DOUBTED if self.decision[number] == AUTO
@@ -145,13 +133,8 @@ class FixStates(Judgements):
         return alike[np.argsort(np.abs(alike - number), kind='stable')].tolist()
 
 
-def _residuals(graph: Graph, held: IntArray, some: BoolArray) -> FloatArray:
+def _residuals(graph: Graph, held: IntArray) -> FloatArray:
     """Return the errors at the estimate, shape (K, 3), nan where nothing is measured."""
-    residuals = np.empty((len(held), 3))
-    biased, observed = graph.edges_at(held[some]), graph.observed_at(held[~some])
-    for which, error, information in (
-            (some, graph.edge_errors(biased), biased.information),
-            (~some, graph.observed_errors(observed), observed.information)):
-        measured = np.diagonal(information, axis1=1, axis2=2) > 0.0
-        residuals[which] = np.where(measured, error, np.nan)
-    return residuals
+    factors = graph.factors_at(held)
+    measured = np.diagonal(factors.information, axis1=1, axis2=2) > 0.0
+    return np.where(measured, graph.errors(factors), np.nan)

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig, Robust
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.fix_states import FixStates, LONE
@@ -26,7 +25,6 @@ from pose_graph_ros.core.judgement.runs import odometry_between
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.tracks import (
-    biased_observations,
     Observation,
     observations,
     Track,
@@ -96,23 +94,19 @@ class FixJudge:
         graph = self._smoother.graph
         solved = not graph.has_touched
         self._runs.chain.extend(graph)
-        is_edge = np.array([one.is_edge for one in judged])
-        numbers, begin = np.array([one.number for one in judged]), graph.next_ids
-        seen = _both(change.edges.rows(numbers[is_edge] - begin.edge),
-                     change.observed.rows(numbers[~is_edge] - begin.observed), is_edge)
+        seen = observations(change.factors.rows(
+            np.array([one.number for one in judged]) - graph.next_ids.factor))
         for one, each in zip(judged, seen, strict=True):
             self._judge(one.stamp_ns, each, one, solved=solved)
         return self._with_weights(change, before)
 
     def _with_weights(self, change: GraphUpdate, before: _Decided) -> GraphUpdate:
         """Return an update with the weights of new records and of those that have changed."""
-        edges, observed = self._states.weights(before.state, self._reweighting)
-        loosened = before.loosened
+        weights, loosened = self._states.weights(before.state, self._reweighting), before.loosened
         for edge in () if loosened is self._loosened else {*loosened, *self._loosened}:
             if loosened.get(edge) != self._loosened.get(edge):
-                edges[edge] = self._loosened.get(edge, 1.0)
-        return change._replace(weigh_edges={**change.weigh_edges, **edges},
-                               weigh_observed={**change.weigh_observed, **observed})
+                weights[edge] = self._loosened.get(edge, 1.0)
+        return change._replace(weigh={**change.weigh, **weights})
 
     @property
     def chain(self) -> OdometryChain:
@@ -210,13 +204,12 @@ class FixJudge:
         else:
             self._decide(final)
         change = self._with_weights(GraphUpdate(), before)
-        if (len(change.weigh_edges) + len(change.weigh_observed) > 0
-                and self._smoother.update(change).reason != ''):
+        if len(change.weigh) > 0 and self._smoother.update(change).reason != '':
             self.rollback()
         else:
             self.commit()
 
-    def final_weights(self) -> tuple[FloatArray, FloatArray]:
+    def final_weights(self) -> FloatArray:
         """Return the weights that `finish` would give, by row."""
         graph, states = self._smoother.graph, self._states
         weights = graph.weights
@@ -224,9 +217,7 @@ class FixJudge:
             return weights
         self._begin()
         self._judge_all()
-        for some, table, row_of in ((states.edge, weights[0], graph.edge_rows),
-                                    (~states.edge, weights[1], graph.observed_rows)):
-            table[row_of(states.held[some])] = states.believed[some]
+        weights[graph.factor_rows(states.held)] = states.believed
         final = self._decided()
         self.rollback()
         self._final = final
@@ -262,18 +253,15 @@ class FixJudge:
 
     def _seen(self, numbers: IntArray) -> list[Observation | None]:
         """Return the observations of some records, as they were added."""
-        graph, observed = self._smoother.graph, self._states.observed[numbers]
-        is_edge = observed < 0
-        return _both(graph.edges_at(self._states.held[numbers[is_edge]]),
-                     graph.observed_at(observed[~is_edge]), is_edge)
+        return observations(self._smoother.graph.factors_at(self._states.added[numbers]))
 
     def decide_leaving(
-        self, edges: IntArray, observed: IntArray,
+        self, factors: IntArray,
     ) -> tuple[list[Verdict], tuple[int, Track] | None]:
         """Return the verdicts on what leaves unused, and where the robot was, for `forget`."""
         graph, states = self._smoother.graph, self._states
         self._runs.chain.extend(graph)
-        leaving = states.leaving(edges, observed)
+        leaving = states.leaving(factors)
         unused = np.flatnonzero(leaving & ~states.believed)
         return (states.verdicts(graph, unused[-MOST_OTHERS:]),
                 self._after(np.flatnonzero(leaving & states.believed)))
@@ -295,17 +283,16 @@ class FixJudge:
         return cut
 
     def forget(
-        self, nodes: IntArray, edges: IntArray, observed: IntArray,
-        last: tuple[int, Track] | None,
+        self, nodes: IntArray, factors: IntArray, last: tuple[int, Track] | None,
     ) -> None:
-        leaving = self._states.leaving(edges, observed)
+        leaving = self._states.leaving(factors)
         if np.any(leaving):
             self._states.select(np.flatnonzero(~leaving))
         self._cut, self._final = last or self._cut, None
         if self._cut is not None:
             self._cut = self._cut[0], self._cut[1].carried(self._runs.chain, nodes)
         self._runs.forget(nodes)
-        gone = {*edges.tolist()}
+        gone = {*factors.tolist()}
         if not gone.isdisjoint(self._loosened):
             self._loosened = {edge: weight for edge, weight in self._loosened.items()
                               if edge not in gone}
@@ -336,9 +323,3 @@ class FixJudge:
         self._now_ns = now_ns
         self._states.restore(saved)
         self._loosened = dict(loosened)
-
-
-def _both(edges: Edges, observed: ObservedNodes, is_edge: BoolArray) -> list[Observation | None]:
-    """Return the observations of two tables, in the order that `is_edge` tells."""
-    tables = iter(observations(observed)), iter(biased_observations(edges))
-    return [next(tables[edge]) for edge in is_edge.tolist()]

@@ -19,7 +19,7 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Loss, Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -40,7 +40,7 @@ from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.saved_columns import Integers, Numbers
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.source_constraints import Held, NewConstraint
+from pose_graph_ros.core.sources.source_constraints import NewConstraint
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Judge:
         self._fixes = FixJudge(smoother, reweighting, config)
         self._odometry = OdometryStates(nodes)
         self._closures = ClosureJudge(smoother, reweighting)
-        # the judged closures of the last `before`, by their numbers among its edges
+        # the judged closures of the last `before`, by their numbers among its factors
         self._staged = np.empty(0, dtype=np.int64)
         self._new: Sequence[NewConstraint] = ()  # all constraints of the last `before`
         # on the newest constraints that have left the graph unused
@@ -89,14 +89,13 @@ class Judge:
         """Return an update in which the new rows have the weights that they begin with."""
         self._new = new
         change = self._fixes.before(new, change, now_ns)
-        first = self._smoother.graph.next_ids.edge
-        closures = [
-            one for one in new if one.is_edge and self._is_judged_closure(one, change, first)]
+        first = self._smoother.graph.next_ids.factor
+        closures = [one for one in new if self._is_judged_closure(one, change, first)]
         if len(closures) == 0:
             return change
         self._staged = np.array([one.number - first for one in closures])
         return _weighed(change, self._staged, self._closures.before(
-            closures, change.edges.rows(self._staged), now_ns))
+            closures, change.factors.rows(self._staged), now_ns))
 
     def solve(self, change: GraphUpdate, *, at_once: bool = False) -> UpdateResult:
         """
@@ -117,47 +116,36 @@ class Judge:
         if result.reason != DIVERGED:
             return result
         if self._smoother.append(change):
-            self.solve_later({}, {})
+            self.solve_later({})
             return UpdateResult(Status.MAX_ITERATIONS, '', 0, 0, 0, 0)
         if not at_once and not self.may_solve():
-            without, *later = self._without_weights(change)
+            without, later = self._without_weights(change)
             result = self._smoother.update(without, fall_back=False)
-            if result.reason == DIVERGED:
-                later = [{}, {}]
-            self.solve_later(*later)
+            self.solve_later({} if result.reason == DIVERGED else later)
             return result
         return self._smoother.update(change)
 
-    def _without_weights(
-        self, change: GraphUpdate,
-    ) -> tuple[GraphUpdate, dict[int, float], dict[int, float]]:
+    def _without_weights(self, change: GraphUpdate) -> tuple[GraphUpdate, dict[int, float]]:
         """
         Return an update with weight 0 for its new measurements in the map that have a loss.
 
-        With it come the weights of edges and observed nodes, by id, that it leaves out. As long as
-        the graph cannot be solved with them, reweighting tries to set them.
+        With it come the weights, by id, that it leaves out. As long as the graph cannot be solved
+        with them, reweighting tries to set them.
         """
-        begin = self._smoother.graph.next_ids
-        weights = change.edges.weight.copy(), change.observed.weight.copy()
-        later: tuple[dict[int, float], dict[int, float]] = {}, {}
-        wanted = dict(change.weigh_edges), dict(change.weigh_observed)
+        begin, weights = self._smoother.graph.next_ids.factor, change.factors.weight.copy()
+        later, wanted = dict[int, float](), dict(change.weigh)
         for one in self._new:
             if one.kind is LoopClosure or self._config.measurement_source(
                     one.source, one.kind).applied_loss is Loss.NONE:
                 continue
-            kind, number = (0, one.held_by) if one.held_by >= 0 else (1, one.number)
-            row = number - (begin.edge, begin.observed)[kind]
-            later[kind][number] = wanted[kind].pop(number, float(weights[kind][row]))
-            weights[kind][row] = 0.0
-        for kind in (0, 1):
-            for number in list(wanted[kind]):
-                if self._reweighting.knows(number, edge=kind == 0):
-                    later[kind][number] = wanted[kind].pop(number)
-        edges, observed = weights
+            row = one.held - begin
+            later[one.held] = wanted.pop(one.held, float(weights[row]))
+            weights[row] = 0.0
+        for number in list(wanted):
+            if self._reweighting.knows(number):
+                later[number] = wanted.pop(number)
         return change._replace(
-            edges=replace(change.edges, weight=edges), weigh_edges=wanted[0],
-            observed=replace(change.observed, weight=observed), weigh_observed=wanted[1],
-        ), *later
+            factors=replace(change.factors, weight=weights), weigh=wanted), later
 
     def may_solve(self) -> bool:
         """Tell whether an update that has diverged may solve for all at once."""
@@ -165,9 +153,9 @@ class Judge:
         is_large = self._smoother.graph.n_nodes > BELIEF.large
         return not is_large and trial.may_solve()
 
-    def solve_later(self, edges: Mapping[int, float], observed: Mapping[int, float]) -> None:
+    def solve_later(self, weights: Mapping[int, float]) -> None:
         """Solve the graph with some weights as a copy between the updates, as these diverge."""
-        self._closures.trial.solve_later(edges, observed)
+        self._closures.trial.solve_later(weights)
 
     @property
     def solves_later(self) -> bool:
@@ -176,8 +164,8 @@ class Judge:
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
         number = one.number - first
         # one without a position, such as of the walls of a building, recognises no place
-        return (change.edges.kind[number] == EdgeKind.LOOP_CLOSURE
-                and bool(change.edges.information[number, 0, 0] > 0.0)
+        return (change.factors.kind[number] == FactorKind.LOOP_CLOSURE
+                and bool(change.factors.information[number, 0, 0] > 0.0)
                 and self._config.measurement_source(
                     one.source, LoopClosure).robust is Robust.JUDGED)
 
@@ -215,14 +203,11 @@ class Judge:
         return self._closures.states.held, self._closures.states.stamps_ns
 
     def drawn_rows(self) -> DrawnRows:
-        """Return the rows of constraints that are drawn in another way than believed ones."""
-        graph, (unused, is_edge) = self._smoother.graph, self._fixes.states.unused
+        """Return the ids of factors that are drawn in another way than believed ones."""
         weak, waiting, doubted = self._closures.states.drawn_ids()
         doubted = np.append(doubted, self._odometry.doubted_edges).astype(np.int64)
-        weak, waiting, doubted, edges = (graph.edge_rows(each).tolist() for each in (
-            weak, waiting, doubted, unused[is_edge]))
-        return DrawnRows(
-            weak, waiting, doubted, edges, graph.observed_rows(unused[~is_edge]).tolist())
+        return DrawnRows(*(each.tolist() for each in (
+            weak, waiting, doubted, self._fixes.states.unused)))
 
     def changes(self) -> list[Change]:
         return [*self._closures.states.take_changes(), *self._odometry.take_changes(),
@@ -239,25 +224,25 @@ class Judge:
         judge = self._fixes if is_fix else self._closures
         return judge.decide(name, decision)
 
-    def decide_leaving(self, edges: IntArray, observed: IntArray) -> Leaving:
+    def decide_leaving(self, factors: IntArray) -> Leaving:
         """
         Return what is decided on constraints that are about to leave the graph, for `forget`.
         """
         graph = self._smoother.graph
-        closures = self._closures.decide_leaving(edges)
-        fixes, last = self._fixes.decide_leaving(edges, observed)
+        closures = self._closures.decide_leaving(factors)
+        fixes, last = self._fixes.decide_leaving(factors)
         unused = [*closures, *fixes,
                   *self._odometry.decide_leaving(
-                      graph, edges, self._fixes.states.believed_after)]
+                      graph, factors, self._fixes.states.believed_after)]
         return Leaving([replace(each, left=True, since_ns=self._nodes.newest_ns)
                         for each in unused], last)
 
     def forget(
-        self, nodes: IntArray, edges: IntArray, observed: IntArray, leaving: Leaving | None,
+        self, nodes: IntArray, factors: IntArray, leaving: Leaving | None,
     ) -> None:
-        self._closures.forget(nodes, edges)
-        self._fixes.forget(nodes, edges, observed, leaving and leaving.last)
-        self._odometry.forget(self._smoother.graph, edges, self._fixes.loosened)
+        self._closures.forget(nodes, factors)
+        self._fixes.forget(nodes, factors, leaving and leaving.last)
+        self._odometry.forget(self._smoother.graph, factors, self._fixes.loosened)
         if leaving is not None:
             self._left.extend(leaving.unused)
 
@@ -284,12 +269,12 @@ class Judge:
                     np.searchsorted(self._nodes.ids, chain.nodes)],
                 ~np.isin(chain.nodes[1:], self._nodes.relocated_ids))
 
-    def moved(self, before: Held, after: Held) -> None:
-        """Follow measurements that others hold now, with the same weights."""
+    def moved(self, before: IntArray, after: IntArray) -> None:
+        """Follow measurements that other factors hold now, with the same weights; by ids."""
         self._fixes.states.moved(before, after)
 
-    def final_weights(self) -> tuple[FloatArray, FloatArray]:
-        """Return the weights of edges and observed nodes that the end would give."""
+    def final_weights(self) -> FloatArray:
+        """Return the weights of factors, by row, that the end would give."""
         return self._fixes.final_weights()
 
     def finish(self) -> Callable[[], None]:
@@ -319,7 +304,6 @@ class Judge:
 
 
 def _weighed(change: GraphUpdate, numbers: IntArray, weights: FloatArray) -> GraphUpdate:
-    edges = change.edges
-    every = edges.weight.copy()
+    every = change.factors.weight.copy()
     every[numbers] = weights
-    return change._replace(edges=replace(edges, weight=every))
+    return change._replace(factors=replace(change.factors, weight=every))

@@ -34,7 +34,6 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.saved_columns import (
     Choices,
     Column as SavedColumn,
-    Flags,
     Integers,
     Numbers,
     Pairs,
@@ -47,8 +46,7 @@ NEW = -1
 MOST_OTHERS = 500
 COLUMNS: list[Any] = [
     ('held', np.int64),  # id of what holds it, an edge or an observed node
-    ('edge', np.bool_),  # whether that is an edge
-    ('observed', np.int64),  # id of the observed node that it was added as; -1 for an edge
+    ('added', np.int64),  # id of the factor that it was added as
     ('source', np.int64),  # index of its source
     ('number', np.int64),  # in its name
     ('stamps_ns', np.int64, (2,)),  # of the measurement, and of the other end of a loop closure
@@ -69,8 +67,7 @@ class SavedVerdicts:
     # of each source, how many have left the graph, by their states then
     left: Annotated[IntArray, SavedColumn(int, (len(State),))]
     held: Integers
-    edge: Flags
-    observed: Integers
+    added: Integers
     source: Integers
     number: Integers
     stamps_ns: Pairs
@@ -91,7 +88,7 @@ class Column:
 
 
 class Judgements:
-    held, edge, observed, source, number = Column(), Column(), Column(), Column(), Column()
+    held, added, source, number = Column(), Column(), Column(), Column()
     stamps_ns, state, since_ns = Column(), Column(), Column()
     decision, distance = Column(), Column()
 
@@ -130,9 +127,8 @@ class Judgements:
         self, one: NewConstraint, now_ns: int, state: int, distance: float = np.nan, **more: int,
     ) -> None:
         source = self.index_of(one.source)
-        held = (one.held_by, True) if one.held_by >= 0 else (one.number, one.is_edge)
         self._records.append_one(np.array((
-            *held, -1 if one.is_edge else one.number, source, self._next[source],
+            one.held, one.number, source, self._next[source],
             (one.stamp_ns, one.reference_ns), state, now_ns, AUTO, distance,
             *{**self._more, **more}.values()), dtype=self.records.dtype))
         self._next[source] += 1
@@ -220,8 +216,7 @@ class Judgements:
             decision=DECISIONS[record['decision']], residual=residual,
             distance=float(record['distance']),
             supported_by=tuple(self.name(other) for other in supported_by[:MOST_NAMED]),
-            contradicted_by=tuple(contradicted_by[:MOST_NAMED]), edge=bool(record['edge']),
-            number=int(record['held']))
+            contradicted_by=tuple(contradicted_by[:MOST_NAMED]), number=int(record['held']))
 
     def listed(self, most_believed: int | None) -> IntArray:
         """Return which are listed: all that a person has decided on, and the newest of sources."""

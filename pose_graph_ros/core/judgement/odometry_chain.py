@@ -18,7 +18,7 @@ from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import factors, tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, full, NodeKind, upper
+from pose_graph_ros.core.graph.constraints import FactorKind, full, NodeKind, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 
@@ -89,18 +89,18 @@ class OdometryChain:
             self._poses.append(np.zeros((1, 3)))
             self._sums.append(np.zeros((1, 6)))
             self._travel.append(np.zeros(1))
-        head, begin = graph.memory.head, int(np.searchsorted(graph.edge_ids, self._next_edge))
-        self._next_edge = graph.next_ids.edge
-        ends = graph.memory['edge_i'][begin:graph.n_edges]
+        head, begin = graph.memory.head, int(np.searchsorted(graph.factor_ids, self._next_edge))
+        self._next_edge = graph.next_ids.factor
+        ends = graph.memory['factor_i'][begin:graph.n_factors]
         last = len(self) - 1
         end = int(self._nodes.values[last])
         if not self._by_row:
             end = int(graph.node_rows(end))
-        new = begin + np.flatnonzero((ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
+        new = begin + np.flatnonzero((ends[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY)
                                      & (ends[:, tb.END_J] > end))
         if len(new) == 0:
             return
-        new = new[np.argsort(graph.memory['edge_i'][new, tb.END_J], kind='stable')]
+        new = new[np.argsort(graph.memory['factor_i'][new, tb.END_J], kind='stable')]
         size = graph.n_nodes - end - 1
         rows, travel = np.empty(size, np.int64), np.empty(size)
         poses, sums = np.empty((size, 3)), np.empty((size, 6))
@@ -196,8 +196,8 @@ class OdometryChain:
 
 def _first(graph: Graph) -> IntArray:
     """Return the row of the pose that odometry begins at, shape (1,), or (0,) without poses."""
-    ends = graph.memory['edge_i'][:graph.n_edges]
-    odometry = ends[ends[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY]
+    ends = graph.memory['factor_i'][:graph.n_factors]
+    odometry = ends[ends[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY]
     if len(odometry) == 0 or _has_left(graph):
         return np.flatnonzero(graph.is_pose)[:1]
     return odometry[np.argmin(odometry[:, tb.END_J])][[tb.END_I]].copy()
@@ -205,7 +205,7 @@ def _first(graph: Graph) -> IntArray:
 
 def _has_left(graph: Graph) -> bool:
     return graph.n_priors > 0 or bool(np.any(
-        graph.memory['edge_i'][:graph.n_edges, tb.EDGE_KIND] == EdgeKind.PRIOR))
+        graph.memory['factor_i'][:graph.n_factors, tb.FACTOR_KIND] == FactorKind.PRIOR))
 
 
 @kernel(signature=(
@@ -221,7 +221,7 @@ def _extend(  # type: ignore[no-untyped-def]
     and prefix sum of the last node. With `over_gaps` a pose without odometry is appended as well.
     Rows, poses, sums, and travel since the last node are written.
     """
-    edge_f, edge_i, node_i = tb.edge_f(head), tb.edge_i(head), tb.node_i(head)
+    factor_f, factor_i, node_i = tb.factor_f(head), tb.factor_i(head), tb.node_i(head)
     n, m, length = 0, 0, 0.0
     x, y, th = pose[0], pose[1], pose[2]
     noise = np.empty(6)
@@ -229,14 +229,14 @@ def _extend(  # type: ignore[no-untyped-def]
         if node_i[v, tb.NODE_TYPE] != NodeKind.POSE:
             continue
         edge = -1
-        while m < len(edges) and edge_i[edges[m], tb.END_J] <= v:
+        while m < len(edges) and factor_i[edges[m], tb.END_J] <= v:
             # others are of another source, between nodes that are chained already
-            ends = edge_i[edges[m]]
+            ends = factor_i[edges[m]]
             if edge < 0 and ends[tb.END_I] == last and ends[tb.END_J] == v:
                 edge = edges[m]
             m += 1
         if edge >= 0:
-            f = edge_f[edge]
+            f = factor_f[edge]
             step = f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2]
             noise[:] = _inverse(f[tb.INFO:tb.INFO + 6])
             if weighted:

@@ -81,7 +81,7 @@ class OdometryStates:
                     for doubt in self._gaps.values() for edge in doubt.edges}
         ids = np.array(sorted(edge for edge, factor in self._loosened.items()
                               if factor < BELIEF.much_less), dtype=np.int64)
-        edges = graph.edges_at(ids)
+        edges = graph.factors_at(ids)
         cuts = np.flatnonzero(edges.i[1:] != edges.j[:-1]) + 1
         gaps = {}
         for part in np.split(np.arange(len(ids)), cuts) if len(ids) > 0 else ():
@@ -96,7 +96,7 @@ class OdometryStates:
                 stamp_ns=stamp_ns, reference_ns=reference_ns, state=State.DOUBTED,
                 since_ns=since_ns.get(first, now_ns), decision=Decision.AUTO,
                 residual=np.full(3, np.nan), distance=np.nan, supported_by=(),
-                contradicted_by=(), edge=True, number=first))
+                contradicted_by=(), number=first))
         return gaps
 
     def take_changes(self) -> list[Change]:
@@ -118,9 +118,9 @@ class OdometryStates:
     ) -> list[Verdict]:
         verdicts = []
         for doubt in self._gaps.values():
-            edges = graph.edges_at(np.array(doubt.edges))
+            edges = graph.factors_at(np.array(doubt.edges))
             begin, end = graph.poses_of((edges.i[0], edges.j[-1]))
-            chi2 = np.sum(energies(graph.edge_errors(edges), edges.information))
+            chi2 = np.sum(energies(graph.errors(edges), edges.information))
             verdicts.append(replace(
                 doubt.verdict, distance=float(np.sqrt(chi2)), residual=se2.between(
                     reduce(se2.compose, edges.mean), se2.between(begin, end)),

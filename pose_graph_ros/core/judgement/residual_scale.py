@@ -24,7 +24,7 @@ from scipy.special import gammainc, gammaincc
 from pose_graph_ros.core.batch.optimizer import optimize, Status
 from pose_graph_ros.core.batch.truncated import CONFIG
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.beliefs import Beliefs, ScaleLeft
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
@@ -50,7 +50,7 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
     chain.extend(graph)
     if len(chain) < graph.n_nodes or len(closures) == 0:
         return scale
-    edges = graph.edges_at(closures)
+    edges = graph.factors_at(closures)
     group = places(chain, edges)
     for _ in range(BELIEF.scale_rounds):
         if optimize(graph, CONFIG).status is Status.FAILED:
@@ -60,11 +60,11 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
         if shown <= scale:
             break
         scale = shown
-        graph.apply(GraphUpdate(weigh_edges=dict.fromkeys(closures.tolist(), scale**-2.0)))
+        graph.apply(GraphUpdate(weigh=dict.fromkeys(closures.tolist(), scale**-2.0)))
     return scale
 
 
-def places(chain: OdometryChain, edges: Edges) -> IntArray:
+def places(chain: OdometryChain, edges: Factors) -> IntArray:
     """Return to which place closures belong, numbers from 0, shape (M,)."""
     stretch = np.floor(np.column_stack(
         [chain.travel(nodes) for nodes in (edges.j, edges.i)]) / BELIEF.place_length)
@@ -201,15 +201,15 @@ class ScaleLearner:
     def _shown(self, source: int, numbers: IntArray, most: int) -> float:
         states, graph = self._states, self._smoother.graph
         some, group = self._sample(numbers, most)
-        edges = graph.edges_at(states.held[some])
+        edges = graph.factors_at(states.held[some])
         return together(
-            residual_scale(*self._smoother.edge_innovations(edges), edges.information, group,
+            residual_scale(*self._smoother.innovations(edges), edges.information, group,
                            self._beliefs.scales[source]),
             float(len(some)), self._beliefs.scales_left[source])
 
     def _sample(self, numbers: IntArray, most: int) -> tuple[IntArray, IntArray]:
         """Return at most so many closures, from all along the path, and the group of each."""
-        edges = self._smoother.graph.edges_at(self._states.held[numbers])
+        edges = self._smoother.graph.factors_at(self._states.held[numbers])
         group = places(self._table.chain, edges)
         n_groups = int(group.max()) + 1
         n_chosen = min(max(n_groups * most // len(numbers), 1), n_groups)

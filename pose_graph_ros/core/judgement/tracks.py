@@ -16,7 +16,7 @@ import numpy.typing as npt
 from pose_graph_ros.core.compiled.jit import INTEGER, INTEGERS, kernel, NUMBER, NUMBERS, ROWS
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import factors
-from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.sources.gauss_markov import STRETCH
@@ -97,30 +97,25 @@ class Track(NamedTuple):
         return Track(self.node, pose, cov)
 
 
-def observations(observed: ObservedNodes) -> list[Observation]:
-    """Return the observations of a table of positions and poses in the map."""
-    size = np.where(observed.kind == ObservedKind.POSITION, 2, 3)
-    noises = {}
-    for n in np.unique(size).tolist():
-        of_size = size == n
-        noise = BELIEF.stated * np.linalg.inv(observed.information[of_size, :n, :n])
-        noises[n] = iter(_floored(_turned(noise, observed.mean[of_size, 2])))
-    return [Observation(node, offset, mean, next(noises[n])) for node, offset, mean, n in zip(
-        observed.node.tolist(), observed.offset, observed.mean, size.tolist(), strict=True)]
-
-
-def biased_observations(edges: Edges) -> list[Observation | None]:
-    """Return those of a table of edges to biases; None for a heading."""
-    found: list[Observation | None] = []
-    for node, mean, information, (x, y, factor, turn_factor) in zip(
-            edges.i.tolist(), edges.mean, edges.information, edges.bias.tolist(), strict=True):
-        if information[0, 0] == 0.0:
-            found.append(None)
-            continue
-        size = 3 if information[2, 2] > 0.0 else 2
-        correlated = (factor**2, factor**2, (turn_factor / STRETCH)**2)
-        noise = np.linalg.inv(information[:size, :size]) + np.diag(correlated[:size])
-        found.append(Observation(node, np.array((x, y, 0.0)), mean, _floored(noise[None])[0]))
+def observations(factors: Factors) -> list[Observation | None]:
+    """Return observations, in the map or by edges to biases; None for a heading alone."""
+    information, biased = factors.information, factors.j >= 0
+    offset = factors.constants[:, :3].copy()
+    offset[biased, 2] = 0.0
+    correlated = np.where(biased[:, None], factors.constants[:, [2, 2, 3]], 0.0) ** 2
+    correlated[:, 2] /= STRETCH**2
+    size = np.where(np.where(
+        biased, information[:, 2, 2] == 0.0, factors.kind == FactorKind.POSITION), 2, 3)
+    found: list[Observation | None] = [None] * len(factors)
+    for n in (2, 3):
+        rows = np.flatnonzero((size == n) & (information[:, 0, 0] > 0.0))
+        own = np.linalg.inv(information[rows, :n, :n])
+        own *= np.where(biased[rows], 1.0, BELIEF.stated)[:, None, None]
+        noise = _floored(_turned(own, np.where(biased[rows], 0.0, factors.mean[rows, 2]))
+                         + correlated[rows, :n, None] * np.eye(n))
+        for row, each in zip(rows.tolist(), noise, strict=True):
+            found[row] = Observation(
+                int(factors.i[row]), offset[row], factors.mean[row], each)
     return found
 
 

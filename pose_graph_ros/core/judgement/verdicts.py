@@ -74,7 +74,6 @@ class Verdict:
     supported_by: tuple[str, ...]  # ids of what agrees with it, at most five
     # ids of what contradicts it, at most five, see `ODOMETRY`
     contradicted_by: tuple[str, ...]
-    edge: bool  # whether `number` is that of an edge; else of an observed node
     number: int  # its id in the graph
     # whether it has left the window of the graph, so that nothing of this changes any more
     left: bool = False

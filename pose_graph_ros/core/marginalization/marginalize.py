@@ -23,16 +23,16 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import normal_equations, tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.marginalization.sparsification import edges_between, turned
 from pose_graph_ros.core.sparse import components
 
 # Kinds of edges that turn with their poses.
-_RELATIVE = (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE, EdgeKind.PRIOR)
+_RELATIVE = (FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE, FactorKind.PRIOR)
 # Those to landmarks turn with poses and landmarks; a prior does with poses alone.
-_TO_LANDMARKS = (EdgeKind.POINT, EdgeKind.RANGE)
+_TO_LANDMARKS = (FactorKind.POINT, FactorKind.RANGE)
 
 
 class Cut(NamedTuple):
@@ -48,8 +48,7 @@ class Marginal(NamedTuple):
     """What constraints that leave a graph say about the nodes that remain."""
 
     prior: Prior | None     # on all nodes that remain, at their present poses
-    edges: IntArray     # ids of those in it
-    observed: IntArray  # ids of those in it
+    factors: IntArray   # ids of those in it
 
 
 def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
@@ -62,7 +61,7 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
     Constraints with weight 0 just leave. The graph does not change. Raises GraphUpdateError for a
     node that is not in the graph.
     """
-    edges, observed, priors = [], [], []
+    factors, priors = [], []
     leaving = _checked(graph, nodes)
     for members in _parts(graph, leaving):
         prior = marginal(graph, members).prior
@@ -70,22 +69,21 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
             continue
         is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
         if len(prior.nodes) == 2 and not prior.anchored and is_pose:
-            edges.append(as_edge(prior))
+            factors.append(as_edge(prior))
         # a heading that is next to unknown may have its minimum turns away, which a mean has not
         elif len(prior.nodes) == 1 and is_pose and abs(
                 (_pseudo_inverse(prior.information) @ prior.vector)[2]) < np.pi:
-            observed.append(as_observed(prior))
+            factors.append(as_observed(prior))
         else:
             priors.append(prior)
     return GraphUpdate(
-        edges=Edges.joined([each for each in edges if np.any(each.information)]),
-        observed=ObservedNodes.joined([each for each in observed if np.any(each.information)]),
+        factors=Factors.joined([each for each in factors if np.any(each.information)]),
         remove_nodes=leaving.tolist(), priors=tuple(priors))
 
 
 def marginal(
-    graph: Graph, nodes: Collection[int], edges: Collection[int] = (),
-    observed: Collection[int] = (), cuts: Sequence[Cut] = (),
+    graph: Graph, nodes: Collection[int], factors: Collection[int] = (),
+    cuts: Sequence[Cut] = (),
 ) -> Marginal:
     """
     Return what all constraints of leaving nodes, and further ones, say about the other nodes.
@@ -93,7 +91,7 @@ def marginal(
     The nodes of the further ones remain unless they leave. Raises as `marginalize` does.
     """
     leaving = _checked(graph, nodes)
-    part = _part(graph, leaving, list(edges), list(observed), [cut.edge for cut in cuts])
+    part = _part(graph, leaving, list(factors), [cut.edge for cut in cuts])
     inside, fixed, poses = np.isin(part.node_ids, leaving), part.fixed, part.poses
     H, b = equations(part)
     energy = part.energies().chi2
@@ -119,7 +117,7 @@ def marginal(
         prior = Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
                       _symmetric(U[np.ix_(says, says)]), u[says], energy,
                       bool(np.any(inside & fixed)) or _is_anchored(part, part.node_ids[kept]))
-    return Marginal(prior, part.edge_ids.astype(np.int64), part.observed_ids.astype(np.int64))
+    return Marginal(prior, part.factor_ids.astype(np.int64))
 
 
 def schur_complement(
@@ -133,7 +131,7 @@ def schur_complement(
     return _symmetric(reduced), b[~leaves] - gain @ b[leaves]
 
 
-def as_edge(prior: Prior) -> Edges:
+def as_edge(prior: Prior) -> Factors:
     """Return an edge between the two poses of a relative prior, with its gradient and Hessian."""
     first, second = np.argsort(prior.nodes)
     at = slice(3 * second, 3 * second + 3)
@@ -145,13 +143,13 @@ def as_edge(prior: Prior) -> Edges:
         information[None])
 
 
-def as_observed(prior: Prior) -> ObservedNodes:
+def as_observed(prior: Prior) -> Factors:
     """Return an observed node on the single pose of a prior, with its gradient and Hessian."""
     information = _semidefinite(prior.information)
     mean = prior.reference[0] + _pseudo_inverse(information) @ prior.vector
     # without information on the heading the error is in map axes, as that of a position
     mean[2] = se2.wrap(mean[2]) if np.any(information[2]) else 0.0
-    return ObservedNodes(prior.nodes, mean=mean[None], kind=[ObservedKind.PRIOR],
+    return Factors.on(prior.nodes, mean=mean[None], kind=[FactorKind.NODE_PRIOR],
                          information=turned(information[None], mean[2:]))
 
 
@@ -166,8 +164,8 @@ def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
 
 def _parts(graph: Graph, leaving: IntArray) -> Iterator[IntArray]:
     """Yield the connected parts of the leaving nodes, each ascending."""
-    edges = graph.edges
-    ends = _ends(edges.rows(edges.weight > 0.0))
+    factors = graph.factors
+    ends = _ends(factors.rows(factors.weight > 0.0))
     pairs = [ends[[0, 1]], ends[[0, 2]], ends[[1, 2]]]
     for prior in graph.priors:
         inside = prior.nodes[np.isin(prior.nodes, leaving)]
@@ -179,9 +177,9 @@ def _parts(graph: Graph, leaving: IntArray) -> Iterator[IntArray]:
         yield leaving[part == first]
 
 
-def _ends(edges: Edges) -> IntArray:
-    """Return the ends of edges, -1 for none, shape (number of ends, M)."""
-    return np.stack((edges.i, edges.j, edges.k))
+def _ends(factors: Factors) -> IntArray:
+    """Return the ends of factors, -1 for none, shape (3, M)."""
+    return np.stack((factors.i, factors.j, factors.k))
 
 
 def _is_anchored(graph: Graph, kept: IntArray) -> bool:
@@ -189,38 +187,33 @@ def _is_anchored(graph: Graph, kept: IntArray) -> bool:
     relative = list(_RELATIVE)
     if np.all(graph.is_pose[graph.node_rows(kept)]):
         relative += _TO_LANDMARKS
-    return bool(graph.n_observed > 0 or not np.all(np.isin(graph.edges.kind, relative))
+    return bool(not np.all(np.isin(graph.factors.kind, relative))
                 or any(prior.anchored for prior in graph.priors))
 
 
 def _part(
-    graph: Graph, leaving: IntArray, more: Sequence[int], more_observed: Sequence[int],
-    without: Sequence[int],
+    graph: Graph, leaving: IntArray, more: Sequence[int], without: Sequence[int],
 ) -> Graph:
-    """Return the part of a graph with the constraints of leaving nodes and further ones."""
-    edges, observed = graph.edges, graph.observed
-    of_edges = (np.any(np.isin(_ends(edges), leaving), axis=0)
-                | np.isin(graph.edge_ids, more)) & (edges.weight > 0.0)
-    of_edges &= ~np.isin(graph.edge_ids, without)
-    of_observed = (np.isin(observed.node, leaving)
-                   | np.isin(graph.observed_ids, more_observed)) & (observed.weight > 0.0)
+    """Return the part of a graph with the factors of leaving nodes and further ones."""
+    factors = graph.factors
+    chosen = (np.any(np.isin(_ends(factors), leaving), axis=0)
+              | np.isin(graph.factor_ids, more)) & (factors.weight > 0.0)
+    chosen &= ~np.isin(graph.factor_ids, without)
     priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
-    ends = _ends(edges)[:, of_edges].ravel()
+    ends = _ends(factors)[:, chosen].ravel()
     ids = np.unique(np.concatenate((
-        leaving, ends[ends >= 0], observed.node[of_observed], *(each.nodes for each in priors))))
-    return part_of(graph, ids, of_edges, of_observed, priors)
+        leaving, ends[ends >= 0], *(each.nodes for each in priors))))
+    return part_of(graph, ids, chosen, priors)
 
 
 def part_of(
-    graph: Graph, ids: IntArray, edges: IntArray | BoolArray, observed: IntArray | BoolArray,
-    priors: Sequence[Prior] = (),
+    graph: Graph, ids: IntArray, factors: IntArray | BoolArray, priors: Sequence[Prior] = (),
 ) -> Graph:
-    """Return a graph of some nodes, by ids, and of some constraints on them alone, by rows."""
+    """Return a graph of some nodes, by ids, and of some factors on them alone, by rows."""
     rows, part = graph.node_rows(ids), Graph()
     part.fill(GraphRows(
-        graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], graph.edges.rows(edges),
-        graph.observed.rows(observed), ids, graph.edge_ids[edges], graph.observed_ids[observed],
-        graph.next_ids, graph.dimension[rows], priors))
+        graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], graph.factors.rows(factors),
+        ids, graph.factor_ids[factors], graph.next_ids, graph.dimension[rows], priors))
     return part
 
 
@@ -242,19 +235,14 @@ def equations(graph: Graph) -> tuple[FloatArray, FloatArray]:
 
 @kernel(signature=(tb.HEAD, ROWS))
 def assemble(head, front):  # type: ignore[no-untyped-def]
-    """Add all constraints to H, of which (3N, 3N + 1) has the upper triangle, and last to b."""
-    edge_f, observed_f = tb.edge_f(head), tb.observed_f(head)
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
+    """Add all factors to H, of which (3N, 3N + 1) has the upper triangle, and last to b."""
+    factor_f, factor_i = tb.factor_f(head), tb.factor_i(head)
     flat, ld = front.reshape(front.size), front.shape[1]
-    for e in range(head[tb.N_EDGES]):
-        if edge_f[e, tb.WEIGHT] > 0.0:
-            third = edge_i[e, tb.END_K]
-            normal_equations.add(head, e, 3 * edge_i[e, tb.END_I], 3 * edge_i[e, tb.END_J],
-                             3 * third if third >= 0 else -1, flat, ld)
-    for k in range(head[tb.N_OBSERVED]):
-        if observed_f[k, tb.WEIGHT] > 0.0:
-            normal_equations.add(
-                head, -1 - k, 3 * observed_i[k, tb.OBS_NODE], -1, -1, flat, ld)
+    for e in range(head[tb.N_FACTORS]):
+        if factor_f[e, tb.WEIGHT] > 0.0:
+            # a missing end has no block: -1
+            at_j, at_k = max(3 * factor_i[e, tb.END_J], -1), max(3 * factor_i[e, tb.END_K], -1)
+            normal_equations.add(head, e, 3 * factor_i[e, tb.END_I], at_j, at_k, flat, ld)
 
 
 def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:

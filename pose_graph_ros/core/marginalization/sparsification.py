@@ -32,7 +32,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization import conservative
 
@@ -46,10 +46,9 @@ _SEEN = 1e-6
 
 
 class SparsePrior(NamedTuple):
-    """A prior as constraints."""
+    """A prior as factors."""
 
-    edges: Edges
-    observed: ObservedNodes
+    factors: Factors    # edges, then observed nodes
     divergence: float   # of Kullback and Leibler, of the constraints from the prior [nats]
     priors: tuple[Prior, ...] = ()  # of each bias, on it and a pose
 
@@ -103,7 +102,7 @@ def sparsify(
     chosen = _spanning_tree(found, k + n_biases + (1 if anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
-        return SparsePrior(Edges(), ObservedNodes(), 0.0)
+        return SparsePrior(Factors(), 0.0)
     blocks = conservative.nearest_below(found.rows[chosen])
     distance = conservative.divergence(found.rows[chosen], blocks)
     most = len(chosen) + n_extra
@@ -124,7 +123,7 @@ def sparsify(
     priors = tuple(
         _on_bias(nodes, displaced, (of.pose, int(row) - 1), of.gain, in_map[at])
         for at, row in enumerate(j) if row > k for of in (of_biases[row - k - 1],))
-    return SparsePrior(edges, seen, distance, priors)
+    return SparsePrior(Factors.joined([edges, seen]), distance, priors)
 
 
 def _basis(
@@ -310,7 +309,7 @@ def _on_bias(
 def edges_between(
     nodes: IntArray, displaced: tuple[FloatArray, FloatArray], start: IntArray, end: IntArray,
     in_map: FloatArray,
-) -> Edges:
+) -> Factors:
     """
     Return edges with information in map axes whose minimum is at displacements of poses.
 
@@ -322,19 +321,19 @@ def edges_between(
     # (3.48) is linear in the measured pose, but for its axes
     mean[:, :2] += np.einsum('mji,mj->mi', se2.rotation(turn), moved[:, :2])
     mean[:, 2] = se2.wrap(mean[:, 2] + moved[:, 2])
-    return Edges(nodes[start], nodes[end], mean, turned(in_map, turn + mean[:, 2]),
-                 np.full(len(start), EdgeKind.PRIOR, dtype=np.uint8))
+    return Factors(nodes[start], nodes[end], mean, turned(in_map, turn + mean[:, 2]),
+                 np.full(len(start), FactorKind.PRIOR, dtype=np.uint8))
 
 
 def _observed(
     nodes: IntArray, displaced: tuple[FloatArray, FloatArray], rows: IntArray, in_map: FloatArray,
-) -> ObservedNodes:
+) -> Factors:
     """Return observed nodes with information in map axes."""
     poses, delta = displaced
     mean = se2.wrapped(poses[rows] + delta[rows])
-    return ObservedNodes(
+    return Factors.on(
         nodes[rows], mean=mean, information=turned(in_map, mean[:, 2]),
-        kind=np.full(len(rows), ObservedKind.PRIOR, dtype=np.uint8))
+        kind=np.full(len(rows), FactorKind.NODE_PRIOR, dtype=np.uint8))
 
 
 def turned(information: FloatArray, theta: FloatArray) -> FloatArray:

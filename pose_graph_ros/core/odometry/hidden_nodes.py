@@ -10,7 +10,7 @@ import numpy as np
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses, wrap_one
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.jumps import gap_motion
@@ -120,7 +120,7 @@ class HiddenNodes(NodeTable):
             self._make_first_node(ready[0])
             self._add_secondary_edges()
 
-    def take_secondary_edges(self) -> list[tuple[str, Edges]]:
+    def take_secondary_edges(self) -> list[tuple[str, Factors]]:
         """Return the new edges of the other sources with their sources' names; forget them."""
         edges, self._secondary.new = self._secondary.new, []
         return edges

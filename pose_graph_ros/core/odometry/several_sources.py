@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.odometry.stream import OdometryStream
 from pose_graph_ros.core.quantities import StampNs
 
@@ -90,7 +90,7 @@ class SecondaryEdges:
         # by source: newest node that its samples cover (-1 for none), next node to check
         self.progress: dict[str, tuple[int, int]] = {}
         # edges not yet taken, each with its source; whoever takes them clears the list
-        self.new: list[tuple[str, Edges]] = []
+        self.new: list[tuple[str, Factors]] = []
 
     def skip_to(self, source: str, node: int, *, reached: bool) -> None:
         """
@@ -111,10 +111,10 @@ class SecondaryEdges:
                 # no edge spans a restart
                 if last >= 0 and not stamps_ns[last] < stream.restarted_ns <= stamps_ns[node]:
                     motion = stream.timeline.motion(int(stamps_ns[last]), int(stamps_ns[node]))
-                    self.new.append((source, Edges(
+                    self.new.append((source, Factors(
                         [ids[last]], [ids[node]], [motion.increment],
                         [covariance.information(stream.covariance(motion))],
-                        [EdgeKind.ODOMETRY])))
+                        [FactorKind.ODOMETRY])))
                 last = node
             node += 1
         self.progress[source] = last, node

@@ -45,7 +45,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     factors.refer_to_pose(f)
     f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
     i[:] = 0
-    i[tb.CLIQUE] = i[tb.EDGE_LIST] = i[tb.OBSERVED_LIST] = -1
+    i[tb.CLIQUE] = i[tb.FACTOR_LIST] = -1
     i[tb.NODE_LOGGED] = head[tb.UPDATE]
     tb.node_id(head)[v] = head[tb.NEXT_NODE]
 
@@ -84,12 +84,12 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     NO_ROOM: a table is full. NOT_A_CHAIN: a general update is necessary. After these two the graph
     is unchanged.
     """
-    clique_f, node_f, edge_f = tb.clique_f(head), tb.node_f(head), tb.edge_f(head)
+    clique_f, node_f, factor_f = tb.clique_f(head), tb.node_f(head), tb.factor_f(head)
     pool_f, work_f, node_i = tb.pool_f(head), tb.work_f(head), tb.node_i(head)
-    edge_i, clique_i, pool_i = tb.edge_i(head), tb.clique_i(head), tb.pool_i(head)
-    v, e = head[tb.N_NODES], head[tb.N_EDGES]
+    factor_i, clique_i, pool_i = tb.factor_i(head), tb.clique_i(head), tb.pool_i(head)
+    v, e = head[tb.N_NODES], head[tb.N_FACTORS]
     lacks = lacks_memory(head, head[tb.POOL_F_END] + _PAIR + _ROOT, head[tb.POOL_I_END] + 3, 256)
-    if lacks or v + head[tb.N_PRIORS] >= head[tb.NODE_ROOM] or e >= head[tb.EDGE_ROOM]:
+    if lacks or v + head[tb.N_PRIORS] >= head[tb.NODE_ROOM] or e >= head[tb.FACTOR_ROOM]:
         return NO_ROOM
     if len(mean) != 3 or information.shape != (3, 3):
         return NOT_A_CHAIN
@@ -105,12 +105,12 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         return NOT_A_CHAIN
     head[tb.UPDATE] += 1    # rows are stamped, but not logged: nothing has to be rolled back
     _write_node(head, v, last, mean)
-    f = edge_f[e]
+    f = factor_f[e]
     factors.prepare(f, 0)
-    tb.edge_id(head)[e] = head[tb.NEXT_EDGE]
-    edge_i[e, tb.EDGE_CHECKED] = edge_i[e, tb.EDGE_WAITS] = 0
-    edge_i[e, tb.OWNER] = c
-    edge_i[e, tb.EDGE_LOGGED] = head[tb.UPDATE]
+    tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
+    factor_i[e, tb.FACTOR_CHECKED] = factor_i[e, tb.FACTOR_WAITS] = 0
+    factor_i[e, tb.OWNER] = c
+    factor_i[e, tb.FACTOR_LOGGED] = head[tb.UPDATE]
     factors.linearize(head, e)
     f[tb.ERROR2] = f[tb.ENERGY] = 0.0
     # the front of the old root and the new node, in work space that holds the new root as well
@@ -152,10 +152,10 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     pool_i[old[tb.NODES]], pool_i[old[tb.NODES] + 1] = last, v
     write_rows(front, 6, ld, pool_f, old[tb.VALUES])
     node_i[v, tb.CLIQUE] = r
-    edge_i[e, tb.NEXT_I], node_i[last, tb.EDGE_LIST] = node_i[last, tb.EDGE_LIST], 4 * e
-    edge_i[e, tb.NEXT_J], node_i[v, tb.EDGE_LIST] = -1, 4 * e + 1
-    head[tb.N_NODES], head[tb.N_EDGES], head[tb.NEWEST] = v + 1, e + 1, v
+    factor_i[e, tb.NEXT_I], node_i[last, tb.FACTOR_LIST] = node_i[last, tb.FACTOR_LIST], 4 * e
+    factor_i[e, tb.NEXT_J], node_i[v, tb.FACTOR_LIST] = -1, 4 * e + 1
+    head[tb.N_NODES], head[tb.N_FACTORS], head[tb.NEWEST] = v + 1, e + 1, v
     head[tb.NEXT_NODE] += 1
-    head[tb.NEXT_EDGE] += 1
+    head[tb.NEXT_FACTOR] += 1
     head[tb.LOG_I_END] = 0
     return EXTENDED

@@ -32,7 +32,7 @@ from pose_graph_ros.core.compiled.jit import (
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import factors, tables as tb
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.error_functions import write_data
 from pose_graph_ros.core.graph.pools import row_start
 
@@ -56,11 +56,11 @@ class Innovations(NamedTuple):
         return np.einsum('mi,mij,mj->m', self.errors, information, scaled)
 
 
-def innovations(head: IntArray, edges: Edges) -> Innovations:
+def innovations(head: IntArray, edges: Factors) -> Innovations:
     """Return by how much edges, not in the graph or with weight 0, disagree with the estimate."""
     result = Innovations(np.empty((len(edges), 3)), np.empty((len(edges), 3, 3)))
-    columns = edges.i, edges.j, edges.mean, edges.kind, edges.bias
-    edge_innovations(head, *map(np.ascontiguousarray, columns), *result)
+    columns = edges.i, edges.j, edges.mean, edges.kind, edges.constants
+    _write_innovations(head, *map(np.ascontiguousarray, columns), *result)
     return result
 
 
@@ -91,12 +91,12 @@ def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS, MATRICES), allocates=True)
-def edge_innovations(head, i, j, mean, kind, bias, error, out):  # type: ignore[no-untyped-def]
-    """Write errors, (M, 3), of edges given by columns of `Edges`, and J P J^T, (M, 3, 3)."""
+def _write_innovations(head, i, j, mean, kind, constants, error, out):  # type: ignore[no-untyped-def]
+    """Write errors, (M, 3), of edges given by columns of `Factors`, and J P J^T, (M, 3, 3)."""
     node_f = tb.node_f(head)
-    f, start_j, end_j = np.empty(tb.EDGE_F), np.empty((3, 3)), np.empty((3, 3))
+    f, start_j, end_j = np.empty(tb.FACTOR_F), np.empty((3, 3)), np.empty((3, 3))
     for k in range(len(i)):
-        write_data(f, kind[k], mean[k], bias[k])
+        write_data(f, kind[k], mean[k], constants[k])
         _edge_jacobians(f, kind[k], node_f[i[k]], node_f[j[k]], error[k], start_j, end_j)
         _write_covariance(head, i[k], start_j, j[k], end_j, out[k])
 

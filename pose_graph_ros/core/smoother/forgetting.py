@@ -17,7 +17,6 @@ from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import (
     factors,
-    incidence,
     pools,
     prior_rows,
     tables as tb,
@@ -82,10 +81,10 @@ def far_from_linear(head, nodes):  # type: ignore[no-untyped-def]
     """
     scalars, error2 = tb.scalars(head), 0.0
     for v in nodes:
-        at = incidence.first(head, v)
-        while at != incidence.END:
-            error2 += factors.parts(head, incidence.entry_of(at))[0][tb.ERROR2]
-            at = incidence.following(head, v, at)
+        at = tb.node_i(head)[v, tb.FACTOR_LIST]
+        while at >= 0:
+            error2 += tb.factor_f(head)[at >> 2, tb.ERROR2]
+            at = tb.factor_i(head)[at >> 2, tb.NEXT_I + (at & 3)]
     return error2 > min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * len(nodes))
 
 
@@ -130,24 +129,23 @@ def touch_mixed(head, nodes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _drop_constraints(head, v, leaves):  # type: ignore[no-untyped-def]
-    """Take the constraints of a leaving node out of all lists and sums; return their energy."""
-    node_i, edge_i = tb.node_i(head), tb.edge_i(head)
-    energy, at = 0.0, incidence.first(head, v)
-    while at != incidence.END:
-        entry = incidence.entry_of(at)
-        at = incidence.following(head, v, at)
-        f = factors.parts(head, entry)[0]
+def _drop_factors(head, v, leaves):  # type: ignore[no-untyped-def]
+    """Take the factors of a leaving node out of all lists and sums; return their energy."""
+    node_i, factor_i = tb.node_i(head), tb.factor_i(head)
+    energy, at = 0.0, node_i[v, tb.FACTOR_LIST]
+    while at >= 0:
+        e = at >> 2
+        at = factor_i[e, tb.NEXT_I + (at & 3)]
+        f = tb.factor_f(head)[e]
         if f[tb.WEIGHT] == 0.0:
             continue    # another of its ends has left just before
-        scale_by(head, entry, -f[tb.WEIGHT])
-        for m in range(3 if entry >= 0 else 0):
-            if edge_i[entry, m] >= 0 and not leaves[edge_i[entry, m]]:
-                unlink(head, entry, m)
+        scale_by(head, e, -f[tb.WEIGHT])
+        for m in range(3):
+            if factor_i[e, m] >= 0 and not leaves[factor_i[e, m]]:
+                unlink(head, e, m)
         energy += f[tb.ENERGY]
         f[tb.WEIGHT] = f[tb.ENERGY] = f[tb.ERROR2] = 0.0
-    node_i[v, tb.CLIQUE] = node_i[v, tb.OBSERVED_LIST] = -1
-    node_i[v, tb.EDGE_LIST] = tb.LEAVES
+    node_i[v, tb.CLIQUE], node_i[v, tb.FACTOR_LIST] = -1, tb.LEAVES
     head[tb.N_LEAVING] += 1
     return energy
 
@@ -176,7 +174,7 @@ def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
             _scale_by_prior(head, c, -1.0)
             energy += clique_f[c, tb.PRIOR_ENERGY]
         for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
-            energy += _drop_constraints(head, pool_i[m], leaves)
+            energy += _drop_factors(head, pool_i[m], leaves)
         child = row[tb.CHILD]
         while child >= 0:
             stack[depth] = child

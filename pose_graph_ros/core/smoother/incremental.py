@@ -21,7 +21,7 @@ from pose_graph_ros.core.geometry.se2 import (
     PoseVector,
 )
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.smoother import (
@@ -209,7 +209,7 @@ class IncrementalSmoother:
             raise GraphUpdateError(
                 f'extend: expected arrays of shapes (3,) and (3, 3), got {shapes}')
         if code == chain.NO_ROOM:
-            self.graph.ensure(*(int(count) + 1 for count in head[tb.N_NODES:tb.N_OBSERVED + 1]))
+            self.graph.ensure(self.graph.n_nodes + 1, self.graph.n_factors + 1)
             self._make_room()
             return self.extend(mean, information, weight)
         node, last = self.graph.next_ids.node, self.graph.newest_pose
@@ -217,8 +217,8 @@ class IncrementalSmoother:
             raise GraphUpdateError('extend: expected a graph with a hidden node to go on from')
         return self.update(GraphUpdate(
             hidden=se2.compose(self.graph.poses_of(last), mean)[None],
-            edges=Edges([last], [node], mean[None], information[None], [EdgeKind.ODOMETRY],
-                        [weight])))
+            factors=Factors([last], [node], mean[None], information[None], [FactorKind.ODOMETRY],
+                            [weight])))
 
     def forget(self, nodes: Collection[int]) -> Left:
         """
@@ -312,7 +312,7 @@ class IncrementalSmoother:
         all_covariances(self._memory.head, out)
         return out
 
-    def edge_innovations(self, edges: Edges) -> Innovations:
+    def innovations(self, edges: Factors) -> Innovations:
         """
         Return by how much edges, not in the graph or with weight 0, disagree with the estimate.
 

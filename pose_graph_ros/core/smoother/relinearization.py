@@ -1,9 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Fluid relinearization: which constraints are linearized again after a solve.
+Fluid relinearization: which factors are linearized again after a solve.
 
-The constraints of nodes that have turned are checked, and so are the frames of cliques that have
+The factors of nodes that have turned are checked, and so are the frames of cliques that have
 turned against their parents' frames. If their squared linearization errors add up to more than the
 budget of the step, the largest of them are linearized again, and their nodes are touched for the
 next iteration (M. Kaess et al., "iSAM2", IJRR 2012, here with whitened errors).
@@ -13,68 +13,58 @@ import math
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.graph import factors, incidence, tables as tb, transaction_log
+from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
 from pose_graph_ros.core.graph.rows import touch
 from pose_graph_ros.core.smoother.back_substitution import back_substitute
 
 
 @kernel(forceinline=True)
-def set_waits(head, entry, waits):  # type: ignore[no-untyped-def]
-    """Note whether a constraint is listed as waiting, 1 or 0; return what was noted before."""
-    edge_i, observed_i = tb.edge_i(head), tb.observed_i(head)
-    if entry >= 0:
-        before, edge_i[entry, tb.EDGE_WAITS] = edge_i[entry, tb.EDGE_WAITS], waits
-    else:
-        k = -1 - entry
-        before, observed_i[k, tb.OBS_WAITS] = observed_i[k, tb.OBS_WAITS], waits
+def set_waits(head, e, waits):  # type: ignore[no-untyped-def]
+    """Note whether a factor is listed as waiting, 1 or 0; return what was noted before."""
+    row = tb.factor_i(head)[e]
+    before, row[tb.FACTOR_WAITS] = row[tb.FACTOR_WAITS], waits
     return before
 
 
 @kernel
-def _check_constraint(head, entry, frame):  # type: ignore[no-untyped-def]
+def _check_factor(head, e, frame):  # type: ignore[no-untyped-def]
     """
-    Evaluate a constraint at the present estimate; it waits if its linearization error is large.
+    Evaluate a factor at the present estimate; it waits if its linearization error is large.
 
     Frame is the turn of its clique, as for `factors.check`.
     """
-    scalars, (f, _, _, _, _) = tb.scalars(head), factors.parts(head, entry)
-    if entry >= 0:
-        transaction_log.log_energy(head, entry)
-    else:
-        transaction_log.log_constraint(head, entry)
+    scalars, f = tb.scalars(head), tb.factor_f(head)[e]
+    transaction_log.log_energy(head, e)
     scalars[tb.CHI2] -= f[tb.ENERGY]
-    factors.check(head, entry, frame)
+    factors.check(head, e, frame)
     scalars[tb.CHI2] += f[tb.ENERGY]
     scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
     large = f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
-    if large and set_waits(head, entry, 1) == 0:
-        tb.waiting(head)[head[tb.N_WAITING]] = entry
+    if large and set_waits(head, e, 1) == 0:
+        tb.waiting(head)[head[tb.N_WAITING]] = e
         head[tb.N_WAITING] += 1
 
 
 @kernel
 def _check(head):  # type: ignore[no-untyped-def]
-    """Check the constraints of all listed nodes, each constraint once."""
-    scalars, edge_i, work_i = tb.scalars(head), tb.edge_i(head), tb.work_i(head)
+    """Check the factors of all listed nodes, each factor once."""
+    scalars, factor_i, work_i = tb.scalars(head), tb.factor_i(head), tb.work_i(head)
     iteration = head[tb.ITERATION]
     checks = work_i[head[tb.NODE_ROOM]:]
     scalars[tb.ERROR2_SUM] = 0.0
-    owner, frame = -1, factors.NO_TURN  # edges that follow each other often have the same owner
+    owner, frame = -1, factors.NO_TURN  # those that follow each other often have the same owner
     for n in range(head[tb.N_CHECKS]):
-        v = checks[n]
-        at = incidence.first(head, v)
-        while at != incidence.END:
-            entry = incidence.entry_of(at)
-            if entry < 0:
-                _check_constraint(head, entry, factors.NO_TURN)
-            elif edge_i[entry, tb.EDGE_CHECKED] != iteration:
-                edge_i[entry, tb.EDGE_CHECKED] = iteration
-                if edge_i[entry, tb.OWNER] != owner:
-                    owner = edge_i[entry, tb.OWNER]
+        at = tb.node_i(head)[checks[n], tb.FACTOR_LIST]
+        while at >= 0:
+            e = at >> 2
+            if factor_i[e, tb.FACTOR_CHECKED] != iteration:
+                factor_i[e, tb.FACTOR_CHECKED] = iteration
+                if factor_i[e, tb.OWNER] != owner:
+                    owner = factor_i[e, tb.OWNER]
                     phi = clique_frames.present_turn(head, owner)
                     frame = (phi, math.cos(phi), math.sin(phi))
-                _check_constraint(head, entry, frame)
-            at = incidence.following(head, v, at)
+                _check_factor(head, e, frame)
+            at = factor_i[e, tb.NEXT_I + (at & 3)]
 
 
 @kernel
@@ -101,7 +91,7 @@ def _check_turned(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def forget_waiting(head):  # type: ignore[no-untyped-def]
-    """Empty the lists of waiting constraints and turned frames without linearizing them again."""
+    """Empty the lists of waiting factors and turned frames without linearizing them again."""
     for n in range(head[tb.N_WAITING]):
         set_waits(head, tb.waiting(head)[n], 0)
     head[tb.N_WAITING] = head[tb.N_TURNED] = 0
@@ -110,9 +100,9 @@ def forget_waiting(head):  # type: ignore[no-untyped-def]
 @kernel
 def relinearize(head):  # type: ignore[no-untyped-def]
     """
-    Linearize the worst waiting constraints again, until 0.4 of the budget remains.
+    Linearize the worst waiting factors again, until 0.4 of the budget remains.
 
-    The nodes of the relinearized constraints are touched; the lists of the waiting are emptied.
+    The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
     """
     allowed = 0.4 * _budget(head)
     work_f, waiting = tb.work_f(head), tb.waiting(head)
@@ -123,7 +113,7 @@ def relinearize(head):  # type: ignore[no-untyped-def]
     bins[:] = 0.0
     left, cut = 0.0, 0
     for n in range(head[tb.N_WAITING]):
-        error2 = factors.parts(head, waiting[n])[0][tb.ERROR2]
+        error2 = tb.factor_f(head)[waiting[n], tb.ERROR2]
         bins[_bin(error2 / allowed)] += error2
         left += error2
     turned = work_i[2 * head[tb.NODE_ROOM]:]
@@ -135,14 +125,13 @@ def relinearize(head):  # type: ignore[no-untyped-def]
         left -= bins[cut]
         cut += 1
     for n in range(head[tb.N_WAITING]):
-        entry = waiting[n]
-        f, _, i, j, k = factors.parts(head, entry)
-        transaction_log.log_constraint(head, entry)
-        set_waits(head, entry, 0)
-        if _bin(f[tb.ERROR2] / allowed) < cut:
+        e = waiting[n]
+        transaction_log.log_factor(head, e)
+        set_waits(head, e, 0)
+        if _bin(tb.factor_f(head)[e, tb.ERROR2] / allowed) < cut:
             head[tb.N_RELINEARIZED] += 1
-            factors.linearize(head, entry)
-            for v in (i, j, k):
+            factors.linearize(head, e)
+            for v in tb.factor_i(head)[e, tb.END_I:tb.END_K + 1]:
                 if v >= 0:
                     _touch(head, v)
     for n in range(head[tb.N_TURNED]):
@@ -180,7 +169,7 @@ def solve_and_check(head):  # type: ignore[no-untyped-def]
     """
     Solve from the roots on the stack down; return the sum of the squared linearization errors.
 
-    The constraints with large errors wait to be linearized again.
+    The factors with large errors wait to be linearized again.
     """
     back_substitute(head)
     _check(head)

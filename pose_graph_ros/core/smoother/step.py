@@ -15,7 +15,7 @@ call of `refine` does one iteration, and the graph is valid after each.
 """
 
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
-from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
+from pose_graph_ros.core.graph import tables as tb, transaction_log
 from pose_graph_ros.core.graph.rows import touch
 from pose_graph_ros.core.smoother import relinearization, tree_update
 from pose_graph_ros.core.smoother.tree_update import (
@@ -104,17 +104,15 @@ def _touch_clique(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def _touch_waiting(head):  # type: ignore[no-untyped-def]
     """Touch the cliques of waiting constraints and turned frames; eliminating linearizes them."""
-    edge_i, clique_i, work_i = tb.edge_i(head), tb.clique_i(head), tb.work_i(head)
+    factor_i, clique_i, work_i = tb.factor_i(head), tb.clique_i(head), tb.work_i(head)
     turned = work_i[2 * head[tb.NODE_ROOM]:]
     for n in range(head[tb.N_TURNED]):
         _touch_clique(head, clique_i[turned[n], tb.PARENT])
     for n in range(head[tb.N_WAITING]):
-        entry = tb.waiting(head)[n]
-        transaction_log.log_constraint(head, entry)
-        relinearization.set_waits(head, entry, 0)
-        v = factors.parts(head, entry)[2]
-        _touch_clique(
-            head, edge_i[entry, tb.OWNER] if entry >= 0 else tb.node_i(head)[v, tb.CLIQUE])
+        e = tb.waiting(head)[n]
+        transaction_log.log_factor(head, e)
+        relinearization.set_waits(head, e, 0)
+        _touch_clique(head, factor_i[e, tb.OWNER])
     head[tb.N_WAITING] = head[tb.N_TURNED] = 0
 
 

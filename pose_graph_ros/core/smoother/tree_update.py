@@ -76,10 +76,10 @@ def mark(head):  # type: ignore[no-untyped-def]
         row = clique_i[marked[k]]
         for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
             affected[n_affected] = pool_i[m]
-            n_affected += node_i[pool_i[m], tb.EDGE_LIST] != tb.LEAVES
+            n_affected += node_i[pool_i[m], tb.FACTOR_LIST] != tb.LEAVES
     for s in range(head[tb.N_TOUCHED]):
         v = touched[s]
-        if node_i[v, tb.CLIQUE] < 0 and node_i[v, tb.EDGE_LIST] != tb.LEAVES:
+        if node_i[v, tb.CLIQUE] < 0 and node_i[v, tb.FACTOR_LIST] != tb.LEAVES:
             affected[n_affected] = v
             n_affected += 1
     return marked[:n_marked], affected[:n_affected]

@@ -123,18 +123,13 @@ class Trial:
         now, before, copy = self._graph.rows(), self._before, self.graph
         poses = continued(self._graph, copy.poses, copy.node_ids)
         copy.fill(now._replace(poses=poses).since(before.next_ids))
-        weights = [
-            _changed(ids_before, old, ids_now, new, chosen)
-            for ids_before, old, ids_now, new, chosen in (
-                (before.edge_ids, before.edges.weight, now.edge_ids, now.edges.weight,
-                 self._update.weigh_edges),
-                (before.observed_ids, before.observed.weight, now.observed_ids,
-                 now.observed.weight, self._update.weigh_observed))]
+        weights = _changed(before.factor_ids, before.factors.weight, now.factor_ids,
+                           now.factors.weight, self._update.weigh)
         was_fixed = copy.fixed[copy.node_rows(now.node_ids)]
         known = {_key(prior) for prior in before.priors}
         copy.apply(_gone(copy, self._graph)._replace(
             priors=[prior for prior in now.priors if _key(prior) not in known],
-            weigh_edges=weights[0], weigh_observed=weights[1],
+            weigh=weights,
             fix=self._graph.node_ids[now.fixed & ~was_fixed].tolist(),
             free=self._graph.node_ids[was_fixed & ~now.fixed].tolist()))
 
@@ -146,10 +141,9 @@ def _key(prior: Prior) -> bytes:
 
 def _gone(copy: Graph, graph: Graph) -> GraphUpdate:
     """Return the update that takes out of a copy what has left the graph."""
-    nodes, edges, observed = (ids[rows(ids) < 0].tolist() for ids, rows in (
-        (copy.node_ids, graph.node_rows), (copy.edge_ids, graph.edge_rows),
-        (copy.observed_ids, graph.observed_rows)))
-    return GraphUpdate(remove_nodes=nodes, drop_edges=edges, drop_observed=observed)
+    nodes, factors = (ids[rows(ids) < 0].tolist() for ids, rows in (
+        (copy.node_ids, graph.node_rows), (copy.factor_ids, graph.factor_rows)))
+    return GraphUpdate(remove_nodes=nodes, drop=factors)
 
 
 def _changed(

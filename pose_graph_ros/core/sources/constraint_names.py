@@ -2,15 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the constraints with the largest energies: source, stamp and hidden nodes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.graph_view import constraint_tables, ConstraintTable, DIAGONAL
+from pose_graph_ros.core.graph.graph_view import DIAGONAL, factor_table, FactorTable
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.source_constraints import Queue
@@ -24,7 +23,6 @@ class ConstraintEnergy:
     source: str  # source of the measurement; empty if unknown
     kind: str  # `odometry`, `loop_closure`, `global_pose`, `position`, `heading`, or `bias`
     name: str  # readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`
-    edge: bool = True  # whether `number` is that of an edge; else of an observed node
     number: int = -1  # its id in the graph
     # numbers of the hidden nodes of the path that it has, in the order of the name
     nodes: tuple[int, ...] = ()
@@ -36,42 +34,40 @@ def largest(
     graph: Graph, nodes: HiddenNodes, factors: FactorBuilder, n: int,
 ) -> list[ConstraintEnergy]:
     """Return the constraints with the largest weighted energies, in descending order."""
-    tables = constraint_tables(graph)
-    energies = np.concatenate([table.weights * table.energies for table in tables])
+    table = factor_table(graph)
+    energies = table.weights * table.energies
     n = min(n, int(np.count_nonzero(energies > 0.0)))
     if n <= 0:
         return []
     rows = np.flatnonzero(energies >= np.partition(energies, len(energies) - n)[-n])
     rows = rows[np.argsort(-energies[rows], kind='stable')][:n]
-    return [_named(row, float(energies[row]), tables, graph, (nodes, factors))
+    return [_named(row, float(energies[row]), table, graph, (nodes, factors))
             for row in rows.tolist()]
 
 
 def _named(
-    row: int, energy: float, tables: Sequence[ConstraintTable], graph: Graph,
+    row: int, energy: float, table: FactorTable, graph: Graph,
     origins: tuple[HiddenNodes, FactorBuilder],
 ) -> ConstraintEnergy:
-    """Return a constraint by its row: edges come first, then observed nodes."""
+    """Return a constraint by its row."""
     nodes, factors = origins
-    edge = row < graph.n_edges
-    table, at = (tables[0], row) if edge else (tables[1], row - graph.n_edges)
-    number = int((graph.edge_ids if edge else graph.observed_ids)[at])
-    integers = table.integers[at]
-    ends = integers[[tb.END_I, tb.END_J] if edge else [tb.OBS_NODE]]
+    number, integers = int(graph.factor_ids[row]), table.integers[row]
+    ends = integers[[tb.END_I, tb.END_J]]
+    ends = ends[ends >= 0]
     ids = graph.node_ids[ends]
     places = np.searchsorted(nodes.ids, ids[graph.is_pose[ends]]).tolist()
-    origin, of_bias = factors.origin(number, edge=edge), factors.bias_origin(int(ids[0]))
+    origin, of_bias = factors.origin(number), factors.bias_origin(int(ids[0]))
     known = origin or of_bias
-    if edge and integers[tb.EDGE_KIND] != EdgeKind.BIAS:
-        kind = EdgeKind(int(integers[tb.EDGE_KIND])).name.lower()
+    if len(ends) == 2 and integers[tb.FACTOR_KIND] != FactorKind.BIAS:
+        kind = FactorKind(int(integers[tb.FACTOR_KIND])).name.lower()
         i, j = np.searchsorted(nodes.ids, ids).tolist()
         source = '' if origin is None else origin.source
-        if origin is None and integers[tb.EDGE_KIND] == EdgeKind.ODOMETRY:
+        if origin is None and integers[tb.FACTOR_KIND] == FactorKind.ODOMETRY:
             source = nodes.primary_at(int(nodes.stamps_ns[j]))
         name = f'{source or kind} x{i} - x{j}'
     else:
         if len(places) > 0:
-            position, _, heading = table.numbers[at][DIAGONAL] > 0.0
+            position, _, heading = table.numbers[row][DIAGONAL] > 0.0
             kind = 'heading' if not position else 'global_pose' if heading else 'position'
             where = f' near x{places[0]}'
         else:
@@ -83,7 +79,7 @@ def _named(
             what = f'error of {source}' if kind == 'bias' else source
             name = f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'
     return ConstraintEnergy(
-        energy, float(table.energies[at]), int(table.freedom[at]), source, kind, name, edge,
+        energy, float(table.energies[row]), int(table.freedom[row]), source, kind, name,
         number, tuple(places), -1 if known is None else known.stamp_ns)
 
 

@@ -24,10 +24,9 @@ import numpy as np
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
+    FactorKind,
+    Factors,
     full,
-    ObservedKind,
-    ObservedNodes,
     upper,
 )
 from pose_graph_ros.core.graph.graph import Graph
@@ -98,7 +97,7 @@ def measured_path(
     chosen = _chosen(len(observed))
     stamps_ns, observed = stamps_ns[chosen], observed.rows(chosen)
     begin_at = None if past is None else past.node
-    until, edges = _odometry(graph, odometry, observed.node, begin_at)
+    until, edges = _odometry(graph, odometry, observed.i, begin_at)
     yield
     n, begin = len(until), 0
     motions = _no_motions(n)
@@ -121,11 +120,11 @@ def left_behind(
 ) -> PastPath:
     """Return the positions of a source before a node, when those before it leave the graph."""
     stamps_ns, observed = _sorted(graph, stamps_ns, ids)
-    before = np.flatnonzero(observed.node < node)
+    before = np.flatnonzero(observed.i < node)
     stamps_ns, observed = stamps_ns[before], observed.rows(before)
     if past is None:
-        past = no_past(int(observed.node[0]) if len(observed) > 0 else node)
-    until, edges = _odometry(graph, odometry, np.append(observed.node, node), past.node)
+        past = no_past(int(observed.i[0]) if len(observed) > 0 else node)
+    until, edges = _odometry(graph, odometry, np.append(observed.i, node), past.node)
     n = len(until)
     motions = _no_motions(n)
     chain_motions(*edges, until, 0, n, *motions)
@@ -139,19 +138,19 @@ def _no_motions(n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 def _sorted(
     graph: Graph, stamps_ns: IntArray, ids: IntArray,
-) -> tuple[IntArray, ObservedNodes]:
+) -> tuple[IntArray, Factors]:
     """Return those of some observed nodes that are in the graph, and no headings, by stamp."""
-    rows = graph.observed_rows(ids)
+    rows = graph.factor_rows(ids)
     stamps_ns, rows = stamps_ns[rows >= 0], rows[rows >= 0]
-    placed = graph.memory['observed_i'][rows, tb.OBS_KIND] != ObservedKind.HEADING
+    placed = graph.memory['factor_i'][rows, tb.FACTOR_KIND] != FactorKind.HEADING
     stamps_ns, rows = stamps_ns[placed], rows[placed]
-    where = graph.memory['observed_f'][rows, tb.MEAN:tb.MEAN + 2]
+    where = graph.memory['factor_f'][rows, tb.MEAN:tb.MEAN + 2]
     order = np.lexsort((where[:, 1], where[:, 0], stamps_ns))
-    return stamps_ns[order], graph.observed_at(graph.observed_ids[rows[order]])
+    return stamps_ns[order], graph.factors_at(graph.factor_ids[rows[order]])
 
 
 def _path(
-    stamps_ns: IntArray, observed: ObservedNodes, *motions: FloatArray,
+    stamps_ns: IntArray, observed: Factors, *motions: FloatArray,
 ) -> MeasuredPath:
     """Return the path of some positions, with the columns that say how the robot moved."""
     covariance = np.linalg.inv(observed.information[:, :2, :2])
@@ -181,8 +180,8 @@ def _odometry(
     until = np.maximum.accumulate(at[rows] - first)
     n = int(until[-1]) if len(until) > 0 else 0
     edge_after = np.full(n, -1)
-    table = graph.memory['edge_i'][:graph.n_edges]
-    edges = np.flatnonzero(table[:, tb.EDGE_KIND] == EdgeKind.ODOMETRY)
+    table = graph.memory['factor_i'][:graph.n_factors]
+    edges = np.flatnonzero(table[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY)
     start = at[table[edges, tb.END_I]] - first
     inside: BoolArray = ((start >= 0) & (start < n)
                          & (at[table[edges, tb.END_J]] - first == start + 1))
@@ -192,7 +191,7 @@ def _odometry(
         odometry.ids, graph.node_ids[graph.is_pose][first:first + n + 1])]
     seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
     known = edge_after >= 0
-    numbers = graph.memory['edge_f'][edge_after[known]]
+    numbers = graph.memory['factor_f'][edge_after[known]]
     claimed = odometry.errors.inverse_noise.informations(
         full(numbers[:, tb.INFO:tb.INFO + 6]))
     means, informations = np.zeros((n, 3)), np.zeros((n, 6))

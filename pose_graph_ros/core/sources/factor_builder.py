@@ -26,7 +26,6 @@ from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_constraints import (
     AttachedMeasurement,
     ConstraintOrigin,
-    Held,
     NewConstraint,
     NO_NOISE,
     Queue,
@@ -54,11 +53,9 @@ class FactorBuilder:
         self._constraints: dict[str, SourceConstraints] = {}
         self._pose_edges: dict[str, GrowingArray] = {}  # ids of the edges between poses, by source
         self.new: list[NewConstraint] = []  # constraints of the update that was built last
-        self._n_new_bias_edges = 0
         # biases of gyroscopes, and the edges of their rotations
         self.gyros: dict[str, GyroBias] = {}
         self._abandoned: list[int] = []  # ids of biases that hold no measurement any more
-        self.n_bias_edges = 0  # number of edges of the graph that end at a bias
 
     @property
     def _chains(self) -> list[tuple[str, BiasChain]]:
@@ -77,13 +74,12 @@ class FactorBuilder:
         for _, chain in self._chains:
             chain.begin()
         self.new = [
-            NewConstraint(True, additions.add_edge(edge), source, stamp_ns, LoopClosure, reference)
+            NewConstraint(additions.add(edge), source, stamp_ns, LoopClosure, reference)
             for source, edge, stamp_ns, reference in queue.edges]
         self.new += [self._add(attached, additions) for attached in sorted(
             queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
         for turn in sorted(queue.turns, key=lambda turn: turn.stamp_ns):
             self.gyro_bias(turn.source).add(turn, graph, additions)
-        self._n_new_bias_edges = len(additions.edges) - len(queue.edges) - len(queue.turns)
         return additions.update()
 
     def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
@@ -95,13 +91,14 @@ class FactorBuilder:
         if settings.correlation_time != 0.0:
             noise = motion_noise(measurement, attachment)
         if model is None:
-            added = additions.add_observed(observed)
-            return NewConstraint(False, added, source, stamp_ns, kind, noise=noise)
-        edge = model.add(stamp_ns, observed, noise, additions)
+            return NewConstraint(
+                additions.add(observed), source, stamp_ns, kind, noise=noise)
         if not settings.finds_correlation:
-            return NewConstraint(True, edge, source, stamp_ns, kind)
-        added = additions.add_observed(observed.weighted(0.0))
-        return NewConstraint(False, added, source, stamp_ns, kind, noise=noise, held_by=edge)
+            return NewConstraint(
+                model.add(stamp_ns, observed, noise, additions), source, stamp_ns, kind)
+        added = additions.add(observed.weighted(0.0))
+        edge = model.add(stamp_ns, observed, noise, additions)
+        return NewConstraint(added, source, stamp_ns, kind, noise=noise, held_by=edge)
 
     def gyro_bias(self, source: str) -> GyroBias:
         """Return the bias of a gyroscope, which may be new."""
@@ -148,8 +145,8 @@ class FactorBuilder:
         """Return the ids of the edges between poses, by source, without primary odometry."""
         return {source: edges.values for source, edges in self._pose_edges.items()}
 
-    def held(self) -> dict[str, tuple[IntArray, Held]]:
-        """Return the stamps of all measurements in the map [ns], and what holds them."""
+    def held(self) -> dict[str, tuple[IntArray, IntArray]]:
+        """Return the stamps of all measurements in the map [ns], and ids of what holds them."""
         return {source: (each.rows.values[:, 0], each.held())
                 for source, each in self._constraints.items()}
 
@@ -172,34 +169,32 @@ class FactorBuilder:
         self._abandoned += model.nodes
 
     def leaving_biases(
-        self, edges: IntArray, observed: IntArray, others: Mapping[str, GaussMarkovBias],
+        self, factors: IntArray, others: Mapping[str, GaussMarkovBias],
     ) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned]
         for gyro in self.gyros.values():
-            biases += gyro.leaving(edges)
+            biases += gyro.leaving(factors)
         for source, constraints in self._constraints.items():
             models = [each[source] for each in (self._error_models, others) if source in each]
-            left = constraints.rows.values[~constraints.leaving(edges, observed), 0]
+            left = constraints.rows.values[~constraints.leaving(factors), 0]
             oldest_ns = int(np.min(left)) if len(left) > 0 else None
             for model in models:
                 biases += model.leaving(oldest_ns)
         return biases
 
-    def forget(
-        self, nodes: IntArray, edges: IntArray, observed: IntArray,
-    ) -> dict[str, IntArray]:
+    def forget(self, nodes: IntArray, factors: IntArray) -> dict[str, IntArray]:
         """Return the numbers of the measurements that are left, after forgetting the others."""
         gone, kept = {*nodes.tolist()}, {}
         for _, chain in self._chains:
             chain.forget(gone)
         for gyro in self.gyros.values():
-            gyro.forget_edges(edges)
+            gyro.forget_factors(factors)
         self._abandoned = [node for node in self._abandoned if node not in gone]
         for source, constraints in self._constraints.items():
-            kept[source] = constraints.forget(constraints.leaving(edges, observed))
+            kept[source] = constraints.forget(constraints.leaving(factors))
         for known in self._pose_edges.values():
-            known.select(np.flatnonzero(~np.isin(known.values, edges)))
+            known.select(np.flatnonzero(~np.isin(known.values, factors)))
         return kept
 
     def rollback(self) -> None:
@@ -207,22 +202,18 @@ class FactorBuilder:
             chain.rollback()
 
     def commit(self) -> None:
-        self.n_bias_edges += self._n_new_bias_edges
-        for is_edge, number, source, stamp_ns, kind, _, noise, held_by in self.new:
+        for number, source, stamp_ns, kind, _, noise, held_by in self.new:
             odometry = self.config.odometry.get(source) if stamp_ns < 0 else None
             settings = odometry or self.config.measurement_source(source, kind)
             loss = (settings.loss if isinstance(settings, OdometrySource)
                     else settings.applied_loss)
             threshold = settings.rejection_threshold
-            self._reweighting.add(number, loss, threshold, edge=is_edge)
+            self._reweighting.add(number, loss, threshold)
             if held_by >= 0:
-                self._reweighting.add(held_by, loss, threshold, edge=True)
+                self._reweighting.add(held_by, loss, threshold)
                 self._reweighting.set_base_weight(number, 0.0)
             if kind is not LoopClosure:
-                if source not in self._constraints:
-                    self._constraints[source] = SourceConstraints(
-                        as_edges=self._has_given_bias(source))
-                constraints = self._constraints[source]
+                constraints = self._constraints.setdefault(source, SourceConstraints())
                 constraints.append(stamp_ns, number, noise, held_by)
             else:
                 edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
@@ -231,17 +222,17 @@ class FactorBuilder:
         for _, chain in self._chains:
             chain.begin()
 
-    def origin(self, number: int, *, edge: bool) -> ConstraintOrigin | None:
+    def origin(self, number: int) -> ConstraintOrigin | None:
         """Return where a constraint comes from; None if this builder has not added it."""
         for source, constraints in self._constraints.items():
-            stamp_ns = constraints.stamp_ns(number, edge=edge)
+            stamp_ns = constraints.stamp_ns(number)
             if stamp_ns is not None:
                 return ConstraintOrigin(source, stamp_ns)
-        for source, edges in self._pose_edges.items() if edge else ():
+        for source, edges in self._pose_edges.items():
             at = int(np.searchsorted(edges.values, number))
             if at < len(edges) and edges.values[at] == number:
                 return ConstraintOrigin(source, -1)
-        for source, gyro in self.gyros.items() if edge else ():
+        for source, gyro in self.gyros.items():
             if number in gyro.edges:
                 return ConstraintOrigin(source, -1)
         return None
@@ -298,19 +289,13 @@ class FactorBuilder:
         if not same and settings.finds_correlation:
             self._error_models.pop(source, None)
         same = same and settings.finds_correlation >= (saved.errors is not None)
-        self._constraints[source] = constraints = SourceConstraints(
-            as_edges=self._has_given_bias(source))
+        self._constraints[source] = constraints = SourceConstraints()
         if same:
             constraints.restore(saved)
         constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints)
 
     def _settings(self, source: str) -> MeasurementSource:
         return self.config.measurement_source(source, GlobalPose)
-
-    def _has_given_bias(self, source: str) -> bool:
-        """Tell whether measurements of a source are edges to a bias from the beginning."""
-        return (source in self._error_models
-                and not self._settings(source).finds_correlation)
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well the newest measurements of each source fit the estimate."""
@@ -324,7 +309,6 @@ class FactorBuilder:
 
     def report(self, source: str, graph: Graph) -> SourceReport:
         constraints = self._constraints[source]
-        used = constraints.held().weights(graph, graph.weights) > 0.0
         return source_report.report(
-            graph, constraints.rows.values[used], biased=constraints.as_edges,
+            graph, constraints.rows.values[constraints.are_used(graph)],
             in_use=self.errors_in_use(source), found=self._settings(source).finds_correlation)

@@ -30,7 +30,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate, NextIds
 from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -67,30 +67,22 @@ class Additions:
     first: NextIds  # ids of the first new rows
     biases: list[FloatArray] = field(default_factory=list)
     dimensions: list[int] = field(default_factory=list)
-    edges: list[Edges] = field(default_factory=list)
-    observed: list[ObservedNodes] = field(default_factory=list)
-    remove_edges: list[int] = field(default_factory=list)
-    remove_observed: list[int] = field(default_factory=list)
+    factors: list[Factors] = field(default_factory=list)
+    remove: list[int] = field(default_factory=list)
 
     def update(self) -> GraphUpdate:
         return GraphUpdate(
             biases=np.array(self.biases).reshape(-1, 3), dimensions=self.dimensions,
-            edges=Edges.joined(self.edges),
-            observed=ObservedNodes.joined(self.observed), remove_edges=self.remove_edges,
-            remove_observed=self.remove_observed)
+            factors=Factors.joined(self.factors), remove=self.remove)
 
     def add_bias(self, value: float = 0.0, dimension: int = 3) -> int:
         self.biases.append(np.array((value, 0.0, 0.0)))
         self.dimensions.append(dimension)
         return self.first.node + len(self.biases) - 1
 
-    def add_edge(self, edge: Edges) -> int:
-        self.edges.append(edge)
-        return self.first.edge + len(self.edges) - 1
-
-    def add_observed(self, observed: ObservedNodes) -> int:
-        self.observed.append(observed)
-        return self.first.observed + len(self.observed) - 1
+    def add(self, factor: Factors) -> int:
+        self.factors.append(factor)
+        return self.first.factor + len(self.factors) - 1
 
 
 class BiasChain:
@@ -168,7 +160,7 @@ class GaussMarkovBias(BiasChain):
         return True
 
     def add(
-        self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray, additions: Additions,
+        self, stamp_ns: int, observed: Factors, noise: FloatArray, additions: Additions,
     ) -> int:
         """
         Return the id of the edge that is added, from a measurement's node to its bin's state.
@@ -183,10 +175,10 @@ class GaussMarkovBias(BiasChain):
         if at == len(self.nodes) or self._begins_ns[at] != begin_ns:
             self._make_bin(at, begin_ns, additions)
         phi = self._phi(abs(rest_ns - self._width_ns / 2))
-        return additions.add_edge(biased_constraint(
+        return additions.add(biased_constraint(
             observed, noise, self.nodes[at], phi, self.errors))
 
-    def preview(self, stamp_ns: int, observed: ObservedNodes, noise: FloatArray) -> Edges | None:
+    def preview(self, stamp_ns: int, observed: Factors, noise: FloatArray) -> Factors | None:
         """Return the edge of a measurement to the last state before it; None without one."""
         at = bisect.bisect(self._begins_ns, stamp_ns) - 1
         if at < 0:
@@ -210,14 +202,13 @@ class GaussMarkovBias(BiasChain):
             before, after = after, before
         node = additions.add_bias()
         if before is None:
-            tie = additions.add_observed(ObservedNodes(
-                [node], None, np.zeros((1, 3)), _INFORMATION[None], [ObservedKind.GLOBAL_POSE]))
+            tie = additions.add(Factors.on(
+                [node], None, np.zeros((1, 3)), _INFORMATION[None], [FactorKind.GLOBAL_POSE]))
         else:
             tie = self._tied(
                 node, self.nodes[before], begin_ns - self._begins_ns[before], additions)
         if after is not None:
-            removed = additions.remove_observed if before is None else additions.remove_edges
-            removed.append(self._ties[after])
+            additions.remove.append(self._ties[after])
             self._ties[after] = self._tied(
                 self.nodes[after], node, self._begins_ns[after] - begin_ns, additions)
         for column, value in zip(self._columns, (begin_ns, node, tie), strict=True):
@@ -225,14 +216,14 @@ class GaussMarkovBias(BiasChain):
 
     def _tied(self, node: int, before: int, gap_ns: int, additions: Additions) -> int:
         phi = self._phi(abs(gap_ns))
-        return additions.add_edge(Edges(
+        return additions.add(Factors(
             [node], [before], np.zeros((1, 3)), _INFORMATION[None] / (1.0 - phi * phi),
-            [EdgeKind.BIAS], bias=np.array([(0.0, 0.0, phi, phi)])))
+            [FactorKind.BIAS], constants=np.array([(0.0, 0.0, phi, phi)])))
 
 
 def biased_constraint(
-    observed: ObservedNodes, noise: FloatArray, bias: int, phi: float, errors: CorrelatedErrors,
-) -> Edges:
+    observed: Factors, noise: FloatArray, bias: int, phi: float, errors: CorrelatedErrors,
+) -> Factors:
     """
     Return the edge from a hidden node x to a state of the bias that holds a measurement.
 
@@ -246,7 +237,7 @@ def biased_constraint(
     rows = np.flatnonzero(np.diagonal(given) > 0.0)  # what is measured: position, heading or both
     block = np.ix_(rows, rows)
     cov = np.linalg.inv(given[block])
-    if kind == ObservedKind.GLOBAL_POSE:
+    if kind == FactorKind.GLOBAL_POSE:
         cov = covariance.turned(cov, -float(mean[2]))
     is_heading = (rows == 2).astype(np.int64)
     total = np.diagonal(cov).copy()
@@ -260,7 +251,7 @@ def biased_constraint(
         errors.white * scale[:, None] * cov * scale + np.diag(rest))
     factors = np.zeros(2)
     factors[is_heading] = phi * np.sqrt(correlated) * np.where(is_heading, STRETCH, 1.0)
-    if kind != ObservedKind.POSITION:
+    if kind != FactorKind.POSITION:
         mean[2] = se2.wrap(mean[2] - offset[2])
-    return Edges([observed.node[0]], [bias], [mean], [information], [EdgeKind.BIAS],
-                 weight=observed.weight, bias=[(offset[0], offset[1], *factors)])
+    return Factors([observed.i[0]], [bias], [mean], [information], [FactorKind.BIAS],
+                 weight=observed.weight, constants=[(offset[0], offset[1], *factors)])

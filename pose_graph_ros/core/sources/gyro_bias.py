@@ -22,7 +22,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import GyroSource
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.turns import Turn
 from pose_graph_ros.core.saved_columns import Integers, Pairs
@@ -72,8 +72,8 @@ class GyroBias(BiasChain):
         # one that was set aside for long has the state of the bin before, if its own has none
         state = self.nodes[max(bisect.bisect_right(self._begins_ns, turn.stamp_ns) - 1, 0)]
         if turn.rest_variance > 0.0:
-            additions.add_observed(_observed(state, turn.rest_rate, turn.rest_variance))
-        self._edges.append_one((additions.add_edge(turn_edge(turn, state)), state))
+            additions.add(_observed(state, turn.rest_rate, turn.rest_variance))
+        self._edges.append_one((additions.add(turn_edge(turn, state)), state))
 
     def _make_state(
         self, begin_ns: int, turn: Turn, graph: Graph, additions: Additions,
@@ -92,22 +92,22 @@ class GyroBias(BiasChain):
                 self._columns, (begin_ns, state, NO_TRANSITION), strict=True):
             column.append(number)
         if gap <= SOURCES.switched_off:
-            additions.add_edge(Edges(
+            additions.add(Factors(
                 [state], [before], np.zeros((1, 3)),
-                _information(source.sigma_bias_walk**2 * gap), [EdgeKind.BIAS],
-                bias=np.array([(0.0, 0.0, 1.0, 0.0)])))
+                _information(source.sigma_bias_walk**2 * gap), [FactorKind.BIAS],
+                constants=np.array([(0.0, 0.0, 1.0, 0.0)])))
         else:
-            additions.add_observed(_observed(state, 0.0, source.sigma_bias**2))
+            additions.add(_observed(state, 0.0, source.sigma_bias**2))
 
-    def leaving(self, edges: IntArray) -> list[int]:
-        """Return the ids of the states that nothing needs once some edges have left the graph."""
-        needed = self._edges.values[~np.isin(self.edges, edges), 1]
+    def leaving(self, factors: IntArray) -> list[int]:
+        """Return the ids of the states that nothing needs once some factors have left."""
+        needed = self._edges.values[~np.isin(self.edges, factors), 1]
         oldest = int(np.min(needed, initial=self.newest))
         return self.nodes[:bisect.bisect_left(self.nodes, oldest)]
 
-    def forget_edges(self, edges: IntArray) -> None:
-        """Forget edges that have left the graph, by their ids."""
-        self._edges.select(np.flatnonzero(~np.isin(self.edges, edges)))
+    def forget_factors(self, factors: IntArray) -> None:
+        """Forget factors that have left the graph, by their ids."""
+        self._edges.select(np.flatnonzero(~np.isin(self.edges, factors)))
 
     def saved(self) -> SavedGyroBias:
         # a restored chain may have begun with bins of another width
@@ -130,15 +130,15 @@ def _information(variance: float) -> FloatArray:
     return information
 
 
-def _observed(state: int, rate: float, variance: float) -> ObservedNodes:
+def _observed(state: int, rate: float, variance: float) -> Factors:
     """Return the observation of a state: a rate [rad/s] and its variance."""
-    return ObservedNodes([state], None, np.array([(rate, 0.0, 0.0)]), _information(variance),
-                         [ObservedKind.GLOBAL_POSE])
+    return Factors.on([state], None, np.array([(rate, 0.0, 0.0)]), _information(variance),
+                      [FactorKind.GLOBAL_POSE])
 
 
-def turn_edge(turn: Turn, state: int) -> Edges:
+def turn_edge(turn: Turn, state: int) -> Factors:
     information = np.zeros((1, 3, 3))
     information[0, 2, 2] = 1.0 / turn.variance
-    return Edges(
-        [turn.i], [turn.j], np.array([(0.0, 0.0, turn.angle)]), information, [EdgeKind.TURN],
-        bias=np.array([(0.0, 0.0, 0.0, turn.seconds)]), k=[state])
+    return Factors(
+        [turn.i], [turn.j], np.array([(0.0, 0.0, turn.angle)]), information, [FactorKind.TURN],
+        constants=np.array([(0.0, 0.0, 0.0, turn.seconds)]), k=[state])

@@ -12,7 +12,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import (
     Absolute,
     Answer,
@@ -57,7 +57,7 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
     return nodes.attachment(node, np.zeros(3), np.zeros((3, 3)))
 
 
-def absolute_constraint(measurement: Absolute, attachment: Attachment) -> ObservedNodes:
+def absolute_constraint(measurement: Absolute, attachment: Attachment) -> Factors:
     """
     Return the observed node of a measurement.
 
@@ -66,18 +66,18 @@ def absolute_constraint(measurement: Absolute, attachment: Attachment) -> Observ
     """
     offset, noise, information = attachment.motion, attachment.noise, np.zeros((3, 3))
     if isinstance(measurement, Position):
-        kind, mean = ObservedKind.POSITION, np.append(measurement.position, 0.0)
+        kind, mean = FactorKind.POSITION, np.append(measurement.position, 0.0)
         offset = se2.compose(offset, np.append(measurement.lever_arm, 0.0))
         information[:2, :2] = covariance.information(
             measurement.covariance + swept_variance(measurement, attachment) * np.eye(2))
     elif isinstance(measurement, HeadingOnly):
-        kind, mean = ObservedKind.HEADING, np.array((0.0, 0.0, measurement.heading))
+        kind, mean = FactorKind.HEADING, np.array((0.0, 0.0, measurement.heading))
         information[2, 2] = 1.0 / (measurement.variance + noise[2, 2])
     else:
-        kind, mean = ObservedKind.GLOBAL_POSE, measurement.pose
+        kind, mean = FactorKind.GLOBAL_POSE, measurement.pose
         information = covariance.information(
             covariance.turned(measurement.covariance, float(mean[2])) + noise)
-    return ObservedNodes([attachment.node], [offset], [mean], [information], [kind])
+    return Factors.on([attachment.node], [offset], [mean], [information], [kind])
 
 
 def swept_variance(measurement: Position, attachment: Attachment) -> float:
@@ -105,7 +105,7 @@ def motion_noise(measurement: Absolute, attachment: Attachment) -> FloatArray:
 
 def loop_closure_constraint(
     measurement: LoopClosure, reference: Attachment, attachment: Attachment,
-) -> Edges:
+) -> Factors:
     """
     Return the edge of a loop closure between the hidden nodes before its two stamps.
 
@@ -123,8 +123,8 @@ def loop_closure_constraint(
     else:
         information = covariance.information(closure_covariance(
             covariance.turned(measurement.covariance, float(z[2])), z, reference, attachment))
-    return Edges([reference.node], [attachment.node], [mean], [information],
-                 [EdgeKind.LOOP_CLOSURE])
+    return Factors([reference.node], [attachment.node], [mean], [information],
+                 [FactorKind.LOOP_CLOSURE])
 
 
 def closure_covariance(

@@ -11,7 +11,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKinds, Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKinds, Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Absolute, Measurement
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, OdometryErrors
@@ -32,13 +32,13 @@ class SavedEdges:
     j: Integers
     mean: Rows3
     information: Rows6
-    kind: EdgeKinds
+    kind: FactorKinds
     stamps_ns: Pairs  # of a loop closure and of its other end [ns]; -1 for odometry
 
 
 class QueuedEdge(NamedTuple):
     source: str
-    edge: Edges
+    edge: Factors
     stamp_ns: int = -1  # of the loop closure [ns]; -1 for an edge of odometry
     reference_ns: int = -1  # stamp of its other end [ns]
 
@@ -50,7 +50,7 @@ class QueuedEdge(NamedTuple):
 
 class AttachedMeasurement(NamedTuple):
     source: str
-    observed: ObservedNodes  # its constraint if its error is treated as white
+    observed: Factors  # its constraint if its error is treated as white
     measurement: Absolute
     attachment: Attachment
 
@@ -113,7 +113,6 @@ class ConstraintOrigin(NamedTuple):
 class NewConstraint(NamedTuple):
     """A constraint in the update that was built last."""
 
-    is_edge: bool
     number: int  # its id
     source: str
     stamp_ns: int  # of the measurement [ns]; -1 for an edge of odometry
@@ -123,14 +122,19 @@ class NewConstraint(NamedTuple):
     noise: FloatArray = NO_NOISE
     held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
 
+    @property
+    def held(self) -> int:
+        """Id of the factor that holds it."""
+        return self.held_by if self.held_by >= 0 else self.number
+
 
 @dataclass(frozen=True, slots=True)
 class SavedSource:
     seen_ns: Integers  # stamps of all measurements that were received [ns], sorted
     # for each stamp the reference of the loop closure, 0 for others; see `waiting`
     seen_references: Integers
-    # Stamp [ns] and id of each constraint, shape (K, 2). The ids are those of edges if a bias with
-    # a given correlation time was estimated, else those of observed nodes.
+    # Stamp [ns] and id of each constraint, shape (K, 2): of an edge if a bias with a given
+    # correlation time was estimated, else of an observed node.
     rows: Pairs
     n_otherwise: int  # number of constraints that were added under other settings
     ties: Integers  # ids of its edges between hidden nodes, except those of the primary odometry
@@ -150,20 +154,6 @@ class SavedSource:
     odometry: Numbers = field(default_factory=lambda: np.empty(0))
 
 
-class Held(NamedTuple):
-    """The constraint that holds each of some measurements."""
-
-    ids: IntArray
-    is_edge: BoolArray
-
-    def weights(self, graph: Graph, by_row: tuple[FloatArray, FloatArray]) -> FloatArray:
-        """Return their weights, given those of the edges and observed nodes of a graph by row."""
-        weights = np.empty(len(self.ids))
-        weights[self.is_edge] = by_row[0][graph.edge_rows(self.ids[self.is_edge])]
-        weights[~self.is_edge] = by_row[1][graph.observed_rows(self.ids[~self.is_edge])]
-        return weights
-
-
 class SourceConstraints:
     """
     The constraints of one source.
@@ -172,9 +162,7 @@ class SourceConstraints:
     an edge to the bias holds it instead. So it can become white again, or get another bias.
     """
 
-    def __init__(self, *, as_edges: bool = False) -> None:
-        # whether they are added as edges, to a bias with a given time constant
-        self.as_edges = as_edges
+    def __init__(self) -> None:
         # stamp [ns] of each measurement, and the id of what it was first added as
         self.rows = GrowingArray((2,), np.int64)
         # what the motion since the node adds to its variances; see `motion_noise`
@@ -197,8 +185,8 @@ class SourceConstraints:
         """Number of measurements, with those that have left the graph."""
         return len(self) + self.n_gone
 
-    def leaving(self, edges: IntArray, observed: IntArray) -> BoolArray:
-        return np.asarray(np.isin(self.rows.values[:, 1], edges if self.as_edges else observed))
+    def leaving(self, factors: IntArray) -> BoolArray:
+        return np.isin(self.rows.values[:, 1], factors)
 
     def forget(self, gone: BoolArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
@@ -217,20 +205,22 @@ class SourceConstraints:
         self.noise.append_one(noise)
         self.edges.append_one(edge)
 
-    def held(self, which: IntArray | slice = slice(None)) -> Held:
+    def held(self, which: IntArray | slice = slice(None)) -> IntArray:
+        """Return the ids of the factors that hold some measurements."""
         edges = self.edges.values[which]
-        return Held(np.where(edges >= 0, edges, self.rows.values[which, 1]),
-                    (edges >= 0) | self.as_edges)
+        return np.where(edges >= 0, edges, self.rows.values[which, 1])
 
-    def stamp_ns(self, number: int, *, edge: bool) -> int | None:
-        """Return the stamp of the measurement that a constraint holds [ns], or None."""
-        if edge is self.as_edges:
-            # ids are appended in increasing order
-            at = int(np.searchsorted(self.rows.values[:, 1], number))
-            found = at < len(self.rows) and self.rows.values[at, 1] == number
-            return int(self.rows.values[at, 0]) if found else None
-        if not edge:
-            return None
+    def are_used(self, graph: Graph, weights: FloatArray | None = None) -> BoolArray:
+        """Tell which measurements have a weight, in the graph or given by row."""
+        weights = graph.weights if weights is None else weights
+        return np.asarray(weights[graph.factor_rows(self.held())] > 0.0)
+
+    def stamp_ns(self, number: int) -> int | None:
+        """Return the stamp of the measurement that a factor holds [ns], or None."""
+        # ids are appended in increasing order
+        at = int(np.searchsorted(self.rows.values[:, 1], number))
+        if at < len(self.rows) and self.rows.values[at, 1] == number:
+            return int(self.rows.values[at, 0])
         found_at = np.flatnonzero(self.edges.values == number)
         return int(self.rows.values[found_at[0], 0]) if len(found_at) > 0 else None
 

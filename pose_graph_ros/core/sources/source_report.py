@@ -8,7 +8,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -111,7 +111,7 @@ class SourceReport(NamedTuple):
 
 
 def report(
-    graph: Graph, rows: IntArray, *, biased: bool, in_use: CorrelatedErrors | None,
+    graph: Graph, rows: IntArray, *, in_use: CorrelatedErrors | None,
     found: bool = False,
 ) -> SourceReport:
     """
@@ -124,13 +124,12 @@ def report(
     newest = rows[-SOURCES.most_residuals:]
     newest = newest[np.argsort(newest[:, 0], kind='stable')]
     newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
-    stamps, numbers = newest[:, 0], newest[:, 1]
-    if biased:
-        errors, information = _biased_residuals(graph, graph.edges_at(numbers))
+    stamps, observed = newest[:, 0], graph.factors_at(newest[:, 1])
+    if np.any(observed.j >= 0):     # all are edges to a bias with a given time constant
+        errors, information = _biased_residuals(graph, observed)
         residuals = errors
     else:
-        observed = graph.observed_at(numbers)
-        errors, information = graph.observed_errors(observed), observed.information
+        errors, information = graph.errors(observed), observed.information
         # of positions, in map axes
         residuals = np.einsum('kij,kj->ki', se2.rotation(observed.mean[:, 2]), errors[:, :2])
         placed = information[:, 0, 0] > 0.0
@@ -141,10 +140,10 @@ def report(
                         estimate(stamps, residuals), in_use, found)
 
 
-def _biased_residuals(graph: Graph, edges: Edges) -> tuple[FloatArray, FloatArray]:
+def _biased_residuals(graph: Graph, edges: Factors) -> tuple[FloatArray, FloatArray]:
     """Return whole errors of positions in map axes, of edges to a bias, and their information."""
-    errors = graph.edge_errors(edges)[:, :2]
-    factor = edges.bias[:, 2]
+    errors = graph.errors(edges)[:, :2]
+    factor = edges.constants[:, 2]
     total = errors - factor[:, None] * graph.poses_of(edges.j)[:, :2]
     variance = factor**2 + 1.0 / (0.5 * np.trace(
         edges.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)

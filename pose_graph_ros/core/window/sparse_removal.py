@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.graph.priors import model, Prior
@@ -112,23 +112,23 @@ class Cuts(NamedTuple):
     """Edges of chains of biases that are cut, and what stays on the other side."""
 
     cuts: Sequence[Cut]
-    observed: ObservedNodes  # on the first states that stay, of the kind PRIOR
+    observed: Factors  # on the first states that stay, of the kind NODE_PRIOR
 
 
-NO_CUTS = Cuts((), ObservedNodes())
+NO_CUTS = Cuts((), Factors())
 
 
 def cut_chains(graph: Graph, biases: IntArray) -> Cuts | None:
     """Return where the chains of some biases are cut; None if one has several ends that stay."""
-    edges = graph.edges
-    rows = np.flatnonzero((edges.weight > 0.0) & (edges.k < 0)
+    edges = graph.factors
+    rows = np.flatnonzero((edges.weight > 0.0) & (edges.j >= 0) & (edges.k < 0)
                           & (np.isin(edges.i, biases) | np.isin(edges.j, biases)))
     ends = np.column_stack((edges.i[rows], edges.j[rows]))
     rows, ends = (each[np.all(graph.is_bias[graph.node_rows(ends)], axis=1)]
                   for each in (rows, ends))
     leaves = np.isin(ends, biases)
     inside = np.all(leaves, axis=1)
-    found, observed, seen = list[Cut](), list[ObservedNodes](), set[int]()
+    found, observed, seen = list[Cut](), list[Factors](), set[int]()
     for row, pair, first in zip(rows[~inside].tolist(), ends[~inside].tolist(),
                                 leaves[~inside, 0].tolist(), strict=True):
         x, y = pair if first else pair[::-1]
@@ -139,7 +139,7 @@ def cut_chains(graph: Graph, biases: IntArray) -> Cuts | None:
         cut, rest = _cut(graph, np.array((*chain, y)), rows[inside], row)
         found.append(cut)
         observed.append(rest)
-    return Cuts(found, ObservedNodes.joined(observed))
+    return Cuts(found, Factors.joined(observed))
 
 
 def _chain(first: int, ends: IntArray) -> list[int]:
@@ -154,17 +154,17 @@ def _chain(first: int, ends: IntArray) -> list[int]:
     return chain
 
 
-def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cut, ObservedNodes]:
+def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cut, Factors]:
     """Return a cut, and what it leaves on the state that stays."""
-    chain = inside[np.isin(graph.edges.i[inside], nodes)]
-    observed = graph.observed
-    part = part_of(
-        graph, np.sort(nodes), np.sort(np.append(chain, edge)),
-        np.isin(observed.node, nodes[:-1]) & (observed.weight > 0.0))
+    factors = graph.factors
+    chain = inside[np.isin(factors.i[inside], nodes)]
+    seen = np.flatnonzero(
+        (factors.j < 0) & np.isin(factors.i, nodes[:-1]) & (factors.weight > 0.0))
+    part = part_of(graph, np.sort(nodes), np.sort(np.concatenate((chain, seen, (edge,)))))
     order = np.argsort(np.argsort(nodes))
     (x, y), last = columns_of(order[[0, -1]]).reshape(2, 3), order[-2]
     whole, own_b = equations(part)
-    part.apply(GraphUpdate(weigh_edges={int(graph.edge_ids[edge]): 0.0}))
+    part.apply(GraphUpdate(weigh={int(graph.factor_ids[edge]): 0.0}))
     H, b = equations(part)
     between = (whole - H)[np.ix_((*x, *y), (*x, *y))], (own_b - b)[[*x, *y]]
     # of the state that is cut off, and the same if the first one were known
@@ -178,12 +178,12 @@ def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cu
     given = 1.0 / (1.0 - 0.5 * math.log(1.0 - new))
     if after[0][0, 0] < 1e-9 * between[0][3, 3]:
         # a chain of which nothing is known but its steps, and the rest is rounding
-        return Cut(int(graph.edge_ids[edge]), int(nodes[0]), 0.0 * own[0], 0.0 * own[1]), (
-            ObservedNodes())
+        return Cut(int(graph.factor_ids[edge]), int(nodes[0]), 0.0 * own[0], 0.0 * own[1]), (
+            Factors())
     reference = graph.poses_of(nodes[-1:])
     rest = as_observed(
         Prior(nodes[-1:], reference, given * after[0], given * after[1], 0.0, True))
-    return Cut(int(graph.edge_ids[edge]), int(nodes[0]), given * own[0], given * own[1]), rest
+    return Cut(int(graph.factor_ids[edge]), int(nodes[0]), given * own[0], given * own[1]), rest
 
 
 def _add_priors(
@@ -232,8 +232,7 @@ NONE: IntArray = np.empty(0, dtype=np.int64)
 
 
 def sparse_removal(
-    graph: Graph, nodes: IntArray, edges: IntArray = NONE, observed: IntArray = NONE,
-    cuts: Cuts = NO_CUTS,
+    graph: Graph, nodes: IntArray, factors: IntArray = NONE, cuts: Cuts = NO_CUTS,
 ) -> GraphUpdate | None:
     """
     Return the update by which nodes leave, and edges and observed nodes take their place.
@@ -241,32 +240,24 @@ def sparse_removal(
     No covariance becomes smaller by it. None if something else than poses is connected with them,
     or what they tell is too stiff for double precision.
     """
-    table, of_nodes = graph.edges, graph.observed
-    with_nodes = graph.constraints_on(nodes)
-    leaves = (np.isin(graph.edge_ids, np.union1d(with_nodes[0], edges)) & (table.weight > 0.0)
-              & ~np.isin(graph.edge_ids, [cut.edge for cut in cuts.cuts]))
-    leave = np.isin(graph.observed_ids, observed) & (of_nodes.weight > 0.0)
+    table, ids, with_nodes = graph.factors, graph.factor_ids, graph.factors_on(nodes)
+    leaves = (np.isin(ids, np.union1d(with_nodes, factors)) & (table.weight > 0.0)
+              & ~np.isin(ids, [cut.edge for cut in cuts.cuts]))
     of_priors = [prior.nodes for prior in graph.priors if np.any(np.isin(prior.nodes, nodes))]
     around = np.setdiff1d(np.concatenate((
-        table.i[leaves], table.j[leaves], table.k[leaves], of_nodes.node[leave], *of_priors)),
-        (*nodes, -1))
+        table.i[leaves], table.j[leaves], table.k[leaves], *of_priors)), (*nodes, -1))
     if not np.all(graph.is_pose[graph.node_rows(around)]):
         return None
-    earlier = ((table.kind == EdgeKind.PRIOR) & np.isin(table.i, around)
-               & np.isin(table.j, around))
-    earlier_observed = (of_nodes.kind == ObservedKind.PRIOR) & np.isin(of_nodes.node, around)
-    more = np.union1d(edges, graph.edge_ids[earlier])
-    more_observed = np.union1d(observed, graph.observed_ids[earlier_observed])
-    sparse = _approximation(
-        marginal(graph, nodes, more.tolist(), more_observed.tolist(), cuts.cuts).prior)
+    earlier = (np.isin(table.kind, (FactorKind.PRIOR, FactorKind.NODE_PRIOR))
+               & np.isin(table.i, around) & np.isin(table.j, (*around, -1)))
+    more = np.union1d(factors, ids[earlier])
+    sparse = _approximation(marginal(graph, nodes, more.tolist(), cuts.cuts).prior)
     if sparse is None:
         return None
     return GraphUpdate(
-        edges=sparse.edges, observed=ObservedNodes.joined([sparse.observed, cuts.observed]),
-        remove_nodes=nodes.tolist(),
+        factors=Factors.joined([sparse.factors, cuts.observed]), remove_nodes=nodes.tolist(),
         # the others leave with the nodes
-        drop_edges=np.setdiff1d(more, with_nodes[0]).tolist(),
-        drop_observed=np.setdiff1d(more_observed, with_nodes[1]).tolist())
+        drop=np.setdiff1d(more, with_nodes).tolist())
 
 
 def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
@@ -278,17 +269,15 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     landmarks stay dense, and so do those on many nodes.
     """
     update = marginalize(graph, nodes.tolist())
-    edges, observed, dense = [update.edges], [update.observed], list[Prior]()
+    factors, dense = [update.factors], list[Prior]()
     for prior in update.priors:
         sparse = _of_window(graph, prior) if len(prior.nodes) <= LIMITS.window_poses else None
         if sparse is not None:
             dense += sparse.priors
-            edges.append(sparse.edges)
-            observed.append(sparse.observed)
+            factors.append(sparse.factors)
         else:
             dense.append(prior)
-    return update._replace(
-        edges=Edges.joined(edges), observed=ObservedNodes.joined(observed), priors=dense)
+    return update._replace(factors=Factors.joined(factors), priors=dense)
 
 
 def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
@@ -321,7 +310,7 @@ def _approximation(
     the divergence is small `enough` [nats]. The last `n_biases` nodes are biases.
     """
     if prior is None:
-        return SparsePrior(Edges(), ObservedNodes(), 0.0)
+        return SparsePrior(Factors(), 0.0)
     try:
         return sparsify(
             prior.nodes, prior.reference, prior.information, prior.vector, enough=enough,
@@ -337,8 +326,8 @@ def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
 
     They are those within a group of nodes that have many of them to each other.
     """
-    edges = graph.edges
-    prior = np.flatnonzero(edges.kind == EdgeKind.PRIOR)
+    edges = graph.factors
+    prior = np.flatnonzero(edges.kind == FactorKind.PRIOR)
     if len(prior) <= most * np.count_nonzero(graph.is_pose):
         return None
     near: dict[int, set[int]] = {}
@@ -349,10 +338,10 @@ def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
         group = _dense_group(near, first)
         inside = prior[np.isin(edges.i[prior], group) & np.isin(edges.j[prior], group)]
         if len(inside) > len(group) - 1 + round(LIMITS.extra * len(group)):
-            ids = graph.edge_ids[inside].tolist()
+            ids = graph.factor_ids[inside].tolist()
             sparse = _approximation(marginal(graph, (), ids).prior)
             if sparse is not None:
-                return GraphUpdate(edges=sparse.edges, drop_edges=ids)
+                return GraphUpdate(factors=sparse.factors, drop=ids)
     return None
 
 
@@ -362,12 +351,13 @@ def old_closures(graph: Graph, newest: int, most: float) -> IntArray:
 
     They are between poses that stay, and were there before the newest poses.
     """
-    edges, older = graph.edges, graph.node_ids[graph.is_pose][:-newest]
+    edges, older = graph.factors, graph.node_ids[graph.is_pose][:-newest]
     old = np.isin(edges.i, older) & np.isin(edges.j, older)
-    first = int(np.min(np.flatnonzero(~old & (edges.kind == EdgeKind.ODOMETRY)), initial=len(old)))
-    closures = np.flatnonzero(old[:first] & (edges.kind[:first] == EdgeKind.LOOP_CLOSURE))
+    newer = np.flatnonzero(~old & (edges.kind == FactorKind.ODOMETRY))
+    first = int(np.min(newer, initial=len(old)))
+    closures = np.flatnonzero(old[:first] & (edges.kind[:first] == FactorKind.LOOP_CLOSURE))
     many = len(closures) > most * np.count_nonzero(graph.is_pose)
-    return graph.edge_ids[closures[:LIMITS.closures_at_once]] if many else NONE
+    return graph.factor_ids[closures[:LIMITS.closures_at_once]] if many else NONE
 
 
 def _dense_group(near: dict[int, set[int]], first: int, size: int = 10) -> IntArray:
@@ -384,11 +374,7 @@ def _dense_group(near: dict[int, set[int]], first: int, size: int = 10) -> IntAr
 
 
 def leaving(graph: Graph, update: GraphUpdate) -> Left:
-    """Return what leaves a graph with an update, constraints with weight 0 included."""
-    edges, observed = graph.edges, graph.observed
+    """Return what leaves a graph with an update, factors with weight 0 included."""
     nodes = np.array(update.remove_nodes, dtype=np.int64)
-    gone = np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes)
-    return Left(
-        np.sort(nodes), np.union1d(graph.edge_ids[gone], list(update.drop_edges)).astype(np.int64),
-        np.union1d(graph.observed_ids[np.isin(observed.node, nodes)],
-                   list(update.drop_observed)).astype(np.int64))
+    return Left(np.sort(nodes), np.union1d(
+        graph.factors_on(nodes), list(update.drop)).astype(np.int64))

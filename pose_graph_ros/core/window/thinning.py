@@ -26,7 +26,7 @@ from pose_graph_ros.core.config import ThinningConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import EdgeKind, ObservedKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -37,35 +37,26 @@ class Segment(NamedTuple):
     """Consecutive poses, and the measurements of them."""
 
     poses: IntArray  # ids, ascending
-    edges: IntArray  # ids of the measurements that are edges
-    observed: IntArray  # ids of the others
+    factors: IntArray  # ids of the measurements
     after: int  # id of the next pose
 
 
-def carriers(graph: Graph) -> tuple[IntArray, IntArray]:
-    """
-    Return the poses that hold the measurements of a graph, by ids.
-
-    Shapes are (M,) for edges, with -1 where an edge is no measurement in the map, and (K,) for
-    observed nodes, likewise.
-    """
-    edges, observed = graph.edges, graph.observed
-    is_pose = graph.is_pose
-    of_pose = is_pose[graph.node_rows(edges.i)]
-    on_bias = (edges.kind == EdgeKind.BIAS) & of_pose
+def carriers(graph: Graph) -> IntArray:
+    """Return the pose, by id, that holds each factor as a measurement; -1 if it is none."""
+    factors, is_pose = graph.factors, graph.is_pose
+    measures = is_pose[graph.node_rows(factors.i)] & (
+        (factors.kind == FactorKind.BIAS)
+        | ((factors.j < 0) & (factors.kind != FactorKind.NODE_PRIOR)))
     # a rotation is held by the later one of its poses
-    holder = np.where(on_bias, edges.i, np.where(
-        edges.kind == EdgeKind.TURN, np.maximum(edges.i, edges.j), -1))
-    measured = is_pose[graph.node_rows(observed.node)] & (observed.kind != ObservedKind.PRIOR)
-    return holder, np.where(measured, observed.node, -1)
+    return np.where(measures, factors.i, np.where(
+        factors.kind == FactorKind.TURN, np.maximum(factors.i, factors.j), -1))
 
 
-def first_of(holder: IntArray, seen: IntArray) -> int:
+def first_of(holder: IntArray) -> int:
     """
     Return the first pose that holds measurements, by its id; one after all poses if none does.
     """
-    every = np.concatenate((holder, seen))
-    return int(np.min(every[every >= 0], initial=np.iinfo(np.int64).max))
+    return int(np.min(holder[holder >= 0], initial=np.iinfo(np.int64).max))
 
 
 def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | None:
@@ -74,8 +65,8 @@ def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | 
 
     No bias has measurements in it and after it.
     """
-    holder, seen = carriers(graph)
-    ahead = older[np.searchsorted(older, first_of(holder, seen)):]
+    holder = carriers(graph)
+    ahead = older[np.searchsorted(older, first_of(holder)):]
     size = _size(graph, ahead[:LIMITS.stretch], np.isin(ahead, leaving))
     # where no bias is needed on both sides
     ends = _ends(graph, ahead[:LIMITS.longest_stretch + 1], holder)
@@ -85,17 +76,16 @@ def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | 
     fitting = int(np.searchsorted(ends, size, side='right'))
     end = int(ends[max(fitting - 1, 0)])
     poses = ahead[:end]
-    return Segment(poses, graph.edge_ids[np.isin(holder, poses)],
-                   graph.observed_ids[np.isin(seen, poses)], int(ahead[end]))
+    return Segment(poses, graph.factor_ids[np.isin(holder, poses)], int(ahead[end]))
 
 
 def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
     """Return after how many of some poses no bias has measurements on both sides, at least one."""
-    edges = graph.edges
-    measured = np.flatnonzero(holder >= 0)
+    edges = graph.factors
+    measured = np.flatnonzero((holder >= 0) & (edges.j >= 0))
     if len(measured) == 0:
         return np.arange(1, len(poses) + 1)
-    bias = np.where(edges.kind == EdgeKind.TURN, edges.k, edges.j)[measured]
+    bias = np.where(edges.kind == FactorKind.TURN, edges.k, edges.j)[measured]
     order = np.lexsort((holder[measured], bias))
     bias, holder = bias[order], holder[measured][order]
     begins = np.flatnonzero(np.diff(bias, prepend=-2))
@@ -111,8 +101,7 @@ def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
 
 def _size(graph: Graph, poses: IntArray, leaves: BoolArray) -> int:
     """Return how many of some poses make a stretch, as far as not too many others are around."""
-    edges = graph.edges
-    is_pose = graph.is_pose
+    edges, is_pose = graph.factors.edges, graph.is_pose
     used = (edges.weight > 0.0) & is_pose[graph.node_rows(edges.i)] & is_pose[
         graph.node_rows(edges.j)]
     ends = np.column_stack((edges.i[used], edges.j[used]))
@@ -205,7 +194,7 @@ class Thinning:
 
     def measurements_are_due(self, graph: Graph) -> bool:
         """Return whether there are so many measurements in the map that the oldest are to go."""
-        n_measured = sum(int(np.count_nonzero(held >= 0)) for held in carriers(graph))
+        n_measured = int(np.count_nonzero(carriers(graph) >= 0))
         # with about one for each node that comes before the next look
         return n_measured + LIMITS.every > LIMITS.measurements * self._n_stay
 
@@ -222,7 +211,7 @@ class Thinning:
         n_stay = int(np.count_nonzero(graph.is_pose)) - len(found.leaving)
         self._n_stay = max(n_stay, LIMITS.least_area * config.newest)
         if not self.measurements_are_due(graph):
-            before = found.leaving < first_of(*carriers(graph))
+            before = found.leaving < first_of(carriers(graph))
             found = Crowd(*(ids[before] for ids in found))
         found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
         # those that are not sure enough to leave must not keep others from being looked at
@@ -236,7 +225,7 @@ class Thinning:
 def groups(graph: Graph, places: Places) -> Iterator[Places]:
     """Yield connected groups of nodes; each must leave the graph before the next is asked for."""
     while len(places.nodes) > 0:
-        edges = graph.edges
+        edges = graph.factors.edges
         used = edges.weight > 0.0
         members = group(places.nodes, np.column_stack((edges.i[used], edges.j[used])))
         inside = np.isin(places.nodes, members)

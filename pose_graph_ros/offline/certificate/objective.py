@@ -96,16 +96,15 @@ def formulate(graph: Constrained) -> Formulation:
             raise NotCoveredError(f'the graph has {name}, which have no heading')
     if graph.n_priors > 0:
         raise NotCoveredError('the graph has priors on several nodes, which are not isotropic')
-    edges, observed = graph.edges_by_row, graph.observed_by_row
-    edges = edges.rows(edges.weight > 0.0)
-    observed = observed.rows(observed.weight > 0.0)
+    factors = graph.factors_by_row
+    factors = factors.rows(factors.weight > 0.0)
     poses, fixed = graph.poses, graph.fixed
-    information = np.concatenate((edges.weighted_information, observed.weighted_information))
+    information = factors.weighted_information
     with np.errstate(over='ignore', invalid='ignore'):
         kappa, tau = _kappa_tau(information)
-    terms = Terms.joined(*Terms.of_both(edges, observed, len(poses)))
-    places = np.concatenate((complex_of(poses[fixed]), terms.arm_i[len(edges):][
-        tau[len(edges):] > 0.0]))
+    terms = Terms.of_factors(factors, len(poses))
+    places = np.concatenate((
+        complex_of(poses[fixed]), terms.arm_i[(factors.j < 0) & (tau > 0.0)]))
     origin = complex(np.mean(places)) if len(places) > 0 else 0j
     # of all nodes, and of the map behind them: unknown, its heading and position as far as known
     number = np.append(np.where(fixed, 0, np.cumsum(~fixed)), 0)

@@ -34,11 +34,9 @@ import numpy as np
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
-    Edges,
+    FactorKind,
+    Factors,
     NodeKind,
-    ObservedKind,
-    ObservedNodes,
 )
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 
@@ -78,9 +76,10 @@ class Term(NamedTuple):
     """Whether it has a weight above 0."""
 
 
-SORTS = {EdgeKind.ODOMETRY: Sort.ODOMETRY, EdgeKind.LOOP_CLOSURE: Sort.LOOP_CLOSURE,
-         EdgeKind.BIAS: Sort.BIAS, EdgeKind.TURN: Sort.TURN, EdgeKind.POINT: Sort.LANDMARK,
-         EdgeKind.RANGE: Sort.LANDMARK, EdgeKind.PRIOR: Sort.PRIOR}
+SORTS = {FactorKind.ODOMETRY: Sort.ODOMETRY, FactorKind.LOOP_CLOSURE: Sort.LOOP_CLOSURE,
+         FactorKind.BIAS: Sort.BIAS, FactorKind.TURN: Sort.TURN, FactorKind.POINT: Sort.LANDMARK,
+         FactorKind.RANGE: Sort.LANDMARK, FactorKind.PRIOR: Sort.PRIOR,
+         FactorKind.NODE_PRIOR: Sort.PRIOR}
 HIDDEN = {NodeKind.POSE: ('x', Role.POSE), NodeKind.LANDMARK: ('l', Role.LANDMARK),
           NodeKind.BIAS: ('b', Role.BIAS)}
 
@@ -110,26 +109,23 @@ def factor_graph(rows: GraphRows, ids: IntArray | None = None) -> Any:
 
 
 def _terms(rows: GraphRows, kinds: list[NodeKind]) -> list[Term]:
-    edges, observed = rows.edges.renumbered(rows.rows_of), rows.observed.renumbered(rows.rows_of)
+    factors = rows.factors.renumbered(rows.rows_of)
     found, measured = [], set()
-    stepped = set(edges.i[edges.kind == EdgeKind.ODOMETRY].tolist())
-    for i, j, k, kind, weight, mean in zip(
-            edges.i.tolist(), edges.j.tolist(), edges.k.tolist(), edges.kind.tolist(),
-            edges.weight.tolist(), edges.mean.tolist(), strict=True):
-        sort = SORTS[EdgeKind(kind)]
+    stepped = set(factors.i[factors.kind == FactorKind.ODOMETRY].tolist())
+    # those to biases come first
+    for row in np.argsort(factors.j < 0, kind='stable').tolist():
+        kind, i, j, k = (int(column[row]) for column in (
+            factors.kind, factors.i, factors.j, factors.k))
+        place, used = (i, *factors.mean[row, :2].tolist()), bool(factors.weight[row] > 0.0)
+        sort = SORTS.get(FactorKind(kind), Sort.OBSERVED)
         if sort is Sort.LOOP_CLOSURE and i == j + 1 and j not in stepped:
             sort = Sort.ODOMETRY    # that leads back
             stepped.add(j)
-        if kind == EdgeKind.BIAS and kinds[i] is NodeKind.POSE:
+        if kind == FactorKind.BIAS and kinds[i] is NodeKind.POSE:
             sort = Sort.OBSERVED
-            measured.add((i, *mean[:2]))
-        found.append(Term(sort, (i, j) if k < 0 else (i, j, k), weight > 0.0))
-    for node, kind, weight, mean in zip(
-            observed.node.tolist(), observed.kind.tolist(), observed.weight.tolist(),
-            observed.mean.tolist(), strict=True):
-        if weight > 0.0 or (node, *mean[:2]) not in measured:
-            sort = Sort.PRIOR if kind == ObservedKind.PRIOR else Sort.OBSERVED
-            found.append(Term(sort, (node,), weight > 0.0))
+            measured.add(place)
+        if j >= 0 or used or place not in measured:
+            found.append(Term(sort, tuple(node for node in (i, j, k) if node >= 0), used))
     found += [Term(Sort.PRIOR, tuple(rows.rows_of(prior.nodes).tolist()))
               for prior in rows.priors]
     return found
@@ -353,10 +349,11 @@ def five_states() -> list[tuple[str, GraphRows]]:
         poses[:, 0] = 2.0 * np.arange(n)
         i, eyes = np.arange(n - 1), np.tile(np.eye(3), (5, 1, 1))
         graph.apply(GraphUpdate(
-            hidden=poses, edges=Edges(i, i + 1, np.diff(poses, axis=0), eyes[:n - 1],
-                                      [EdgeKind.ODOMETRY] * (n - 1)),
-            observed=ObservedNodes(
-                observed, mean=np.zeros((len(observed), 3)), information=eyes[:len(observed)],
-                kind=[ObservedKind.GLOBAL_POSE] * len(observed))))
+            hidden=poses, factors=Factors.joined([
+                Factors(i, i + 1, np.diff(poses, axis=0), eyes[:n - 1],
+                        [FactorKind.ODOMETRY] * (n - 1)),
+                Factors.on(observed, mean=np.zeros((len(observed), 3)),
+                           information=eyes[:len(observed)],
+                           kind=[FactorKind.GLOBAL_POSE] * len(observed))])))
         states.append((title, graph.rows()))
     return states

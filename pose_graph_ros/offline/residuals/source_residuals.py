@@ -53,7 +53,6 @@ class SourceResiduals(NamedTuple):
     used: BoolArray  # which constraints have a weight above 0
     scale: FloatArray  # factor on the claimed sigmas that the graph uses
     ids: IntArray  # in the graph
-    is_edge: BoolArray  # whether these are ids of edges; else of observed nodes
 
     def rows(self, which: BoolArray | IntArray) -> 'SourceResiduals':
         """Return some of the constraints."""
@@ -89,25 +88,20 @@ class SourceResiduals(NamedTuple):
         return np.asarray(np.sqrt(np.einsum('mi,mij,mj->m', self.errors, joint, self.errors)))
 
 
-class Scales(NamedTuple):
-    """Factors on the claimed sigmas that a graph uses, without those of a robust loss, by row."""
+def scales_in_use(graph: Graph, reweighting: Reweighting) -> FloatArray:
+    """
+    Return the factors on the claimed sigmas that a graph uses, without those of a robust loss.
 
-    edges: FloatArray
-    observed: FloatArray
-
-
-def scales_in_use(graph: Graph, reweighting: Reweighting) -> Scales:
-    """Return the factors that a graph uses."""
-    weights = graph.weights
-    for table, saved, rows_of in zip(
-            weights, reweighting.saved(), (graph.edge_rows, graph.observed_rows), strict=True):
-        rows = rows_of(saved.rows)
-        table[rows[rows >= 0]] = saved.shares[rows >= 0]
-    return Scales(*(np.where(weight > 0.0, weight, 1.0)**-0.5 for weight in weights))
+    They are by row.
+    """
+    weights, saved = graph.weights, reweighting.saved()
+    rows = graph.factor_rows(saved.rows)
+    weights[rows[rows >= 0]] = saved.shares[rows >= 0]
+    return np.asarray(np.where(weights > 0.0, weights, 1.0)**-0.5)
 
 
 def collect(
-    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder, scales: Scales,
+    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder, scales: FloatArray,
 ) -> dict[str, SourceResiduals]:
     """
     Return the residuals of each source that has constraints in the graph.
@@ -117,20 +111,20 @@ def collect(
     graph, covariances = smoother.graph, smoother.covariances()
     found: dict[str, SourceResiduals] = {}
     for source, (stamps, held) in factors.held().items():
-        observed, edges = held.ids[~held.is_edge], held.ids[held.is_edge]
+        biased = graph.factors_at(held).j >= 0
+        observed, edges = held[~biased], held[biased]
         parts = [
-            _of_observed(graph, observed, covariances,
-                         scales.observed[graph.observed_rows(observed)]),
-            _of_biased(graph, edges, covariances, scales.edges[graph.edge_rows(edges)],
+            _of_observed(graph, observed, covariances, scales[graph.factor_rows(observed)]),
+            _of_biased(graph, edges, covariances, scales[graph.factor_rows(edges)],
                        _total(factors, source))]
-        order = np.concatenate((np.flatnonzero(~held.is_edge), np.flatnonzero(held.is_edge)))
-        columns: Any = (stamps[order], *map(np.concatenate, zip(*parts, strict=True)),
-                        held.ids[order], held.is_edge[order])
+        order = np.argsort(biased, kind='stable')
+        columns: Any = (
+            stamps[order], *map(np.concatenate, zip(*parts, strict=True)), held[order])
         found[source] = _sorted(SourceResiduals(source, 'map', *columns))
     for (source, kind), ids in edges_by_source(graph, nodes, factors).items():
         if source not in found:
             found[source] = _sorted(_of_edges(
-                smoother, nodes, (source, kind), ids, scales.edges[graph.edge_rows(ids)]))
+                smoother, nodes, (source, kind), ids, scales[graph.factor_rows(ids)]))
     return {source: each for source, each in found.items() if len(each.ids) > 0}
 
 
@@ -147,14 +141,14 @@ def _of_observed(
     graph: Graph, ids: IntArray, covariances: FloatArray, scale: FloatArray,
 ) -> _Columns:
     """Return the columns from `errors` to `scale` of observed nodes, in map axes."""
-    observed = graph.observed_at(ids)
-    errors = graph.observed_errors(observed)
+    observed = graph.factors_at(ids)
+    errors = graph.errors(observed)
     turn = _turns(observed.mean[:, 2])
     information = turn @ observed.information @ np.swapaxes(turn, 1, 2)
     measured = np.diagonal(observed.information, axis1=1, axis2=2) > 0.0
     errors = np.einsum('kij,kj->ki', turn, errors) * measured
     return (errors, measured, inverse(information, measured) * scale[:, None, None]**2,
-            _taken(graph, observed.node, observed.offset[:, :2], covariances),
+            _taken(graph, observed.i, observed.offset[:, :2], covariances),
             observed.weight > 0.0, scale)
 
 
@@ -162,14 +156,14 @@ def _of_biased(
     graph: Graph, ids: IntArray, covariances: FloatArray, scale: FloatArray, total: float,
 ) -> _Columns:
     """Return the same of edges to a bias; the bias is a part of the error."""
-    edges = graph.edges_at(ids)
-    states, factor = graph.poses_of(edges.j), edges.bias[:, [2, 2, 3]]
+    edges = graph.factors_at(ids)
+    states, factor = graph.poses_of(edges.j), edges.constants[:, [2, 2, 3]]
     measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
-    errors = (graph.edge_errors(edges) - factor * states) * measured
+    errors = (graph.errors(edges) - factor * states) * measured
     variance = (factor / (1.0, 1.0, STRETCH))**2 * measured
     covariance = inverse(edges.information, measured) + variance[:, :, None] * np.eye(3)
     return (errors, measured, covariance * scale[:, None, None]**2,
-            _taken(graph, edges.i, edges.bias[:, :2], covariances), edges.weight > 0.0,
+            _taken(graph, edges.i, edges.constants[:, :2], covariances), edges.weight > 0.0,
             np.sqrt(total) * scale)
 
 
@@ -190,18 +184,18 @@ def _of_edges(
 ) -> SourceResiduals:
     """Return the residuals of edges between poses, given their source and kind."""
     graph = smoother.graph
-    edges = graph.edges_at(ids)
+    edges = graph.factors_at(ids)
     measured = np.diagonal(edges.information, axis1=1, axis2=2) > 0.0
     taken = np.full((len(ids), 3, 3), np.nan)
     # each takes up to the depth of the tree
     some = spread(len(ids), 1000)
-    taken[some] = smoother.edge_innovations(edges.rows(some)).covariances
+    taken[some] = smoother.innovations(edges.rows(some)).covariances
     later = np.searchsorted(nodes.ids, np.maximum(edges.i, edges.j))
     return SourceResiduals(
         *name, nodes.stamps_ns[np.clip(later, 0, len(nodes) - 1)],
-        graph.edge_errors(edges) * measured, measured,
+        graph.errors(edges) * measured, measured,
         inverse(edges.information, measured) * scale[:, None, None]**2, taken,
-        edges.weight > 0.0, scale, ids, np.ones(len(ids), dtype=bool))
+        edges.weight > 0.0, scale, ids)
 
 
 def spread(n: int, most: int) -> IntArray:

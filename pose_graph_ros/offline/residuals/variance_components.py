@@ -22,7 +22,7 @@ graph has as a bias keep their covariances, and what their residuals at the esti
 such errors are taken for independent, nothing is known of the others either.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import math
 from typing import Any, NamedTuple
@@ -33,7 +33,8 @@ from scipy.sparse.linalg import splu
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import edge_errors, observed_errors
+from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.error_functions import errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
@@ -61,7 +62,7 @@ SPREAD = 1.5
 
 
 class Constraints(NamedTuple):
-    """All constraints of a graph that are used, edges first."""
+    """All constraints of a graph that are used."""
 
     errors: FloatArray  # shape (M, 3)
     measured: BoolArray  # which coordinates are measured, shape (M, 3)
@@ -69,7 +70,7 @@ class Constraints(NamedTuple):
     weight: FloatArray
     jacobian: csr_array  # by all free coordinates of hidden nodes, 3 M rows
     prior: csr_array  # information of dense priors
-    rows: IntArray  # row of each in its table, edges first and then, counted on, observed nodes
+    rows: IntArray  # of each in the graph
 
 
 class Found(NamedTuple):
@@ -105,49 +106,36 @@ def split(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
 def constraints(graph: Graph) -> Constraints:
     """Return the constraints of a graph with a weight above 0, linear at its estimate."""
     poses = graph.poses
-    tables: tuple[Any, ...] = graph.edges_by_row, graph.observed_by_row
-    parts = [_linearized(edge_errors, poses, tables[0].rows(tables[0].weight > 0.0), 'ijk'),
-             _linearized(observed_errors, poses, tables[1].rows(tables[1].weight > 0.0),
-                         ['node'])]
-    errors, values, columns = (np.concatenate(each) for each in zip(*(
-        (error, *(np.concatenate((each, np.zeros((len(each), 3, 9 - each.shape[2]), each.dtype)),
-                                 axis=2) for each in rest)) for error, *rest in parts),
-        strict=True))
-    n = 3 * len(errors)
+    used = np.flatnonzero(graph.weights > 0.0)
+    factors = graph.factors_by_row.rows(used)
+    error, values, columns = _linearized(poses, factors)
+    n = 3 * len(error)
     size = 3 * len(poses)
     jacobian = csr_array((values.reshape(n, 9).ravel(), columns.reshape(n, 9).ravel(),
                           np.arange(0, 9 * n + 1, 9)), shape=(n, size))
     free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
-    information, weight = (np.concatenate([getattr(table, name)[table.weight > 0.0]
-                                           for table in tables])
-                           for name in ('information', 'weight'))
-    rows = [np.flatnonzero(table.weight > 0.0) for table in tables]
     return Constraints(
-        errors, np.diagonal(information, axis1=1, axis2=2) > 0.0, information, weight,
-        jacobian[:, free], _prior(graph, size)[free][:, free],
-        np.concatenate((rows[0], rows[1] + graph.n_edges)))
+        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
+        factors.weight, jacobian[:, free], _prior(graph, size)[free][:, free], used)
 
 
-def _linearized(
-    function: Callable[..., FloatArray], poses: FloatArray, table: Any,
-    names: Sequence[str],
-) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return errors with their derivatives by the nodes of some ends, and the columns of these."""
-    n, errors = len(poses), function(poses, table)
+def _linearized(poses: FloatArray, table: Factors) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return errors with their derivatives by the nodes of the ends, and the columns of these."""
+    n, error = len(poses), errors(poses, table)
     values, columns = [], []
-    for name in names:
+    for name in 'ijk':
         ends = getattr(table, name)
         for k in range(3):
             step = np.zeros(3)
             step[k] = 1e-5   # m or rad
             moved = np.concatenate((poses, poses + step, poses - step))
-            after, before = (function(moved, replace(table, **{
+            after, before = (errors(moved, replace(table, **{
                 name: np.where(ends < 0, ends, ends + part * n)})) for part in (1, 2))
             change = after - before
             change[:, 2] = se2.wrap(change[:, 2])
             values.append(change / 2e-5)
             columns.append(np.tile(3 * np.maximum(ends, 0)[:, None] + k, (1, 3)))
-    return errors, np.stack(values, axis=2), np.stack(columns, axis=2)
+    return error, np.stack(values, axis=2), np.stack(columns, axis=2)
 
 
 def _prior(graph: Graph, size: int) -> csr_array:
@@ -279,7 +267,7 @@ def analyse(parts: Parts) -> Analysis:
     fits = {source: fit(each, factors.errors_in_use(source))
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
-             if each.kind != 'map' or not np.any(each.is_edge)}
+             if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
     correlated = frozenset(
         source for source, each in white.items() if each.kind == 'map'
         and (found := whiteness(each)) is not None and found.tau > 0.0)
@@ -298,7 +286,7 @@ def _together(
         claimed = inverse(data.information, data.measured)
     except np.linalg.LinAlgError:   # what thinning leaves has no covariance
         return {source: at_estimate[source].unknown for source in sources}
-    place = np.full(graph.n_edges + graph.n_observed, -1)
+    place = np.full(graph.n_factors, -1)
     place[data.rows] = np.arange(len(data.rows))
     own, shares = claimed.copy(), {source: np.zeros_like(claimed) for source in sources}
     for source, row, motion in _motions(graph, nodes, parts.judge.closures()):
@@ -307,8 +295,7 @@ def _together(
                 np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0):
             shares[source][k], own[k] = motion, claimed[k] - motion
     fixed = claimed / data.weight[:, None, None]
-    rows = {source: place[graph.edge_rows(each.ids) if np.all(each.is_edge)
-                          else graph.n_edges + graph.observed_rows(each.ids)][each.used]
+    rows = {source: place[graph.factor_rows(each.ids)][each.used]
             for source, each in sources.items()}
     for source, at in rows.items():
         shares[source][at] += own[at]
@@ -334,7 +321,7 @@ def _motions(
     These are given by the ids of their edges, and stamps of each and of its other end [ns].
     """
     ids, stamps_ns = closures
-    for row, mean, (stamp, other) in zip(graph.edge_rows(ids).tolist(), graph.edges_at(
+    for row, mean, (stamp, other) in zip(graph.factor_rows(ids).tolist(), graph.factors_at(
             ids).mean, stamps_ns.tolist(), strict=True):
         reference, attachment = attach(nodes, other), attach(nodes, stamp)
         if isinstance(reference, Answer) or isinstance(attachment, Answer):

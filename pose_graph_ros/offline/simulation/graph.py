@@ -17,7 +17,7 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation import sensors
@@ -46,25 +46,25 @@ class SimulatedGraph:
     """True poses of the nodes at their stamps."""
     start: FloatArray
     """Poses by odometry, from the true first one, shape (N, 3)."""
-    edges: Edges
+    edges: Factors
     """Odometry, then loop closures."""
     group: IntArray
     """Number of the group of each false closure, -1: true, shape (L,)."""
-    observed: ObservedNodes
+    observed: Factors
     wrong: IntArray
     """Which of the observed nodes are moved by a jump, shape (W,)."""
     missing_groups: int
     """Of false closures, for which there were no places."""
 
     @property
-    def loops(self) -> Edges:
+    def loops(self) -> Factors:
         """Loop closures."""
-        return self.edges.rows(self.edges.kind == EdgeKind.LOOP_CLOSURE)
+        return self.edges.rows(self.edges.kind == FactorKind.LOOP_CLOSURE)
 
     def graph(self, poses: FloatArray) -> Graph:
         """Return the graph with some poses, shape (N, 3); its first node is fixed if need be."""
         graph = Graph()
-        graph.apply(GraphUpdate(hidden=poses, edges=self.edges, observed=self.observed,
+        graph.apply(GraphUpdate(hidden=poses, factors=Factors.joined([self.edges, self.observed]),
                                 fix=[0] if len(self.observed) == 0 else []))
         return graph
 
@@ -91,14 +91,14 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
     return SimulatedGraph(
-        truth, composed(poses[0], odometry.mean), Edges.joined((odometry, loops)), group,
-        ObservedNodes.joined((fixes, absolute)),
+        truth, composed(poses[0], odometry.mean), Factors.joined((odometry, loops)), group,
+        Factors.joined((fixes, absolute)),
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
 
 def odometry_edges(
     generator: np.random.Generator, truth: Trajectory, jumps: Iterable[Jump] = (),
-) -> Edges:
+) -> Factors:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
     variances = sensors.model_variances(steps)
@@ -112,8 +112,8 @@ def odometry_edges(
             mean[k] = se2.compose(mean[k], np.array(jump.step))
     information = np.zeros((n, 3, 3))
     information[:, range(3), range(3)] = 1.0 / variances
-    return Edges(np.arange(n), np.arange(1, n + 1), mean, information,
-                 np.full(n, EdgeKind.ODOMETRY))
+    return Factors(np.arange(n), np.arange(1, n + 1), mean, information,
+                 np.full(n, FactorKind.ODOMETRY))
 
 
 def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
@@ -124,11 +124,11 @@ def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
     return se2.wrapped(np.column_stack((positions, heading)))
 
 
-def _closures(way: Course, path: Motion, node_distance: float) -> tuple[Edges, IntArray, int]:
+def _closures(way: Course, path: Motion, node_distance: float) -> tuple[Factors, IntArray, int]:
     """Return loop closures, the group of each, and how many groups are missing."""
     settings, streams, truth = way.setup.closures, way.streams, path.truth
     if settings is None:
-        return Edges(), np.empty(0, dtype=np.int64), 0
+        return Factors(), np.empty(0, dtype=np.int64), 0
     settings = replace(settings, first_s=0.0)
     # so that no two closures of a group have the same ends
     spacing = max(settings.false.spacing, 1.5 * node_distance)
@@ -142,18 +142,18 @@ def _closures(way: Course, path: Motion, node_distance: float) -> tuple[Edges, I
     every = every.rows(sensors.heard(every.later_ns, CLOSURES, way.setup.outages))
     ends = np.searchsorted(truth.stamps_ns, every.stamps_ns)
     information = np.diag(np.array(way.setup.sigmas(CLOSURES))**-2)
-    edges = Edges(ends[:, 0], ends[:, 1], every.values, np.tile(information, (len(ends), 1, 1)),
-                  np.full(len(ends), EdgeKind.LOOP_CLOSURE))
+    edges = Factors(ends[:, 0], ends[:, 1], every.values, np.tile(information, (len(ends), 1, 1)),
+                    np.full(len(ends), FactorKind.LOOP_CLOSURE))
     return edges, every.wrong, missing
 
 
-def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[ObservedNodes, IntArray]:
+def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[Factors, IntArray]:
     """Return fixes or global poses, each with its error moved to the nearest node; the wrong."""
     found = absolute(way, topic, way.motion.truth)
     stamps, values, wrong = found.rows(sensors.heard(found.stamps_ns, topic, way.setup.outages))
     if len(stamps) == 0:
-        return ObservedNodes(), np.empty(0, dtype=np.int64)
-    kind = ObservedKind.POSITION if topic == FIXES else ObservedKind.GLOBAL_POSE
+        return Factors(), np.empty(0, dtype=np.int64)
+    kind = FactorKind.POSITION if topic == FIXES else FactorKind.GLOBAL_POSE
     width = values.shape[1]
     errors = values - way.motion.truth.at(stamps)[:, :width]
     # the nearest node in time, and the first of those that are nearest to it
@@ -163,5 +163,5 @@ def _observed(way: Course, truth: Trajectory, topic: str) -> tuple[ObservedNodes
     mean, information = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3, 3))
     mean[:, :width] = truth.poses[nodes, :width] + errors[first]
     information[:, range(width), range(width)] = np.array(way.setup.sigmas(topic))**-2
-    return (ObservedNodes(nodes, None, se2.wrapped(mean), information, np.full(len(nodes), kind)),
+    return (Factors.on(nodes, None, se2.wrapped(mean), information, np.full(len(nodes), kind)),
             np.flatnonzero(wrong[first] >= 0))

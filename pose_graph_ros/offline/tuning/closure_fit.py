@@ -9,7 +9,7 @@ The likelihood of all edges of a graph, with the poses integrated out, is to the
 
 with errors r and Jacobian J at poses near the optimum and the information W of the edges
 (Laplace's approximation; e.g. C. M. Bishop, "Pattern recognition and machine learning", section
-4.4). Unlike chi2, it is least at the right factors. Edges that disagree show the sum of their
+4.4). Unlike chi2, it is least at the right factors. Factors that disagree show the sum of their
 noise; that of odometry grows with the length of the loop, which tells both apart.
 """
 
@@ -22,7 +22,7 @@ from scipy.sparse import bsr_array, csc_array
 from scipy.sparse.linalg import splu
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.offline.residuals.variance_components import constraints
 from pose_graph_ros.offline.tuning.fit import decided, Fit, Minimum, minimum
@@ -39,12 +39,12 @@ class ClosureProblem:
 
     def __init__(self, graph: Graph, tick: Callable[[], None] = lambda: None) -> None:
         self._tick, data = tick, constraints(graph)
-        kinds = np.append(graph.edges_by_row.kind, np.full(graph.n_observed, -1))[data.rows]
-        self.n_closures = int(np.sum(kinds == EdgeKind.LOOP_CLOSURE))
+        kinds = graph.factors_by_row.kind[data.rows]
+        self.n_closures = int(np.sum(kinds == FactorKind.LOOP_CLOSURE))
         """How many closures are believed."""
         # at a factor of 1, of odometry and of closures
         self._parts: list[Any] = []
-        for kind in (EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE):
+        for kind in (FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE):
             rows = np.flatnonzero(kinds == kind)
             n = len(rows)
             jacobian = data.jacobian[(3 * rows[:, None] + np.arange(3)).ravel()]

@@ -17,7 +17,7 @@ from pose_graph_ros.core.alignment.estimator import (
 from pose_graph_ros.core.config import AlignmentPolicy, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 
 # Weighted sums of squares of some 100 m.
 EXACT = 1e-9
@@ -47,7 +47,7 @@ class Drive:
     sigma: float
 
     @property
-    def observed(self) -> ObservedNodes:
+    def observed(self) -> Factors:
         return observed_nodes(self.node, self.xy, self.sigma)
 
     def moved(self, rows: slice | IntArray, shift: FloatArray) -> 'Drive':
@@ -62,11 +62,11 @@ class Drive:
         return abs(float(se2.wrap(turn.T_map_graph[2] - true)))
 
 
-def observed_nodes(node: IntArray, xy: FloatArray, sigma: float) -> ObservedNodes:
+def observed_nodes(node: IntArray, xy: FloatArray, sigma: float) -> Factors:
     information = np.zeros((len(node), 3, 3))
     information[:, 0, 0] = information[:, 1, 1] = sigma**-2
-    return ObservedNodes(node, None, np.column_stack((xy, np.zeros(len(node)))), information,
-                         np.full(len(node), ObservedKind.POSITION))
+    return Factors.on(node, None, np.column_stack((xy, np.zeros(len(node)))), information,
+                         np.full(len(node), FactorKind.POSITION))
 
 
 def drive(
@@ -111,7 +111,7 @@ def lasting(stamps: FloatArray, times: float | FloatArray) -> TimeCorrelation:
     return TimeCorrelation(stamps, np.broadcast_to(times, stamps.shape))
 
 
-def by(odometry: FloatArray, table: ObservedNodes) -> GraphAlignment:
+def by(odometry: FloatArray, table: Factors) -> GraphAlignment:
     """Return what observed nodes with white noise say."""
     return find_alignment(odometry, table, POLICY, NOISE, lasting(np.zeros(len(table)), 0.0))
 
@@ -125,7 +125,7 @@ def found(drive: Drive, times: float | FloatArray | None = None) -> GraphAlignme
 
 
 def checked(
-    solved: FloatArray, odometry: FloatArray, table: ObservedNodes, sigma: float = 0.0,
+    solved: FloatArray, odometry: FloatArray, table: Factors, sigma: float = 0.0,
 ) -> GraphAlignment | None:
     return recheck(solved, odometry, table, POLICY, NOISE,
                    correlation=lasting(np.zeros(len(table)), 0.0), sigma=sigma)
@@ -335,7 +335,7 @@ def test_positions_after_a_drive_that_drifted_by_radians_align(factor: float) ->
 def test_one_global_pose_gives_the_angle() -> None:
     some = drive(0, 6, 3.0, sigma=5.0)
     table = some.observed
-    table.kind[4] = ObservedKind.GLOBAL_POSE
+    table.kind[4] = FactorKind.GLOBAL_POSE
     table.mean[4] = some.truth[some.node[4]]
     table.information[4] = np.diag([1.0, 1.0, 100.0])
     turn = by(some.odometry, table)

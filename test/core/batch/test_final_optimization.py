@@ -22,6 +22,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import costs_and_weights
 from pose_graph_ros.core.measurements import (
@@ -94,11 +95,11 @@ def rms(backend: PoseGraphBackend, truth: FloatArray) -> float:
 def robust_cost(backend: PoseGraphBackend, loss: Loss, threshold: float,
                 poses: FloatArray) -> float:
     """Sum up rho over the fixes and plain energies over the rest."""
-    edges, observed = backend.graph.edges, backend.graph.observed
+    edges, observed = backend.graph.factors.edges, backend.graph.factors.observed
     fixes = error_functions.energies(
-        error_functions.observed_errors(poses, observed), observed.information)
-    rest = error_functions.energies(error_functions.edge_errors(poses, edges), edges.information)
-    has_loss = observed.kind == 1
+        error_functions.errors(poses, observed), observed.information)
+    rest = error_functions.energies(error_functions.errors(poses, edges), edges.information)
+    has_loss = observed.kind == FactorKind.POSITION
     return float(np.sum(rest) + np.sum(fixes[~has_loss])
                  + np.sum(costs_and_weights(loss, fixes[has_loss], threshold)[0]))
 
@@ -122,7 +123,7 @@ def test_the_minimum_is_that_of_the_robust_cost(loss: Loss, seed: int) -> None:
         0.0, 0.02, poses.size), method='BFGS', options={'gtol': 1e-6, 'maxiter': 2000})
     assert report.chi2 <= found.fun * (1.0 + 1e-9)
     np.testing.assert_allclose(poses[:, :2], found.x.reshape(-1, 3)[:, :2], atol=1e-4)
-    weights = backend.graph.observed.weight
+    weights = backend.graph.factors.observed.weight
     assert weights[4] < 0.5     # row 0 is the global pose, so row 4 is fix 3
     assert weights[0] == 1.0
 
@@ -142,7 +143,7 @@ def test_fixes_with_small_weights_regain_them_when_more_fixes_agree() -> None:
         backend.add_measurement(
             Position(stamp, np.add(moved[:2], [0.0, 6.0]), 0.09 * np.eye(2), np.zeros(2)), 'fix')
         backend.update()
-        weights.append(backend.graph.observed.weight[:3])
+        weights.append(backend.graph.factors.observed.weight[:3])
     assert weights[2][0] > 0.9      # the pose
     assert weights[2][1] < 0.1      # the first fix
     assert weights[-1][0] < 0.1
@@ -163,7 +164,7 @@ def test_a_wrong_loop_closure_gets_a_small_weight(loss: Loss) -> None:
         reference_ns=20 * SECOND)
     backend = fed(PoseGraphBackend(config(loss)), odometry, [*measurements, *scans, wrong])
     backend.optimize()
-    edges = backend.graph.edges
+    edges = backend.graph.factors.edges
     closures = np.flatnonzero(edges.kind == 1)
     lost = closures[np.argmin(edges.weight[closures])]
     assert (edges.i[lost], edges.j[lost]) == (19, 89)
@@ -199,13 +200,13 @@ def test_a_failed_optimisation_leaves_weights_and_poses_to_the_bit(
     odometry, measurements, _ = drive(9, outliers=(5, 20, 40))
     solve = Failing(last, raises=raises)
     backend = fed(PoseGraphBackend(config(Loss.CAUCHY), solve=solve), odometry, measurements)
-    before, weights = snapshot(backend.graph), backend.graph.observed.weight
+    before, weights = snapshot(backend.graph), backend.graph.factors.observed.weight
     poses, estimate = backend.graph.poses.copy(), backend.estimate()
     assert np.min(weights) < 0.1
     report = backend.optimize()
     assert report.status is Status.FAILED
     assert snapshot(backend.graph) == before
-    np.testing.assert_array_equal(backend.graph.observed.weight, weights)
+    np.testing.assert_array_equal(backend.graph.factors.observed.weight, weights)
     np.testing.assert_array_equal(backend.graph.poses, poses)
     np.testing.assert_array_equal(backend.estimate().path.poses, estimate.path.poses)
     solve.left = 10**9
@@ -235,6 +236,6 @@ def test_a_loss_that_takes_all_weight_away_fails_no_update(loss: Loss) -> None:
         backend.add_measurement(GlobalPose(stamp, pose, np.diag([0.01, 0.01, 1e-4])), 'pose')
         assert backend.update().status is not Status.FAILED
     assert backend.optimize().status is Status.CONVERGED
-    assert backend.graph.observed.weight.tolist() == [
+    assert backend.graph.factors.observed.weight.tolist() == [
         pytest.approx(1.0, abs=1e-3), 0.0, *[pytest.approx(1.0, abs=1e-3)] * 8]
     np.testing.assert_allclose(backend.graph.poses[-1], [22.5, 0.0, 0.0], atol=1e-3)

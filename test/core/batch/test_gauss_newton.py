@@ -26,10 +26,13 @@ def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
     n_biases = int(rng.integers(0, 4))
     graph = random_graph(
         seed, n_nodes, 2 * n_nodes, 6, fix=(int(rng.integers(n_nodes)),), n_biases=n_biases)
-    loose = range(n_nodes - 1, graph.n_edges - 4 * n_biases)
+    is_edge = graph.factors.j >= 0
+    first, second, *_ = observed = np.flatnonzero(~is_edge).tolist()
+    loose = range(n_nodes - 1, first - 1 if n_biases > 0 else first)
     weights = {int(e): float(rng.choice([0.0, 0.3, 2.5])) for e in loose}
-    weights |= {e: float(rng.choice([0.3, 2.5])) for e in range(loose.stop, graph.n_edges)}
-    graph.apply(GraphUpdate(weigh_edges=weights, weigh_observed={0: 0.0, 1: 0.5}))
+    weights |= {e: float(rng.choice([0.3, 2.5])) for e in range(loose.stop, graph.n_factors)
+                if e not in observed}
+    graph.apply(GraphUpdate(weigh={**weights, first: 0.0, second: 0.5}))
     return graph
 
 

@@ -18,7 +18,7 @@ from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Absolute error of two linear solves with condition numbers of some 1e3 [m, rad].
@@ -56,8 +56,8 @@ def observe_exactly(graph: Graph, nodes: list[int], rng: np.random.Generator) ->
     observed = random_observed(rng, nodes)
     mean = se2.compose(graph.poses[nodes], observed.offset)
     mean[::3, 2] = 0.0
-    graph.apply(GraphUpdate(observed=ObservedNodes(
-        observed.node, observed.offset, mean, observed.information, observed.kind)))
+    graph.apply(GraphUpdate(factors=Factors.on(
+        observed.i, observed.offset, mean, observed.information, observed.kind)))
 
 
 @either
@@ -94,13 +94,13 @@ def dense_solution(
     factor: ComplexArray, shift: ComplexArray, target: ComplexArray,
 ) -> ComplexArray:
     """Minimise sum w |v_j - factor v_i - shift|^2 + sum w |v_node - target|^2."""
-    m, rows = graph.n_edges, graph.n_edges + graph.n_observed
+    m, rows = len(graph.factors.edges), len(graph.factors.edges) + len(graph.factors.observed)
     matrix, right = np.zeros((rows, graph.n_nodes), complex), np.zeros(rows, complex)
-    for k, (i, j) in enumerate(zip(graph.edges.i, graph.edges.j, strict=True)):
+    for k, (i, j) in enumerate(zip(graph.factors.edges.i, graph.factors.edges.j, strict=True)):
         matrix[k, j] += np.sqrt(weight[k])
         matrix[k, i] -= np.sqrt(weight[k]) * factor[k]
         right[k] = np.sqrt(weight[k]) * shift[k]
-    for k, node in enumerate(graph.observed.node):
+    for k, node in enumerate(graph.factors.observed.i):
         matrix[m + k, node] = np.sqrt(unary_weight[k])
         right[m + k] = np.sqrt(unary_weight[k]) * target[k]
     v = known.copy()
@@ -116,8 +116,8 @@ def test_it_solves_two_linear_problems(
     chordal: Chordal, seed: int, n_nodes: int, extra: int, fix: set[int],
 ) -> None:
     graph = random_graph(seed, n_nodes, n_nodes - 1 + extra, 5, tuple(fix))
-    graph.apply(GraphUpdate(weigh_edges={0: 0.5, n_nodes - 1: 0.0}, weigh_observed={1: 3.0}))
-    edges, observed, poses = graph.edges, graph.observed, graph.poses
+    graph.apply(GraphUpdate(weigh={0: 0.5, n_nodes - 1: 0.0, graph.n_factors - 4: 3.0}))
+    edges, observed, poses = graph.factors.edges, graph.factors.observed, graph.poses
     tables = edges.weighted_information, observed.weighted_information
     heading = [table[:, 2, 2] for table in tables]
     position = [0.5 * (table[:, 0, 0] + table[:, 1, 1]) for table in tables]
@@ -131,7 +131,7 @@ def test_it_solves_two_linear_problems(
     t = dense_solution(
         graph, poses @ TO_COMPLEX, *position, factor=np.ones(len(edges)),
         shift=u[edges.i] * (edges.mean @ TO_COMPLEX),
-        target=observed.mean @ TO_COMPLEX - u[observed.node] * (observed.offset @ TO_COMPLEX))
+        target=observed.mean @ TO_COMPLEX - u[observed.i] * (observed.offset @ TO_COMPLEX))
     start = chordal(graph)
     np.testing.assert_allclose(np.exp(1j * start[:, 2]), u, atol=1e-7)
     np.testing.assert_allclose(start @ TO_COMPLEX, t, atol=1e-6)
@@ -140,9 +140,9 @@ def test_it_solves_two_linear_problems(
 @either
 def test_headings_that_cancel_are_an_error(chordal: Chordal) -> None:
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), observed=ObservedNodes(
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), factors=Factors.on(
         [0, 0], None, [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]], [np.eye(3)] * 2,
-        [ObservedKind.GLOBAL_POSE] * 2)))
+        [FactorKind.GLOBAL_POSE] * 2)))
     with pytest.raises(LinearSolveError, match='cancel'):
         chordal(graph)
 
@@ -158,8 +158,8 @@ def test_joint_and_unit_starts_are_exact_without_noise_from_positions_alone(
     offset = np.column_stack((rng.uniform(-1.0, 1.0, (n, 2)), np.zeros(n)))
     mean = np.column_stack((se2.transform(truth, offset[:, :2]), np.zeros(n)))
     graph.apply(GraphUpdate(
-        observed=ObservedNodes(np.arange(n), offset, mean, information,
-                               np.full(n, ObservedKind.POSITION)),
+        factors=Factors.on(np.arange(n), offset, mean, information,
+                               np.full(n, FactorKind.POSITION)),
         free=np.flatnonzero(graph.fixed).tolist()))
     graph.set_poses(random_poses(rng, n))
     assert_poses_equal(joint(graph, unit=unit), truth)
@@ -168,7 +168,7 @@ def test_joint_and_unit_starts_are_exact_without_noise_from_positions_alone(
 @either
 def test_headings_alone_do_not_determine_positions(chordal: Chordal) -> None:
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), fix=(0,), edges=Edges(
-        [0], [1], [[1.0, 0.0, 0.5]], [np.diag([0.0, 0.0, 1.0])], [EdgeKind.LOOP_CLOSURE])))
+    graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), fix=(0,), factors=Factors(
+        [0], [1], [[1.0, 0.0, 0.5]], [np.diag([0.0, 0.0, 1.0])], [FactorKind.LOOP_CLOSURE])))
     with pytest.raises(LinearSolveError, match='singular'):
         chordal(graph)

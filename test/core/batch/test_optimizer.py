@@ -34,7 +34,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -72,7 +72,7 @@ def gradient(graph: Graph) -> FloatArray:
 
 def other_solver(graph: Graph) -> tuple[float, FloatArray]:
     """Return chi2 and the poses of scipy's optimum, from the graph's own start."""
-    edges, observed, free = graph.edges, graph.observed, ~graph.fixed
+    edges, observed, free = graph.factors.edges, graph.factors.observed, ~graph.fixed
     roots = [np.linalg.cholesky(w).T for w in edges.information]
     values, vectors = np.linalg.eigh(observed.information)
     unary_roots = np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
@@ -90,7 +90,7 @@ def other_solver(graph: Graph) -> tuple[float, FloatArray]:
         whitened += [
             root @ slow_observed(poses[i], offset, z)[0]
             for root, i, offset, z in zip(
-                unary_roots, observed.node, observed.offset, observed.mean, strict=True)]
+                unary_roots, observed.i, observed.offset, observed.mean, strict=True)]
         return np.concatenate(whitened)
 
     result = least_squares(errors, graph.poses[free].ravel(), xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -105,8 +105,8 @@ def test_the_optimum_is_that_of_scipy(seed: int) -> None:
     observed = random_observed(rng, at)
     mean = se2.compose(graph.poses[at], observed.offset) + 0.1 * rng.standard_normal((3, 3))
     mean[0, 2] = 0.0     # a position
-    graph.apply(GraphUpdate(observed=ObservedNodes(
-        observed.node, observed.offset, mean, observed.information, observed.kind)))
+    graph.apply(GraphUpdate(factors=Factors.on(
+        observed.i, observed.offset, mean, observed.information, observed.kind)))
     chi2, poses = other_solver(graph)
     result = optimizer.optimize(graph, SolverConfig())
     assert result.status is Status.CONVERGED
@@ -153,13 +153,13 @@ def test_being_stuck_where_an_angle_jumps_does_not_count_as_converged(
 def test_a_map_far_from_its_origin_converges_to_the_same_shape() -> None:
     near, far, rng = consistent_graph(6, noise=0.05), Graph(), np.random.default_rng(6)
     n = near.n_nodes
-    observed = ObservedNodes(
+    observed = Factors.on(
         np.arange(n), None, near.poses + rng.normal(0.0, 0.1, (n, 3)),
-        np.tile(np.diag([100.0, 80.0, 0.0]), (n, 1, 1)), [ObservedKind.POSITION] * n)
-    near.apply(GraphUpdate(observed=observed, free=[0]))
+        np.tile(np.diag([100.0, 80.0, 0.0]), (n, 1, 1)), [FactorKind.POSITION] * n)
+    near.apply(GraphUpdate(factors=observed, free=[0]))
     shift = np.array([691_000.0, 5_334_000.0, 0.0])     # as UTM has it
-    far.apply(GraphUpdate(near.poses + shift, near.edges, replace(
-        observed, mean=observed.mean + shift)))
+    far.apply(GraphUpdate(near.poses + shift, Factors.joined([
+        near.factors.edges, replace(observed, mean=observed.mean + shift)])))
     for graph in (near, far):
         assert optimizer.optimize(graph, SolverConfig()).status is Status.CONVERGED
     # a double has steps of 1e-9 m there
@@ -172,29 +172,29 @@ def floating(rng: np.random.Generator) -> Graph:
 
 def with_a_loose_part(rng: np.random.Generator) -> Graph:
     graph = random_graph(1, fix=(0,))
-    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=random_edges(rng, [7], [8])))
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), factors=random_edges(rng, [7], [8])))
     return graph
 
 
 def without_any_heading(_: np.random.Generator) -> Graph:
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), observed=ObservedNodes(
-        [0], None, [[1.0, 2.0, 0.0]], [np.diag([1.0, 1.0, 0.0])], [ObservedKind.POSITION])))
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), factors=Factors.on(
+        [0], None, [[1.0, 2.0, 0.0]], [np.diag([1.0, 1.0, 0.0])], [FactorKind.POSITION])))
     return graph
 
 
 def beyond_all_numbers(_: np.random.Generator) -> Graph:
     graph = random_graph(2, fix=(0,))
-    graph.apply(GraphUpdate(observed=ObservedNodes(
-        [3], None, [[1e200, 0.0, 0.0]], [np.eye(3)], [ObservedKind.GLOBAL_POSE])))
+    graph.apply(GraphUpdate(factors=Factors.on(
+        [3], None, [[1e200, 0.0, 0.0]], [np.eye(3)], [FactorKind.GLOBAL_POSE])))
     return graph
 
 
 def cut_off(_: np.random.Generator) -> Graph:
     graph = random_graph(seed=5, n_nodes=4, n_observed=0, fix=(0,))
-    edges = graph.edges
+    edges = graph.factors.edges
     graph.apply(GraphUpdate(
-        remove_edges=np.flatnonzero((edges.i == 0) | (edges.j == 0)).tolist()))
+        remove=np.flatnonzero((edges.i == 0) | (edges.j == 0)).tolist()))
     return graph
 
 
@@ -238,22 +238,24 @@ def test_from_nothing_it_finds_the_minimum_from_anywhere(seed: int) -> None:
 def test_the_smoother_continues_from_the_result(seed: int, *, from_nothing: bool) -> None:
     smoother, rng = IncrementalSmoother(EXACT), np.random.default_rng(seed)
     first = consistent_graph(seed, noise=0.05)
-    smoother.update(GraphUpdate(hidden=first.poses, edges=first.edges, fix=[0]))
+    smoother.update(GraphUpdate(hidden=first.poses, factors=first.factors, fix=[0]))
     graph = smoother.graph
-    graph.apply(GraphUpdate(observed=random_observed(rng, [3]), weigh_observed={0: 0.01}))
+    graph.apply(GraphUpdate(
+        factors=random_observed(rng, [3]), weigh={graph.n_factors: 0.01}))
     optimize = optimizer.optimize_from_linear_start if from_nothing else optimizer.optimize
     assert optimize(graph, THOROUGH).status is Status.CONVERGED
     poses = graph.poses.copy()
     for k in range(3):
         n = graph.n_nodes
-        edges = Edges(
+        edges = Factors(
             [n - 1, k], [n, n], [[1.0, 0.1, 0.2], se2.between(poses[k], poses[-1])],
             np.tile(np.diag([50.0, 50.0, 100.0]), (2, 1, 1)), [0, 1])
         hidden = se2.compose(graph.poses[-1], np.array([1.0, 0.1, 0.2]))[None]
-        assert smoother.update(GraphUpdate(hidden=hidden, edges=edges)).status is Status.CONVERGED
+        result = smoother.update(GraphUpdate(hidden=hidden, factors=edges))
+        assert result.status is Status.CONVERGED
         found = graph.poses.copy()
         other = Graph()
-        other.apply(GraphUpdate(hidden=found, edges=graph.edges, observed=graph.observed, fix=[0]))
+        other.apply(GraphUpdate(hidden=found, factors=graph.factors, fix=[0]))
         assert optimizer.optimize(other, THOROUGH).status is Status.CONVERGED
         np.testing.assert_allclose(found, other.poses, atol=SAME_POSES)
 

@@ -18,7 +18,7 @@ from pose_graph_ros.core.batch.plain_optimizer import (
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 CONFIG = SolverConfig(max_iterations=200)
@@ -34,10 +34,10 @@ def noisy_graph(seed: int, n: int = 30, noise: float = 0.1) -> Graph:
                            chords[:3])).T
     root = np.triu(rng.normal(size=(len(i), 3, 3))) + 3.0 * np.eye(3)
     mean = se2.between(truth[i], truth[j]) + noise * rng.normal(size=(len(i), 3))
-    kind = np.where(j - i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    kind = np.where(j - i == 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     graph = Graph()
     graph.apply(GraphUpdate(
-        truth + rng.normal(size=(n, 3)), Edges(
+        truth + rng.normal(size=(n, 3)), Factors(
             i, j, mean, np.swapaxes(root, 1, 2) @ root, kind), fix=[3, 7] if seed % 2 else [0]))
     return graph
 
@@ -82,7 +82,7 @@ def test_edges_that_do_not_measure_all_coordinates_are_not_covered(seed: int) ->
     root = rng.normal(size=(2, 3))
     information[3] = root.T @ root
     graph = Graph()
-    graph.apply(GraphUpdate(rng.normal(size=(n, 3)), Edges(
+    graph.apply(GraphUpdate(rng.normal(size=(n, 3)), Factors(
         chain[:, 0], chain[:, 1], rng.normal(size=(4, 3)), information, np.zeros(4, np.int64)),
         fix=[0]))
     assert not PlainGraph.is_covered(graph.rows())
@@ -93,14 +93,15 @@ def test_edges_that_do_not_measure_all_coordinates_are_not_covered(seed: int) ->
 @pytest.mark.parametrize('start', [Start.CHORDAL, Start.PRESENT])
 def test_what_overflows_is_no_result_and_no_warning(start: Start) -> None:
     graph = noisy_graph(0, n=8)
-    edges = graph.edges
+    edges = graph.factors.edges
     refused = 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
         scale = 10.0 ** rng.uniform(-140.0, 140.0, (len(edges), 1, 1))
         mean = edges.mean * [*10.0 ** rng.uniform(0.0, 90.0, 2), 1.0]
-        plain = PlainGraph(graph.rows().with_edges(replace(
-            edges, information=scale * edges.information, mean=mean)))
+        plain = PlainGraph(graph.rows().with_factors(Factors.joined([
+            replace(edges, information=scale * edges.information, mean=mean),
+            graph.factors.observed])))
         before = plain.poses.copy()
         if PlainOptimizer(plain, CONFIG).optimize(start) is None:
             refused += 1

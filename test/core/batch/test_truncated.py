@@ -50,7 +50,7 @@ class Dense:
 
     def __init__(self, problem: TruncatedProblem, start: FloatArray) -> None:
         graph = problem.graph
-        self.edges, self.closures = graph.edges, len(graph.edges) - len(problem)
+        self.edges, self.closures = graph.factors.edges, len(graph.factors.edges) - len(problem)
         self.start = start
         self.root = np.linalg.cholesky(self.edges.information).transpose(0, 2, 1)
 

@@ -14,7 +14,7 @@ from pose_graph_ros.core.elimination.clique_frames import prior_error2
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import prior_rows, tables as tb
-from pose_graph_ros.core.graph.constraints import ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -47,8 +47,8 @@ def test_the_error_of_a_turned_prior_is_that_of_its_displacement(
     prior = random_prior(rng, list(range(K)), reference, anchored=anchored)
     prior = replace(prior, vector=prior.information @ displacement(prior, after))
     smoother = IncrementalSmoother(EXACT)
-    smoother.update(GraphUpdate(hidden=before, priors=[prior], observed=ObservedNodes(
-        range(K), None, before, [1e12 * np.eye(3)] * K, [ObservedKind.GLOBAL_POSE] * K)))
+    smoother.update(GraphUpdate(hidden=before, priors=[prior], factors=Factors.on(
+        range(K), None, before, [1e12 * np.eye(3)] * K, [FactorKind.GLOBAL_POSE] * K)))
     head, nodes = smoother.graph.memory.head, smoother.graph.memory['node_f'][:K]
     before = smoother.poses.copy()
     change = se2.wrapped(after - before)

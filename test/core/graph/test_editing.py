@@ -12,11 +12,12 @@ from slow_smoother import differences, state
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import tables as tb
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 seeds = st.integers(0, 2**32 - 1)
 edits = st.lists(st.tuples(
-    st.sampled_from(['edge', 'observed', 'fix', 'free', 'node']), st.integers(0, 10**6),
+    st.sampled_from(['factor', 'fix', 'free', 'node']), st.integers(0, 10**6),
     st.sampled_from([0.0, 1e-9, 0.5, 1.0, 20.0])), max_size=12)
 
 
@@ -24,27 +25,23 @@ def edited(graph: Graph, steps: list[tuple[str, int, float]], rng: np.random.Gen
     for what, number, value in steps:
         node = number % graph.n_nodes
         graph.apply({
-            'edge': GraphUpdate(weigh_edges={number % graph.n_edges: value}),
-            'observed': GraphUpdate(weigh_observed={number % graph.n_observed: value}),
+            'factor': GraphUpdate(weigh={number % graph.n_factors: value}),
             'fix': GraphUpdate(fix=(node,)), 'free': GraphUpdate(free=(node,)),
             'node': GraphUpdate(
-                hidden=random_poses(rng, 1), edges=random_edges(rng, [node], [graph.n_nodes]),
-                observed=random_observed(rng, [graph.n_nodes]))}[what])
+                hidden=random_poses(rng, 1), factors=Factors.joined([
+                    random_edges(rng, [node], [graph.n_nodes]),
+                    random_observed(rng, [graph.n_nodes])]))}[what])
 
 
-def listed(graph: Graph) -> list[tuple[list[int], list[int]]]:
-    """Return the ids of the edges and the observed nodes in the lists of each node, sorted."""
+def listed(graph: Graph) -> list[list[int]]:
+    """Return the ids of the factors in the list of each node, sorted."""
     memory, found = graph.memory, []
     for row in memory['node_i'][:graph.n_nodes]:
-        edges, observed = [], []
-        entry, k = int(row[tb.EDGE_LIST]), int(row[tb.OBSERVED_LIST])
+        factors, entry = [], int(row[tb.FACTOR_LIST])
         while entry >= 0:
-            edges.append(int(graph.edge_ids[entry >> 2]))
-            entry = int(memory['edge_i'][entry >> 2, tb.NEXT_I + (entry & 3)])
-        while k >= 0:
-            observed.append(int(graph.observed_ids[k]))
-            k = int(memory['observed_i'][k, tb.OBS_NEXT])
-        found.append((sorted(edges), sorted(observed)))
+            factors.append(int(graph.factor_ids[entry >> 2]))
+            entry = int(memory['factor_i'][entry >> 2, tb.NEXT_I + (entry & 3)])
+        found.append(sorted(factors))
     return found
 
 
@@ -55,12 +52,12 @@ def test_after_any_edits_chi2_and_lists_are_those_of_the_rows(
 ) -> None:
     graph = random_graph(seed)
     edited(graph, steps, np.random.default_rng(seed))
-    edges, observed = graph.edges, graph.observed
+    factors = graph.factors
     assert graph.memory['scalars'][tb.CHI2] == pytest.approx(
         graph.energies().chi2, rel=1e-9, abs=1e-6)
     assert listed(graph) == [
-        (np.flatnonzero(((edges.i == node) | (edges.j == node)) & (edges.weight > 0.0)).tolist(),
-         np.flatnonzero((observed.node == node) & (observed.weight > 0.0)).tolist())
+        np.flatnonzero(((factors.i == node) | (factors.j == node))
+                       & (factors.weight > 0.0)).tolist()
         for node in range(graph.n_nodes)]
 
 
@@ -70,16 +67,15 @@ def graph_of(seed: int) -> Graph:
     """Return a graph with biases, some constraints of which have the weight 0."""
     graph, rng = random_graph(seed, n_nodes=9, n_biases=3), np.random.default_rng(seed)
     graph.apply(GraphUpdate(
-        remove_edges=rng.choice(graph.n_edges, 4, replace=False).tolist(),
-        remove_observed=rng.choice(graph.n_observed, 2, replace=False).tolist(), fix=(2,)))
+        remove=rng.choice(graph.n_factors, 6, replace=False).tolist(), fix=(2,)))
     return graph
 
 
 def leaving(graph: Graph, rng: np.random.Generator) -> GraphUpdate:
-    nodes, edges, observed = (
-        rng.choice(ids, min(len(ids), int(rng.integers(0, 4))), replace=False).tolist()
-        for ids in (graph.node_ids, graph.edge_ids, graph.observed_ids))
-    return GraphUpdate(remove_nodes=nodes, drop_edges=edges, drop_observed=observed)
+    nodes, factors = (
+        rng.choice(ids, min(len(ids), int(rng.integers(0, 5))), replace=False).tolist()
+        for ids in (graph.node_ids, graph.factor_ids))
+    return GraphUpdate(remove_nodes=nodes, drop=factors)
 
 
 @given(seeds)
@@ -91,25 +87,20 @@ def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
         graph.apply(update)
         stays = ~np.isin(before.node_ids, update.remove_nodes)
         nodes = before.node_ids[stays]
-        edges = (np.isin(before.edges.i, nodes) & np.isin(before.edges.j, nodes)
-                 & ~np.isin(before.edge_ids, update.drop_edges))
-        observed = (np.isin(before.observed.node, nodes)
-                    & ~np.isin(before.observed_ids, update.drop_observed))
+        factors = (np.isin(before.factors.i, nodes) & np.isin(before.factors.j, (*nodes, -1))
+                   & ~np.isin(before.factor_ids, update.drop))
         assert graph.node_ids.tolist() == nodes.tolist()
-        assert graph.edge_ids.tolist() == before.edge_ids[edges].tolist()
-        assert graph.observed_ids.tolist() == before.observed_ids[observed].tolist()
+        assert graph.factor_ids.tolist() == before.factor_ids[factors].tolist()
         assert graph.next_ids == before.next_ids
-        for table, rows in ((graph.edges, before.edges.rows(edges)),
-                            (graph.observed, before.observed.rows(observed))):
-            for column, expected in zip(table.columns, rows.columns, strict=True):
-                np.testing.assert_array_equal(column, expected)
+        for column, expected in zip(
+                graph.factors.columns, before.factors.rows(factors).columns, strict=True):
+            np.testing.assert_array_equal(column, expected)
         anew = Graph()
         anew.fill(before._replace(
             poses=before.poses[stays], node_kind=before.node_kind[stays],
             dimension=before.dimension[stays], fixed=before.fixed[stays],
-            edges=before.edges.rows(edges), observed=before.observed.rows(observed),
-            node_ids=nodes, edge_ids=before.edge_ids[edges],
-            observed_ids=before.observed_ids[observed]))
+            factors=before.factors.rows(factors), node_ids=nodes,
+            factor_ids=before.factor_ids[factors]))
         assert snapshot(graph) == snapshot(anew)
         assert listed(graph) == listed(anew)
         assert graph.newest_pose == anew.newest_pose
@@ -126,31 +117,29 @@ def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
 @settings(max_examples=25)
 def test_new_rows_go_on_with_the_ids_and_find_the_nodes(seed: int) -> None:
     graph, rng = graph_of(seed), np.random.default_rng(seed)
-    graph.apply(leaving(graph, rng)._replace(remove_nodes=[1, 11], drop_edges=[0]))
+    graph.apply(leaving(graph, rng)._replace(remove_nodes=[1, 11], drop=[0]))
     left, first = graph.node_ids[~graph.is_bias].tolist(), graph.next_ids
     i, j = rng.choice(left, 2, replace=False).tolist()
-    edges = random_edges(rng, [i, first.node], [first.node + 1, j])
-    observed = random_observed(rng, [first.node, i])
-    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), edges=edges, observed=observed))
+    factors = Factors.joined([random_edges(rng, [i, first.node], [first.node + 1, j]),
+                              random_observed(rng, [first.node, i])])
+    graph.apply(GraphUpdate(hidden=random_poses(rng, 2), factors=factors))
     assert graph.node_ids[-2:].tolist() == [12, 13] == [first.node, first.node + 1]
-    assert graph.next_ids == (first.node + 2, first.edge + 2, first.observed + 2)
-    found = graph.edges_at([first.edge, first.edge + 1])
-    assert (found.i.tolist(), found.j.tolist()) == (edges.i.tolist(), edges.j.tolist())
-    assert graph.observed_at([first.observed, first.observed + 1]).node.tolist() == [12, i]
+    assert graph.next_ids == (first.node + 2, first.factor + 4)
+    found = graph.factors_at(first.factor + np.arange(4))
+    assert (found.i.tolist(), found.j.tolist()) == (factors.i.tolist(), factors.j.tolist())
     poses = dict(zip(graph.node_ids.tolist(), graph.poses, strict=True))
     np.testing.assert_array_equal(graph.poses_of([j, 12]), [poses[j], poses[12]])
     assert graph.node_rows([1, 11, 99, -1]).tolist() == [-1] * 4
-    assert graph.edge_rows(0) == -1
+    assert graph.factor_rows(0) == -1
 
 
 GONE: dict[str, tuple[Callable[[], GraphUpdate], str]] = {
     'fix': (lambda: GraphUpdate(fix=[3]), 'fix: hidden node 3 has left the graph'),
     'remove': (lambda: GraphUpdate(remove_nodes=[3]), 'remove_nodes: hidden node 3 has left'),
-    'edge': (lambda: GraphUpdate(weigh_edges={0: 1.0}), 'weigh_edges: edge 0 has left the graph'),
-    'observed': (lambda: GraphUpdate(remove_observed=[1]),
-                 'remove_observed: observed node 1 has left the graph'),
-    'end': (lambda: GraphUpdate(edges=random_edges(np.random.default_rng(0), [2, 4], [4, 3])),
-            'Edges: hidden node 3 has left the graph; row 1'),
+    'weigh': (lambda: GraphUpdate(weigh={0: 1.0}), 'weigh: factor 0 has left the graph'),
+    'factor': (lambda: GraphUpdate(remove=[1]), 'remove: factor 1 has left the graph'),
+    'end': (lambda: GraphUpdate(factors=random_edges(np.random.default_rng(0), [2, 4], [4, 3])),
+            'Factors: hidden node 3 has left the graph; row 1'),
 }
 
 
@@ -158,7 +147,7 @@ GONE: dict[str, tuple[Callable[[], GraphUpdate], str]] = {
 def test_an_id_that_has_left_is_refused_by_name(name: str) -> None:
     make, message = GONE[name]
     graph = random_graph(4, n_nodes=7)
-    graph.apply(GraphUpdate(remove_nodes=[3], drop_edges=[0], drop_observed=[1]))
+    graph.apply(GraphUpdate(remove_nodes=[3], drop=[0, 1]))
     before = state(graph)
     with pytest.raises(GraphUpdateError, match=message):
         graph.apply(make())
@@ -169,27 +158,27 @@ def test_within_an_update_rows_stay_and_a_rollback_brings_all_back() -> None:
     graph = graph_of(5)
     before = state(graph)
     graph.begin()
-    graph.apply(GraphUpdate(remove_nodes=[0, 8, 10], drop_edges=[3], drop_observed=[0]))
+    graph.apply(GraphUpdate(remove_nodes=[0, 8, 10], drop=[3, 0]))
     assert graph.n_nodes == 12
     assert graph.newest_pose == 7
     assert graph.leaving() == GraphUpdate(
-        remove_nodes=[0, 8, 10], drop_edges=[3], drop_observed=[0])
+        remove_nodes=[0, 8, 10], drop=[0, 3])
     graph.rollback()
     assert differences(before, state(graph)) == []
-    assert graph.leaving() == GraphUpdate(remove_nodes=[], drop_edges=[], drop_observed=[])
+    assert graph.leaving() == GraphUpdate(remove_nodes=[], drop=[])
     graph.begin()
-    edges = graph.edges
+    factors = graph.factors
     graph.apply(GraphUpdate(remove_nodes=[0, 8]))
     left = graph.commit()
     assert left.nodes.tolist() == [0, 8]
-    assert left.edges.tolist() == np.flatnonzero(
-        np.isin(edges.i, [0, 8]) | np.isin(edges.j, [0, 8])).tolist()
+    assert left.factors.tolist() == np.flatnonzero(
+        np.isin(factors.i, [0, 8]) | np.isin(factors.j, [0, 8])).tolist()
 
 
 def test_rows_are_filled_with_their_ids_which_must_ascend() -> None:
     graph = graph_of(7)
     first = graph.rows()
-    graph.apply(GraphUpdate(remove_nodes=[1, 11], drop_edges=[4]))
+    graph.apply(GraphUpdate(remove_nodes=[1, 11], drop=[4]))
     copy = Graph()
     copy.fill(graph.rows())
     assert (snapshot(copy), copy.next_ids) == (snapshot(graph), graph.next_ids)

@@ -19,7 +19,7 @@ from random_graphs import (
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Tolerance for coordinates of about 10 m after three or four rotations, each rounded to 2e-15.
@@ -56,11 +56,11 @@ def test_errors_are_those_of_g2o(seed: int) -> None:
 def test_angles_are_wrapped_once_and_at_the_end() -> None:
     # th_j - th_i = -2 pi + 0.2 and z = 0.3: wrapping only a part would leave 2 pi in the error
     poses = np.array([[0.0, 0.0, np.pi - 0.1], [0.0, 0.0, -np.pi + 0.1]])
-    edges = Edges([0], [1], [[0.0, 0.0, 0.3]], [np.eye(3)], [EdgeKind.ODOMETRY])
-    assert error_functions.edge_errors(poses, edges)[0, 2] == pytest.approx(-0.1, abs=ROUNDING)
-    observed = ObservedNodes([1], [[0.0, 0.0, -0.3]], [[0.0, 0.0, np.pi - 0.1]], [np.eye(3)],
-                             [ObservedKind.GLOBAL_POSE])
-    assert error_functions.observed_errors(poses, observed)[0, 2] == pytest.approx(
+    edges = Factors([0], [1], [[0.0, 0.0, 0.3]], [np.eye(3)], [FactorKind.ODOMETRY])
+    assert error_functions.errors(poses, edges)[0, 2] == pytest.approx(-0.1, abs=ROUNDING)
+    observed = Factors.on([1], [[0.0, 0.0, -0.3]], [[0.0, 0.0, np.pi - 0.1]], [np.eye(3)],
+                             [FactorKind.GLOBAL_POSE])
+    assert error_functions.errors(poses, observed)[0, 2] == pytest.approx(
         -0.1, abs=ROUNDING)
 
 
@@ -71,12 +71,12 @@ def test_an_observed_node_is_an_edge_with_zero_mean_from_a_node_fixed_there(seed
     observed = random_observed(rng, list(range(N)), offset=False)
     with_observed, with_edges = Graph(), Graph()
     chain = random_edges(rng, list(range(N - 1)), list(range(1, N)))
-    with_observed.apply(GraphUpdate(hidden=poses, edges=chain, observed=observed))
-    with_edges.apply(GraphUpdate(hidden=poses, edges=chain))
+    with_observed.apply(GraphUpdate(hidden=poses, factors=Factors.joined([chain, observed])))
+    with_edges.apply(GraphUpdate(hidden=poses, factors=chain))
     with_edges.apply(GraphUpdate(
         hidden=observed.mean, fix=range(N, 2 * N),
-        edges=Edges(np.arange(N, 2 * N), observed.node, np.zeros((N, 3)), observed.information,
-                    [EdgeKind.LOOP_CLOSURE] * N)))
+        factors=Factors(np.arange(N, 2 * N), observed.i, np.zeros((N, 3)), observed.information,
+                    [FactorKind.LOOP_CLOSURE] * N)))
     H, b = dense_system(with_observed)
     H_edges, b_edges = free_part(with_edges, *dense_system(with_edges))
     np.testing.assert_allclose(H_edges, H, atol=WEIGHTED_ROUNDING)

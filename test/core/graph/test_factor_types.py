@@ -18,11 +18,9 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
-    Edges,
+    FactorKind,
     FACTORS,
-    ObservedKind,
-    ObservedNodes,
+    Factors,
 )
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -32,32 +30,31 @@ POINTS = np.array([[3.0, 2.0], [-2.0, 4.0], [5.0, -3.0]])
 seeds = st.integers(0, 2**32 - 1)
 
 
-def slow_error(poses: FloatArray, edges: Edges, e: int) -> FloatArray:
+def slow_error(poses: FloatArray, edges: Factors, e: int) -> FloatArray:
     """Return the error of one edge by its formula."""
     start, end = poses[edges.i[e]], poses[edges.j[e]]
-    mean, bias, kind = edges.mean[e], edges.bias[e], edges.kind[e]
+    mean, bias, kind = edges.mean[e], edges.constants[e], edges.kind[e]
     inverse = np.linalg.inv(matrix(start))
-    if kind == EdgeKind.BIAS:
+    if kind == FactorKind.BIAS:
         return slow_to_bias(start, end, mean, bias)[0]
-    if kind == EdgeKind.TURN:
+    if kind == FactorKind.TURN:
         drift = bias[3] * poses[edges.k[e], 0] if edges.k[e] >= 0 else 0.0
         turn = end[2] - start[2] - mean[2] + drift
         return np.array([0.0, 0.0, np.arctan2(np.sin(turn), np.cos(turn))])
     point = (inverse @ [*end[:2], 1.0])[:2]
-    if kind == EdgeKind.POINT:
+    if kind == FactorKind.POINT:
         return np.array([*(point - mean[:2]), 0.0])
-    if kind == EdgeKind.RANGE:
+    if kind == FactorKind.RANGE:
         return np.array([np.hypot(*(point - bias[:2])) - mean[0], 0.0, 0.0])
     return slow_edge(start, end, mean)[0]
 
 
 def whitened(graph: Graph, values: FloatArray) -> FloatArray:
     """Return all errors, multiplied by roots of their information, at other values of nodes."""
-    edges, observed = graph.edges, graph.observed
-    errors = [slow_error(values, edges, e) for e in range(len(edges))]
-    errors += [slow_observed(values[node], observed.offset[k], observed.mean[k])[0]
-               for k, node in enumerate(observed.node.tolist())]
-    W = np.concatenate((edges.weighted_information, observed.weighted_information))
+    factors = graph.factors
+    errors = [slow_error(values, factors, e) if factors.j[e] >= 0 else slow_observed(
+        values[factors.i[e]], factors.offset[e], factors.mean[e])[0] for e in range(len(factors))]
+    W = factors.weighted_information
     # the root of a singular matrix by its eigenvectors
     size, vectors = np.linalg.eigh(W)
     roots = np.sqrt(np.maximum(size, 0.0))[:, :, None] * np.swapaxes(vectors, 1, 2)
@@ -98,25 +95,25 @@ def drive(rng: np.random.Generator, noise: float) -> list[GraphUpdate]:
             continue
         parts = []
         motion = se2.between(truth[k - 1], truth[k]) + noise * sigmas * rng.normal(size=3)
-        parts.append(Edges([names[-1]], [node], [motion], [np.diag(sigmas**-2)],
-                           [EdgeKind.ODOMETRY]))
+        parts.append(Factors([names[-1]], [node], [motion], [np.diag(sigmas**-2)],
+                           [FactorKind.ODOMETRY]))
         if k == 1:
             update = update._replace(biases=np.array([[0.01, 0.0, 0.0]]), dimensions=[1],
                                      landmarks=POINTS + noise * rng.normal(size=POINTS.shape))
             # a single range does not determine a landmark
-            observed = ObservedNodes(
+            observed = Factors.on(
                 [bias, first_point + 2], mean=[[biases[0], 0.0, 0.0], [*POINTS[2], 0.0]],
                 information=[np.diag((1e4, 0.0, 0.0)), np.diag((1.0, 1.0, 0.0))],
-                kind=[ObservedKind.POSITION] * 2)
-            update = update._replace(observed=observed)
+                kind=[FactorKind.POSITION] * 2)
+            parts.append(observed)
         if k == 4:
             update = update._replace(biases=np.array([[0.01, 0.0, 0.0]]), dimensions=[1])
-            parts.append(Edges([node + 1], [bias], np.zeros((1, 3)), [np.diag((1e3, 0.0, 0.0))],
-                               [EdgeKind.BIAS], bias=[[0.0, 0.0, 1.0, 0.0]]))
+            parts.append(Factors([node + 1], [bias], np.zeros((1, 3)), [np.diag((1e3, 0.0, 0.0))],
+                               [FactorKind.BIAS], constants=[[0.0, 0.0, 1.0, 0.0]]))
             bias = node + 1
         turn = truth[k, 2] - truth[k - 1, 2] + dt * biases[k >= 4] + 0.01 * noise * rng.normal()
-        parts.append(Edges([names[-1]], [node], [[0.0, 0.0, turn]], [np.diag((0.0, 0.0, 1e4))],
-                           [EdgeKind.TURN], bias=[[0.0, 0.0, 0.0, dt]], k=[bias]))
+        parts.append(Factors([names[-1]], [node], [[0.0, 0.0, turn]], [np.diag((0.0, 0.0, 1e4))],
+                           [FactorKind.TURN], constants=[[0.0, 0.0, 0.0, dt]], k=[bias]))
         names.append(node)
         for m, point in enumerate(POINTS):
             seen = (np.linalg.inv(matrix(truth[k])) @ [*point, 1.0])[:2]
@@ -125,14 +122,14 @@ def drive(rng: np.random.Generator, noise: float) -> list[GraphUpdate]:
             arm = np.zeros(4)
             if m < 2:
                 mean[:2], information[:2, :2] = seen, random_information(rng, 1)[0, :2, :2]
-                kind = EdgeKind.POINT
+                kind = FactorKind.POINT
             else:
                 arm[:2] = 0.4, -0.2
                 mean[0], information[0, 0], kind = np.hypot(*(seen - arm[:2])), 100.0, (
-                    EdgeKind.RANGE)
-            parts.append(Edges([node], [first_point + m], [mean], [information], [kind],
-                               bias=[arm]))
-        updates.append(update._replace(edges=Edges.joined(parts)))
+                    FactorKind.RANGE)
+            parts.append(Factors([node], [first_point + m], [mean], [information], [kind],
+                               constants=[arm]))
+        updates.append(update._replace(factors=Factors.joined(parts)))
     return updates
 
 
@@ -195,16 +192,17 @@ def test_a_rollback_restores_and_nodes_leave_with_edges_of_three_ends(
     graph = graph_of(drive(np.random.default_rng(seed), 0.3))
     whole = graph.rows()
     graph.begin()
-    graph.apply(GraphUpdate(weigh_edges={
-        number % graph.n_edges: weight for number, weight in weights}, remove_nodes=[2]))
+    graph.apply(GraphUpdate(weigh={
+        number % graph.n_factors: weight for number, weight in weights}, remove_nodes=[2]))
     graph.rollback()
-    for column, before in zip(graph.edges.columns, whole.edges.columns, strict=True):
+    for column, before in zip(graph.factors.columns, whole.factors.columns, strict=True):
         np.testing.assert_array_equal(column, before)
     graph.begin()
     graph.apply(GraphUpdate(remove_nodes=[2]))
     graph.commit()
-    left = whole.edges.rows((whole.edges.k != 2) & (whole.edges.j != 2))
-    for column, kept in zip(graph.edges.columns, left.columns, strict=True):
+    factors = whole.factors
+    left = factors.rows((factors.i != 2) & (factors.j != 2) & (factors.k != 2))
+    for column, kept in zip(graph.factors.columns, left.columns, strict=True):
         np.testing.assert_array_equal(column, kept)
     copy = Graph()
     copy.fill(graph.rows())
@@ -213,27 +211,27 @@ def test_a_rollback_restores_and_nodes_leave_with_edges_of_three_ends(
 
 
 @pytest.mark.parametrize(('kind', 'change', 'message'), [
-    (EdgeKind.POINT, {'j': [1]}, r'kind POINT to have landmark'),
-    (EdgeKind.RANGE, {'j': [1]}, r'kind RANGE to have landmark'),
-    (EdgeKind.TURN, {'k': [1]}, r'Edges\.k: .*kind TURN to have bias'),
-    (EdgeKind.ODOMETRY, {'j': [1], 'k': [2]}, r'Edges\.k: .*to have none'),
-    (EdgeKind.POINT, {'mean': [[1.0, 0.0, 1.0]]}, 'mean: expected 0 in rows'),
-    (EdgeKind.RANGE, {'information': [np.eye(3)]}, 'information: expected 0 in rows'),
-    (EdgeKind.TURN, {'k': [99]}, r'expected a hidden node in 0\.\.5'),
+    (FactorKind.POINT, {'j': [1]}, r'kind POINT to have landmark'),
+    (FactorKind.RANGE, {'j': [1]}, r'kind RANGE to have landmark'),
+    (FactorKind.TURN, {'k': [1]}, r'Factors\.k: .*kind TURN to have bias'),
+    (FactorKind.ODOMETRY, {'j': [1], 'k': [2]}, r'Factors\.k: .*to have none'),
+    (FactorKind.POINT, {'mean': [[1.0, 0.0, 1.0]]}, 'mean: expected 0 in rows'),
+    (FactorKind.RANGE, {'information': [np.eye(3)]}, 'information: expected 0 in rows'),
+    (FactorKind.TURN, {'k': [99]}, r'expected a hidden node in 0\.\.5'),
 ])
 def test_what_a_kind_of_edge_does_not_have_is_refused(
-    kind: EdgeKind, change: dict[str, object], message: str,
+    kind: FactorKind, change: dict[str, object], message: str,
 ) -> None:
     graph, factor = Graph(), FACTORS[kind]
     graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), biases=np.zeros((1, 3)), dimensions=[1],
                             landmarks=POINTS))
     rows = np.isin(range(3), factor.rows)
-    columns = {'i': [0], 'j': [3 if kind in {EdgeKind.POINT, EdgeKind.RANGE} else 1],
+    columns = {'i': [0], 'j': [3 if kind in {FactorKind.POINT, FactorKind.RANGE} else 1],
                'mean': [np.where(rows, 1.0, 0.0)], 'information': [np.diag(np.where(rows, 1, 0))],
                'kind': [kind]}
-    before = graph.n_edges
+    before = len(graph.factors.edges)
     with pytest.raises(GraphUpdateError, match=message):
-        graph.apply(GraphUpdate(edges=Edges(**{**columns, **change})))
-    assert graph.n_edges == before
-    graph.apply(GraphUpdate(edges=Edges(**columns)))
-    assert graph.n_edges == before + 1
+        graph.apply(GraphUpdate(factors=Factors(**{**columns, **change})))
+    assert len(graph.factors.edges) == before
+    graph.apply(GraphUpdate(factors=Factors(**columns)))
+    assert len(graph.factors.edges) == before + 1

@@ -3,7 +3,6 @@
 """A `GraphUpdate` is applied whole or not at all; a rollback reverts it bit for bit."""
 
 from collections.abc import Callable
-from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from random_graphs import (
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import editing
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # A graph of seven nodes, 0 to 6, is edited here.
@@ -29,21 +28,21 @@ ASYMMETRIC = np.eye(3) + np.array([[0.0, 0.1, 0.0], [0.0] * 3, [0.0] * 3])
 
 def edge(
     i: object = (0,), j: object = (1,), mean: object = ((1.0, 0.0, 0.0),),
-    information: object = (np.eye(3),), kind: object = (EdgeKind.ODOMETRY,),
+    information: object = (np.eye(3),), kind: object = (FactorKind.ODOMETRY,),
 ) -> GraphUpdate:
-    return GraphUpdate(edges=Edges(i, j, mean, information, kind))
+    return GraphUpdate(factors=Factors(i, j, mean, information, kind))
 
 
 def edge_to_bias(bias: object) -> GraphUpdate:
-    return GraphUpdate(biases=np.zeros((1, 3)), edges=Edges(
-        [0], [N_NODES], np.zeros((1, 3)), [np.eye(3)], [EdgeKind.BIAS], bias=bias))
+    return GraphUpdate(biases=np.zeros((1, 3)), factors=Factors(
+        [0], [N_NODES], np.zeros((1, 3)), [np.eye(3)], [FactorKind.BIAS], constants=bias))
 
 
 def observed(
     node: object = (0,), offset: object = None, mean: object = ((1.0, 0.0, 0.0),),
-    information: object = (np.eye(3),), kind: object = (ObservedKind.GLOBAL_POSE,),
+    information: object = (np.eye(3),), kind: object = (FactorKind.GLOBAL_POSE,),
 ) -> GraphUpdate:
-    return GraphUpdate(observed=ObservedNodes(node, offset, mean, information, kind))
+    return GraphUpdate(factors=Factors.on(node, offset, mean, information, kind))
 
 
 # Invalid updates, with a pattern of the message: what was expected, and the value.
@@ -53,36 +52,41 @@ BAD_UPDATES = {
     'fix_outside': (lambda: GraphUpdate(fix=(7,)), r'fix.*0\.\.6.*7'),
     'fix_no_integer': (lambda: GraphUpdate(hidden=np.zeros((1, 3)), fix=(0.5,)), r'fix.*0\.5'),
     'weight_negative': (
-        lambda: GraphUpdate(weigh_edges={0: -0.1}), r'weigh_edges.*not negative, got -0\.1.*0'),
+        lambda: GraphUpdate(weigh={0: -0.1}), r'weigh.*not negative, got -0\.1.*0'),
     'weight_nan': (
-        lambda: GraphUpdate(weigh_observed={1: np.nan}), 'weigh_observed.*finite.*nan.*number 1'),
-    'edge_i_outside': (lambda: edge(i=[7]), r'Edges.*0\.\.6.*row 0: 7'),
+        lambda: GraphUpdate(weigh={1: np.nan}), 'weigh.*finite.*nan.*number 1'),
+    'edge_i_outside': (lambda: edge(i=[7]), r'Factors.*0\.\.6.*row 0: 7'),
     'edge_to_itself': (lambda: edge(i=[3], j=[3]), 'itself.*row 0: 3'),
-    'edge_mean_nan': (lambda: edge(mean=[[np.nan, 0.0, 0.0]]), r'Edges\.mean.*finite.*nan'),
+    'edge_mean_nan': (lambda: edge(mean=[[np.nan, 0.0, 0.0]]), r'Factors\.mean.*finite.*nan'),
     'edge_information_asymmetric': (
-        lambda: edge(information=[ASYMMETRIC]), r'Edges\.information.*symmetric.*row 0'),
+        lambda: edge(information=[ASYMMETRIC]), r'Factors\.information.*symmetric.*row 0'),
     'edge_information_negative_beside_large': (
         lambda: edge(information=[np.diag([4e8, -100.0, 1.0])]),
-        r'Edges\.information.*semidefinite.*row 0'),
+        r'Factors\.information.*semidefinite.*row 0'),
     'edge_information_zero': (
-        lambda: edge(information=[np.zeros((3, 3))]), r'Edges\.information.*row 0'),
+        lambda: edge(information=[np.zeros((3, 3))]), r'Factors\.information.*row 0'),
     'edge_kind_unknown': (
-        lambda: edge(kind=[len(EdgeKind)]),
+        lambda: edge(kind=[len(FactorKind)]),
         'kind is none of ODOMETRY, LOOP_CLOSURE, BIAS, .*; row 0'),
     'observed_kind_unknown': (
-        lambda: observed(kind=[255]), 'kind is none of GLOBAL_POSE, .*; row 0: 255'),
+        lambda: observed(kind=[255]), 'kind is none of .*, GLOBAL_POSE, .*; row 0: 255'),
     'edge_to_a_pose_as_a_bias': (
-        lambda: edge(kind=[EdgeKind.BIAS]), r'Edges\.j: .*kind BIAS to have bias .*; row 0: 1'),
+        lambda: edge(kind=[FactorKind.BIAS]),
+        r'Factors\.j: .*kind BIAS to have bias .*; row 0: 1'),
+    'edge_to_nothing': (
+        lambda: edge(j=[-1]), r'Factors\.j: .*kind ODOMETRY to have pose .*; row 0: -1'),
+    'observed_with_two_ends': (
+        lambda: edge(kind=[FactorKind.POSITION]), r'Factors\.j: .*to have none .*; row 0: 1'),
     'edge_to_a_bias_of_another_kind': (
         lambda: edge(j=[7])._replace(biases=np.zeros((1, 3))),
-        r'Edges\.j: .* to have pose .*row 0: 7'),
+        r'Factors\.j: .* to have pose .*row 0: 7'),
     'edge_bias_inf': (
-        lambda: edge_to_bias([[0.0, 0.0, np.inf, 1.0]]), r'Edges\.bias.*finite.*inf'),
+        lambda: edge_to_bias([[0.0, 0.0, np.inf, 1.0]]), r'Factors\.constants.*finite.*inf'),
     'edge_second_row': (
         lambda: edge([0, 2], [1, 9], np.zeros((2, 3)), [np.eye(3)] * 2, [0, 0]), 'row 1: 9'),
-    'observed_outside': (lambda: observed(node=[7]), r'ObservedNodes.*0\.\.6.*row 0: 7'),
+    'observed_outside': (lambda: observed(node=[7]), r'Factors.*0\.\.6.*row 0: 7'),
     'observed_offset_inf': (
-        lambda: observed(offset=[[0.0, np.inf, 0.0]]), r'offset.*finite.*inf'),
+        lambda: observed(offset=[[0.0, np.inf, 0.0]]), r'constants.*finite.*inf'),
 }
 
 
@@ -93,8 +97,8 @@ def test_of_a_bad_update_nothing_is_applied_and_it_says_why(name: str) -> None:
     before = snapshot(graph)
     with pytest.raises(GraphUpdateError, match=message):
         graph.apply(make())
-    good = GraphUpdate(edges=random_edges(rng, [6], [0]), observed=random_observed(rng, [3]),
-                       fix=(1,), free=(2,))
+    good = GraphUpdate(fix=(1,), free=(2,), factors=Factors.joined([
+        random_edges(rng, [6], [0]), random_observed(rng, [3])]))
     with pytest.raises(GraphUpdateError):
         graph.apply(good._replace(**{
             part: rows for part, rows in make()._asdict().items() if len(rows) > 0}))
@@ -118,14 +122,13 @@ def test_whatever_the_arrays_are_like_the_rows_are_the_same(
     odd: Callable[[np.ndarray], object],
 ) -> None:
     rng = np.random.default_rng(10)
-    hidden, edges = random_poses(rng, 3), random_edges(rng, [0, 2, 1], [1, 0, 2])
-    observed = random_observed(rng, [2, 0])
+    hidden, factors = random_poses(rng, 3), Factors.joined([
+        random_edges(rng, [0, 2, 1], [1, 0, 2]), random_observed(rng, [2, 0])])
     usual, other = Graph(), Graph()
-    usual.apply(GraphUpdate(hidden=hidden, edges=edges, observed=observed))
+    usual.apply(GraphUpdate(hidden=hidden, factors=factors))
     signatures = len(editing.add_rows.signatures)
     other.apply(GraphUpdate(
-        hidden=odd(hidden), edges=Edges(*map(odd, edges.columns)),
-        observed=ObservedNodes(*map(odd, observed.columns))))
+        hidden=odd(hidden), factors=Factors(*map(odd, factors.columns))))
     assert snapshot(other) == snapshot(usual)
     assert len(editing.add_rows.signatures) == signatures
 
@@ -146,9 +149,8 @@ def test_writing_to_what_leaves_the_graph_does_not_change_it() -> None:
     with pytest.raises(ValueError, match='read-only'):
         graph.poses[0] = 0.0
     # copies
-    for table in (graph.edges, graph.observed):
-        for item in fields(table):
-            getattr(table, item.name)[0] = 1
+    for column in graph.factors.columns:
+        column[0] = 1
     graph.fixed[0] = True
     assert snapshot(graph) == before
 
@@ -165,7 +167,7 @@ def test_what_is_not_in_the_graph_is_refused_by_its_id() -> None:
     graph = random_graph(seed=4)
     with pytest.raises(ValueError, match='hidden node 7 is not in the graph'):
         graph.poses_of([2, 7])
-    with pytest.raises(ValueError, match='edge -1 is not in the graph'):
-        graph.edges_at([-1])
-    with pytest.raises(ValueError, match='observed node 99 is not in the graph'):
-        graph.observed_at(99)
+    with pytest.raises(ValueError, match='factor -1 is not in the graph'):
+        graph.factors_at([-1])
+    with pytest.raises(ValueError, match='factor 99 is not in the graph'):
+        graph.factors_at(99)

@@ -9,7 +9,7 @@ from random_graphs import matrix, random_graph
 
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import graph_view
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows, Lines
 
@@ -23,9 +23,9 @@ def weighted(seed: int, n_biases: int) -> Graph:
     """Return a random graph; some of its edges are odometry, some rows have weights or are out."""
     graph = random_graph(seed, n_edges=10, n_observed=6, n_biases=n_biases)
     graph.apply(GraphUpdate(
-        edges=Edges([0, 2], [1, 3], [[1.0, 0.0, 0.1]] * 2, [np.eye(3)] * 2,
-                    [EdgeKind.ODOMETRY] * 2),
-        weigh_edges={0: 0.25, 1: 0.0}, remove_observed=(2,), weigh_observed={1: 0.5}))
+        factors=Factors([0, 2], [1, 3], [[1.0, 0.0, 0.1]] * 2, [np.eye(3)] * 2,
+                        [FactorKind.ODOMETRY] * 2),
+        weigh={0: 0.25, 1: 0.0, 14: 0.5}, remove=(2,)))
     return graph
 
 
@@ -33,31 +33,22 @@ def slow_view(graph: Graph) -> dict[str, list[list[float]]]:
     """Evaluate each row: five numbers for each constraint, its ends [m] and its error [sigma]."""
     found: dict[str, list[list[float]]] = {
         'nodes': [], 'odometry': [], 'loop_closures': [], 'observed': []}
-    poses, is_bias, edges, observed = graph.poses, graph.is_bias, graph.edges, graph.observed
-    energies = graph.energies()
+    poses, is_bias, factors = graph.poses, graph.is_bias, graph.factors
+    energies = graph.energies().factors
     for k in range(graph.n_nodes):
         if not is_bias[k]:
             found['nodes'].append(poses[k, :2].tolist())
-    for k in range(graph.n_edges):
-        if edges.weight[k] == 0.0:
+    for k in range(len(factors)):
+        if factors.weight[k] == 0.0:
             continue
-        start, information = poses[edges.i[k]], edges.information[k]
-        sigmas = np.sqrt(energies.edges[k] / edges.weight[k] / (np.diag(information) > 0.0).sum())
-        if edges.kind[k] != EdgeKind.BIAS:
-            name = 'odometry' if edges.kind[k] == EdgeKind.ODOMETRY else 'loop_closures'
-            found[name].append([*start[:2], *poses[edges.j[k], :2], sigmas])
-        elif not is_bias[edges.i[k]] and information[0, 0] > 0.0:
-            predicted = matrix(start) @ [*edges.bias[k, :2], 1.0]
-            found['observed'].append([*predicted[:2], *edges.mean[k, :2], sigmas])
-    for k in range(graph.n_observed):
-        information = observed.information[k]
-        if (observed.weight[k] == 0.0 or is_bias[observed.node[k]]
-                or information[0, 0] == 0.0):
-            continue
-        predicted = matrix(poses[observed.node[k]]) @ [*observed.offset[k, :2], 1.0]
-        sigmas = np.sqrt(
-            energies.observed[k] / observed.weight[k] / (np.diag(information) > 0.0).sum())
-        found['observed'].append([*predicted[:2], *observed.mean[k, :2], sigmas])
+        start, information = poses[factors.i[k]], factors.information[k]
+        sigmas = np.sqrt(energies[k] / factors.weight[k] / (np.diag(information) > 0.0).sum())
+        if factors.j[k] >= 0 and factors.kind[k] != FactorKind.BIAS:
+            name = 'odometry' if factors.kind[k] == FactorKind.ODOMETRY else 'loop_closures'
+            found[name].append([*start[:2], *poses[factors.j[k], :2], sigmas])
+        elif not is_bias[factors.i[k]] and information[0, 0] > 0.0:
+            predicted = matrix(start) @ [*factors.constants[k, :2], 1.0]
+            found['observed'].append([*predicted[:2], *factors.mean[k, :2], sigmas])
     return found
 
 
@@ -84,16 +75,15 @@ def test_the_view_shows_each_row_once_and_no_bias(seed: int, n_biases: int) -> N
 
 def test_what_is_not_simply_believed_is_drawn_apart_though_its_weight_is_0() -> None:
     graph = random_graph(3, n_edges=10, n_observed=6, n_biases=0)
-    edges = graph.edges
-    closures = np.flatnonzero(edges.kind == EdgeKind.LOOP_CLOSURE)[:3].tolist()
-    positions = np.flatnonzero(graph.observed.information[:, 0, 0] > 0.0)[:2].tolist()
+    edges = graph.factors
+    closures = np.flatnonzero(edges.kind == FactorKind.LOOP_CLOSURE)[:3].tolist()
+    positions = np.flatnonzero((edges.j < 0) & (edges.information[:, 0, 0] > 0.0))[:2].tolist()
     weak, waiting, doubted = closures
     whole = graph_view.view(graph)
     graph.apply(GraphUpdate(
-        weigh_edges={waiting: 0.0, doubted: 0.0},
-        weigh_observed=dict.fromkeys(positions, 0.0)))
+        weigh=dict.fromkeys((waiting, doubted, *positions), 0.0)))
     view = graph_view.view(
-        graph, DrawnRows([weak], [waiting], [doubted], unused_observed=positions))
+        graph, DrawnRows([weak], [waiting], [doubted], unused=positions))
     assert whole is not None
     assert view is not None
     assert len(view.loop_closures.ends) == len(whole.loop_closures.ends) - 3

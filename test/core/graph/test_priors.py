@@ -89,7 +89,7 @@ def graph_with_priors(seed: int, *, held: bool) -> tuple[IncrementalSmoother, An
     smoother = IncrementalSmoother(EXACT)
     smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
     smoother.update(here.new_nodes(9))
-    smoother.update(GraphUpdate(edges=here.edges(here.pairs(2))))
+    smoother.update(GraphUpdate(factors=here.edges(here.pairs(2))))
     rng, poses = here.rng, np.array(here.truth)
     priors = []
     for anchored in (False, True):
@@ -103,7 +103,7 @@ def graph_with_priors(seed: int, *, held: bool) -> tuple[IncrementalSmoother, An
 
 def dense_covariances(graph: Graph) -> FloatArray:
     """Return the covariances of all nodes, shape (N, 3, 3), at their poses, by a dense inverse."""
-    slow = SlowGraph(graph.poses, graph.fixed, graph.edges, graph.observed)
+    slow = SlowGraph(graph.poses, graph.fixed, graph.factors)
     H, _ = slow.system()
     for prior in graph.priors:
         at = (3 * prior.nodes[:, None] + np.arange(3)).ravel()
@@ -141,7 +141,7 @@ def test_smoother_and_batch_find_the_same_minimum(seed: int, held: bool) -> None
         assert anew._eliminate()
         np.testing.assert_allclose(anew.covariances(), expected, atol=1e-9 * largest)
         smoother.update(here.joined(
-            here.new_nodes(2), observed=here.observed([int(here.rng.integers(10))])))
+            here.new_nodes(2), factors=here.observed([int(here.rng.integers(10))])))
 
 
 @given(seeds, flags)

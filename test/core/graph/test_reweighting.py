@@ -22,23 +22,17 @@ some_losses = st.lists(
 
 
 def registered(chosen: list[tuple[Loss, float, float]], graph: Graph) -> Reweighting:
-    """Return the first edges and observed nodes of a graph with these losses."""
+    """Return the last factors of a graph, edges and observed nodes, with these losses."""
     some = Reweighting()
-    for row, (loss, threshold, base) in enumerate(chosen):
-        some.add(row, loss, threshold, edge=True)
-        if row < graph.n_observed:
-            some.add(row, loss, threshold, edge=False)
-            some.set_base_weight(row, base)
+    for number, (loss, threshold, base) in enumerate(chosen, graph.n_factors - len(chosen)):
+        some.add(number, loss, threshold)
+        some.set_base_weight(number, base)
     return some
 
 
-def energies(graph: Graph) -> tuple[np.ndarray, np.ndarray]:
-    """Return the energies without weights of all edges and observed nodes."""
-    edges, observed = graph.edges, graph.observed
-    return (error_functions.energies(
-                error_functions.edge_errors(graph.poses, edges), edges.information),
-            error_functions.energies(
-                error_functions.observed_errors(graph.poses, observed), observed.information))
+def energies(graph: Graph) -> np.ndarray:
+    """Return the energies without weights of all factors."""
+    return error_functions.energies(graph.errors(graph.factors), graph.factors.information)
 
 
 @given(seeds, some_losses, st.sampled_from([1.0, 4.0]))
@@ -49,16 +43,15 @@ def test_every_weight_is_that_of_the_loss_times_the_base_weight(
     graph = random_graph(seed)
     some = registered(chosen, graph)
     found = some.all_changes(graph, widened)
-    for changed, energy, with_base in zip(found, energies(graph), (False, True), strict=True):
-        expected = {
-            row: (base if with_base else 1.0) * float(costs_and_weights(
-                loss, energy[row:row + 1], widened * threshold)[1][0])
-            for row, (loss, threshold, base) in enumerate(chosen[:len(energy)])
-            if loss is not Loss.NONE}
-        # all others have that weight already
-        assert changed == pytest.approx({k: v for k, v in expected.items() if v != 1.0})
-    graph.apply(GraphUpdate(weigh_edges=found[0], weigh_observed=found[1]))
-    assert some.all_changes(graph, widened) == ({}, {})
+    energy, first = energies(graph), graph.n_factors - len(chosen)
+    expected = {
+        row: base * float(costs_and_weights(
+            loss, energy[row:row + 1], widened * threshold)[1][0])
+        for row, (loss, threshold, base) in enumerate(chosen, first) if loss is not Loss.NONE}
+    # all others have that weight already
+    assert found == pytest.approx({k: v for k, v in expected.items() if v != 1.0})
+    graph.apply(GraphUpdate(weigh=found))
+    assert some.all_changes(graph, widened) == {}
 
 
 @given(seeds, some_losses)
@@ -68,22 +61,19 @@ def test_with_the_cost_chi2_is_the_sum_of_the_robust_costs(
 ) -> None:
     graph = random_graph(seed)
     some = registered(chosen, graph)
-    edges, observed = some.all_changes(graph)
-    graph.apply(GraphUpdate(weigh_edges=edges, weigh_observed=observed))
-    expected = 0.0
-    for energy, with_base in zip(energies(graph), (False, True), strict=True):
-        for row, each in enumerate(energy):
-            loss, threshold, base = (
-                chosen[row] if row < len(chosen) else (Loss.NONE, 1.0, 1.0))
-            base = base if with_base and loss is not Loss.NONE else 1.0
-            expected += base * float(costs_and_weights(loss, np.array([each]), threshold)[0][0])
+    graph.apply(GraphUpdate(weigh=some.all_changes(graph)))
+    energy = energies(graph)
+    expected = float(np.sum(energy[:-len(chosen)]))
+    for each, (loss, threshold, base) in zip(energy[-len(chosen):], chosen, strict=True):
+        own = base if loss is not Loss.NONE else 1.0
+        expected += own * float(costs_and_weights(loss, np.array([each]), threshold)[0][0])
     assert graph.energies().chi2 + some.cost(graph) == pytest.approx(expected)
 
 
 def robust_edges(graph: Graph) -> Reweighting:
     some = Reweighting()
-    for row in range(graph.n_edges):
-        some.add(row, Loss.CAUCHY, 0.1, edge=True)
+    for row in range(len(graph.factors.edges)):
+        some.add(row, Loss.CAUCHY, 0.1)
     return some
 
 
@@ -94,7 +84,7 @@ def test_the_newest_are_reweighted_at_every_update_and_all_others_in_turn(
     graph = random_graph(2, n_edges=20)     # with three duplicates
     some, seen = robust_edges(graph), []
     for _ in range(5):
-        changed = sorted(some.changes(graph)[0])
+        changed = sorted(some.changes(graph))
         assert len(changed) == 8
         assert changed[4:] == [19, 20, 21, 22]
         seen += changed[:4]
@@ -108,15 +98,15 @@ def test_a_saved_state_goes_on_with_the_constraint_that_is_next(
     monkeypatch.setattr(reweighting, 'TUNING', replace(reweighting.TUNING, window=4))
     graph = random_graph(2, n_edges=20)
     one, other = robust_edges(graph), Reweighting()
-    one.add(3, Loss.HUBER, 2.0, edge=False)
-    one.set_base_weight(3, 0.5)
+    one.add(23, Loss.HUBER, 2.0)
+    one.set_base_weight(23, 0.5)
     for _ in range(3):
         one.changes(graph)
-    other.restore(*one.saved())
+    other.restore(one.saved())
     assert_same_value(other.saved(), one.saved())
     for _ in range(4):
         assert other.changes(graph) == one.changes(graph)
     # and it grows on
     for each in (one, other):
-        each.add(4, Loss.CAUCHY, 1.0, edge=False)
+        each.add(24, Loss.CAUCHY, 1.0)
     assert_same_value(other.saved(), one.saved())

@@ -8,7 +8,7 @@ import numpy as np
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import rows, tables as tb
 from pose_graph_ros.core.graph.checks import check
-from pose_graph_ros.core.graph.constraints import Edges, full
+from pose_graph_ros.core.graph.constraints import Factors, full
 
 numbers = st.sampled_from([0.0, 1e-12, 1e-3, 0.5, 1.0, -1.0, 30.0, 1e150, 1e300, np.inf, np.nan])
 skews = st.sampled_from([0.0, 1e-9, 1e-4, -0.5])
@@ -18,14 +18,14 @@ def is_valid(matrix: np.ndarray) -> bool:
     """Return what the full validation says of an information matrix."""
     with np.errstate(all='ignore'):
         try:
-            check(Edges([0], [1], np.zeros((1, 3)), matrix[None], [0]), np.zeros(2, dtype=bool))
+            check(Factors([0], [1], np.zeros((1, 3)), matrix[None], [0]), np.zeros(2, dtype=bool))
         except GraphUpdateError:
             return False
     return True
 
 
 def packed(matrix: np.ndarray) -> tuple[bool, np.ndarray]:
-    row = np.zeros(tb.EDGE_F)
+    row = np.zeros(tb.FACTOR_F)
     valid = rows.write_measurement(row, np.zeros(3), matrix)
     return valid, full(row[None, tb.INFO:tb.INFO + 6])[0]
 

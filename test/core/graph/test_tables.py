@@ -12,7 +12,7 @@ pytestmark = pytest.mark.skipif(sys.platform != 'linux', reason='what Linux says
 _CHAIN = '''
 import os
 import numpy as np
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 def chain(n):
@@ -23,8 +23,8 @@ def chain(n):
     return smoother
 def close(smoother):
     ends = [0], [smoother.graph.n_nodes - 1]
-    smoother.update(GraphUpdate(edges=Edges(
-        *ends, np.array([[5.0, 1.0, 0.5]]), np.eye(3)[None], [EdgeKind.LOOP_CLOSURE])))
+    smoother.update(GraphUpdate(factors=Factors(
+        *ends, np.array([[5.0, 1.0, 0.5]]), np.eye(3)[None], [FactorKind.LOOP_CLOSURE])))
     return smoother.poses.copy()
 '''
 
@@ -38,7 +38,8 @@ if child == 0:
     os._exit(int(np.max(np.abs(close(smoother) - before)) > 100.0))
 moved = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 kept = np.array_equal(smoother.poses, before) and all(
-    np.array_equal(*columns) for columns in zip(rows.edges.columns, smoother.graph.edges.columns))
+    np.array_equal(*columns) for columns in zip(
+        rows.factors.columns, smoother.graph.factors.columns))
 print(moved, int(kept), int(np.array_equal(close(smoother), close(chain(20_000)))))
 ''')
     assert (moved, kept, goes_on) == (1, 1, 1)
@@ -49,7 +50,7 @@ def test_tables_take_memory_for_the_rows_in_use_alone() -> None:
 memory = 'RssAnon', 'RssShmem'
 close(chain(2))         # loads the kernels
 smoother, before = IncrementalSmoother(), resident(*memory)
-smoother.graph.ensure(300_000, 300_000, 300_000)
+smoother.graph.ensure(300_000, 600_000)
 reserved = resident(*memory) - before
 before, big = resident(*memory), chain(20_000)
 print(reserved, resident(*memory) - before)

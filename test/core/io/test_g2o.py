@@ -15,7 +15,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import GraphFile, read_g2o, read_guessed
 from pose_graph_ros.core.io.g2o_writing import write_g2o
@@ -37,9 +37,9 @@ def read(folder: Path, text: str, edge2_order: str | None = None) -> GraphFile:
 
 # --- round trips -----------------------------------------------------------------------------
 
-def sorted_observed(observed: ObservedNodes) -> ObservedNodes:
+def sorted_observed(observed: Factors) -> Factors:
     """Return the rows sorted by their numbers: a file does not keep their order across tags."""
-    order = np.lexsort(np.vstack((observed.mean.T, observed.node)))
+    order = np.lexsort(np.vstack((observed.mean.T, observed.i)))
     return observed.rows(order)
 
 
@@ -52,7 +52,7 @@ def exactly(symmetric: np.ndarray) -> np.ndarray:
 def graph_of_all_kinds(seed: int, n: int = 6) -> Graph:
     rng = np.random.default_rng(seed)
     edges = random_edges(rng, [0, 1, 4, 2, 0, 3, 5, 0], [1, 2, 0, 3, 1, 2, 0, 1])
-    kind = np.where(edges.j - edges.i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    kind = np.where(edges.j - edges.i == 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     information = exactly(random_information(rng, 4))
     mean, offset = random_poses(rng, 4, 5e6), random_poses(rng, 4)
     information[2:, 2, :] = information[2:, :, 2] = 0.0
@@ -61,18 +61,19 @@ def graph_of_all_kinds(seed: int, n: int = 6) -> Graph:
     graph = Graph()
     graph.apply(GraphUpdate(
         hidden=random_poses(rng, n, 5e6), fix=(1, 4),
-        edges=Edges(edges.i, edges.j, edges.mean, exactly(edges.information), kind),
-        observed=ObservedNodes(
-            [5, 3, 3, 0], offset, mean, information,
-            [ObservedKind.GLOBAL_POSE] * 2 + [ObservedKind.POSITION] * 2)))
+        factors=Factors.joined([
+            Factors(edges.i, edges.j, edges.mean, exactly(edges.information), kind),
+            Factors.on([5, 3, 3, 0], offset, mean, information,
+                       [FactorKind.GLOBAL_POSE] * 2 + [FactorKind.POSITION] * 2)])))
     return graph
 
 
 def assert_bit_equal(graph: Graph, expected: Graph) -> None:
     assert graph.poses.tobytes() == expected.poses.tobytes()
     assert graph.fixed.tobytes() == expected.fixed.tobytes()
-    for ours, theirs in ((graph.edges, expected.edges), (
-            sorted_observed(graph.observed), sorted_observed(expected.observed))):
+    for ours, theirs in (
+            (graph.factors.edges, expected.factors.edges),
+            (sorted_observed(graph.factors.observed), sorted_observed(expected.factors.observed))):
         for name in ours.__dataclass_fields__:
             assert getattr(ours, name).tobytes() == getattr(theirs, name).tobytes(), name
 
@@ -83,13 +84,15 @@ def test_a_graph_comes_back_bit_for_bit(folder: Path, seed: int, *, renamed: boo
     ids = np.array([-7, 3, 4, 100, 2**40, 2**62]) if renamed else None
     path = folder / 'round_trip.g2o'
     if renamed:     # the ids decide whether an edge is odometry
-        edges = graph.edges
+        edges = graph.factors.edges
         kind = np.where(np.diff(ids[np.column_stack((edges.i, edges.j))], axis=1)[:, 0] == 1,
-                        EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+                        FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
         other = Graph()
         other.apply(GraphUpdate(
-            hidden=graph.poses, fix=(1, 4), observed=graph.observed,
-            edges=Edges(edges.i, edges.j, edges.mean, edges.information, kind)))
+            hidden=graph.poses, fix=(1, 4),
+            factors=Factors.joined([
+                Factors(edges.i, edges.j, edges.mean, edges.information, kind),
+                graph.factors.observed])))
         graph = other
     write_g2o(graph, path, ids)
     file = read_g2o(path)
@@ -103,16 +106,16 @@ def test_a_graph_comes_back_bit_for_bit(folder: Path, seed: int, *, renamed: boo
 
 def test_what_is_not_used_is_a_comment(folder: Path) -> None:
     path, graph = folder / 'doubted.g2o', graph_of_all_kinds(1)
-    graph.apply(GraphUpdate(remove_edges=[2, 5], weigh_observed={0: 0.0}))
+    graph.apply(GraphUpdate(remove=[2, 5], weigh={8: 0.0}))
     write_g2o(graph, path)
     read_back = read_g2o(path)
     assert read_back.skipped == {}
     np.testing.assert_array_equal(
-        read_back.graph.edges.mean, np.delete(graph.edges.mean, [2, 5], axis=0))
-    assert len(read_back.graph.observed) == len(graph.observed) - 1
+        read_back.graph.factors.edges.mean, np.delete(graph.factors.edges.mean, [2, 5], axis=0))
+    assert len(read_back.graph.factors.observed) == len(graph.factors.observed) - 1
     comments = [line for line in path.read_text().splitlines() if line.startswith('# not used ')]
     ends = [tuple(map(int, line.split()[4:6])) for line in comments if 'EDGE_SE2 ' in line]
-    assert ends == [(int(graph.edges.i[k]), int(graph.edges.j[k])) for k in (2, 5)]
+    assert ends == [(int(graph.factors.i[k]), int(graph.factors.j[k])) for k in (2, 5)]
     assert len(comments) == 3
 
 
@@ -129,8 +132,8 @@ def test_a_closure_with_a_switch_is_an_edge(folder: Path) -> None:
     """)
     assert file.skipped == {}
     np.testing.assert_array_equal(file.ids, [0, 1])
-    np.testing.assert_array_equal(file.graph.edges.mean[1], [-1.0, 0.5, 0.25])
-    np.testing.assert_array_equal(file.graph.edges.i, [0, 1])
+    np.testing.assert_array_equal(file.graph.factors.edges.mean[1], [-1.0, 0.5, 0.25])
+    np.testing.assert_array_equal(file.graph.factors.edges.i, [0, 1])
     with pytest.raises(FileFormatError, match=r':1: EDGE_SE2 is followed by 11 numbers, got 2'):
         read(folder, 'EDGE_SE2_SWITCHABLE 1 0')
 
@@ -149,11 +152,12 @@ def test_ids_may_have_gaps_start_anywhere_and_come_in_any_order(folder: Path) ->
     np.testing.assert_array_equal(file.ids, [441, 442, 450])
     np.testing.assert_allclose(
         file.graph.poses, se2.wrapped(np.array([[1, 2, 3], [7, 8, 9], [4, 5, 6.0]])))
-    np.testing.assert_array_equal(file.graph.edges.i, [2, 0])     # a reversed edge stays so
-    np.testing.assert_array_equal(file.graph.edges.j, [0, 1])
-    np.testing.assert_array_equal(file.graph.edges.mean[0], [1.0, 2.0, 0.5])
+    # a reversed edge stays so
+    np.testing.assert_array_equal(file.graph.factors.edges.i, [2, 0])
+    np.testing.assert_array_equal(file.graph.factors.edges.j, [0, 1])
+    np.testing.assert_array_equal(file.graph.factors.edges.mean[0], [1.0, 2.0, 0.5])
     np.testing.assert_array_equal(
-        file.graph.edges.kind, [EdgeKind.LOOP_CLOSURE, EdgeKind.ODOMETRY])
+        file.graph.factors.edges.kind, [FactorKind.LOOP_CLOSURE, FactorKind.ODOMETRY])
     np.testing.assert_array_equal(file.graph.fixed, [False, False, True])
     assert file.has_start
 
@@ -191,10 +195,10 @@ def test_the_numbers_behind_every_tag_land_where_they_belong(folder: Path) -> No
         EDGE_PRIOR_SE2_XY 0 8 9 11 0.12 22
         OBSERVED_SE2_OFFSET 1 0.1 0.2 0.3 1 2 3 {numbers}
     """).graph
-    np.testing.assert_array_equal(graph.edges.information[0], matrix)
-    np.testing.assert_allclose(graph.edges.mean[0], [1.0, 2.0, 4.0 - 2.0 * np.pi])
-    unary = graph.observed
-    np.testing.assert_array_equal(unary.node, [1, 0, 1])
+    np.testing.assert_array_equal(graph.factors.edges.information[0], matrix)
+    np.testing.assert_allclose(graph.factors.edges.mean[0], [1.0, 2.0, 4.0 - 2.0 * np.pi])
+    unary = graph.factors.observed
+    np.testing.assert_array_equal(unary.i, [1, 0, 1])
     np.testing.assert_array_equal(unary.offset, [[0.0] * 3, [0.0] * 3, [0.1, 0.2, 0.3]])
     np.testing.assert_allclose(
         unary.mean, [[5.0, 6.0, 7.0 - 2.0 * np.pi], [8.0, 9.0, 0.0], [1.0, 2.0, 3.0]])
@@ -202,7 +206,7 @@ def test_the_numbers_behind_every_tag_land_where_they_belong(folder: Path) -> No
     position[2, :] = position[:, 2] = 0.0
     np.testing.assert_array_equal(unary.information, [matrix, position, matrix])
     np.testing.assert_array_equal(unary.kind, [
-        ObservedKind.GLOBAL_POSE, ObservedKind.POSITION, ObservedKind.GLOBAL_POSE])
+        FactorKind.GLOBAL_POSE, FactorKind.POSITION, FactorKind.GLOBAL_POSE])
 
 
 @given(seeds)
@@ -215,7 +219,8 @@ def test_edge2_means_what_it_is_said_to_mean(folder: Path, seed: int) -> None:
     for order, numbers in (('toro', toro), ('isam', isam)):
         text = ' '.join(repr(float(number)) for number in numbers)
         graph = read(folder, f'VERTEX2 0 1 2 3\nEDGE2 0 1 1 0 0 {text}', order).graph
-        np.testing.assert_allclose(graph.edges.information[0], information, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            graph.factors.information[0], information, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(graph.poses[0], [1.0, 2.0, 3.0])
 
 
@@ -390,7 +395,7 @@ def test_the_order_is_found_out(order: str, correlation: float, tag: str, tmp_pa
     assert guess.order == order
     assert ('positive definite' in guess.reason) or ('the median' in guess.reason)
     np.testing.assert_array_equal(
-        guess.file.graph.edges.information, read_g2o(path, order).graph.edges.information)
+        guess.file.graph.factors.information, read_g2o(path, order).graph.factors.information)
 
 
 def test_a_file_that_neither_order_can_be_is_refused_with_its_line(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import functools
 import hashlib
 import json
 from pathlib import Path
+from shutil import copyfile
 import tempfile
 from typing import Any
 
@@ -28,7 +29,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
@@ -72,8 +73,8 @@ def test_other_programs_read_the_graph_and_the_path(tmp_path: Path) -> None:
     rows = saved.rows
     graph = read_g2o(g2o).graph
     np.testing.assert_array_equal(graph.poses, rows.poses[~rows.is_bias])
-    assert graph.n_edges == np.sum(rows.edges.kind != EdgeKind.BIAS)
-    assert graph.n_observed == np.sum(~rows.is_bias[rows.observed.node])
+    assert len(graph.factors.edges) == np.sum(rows.factors.edges.kind != FactorKind.BIAS)
+    assert len(graph.factors.observed) == np.sum(~rows.is_bias[rows.factors.observed.i])
     path = read_tum(tum)
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_array_equal(path.poses[:, :2], rows.poses[saved.nodes.ids, :2])
@@ -207,61 +208,31 @@ def test_another_version_is_refused_and_says_who_wrote_it(tmp_path: Path) -> Non
 def test_a_file_of_version_1_is_read() -> None:
     """It was written by 0.1.0, with numbers for losses and kinds."""
     saved = read_graph(DATA / 'version_1.g2o')
-    assert [tuple(Loss)[k] for k in saved.edge_losses.losses] == [Loss.HUBER] * 3
-    assert [tuple(Loss)[k] for k in saved.observed_losses.losses] == [Loss.CAUCHY] * 2
-    assert np.flatnonzero(saved.rows.edges.kind == EdgeKind.BIAS).tolist() == [5, 6, 7, 11, 12]
-    assert saved.rows.observed.kind.tolist() == [
-        ObservedKind.GLOBAL_POSE, ObservedKind.POSITION, ObservedKind.HEADING,
-        ObservedKind.POSITION]
-    assert saved.waiting.kind.tolist() == [EdgeKind.LOOP_CLOSURE]
+    assert [tuple(Loss)[k] for k in saved.losses.losses] == 3 * [Loss.HUBER] + 2 * [Loss.CAUCHY]
+    assert np.flatnonzero(saved.rows.factors.kind == FactorKind.BIAS).tolist() == [
+        5, 6, 7, 11, 12]
+    assert saved.rows.factors.observed.kind.tolist() == [
+        FactorKind.GLOBAL_POSE, FactorKind.POSITION, FactorKind.HEADING,
+        FactorKind.POSITION]
+    assert saved.waiting.kind.tolist() == [FactorKind.LOOP_CLOSURE]
     backend = PoseGraphBackend.restored(CORRELATED, saved)
     assert backend.estimate().chi2 == pytest.approx(27.1463, abs=1e-3)
 
 
-def old_columns(new: dict[str, Any]) -> dict[str, Any]:
-    return {'rows': new['held']} | {name: new[name] for name in (
-        'sources', 'source', 'stamps_ns', 'state', 'since_ns', 'decision', 'distance')}
-
-
-def old_stream(new: dict[str, Any]) -> dict[str, Any]:
-    waiting, last = new['waiting'], new['last']
-    row, window, speeds = last['row'], last['window'], last['window']['speeds']
-    return {**new, 'waiting_ns': [each['stamp_ns'] for each in waiting], 'waiting': [
-        [*each['pose'], each['speed'], *(each['variance'] or [0.0] * 3)] for each in waiting],
-        'last': {
-            **{name: last[name] for name in ('raw', 'offset', 'jumped')},
-            **{name: row[name] for name in ('counted', 'counted_ns', 'held')},
-            **{name: window[name] for name in ('since_ns', 'since')}, 'way': window['path'],
-            'rate': [*speeds['velocity'], *speeds['recent'], *speeds['greatest']]}}
-
-
 def test_odometry_that_closures_have_doubted_in_version_4_keeps_its_weight(tmp_path: Path) -> None:
-    _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
+    for suffix in ('.g2o', '.json'):
+        copyfile(DATA / f'version_4{suffix}', tmp_path / f'map{suffix}')
+    before = read_graph(tmp_path / 'map')
 
-    def as_version_4(members: dict[str, Any]) -> None:
-        members['version'] = 4
+    def doubt(members: dict[str, Any]) -> None:
         members['graph']['edge_weight'][0] = 0.01
-        streams = members['nodes']['streams']
-        streams |= {name: old_stream(stream) for name, stream in streams.items()}
-        new = members['judgement']
-        members['judgement'] = {
-            'closures': old_columns(new['closures']) | {'scales': new['closures']['scales']},
-            'fixes': old_columns(new['fixes']) | {
-                'edges': new['fixes']['edge'], 'observed': new['fixes']['observed'],
-                'stamps_ns': [stamp for stamp, _ in new['fixes']['stamps_ns']],
-                'believed': [new['fixes']['state']['names'][k] == 'believed'
-                             for k in new['fixes']['state']['of']],
-                'loosened': new['loosened'], 'weights': new['weights']},
-            'odometry': {
-                'rows': [0], 'ends': [[0, 1]], 'weights': [0.01], 'since_ns': [5], 'final': [0]}}
+        members['judgement']['odometry'] |= {
+            'rows': [0], 'ends': [[0, 1]], 'weights': [0.01], 'since_ns': [5], 'final': [0]}
 
-    rewrite(side, as_version_4)
-    saved = read_graph(side)
-    assert saved.rows.edges.weight[0] == 0.01
-    assert_same_value(saved.judgement, saved_drive().judgement)
-    for name, stream in saved_drive().nodes.streams.items():
-        assert_same_value(saved.nodes.streams[name].last, stream.last)
-        assert len(saved.nodes.streams[name].waiting) == len(stream.waiting) > 0
+    rewrite(tmp_path / 'map.json', doubt)
+    saved = read_graph(tmp_path / 'map')
+    assert saved.rows.factors.weight[0] == 0.01
+    assert_same_value(saved.judgement, before.judgement)
 
 
 @pytest.mark.parametrize('body', [b'', b'"format": ', b'}}', b'"a": ' + b'[' * 10**5])
@@ -277,8 +248,8 @@ def test_parts_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
     for change in (lambda members: members['graph'].update(fixed=['x']),
                    lambda members: members.pop('nodes'),
-                   lambda members: members['graph']['edge_weight'].append(1.0),
-                   lambda members: members['graph'].update(bias_edge_i=[10**6] * 3)):
+                   lambda members: members['graph']['factor_weight'].append(1.0),
+                   lambda members: members['graph'].update(other_i=[10**6] * 3)):
         write_graph(saved_drive(), tmp_path / 'map')
         rewrite(side, change)
         with pytest.raises(FileFormatError):
@@ -290,10 +261,10 @@ def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -
     rows, nodes = saved.rows, saved.nodes
     with_gaps = replace(
         saved, nodes=replace(nodes, ids=2 * nodes.ids + 5), rows=rows._replace(
-            edges=rows.edges.renumbered(lambda ids: 2 * ids + 5),
-            node_ids=2 * rows.node_ids + 5, edge_ids=3 * rows.edge_ids,
-            next_ids=NextIds(1000, 1000, 7)),
-        edge_losses=replace(saved.edge_losses, rows=3 * saved.edge_losses.rows))
+            factors=rows.factors.renumbered(lambda ids: 2 * ids + 5),
+            node_ids=2 * rows.node_ids + 5, factor_ids=3 * rows.factor_ids,
+            next_ids=NextIds(1000, 1000)),
+        losses=replace(saved.losses, rows=3 * saved.losses.rows))
     g2o, side, _ = write_graph(with_gaps, tmp_path / 'gaps')
     assert_same_value(read_graph(side), with_gaps)
     assert g2o.read_text().startswith('VERTEX_SE2 5 ')
@@ -319,24 +290,28 @@ def added(case: str) -> GraphUpdate:
     if case == 'turns, one without a bias':
         return GraphUpdate(
             biases=[(0.1 / 3.0, 0.0, 0.0)], dimensions=[1],
-            edges=Edges([1, 2], [2, 3], [(0.0, 0.0, 0.1), (0.0, 0.0, 0.2)], [turn, turn],
-                        [EdgeKind.TURN] * 2, [1.0, 0.5], [(0.0, 0.0, 0.0, 1.0)] * 2, [10, -1]),
-            observed=ObservedNodes([10], None, [(0.1, 0.0, 0.0)], [end], [0]))
+            factors=Factors.joined([
+                Factors([1, 2], [2, 3], [(0.0, 0.0, 0.1), (0.0, 0.0, 0.2)], [turn, turn],
+                        [FactorKind.TURN] * 2, [1.0, 0.5], [(0.0, 0.0, 0.0, 1.0)] * 2, [10, -1]),
+                Factors.on([10], None, [(0.1, 0.0, 0.0)], [end], [FactorKind.GLOBAL_POSE])]))
     if case == 'biases of 1, 2 and 3 coordinates':
         return GraphUpdate(
             biases=[(0.1, 0.0, 0.0), (0.3, -0.7, 0.0), (1.0 / 7.0, 2.0, 0.1)],
             dimensions=[1, 2, 3],
-            edges=Edges([1, 2], [11, 12], [(1.0, 2.0, 0.0), (3.0, 4.0, 0.2)],
-                        [place, place + turn], [EdgeKind.BIAS] * 2, None,
+            factors=Factors.joined([
+                Factors([1, 2], [11, 12], [(1.0, 2.0, 0.0), (3.0, 4.0, 0.2)],
+                        [place, place + turn], [FactorKind.BIAS] * 2, None,
                         [(0.0, 0.0, 1.0, 1.0)] * 2),
-            observed=ObservedNodes([10, 11, 12], None, np.zeros((3, 3)),
-                                   [end, place, place + turn], [0, 0, 0]))
+                Factors.on([10, 11, 12], None, np.zeros((3, 3)), [end, place, place + turn],
+                           [FactorKind.GLOBAL_POSE] * 3)]))
     return GraphUpdate(
         landmarks=[(3.0, 1.0 / 3.0), (5.0, -2.0)],
-        edges=Edges([0, 1, 2], [10, 11, 10], [(3.0, 1.0, 0.0), (4.0, -2.0, 0.0), (1.2, 0.0, 0.0)],
-                    [place, place, distance], [EdgeKind.POINT, EdgeKind.POINT, EdgeKind.RANGE],
+        factors=Factors.joined([
+            Factors([0, 1, 2], [10, 11, 10], [(3.0, 1.0, 0.0), (4.0, -2.0, 0.0), (1.2, 0.0, 0.0)],
+                    [place, place, distance],
+                    [FactorKind.POINT, FactorKind.POINT, FactorKind.RANGE],
                     None, [(0.0,) * 4, (0.0,) * 4, (0.2, -0.1, 0.0, 0.0)]),
-        observed=ObservedNodes([11], None, [(5.0, -2.0, 0.0)], [place], [ObservedKind.POSITION]))
+            Factors.on([11], None, [(5.0, -2.0, 0.0)], [place], [FactorKind.POSITION])]))
 
 
 @pytest.mark.parametrize('case', [
@@ -358,8 +333,7 @@ def test_files_without_the_optional_fields_are_read(tmp_path: Path) -> None:
 
     def remove(members: dict[str, Any]) -> None:
         del members['gyros'], members['gyro_biases']
-        for name in ('bias_edge_k', 'bias_dimensions', 'landmarks', 'node_ids', 'edge_ids',
-                     'observed_ids', 'next_ids'):
+        for name in ('bias_dimensions', 'landmarks', 'node_ids', 'factor_ids', 'next_ids'):
             del members['graph'][name]
 
     rewrite(side, remove)

@@ -215,7 +215,7 @@ def test_a_source_with_other_settings_adds_to_its_saved_constraints(
 # --- odometry after a load -----------------------------------------------------------------------
 
 def last_edge(backend: PoseGraphBackend) -> tuple[np.ndarray, np.ndarray]:
-    edge = backend.graph.edges_at(np.array([backend.graph.n_edges - 1]))
+    edge = backend.graph.factors_at(backend.graph.factor_ids[-1:])
     return edge.mean[0], np.linalg.inv(edge.information[0])
 
 

@@ -144,7 +144,7 @@ def test_a_source_that_is_no_longer_judged_keeps_the_verdicts_so_far(robust: Rob
         (LAP + 10) * SECOND, z, np.diag((0.01, 0.01, 0.0025)), 10 * SECOND), 'loop')
     settle(backend)
     assert len(backend.verdicts()) == len(before)
-    assert backend.graph.edges.weight[-1] > 0.0
+    assert backend.graph.factors.edges.weight[-1] > 0.0
     assert len(backend._reweighting) == (1 if robust is Robust.LOSS else 0)
 
 

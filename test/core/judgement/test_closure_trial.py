@@ -19,7 +19,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import closure_judge
 from pose_graph_ros.core.judgement.settings import BELIEF
@@ -49,9 +49,9 @@ class Counting(IncrementalSmoother):
         self.diverged += result.reason == DIVERGED
         return result
 
-    def edge_innovations(self, edges: Edges) -> Innovations:
+    def innovations(self, edges: Factors) -> Innovations:
         self.gates += len(edges)
-        return super().edge_innovations(edges)
+        return super().innovations(edges)
 
     def _fall_back_to_batch(self) -> UpdateResult:
         self.fallbacks += 1
@@ -66,7 +66,7 @@ class Stuck(Counting):
         self.is_stuck, self.trials = True, 0
 
     def update(self, update: GraphUpdate, *, fall_back: bool = True) -> UpdateResult:
-        if self.is_stuck and not fall_back and len(update.weigh_edges) > 0:
+        if self.is_stuck and not fall_back and len(update.weigh) > 0:
             self.diverged += 1
             return UpdateResult(Status.FAILED, DIVERGED, 0, 0, 0, 0)
         return super().update(update, fall_back=fall_back)

@@ -114,7 +114,7 @@ def test_false_closures_are_doubted_and_all_true_ones_believed(seed: int) -> Non
     assert np.allclose(dirty.graph.poses, clean.graph.poses, atol=1e-6)
     assert error(dirty) < 0.5
     # closures with weight 0 are rows of the graph
-    assert dirty.graph.n_edges == clean.graph.n_edges + len(false)
+    assert len(dirty.graph.factors.edges) == len(clean.graph.factors.edges) + len(false)
 
 
 def group(at: int, to: int, n: int, rng: np.random.Generator) -> list[LoopClosure]:

@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.judgement.closures import Closures, squared_distances
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
@@ -41,9 +41,9 @@ class Drive:
     def add_others(self) -> None:
         bias = self.smoother.graph.n_nodes
         i, j = self.rows[self.rng.integers(len(self.rows))], self.rows[-1]
-        kinds = [EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE] if i != j else []
+        kinds = [FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE] if i != j else []
         self.smoother.update(GraphUpdate(
-            biases=np.zeros((1, 3)), fix=[bias], edges=Edges(
+            biases=np.zeros((1, 3)), fix=[bias], factors=Factors(
                 [i] * len(kinds), [j] * len(kinds), np.ones((len(kinds), 3)),
                 np.tile(np.eye(3), (len(kinds), 1, 1)), kinds, weight=np.zeros(len(kinds)))))
 
@@ -147,9 +147,9 @@ def test_a_chain_has_the_relative_covariances_of_a_graph_without_loops(seed: int
     motion, noise = chain.between(rows[i], rows[j])
     expected = [drive.composed(a, b, np.zeros((11, 3))) for a, b in zip(i, j, strict=True)]
     np.testing.assert_allclose(se2.between(np.array(expected), motion), 0.0, atol=1e-12)
-    edges = Edges(rows[i], rows[j], motion, np.tile(np.eye(3), (len(i), 1, 1)),
-                  np.full(len(i), EdgeKind.LOOP_CLOSURE))
-    found = drive.smoother.edge_innovations(edges)
+    edges = Factors(rows[i], rows[j], motion, np.tile(np.eye(3), (len(i), 1, 1)),
+                  np.full(len(i), FactorKind.LOOP_CLOSURE))
+    found = drive.smoother.innovations(edges)
     np.testing.assert_allclose(found.errors, 0.0, atol=1e-9)
     np.testing.assert_allclose(found.covariances, noise, rtol=1e-7, atol=1e-12)
     lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.array(drive.means)[:, :2].T))))

@@ -25,5 +25,5 @@ def test_every_residual_above_the_gate_is_looked_at(seed: int) -> None:
         backend.graph.set_poses(se2.wrapped(poses))
         bad = cl.residuals(backend.graph, judge._table.rows(inside)) > GATE
         assert np.all(cl.are_above(
-            backend.graph, judge._states.edge[inside], 0.5 * GATE)[bad])
+            backend.graph, judge._states.held[inside], 0.5 * GATE)[bad])
     assert np.any(bad)

@@ -247,8 +247,7 @@ def test_correlated_errors_are_judged_as_well() -> None:
     assert len(driven.doubted) <= 22
     graph = driven.backend.graph
     for verdict in driven.backend.verdicts():
-        weights = graph.weights[0 if verdict.edge else 1]
-        assert bool(weights[verdict.number] > 0.0) is verdict.state.in_graph
+        assert bool(graph.weights[verdict.number] > 0.0) is verdict.state.in_graph
     assert driven.rms < 1.0
 
 

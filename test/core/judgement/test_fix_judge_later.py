@@ -13,6 +13,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, POSITIONS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.judgement.verdicts import Decision, State, Verdict
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
@@ -75,24 +76,26 @@ def doubted(backend: PoseGraphBackend) -> set[int]:
     return {each.stamp_ns for each in backend.verdicts() if each.state is State.DOUBTED}
 
 
+def _held(backend: PoseGraphBackend) -> Factors:
+    """Return the factors that verdicts are on."""
+    return backend.graph.factors_at([each.number for each in backend.verdicts()])
+
+
 def used(backend: PoseGraphBackend, verdict: Verdict) -> bool:
     """Tell whether the row of a verdict has a weight."""
-    return bool(backend.graph.weights[0 if verdict.edge else 1][verdict.number] > 0.0)
+    return bool(backend.graph.weights[verdict.number] > 0.0)
 
 
 def assert_weights_are_as_decided(backend: PoseGraphBackend) -> None:
     """Each measurement has a weight in the row that holds it, if it is believed, and no other."""
     constraints = backend._factors.constraints('fix')
     held = constraints.held(np.arange(len(constraints)))
-    rows = {stamp: (row, edge) for stamp, row, edge in zip(
-        constraints.rows.values[:, 0].tolist(), held.ids.tolist(), held.is_edge.tolist(),
-        strict=True)}
-    observed = backend.graph.weights[1]
+    rows = dict(zip(constraints.rows.values[:, 0].tolist(), held.tolist(), strict=True))
     for verdict in backend.verdicts():
-        assert (verdict.number, verdict.edge) == rows[verdict.stamp_ns]
+        assert verdict.number == rows[verdict.stamp_ns]
         assert used(backend, verdict) is verdict.state.in_graph
-    as_edges = constraints.rows.values[held.is_edge, 1]
-    assert np.all(observed[as_edges] == 0.0)
+    added = constraints.rows.values[:, 1]
+    assert np.all(backend.graph.weights[added[added != held]] == 0.0)
 
 
 @pytest.mark.parametrize('seed', [1, 2])
@@ -134,7 +137,7 @@ def test_what_is_doubted_stays_doubted_when_the_error_model_changes() -> None:
         pass
     assert backend._factors.errors_in_use('fix') is not None
     verdicts = backend.verdicts()
-    assert all(verdict.edge for verdict in verdicts)
+    assert np.all(_held(backend).j >= 0)
     assert len(doubted(backend) & bad) > 0.9 * len(bad)
     assert_weights_are_as_decided(backend)
     # what is forgiven gets a weight in the row that holds it, and so does the rest at the end
@@ -147,7 +150,7 @@ def test_what_is_doubted_stays_doubted_when_the_error_model_changes() -> None:
     # and back to white errors
     backend._tuner._begin('fix', None)
     backend._tuner.finish_change()
-    assert not any(verdict.edge for verdict in backend.verdicts())
+    assert np.all(_held(backend).j < 0)
     assert_weights_are_as_decided(backend)
 
 

@@ -19,7 +19,7 @@ def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
         size, before, totals = len(states), states.records.copy(), states.totals()
         for k in range(size, size + int(rng.integers(5))):
             source = ('fix', 'other', 'third')[rng.integers(3)]
-            states.append(NewConstraint(False, k, source, k, Position), 0,
+            states.append(NewConstraint(k, source, k, Position), 0,
                           (BELIEVED, DOUBTED)[rng.integers(2)], 0.5)
         if rng.random() < 0.4:
             states.truncate(size)
@@ -35,5 +35,5 @@ def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
     np.testing.assert_array_equal(again.records, states.records)
     assert again.totals() == states.totals()
     for each in (states, again):
-        each.append(NewConstraint(False, 0, 'fix', 0, Position), 0, BELIEVED)
+        each.append(NewConstraint(0, 'fix', 0, Position), 0, BELIEVED)
     assert again.name(len(again) - 1) == states.name(len(states) - 1)

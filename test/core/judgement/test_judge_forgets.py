@@ -93,7 +93,7 @@ def test_the_best_runs_stay_the_best_when_old_ones_are_forgotten(seed: int) -> N
 def added(states: ClosureStates, edges: range) -> None:
     for edge in edges:
         states.append(
-            NewConstraint(True, edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
+            NewConstraint(edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
 
 
 def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:

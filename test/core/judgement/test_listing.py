@@ -19,7 +19,7 @@ def test_the_newest_of_each_source_are_listed(
 ) -> None:
     states, expected = FixStates(), []
     for number, (own, good, by_person) in enumerate(constraints):
-        states.append(NewConstraint(False, number, f'fix{own}', number, Position), 0,
+        states.append(NewConstraint(number, f'fix{own}', number, Position), 0,
                       BELIEVED if good else DOUBTED)
         states.decision[number] = OUT if by_person else AUTO
         later = sum(each[0] == own and each[1] == good and not each[2]

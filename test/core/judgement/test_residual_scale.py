@@ -7,7 +7,7 @@ import pytest
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.residual_scale import give_scale, residual_scale
 
@@ -70,18 +70,18 @@ def test_closures_of_a_graph_get_the_weight_of_the_factor(
     for k in range(1, len(truth)):
         truth[k] = se2.compose(truth[k - 1], step)
     first = np.arange(len(truth) - 1)
-    odometry = Edges(
+    odometry = Factors(
         first, first + 1, np.tile(step, (len(first), 1)),
         np.tile(np.diag([400.0, 400.0, 1e4]), (len(first), 1, 1)),
-        [EdgeKind.ODOMETRY] * len(first))
+        [FactorKind.ODOMETRY] * len(first))
     late = np.arange(lap, len(truth))
-    closures = Edges(
+    closures = Factors(
         late - lap, late, rng.normal(0.0, factor * SIGMAS, (len(late), 3)),
-        np.tile(np.diag(SIGMAS**-2.0), (len(late), 1, 1)), [EdgeKind.LOOP_CLOSURE] * len(late))
+        np.tile(np.diag(SIGMAS**-2.0), (len(late), 1, 1)), [FactorKind.LOOP_CLOSURE] * len(late))
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=truth, fix=[0], edges=odometry))
-    rows = graph.n_edges + np.arange(len(late))
-    graph.apply(GraphUpdate(edges=closures))
+    graph.apply(GraphUpdate(hidden=truth, fix=[0], factors=odometry))
+    rows = len(graph.factors.edges) + np.arange(len(late))
+    graph.apply(GraphUpdate(factors=closures))
     scale = give_scale(graph, rows)
     assert least <= scale <= most
-    np.testing.assert_allclose(graph.edges_at(rows).weight, scale**-2.0)
+    np.testing.assert_allclose(graph.factors_at(rows).weight, scale**-2.0)

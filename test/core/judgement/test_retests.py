@@ -16,7 +16,7 @@ EACH = np.arange(3)
 
 def append(states: ClosureStates, n: int) -> None:
     for k in range(n):
-        states.append(NewConstraint(True, k, 'scan', k, LoopClosure, 0), 0, WAITING)
+        states.append(NewConstraint(k, 'scan', k, LoopClosure, 0), 0, WAITING)
 
 
 def retests() -> tuple[Retests, ClosureStates]:

@@ -9,8 +9,8 @@ import pytest
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import Edges
-from pose_graph_ros.core.graph.error_functions import edge_errors, energies
+from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.error_functions import energies, errors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import final
 from pose_graph_ros.core.judgement.closures import forward
@@ -38,9 +38,9 @@ def test_the_right_closures_are_found(seed: int, n_wrong: int, groups: tuple[int
 @pytest.mark.parametrize('seed', range(3))
 def test_the_order_of_the_rows_does_not_matter(seed: int) -> None:
     drive = laps(seed, n_wrong=10, groups=(5,))
-    order = np.random.default_rng(seed).permutation(len(drive.graph.edges))
+    order = np.random.default_rng(seed).permutation(drive.graph.n_factors)
     rows, shuffled = drive.graph.rows(), Graph()
-    shuffled.fill(rows._replace(edges=rows.edges.rows(order)))
+    shuffled.fill(rows._replace(factors=rows.factors.rows(order)))
     place = np.argsort(order)
     problem = TruncatedProblem(shuffled, place[drive.closures])
     assert list(to_the_end(final.select(problem))) == believed(drive)
@@ -62,12 +62,12 @@ def test_a_gate_is_that_of_the_smoother() -> None:
         joint = smoother.joint_covariance(i, j)
         jacobian = _jacobian(problem.graph.poses, edges.rows(slice(k, k + 1)))
         S = jacobian @ joint @ jacobian.T + np.linalg.inv(edges.information[k])
-        error = edge_errors(problem.graph.poses, edges.rows(slice(k, k + 1)))[0]
+        error = errors(problem.graph.poses, edges.rows(slice(k, k + 1)))[0]
         assert (k in passing) == (error @ np.linalg.solve(S, error) <= problem.limits[k])
         assert gates.volume[k] == pytest.approx(np.sqrt(np.linalg.det(S)), rel=1e-5)
 
 
-def _jacobian(poses: np.ndarray, edge: Edges) -> np.ndarray:
+def _jacobian(poses: np.ndarray, edge: Factors) -> np.ndarray:
     """Return the Jacobian of an edge's error by both ends, by differences, shape (3, 6)."""
     columns = []
     for node in (edge.i[0], edge.j[0]):
@@ -75,7 +75,7 @@ def _jacobian(poses: np.ndarray, edge: Edges) -> np.ndarray:
             moved = [poses.copy(), poses.copy()]
             for sign, each in zip((-1.0, 1.0), moved, strict=True):
                 each[node, k] += sign * 1e-6
-            low, high = (edge_errors(each, edge)[0] for each in moved)
+            low, high = (errors(each, edge)[0] for each in moved)
             columns.append((high - low) / 2e-6)
     return np.array(columns).T
 
@@ -88,10 +88,10 @@ def test_an_edge_that_is_turned_round_has_the_same_energy() -> None:
     poses = rng.normal(0.0, 3.0, (2, 3))
     mean = se2.between(poses[1], poses[0]) + rng.normal(0.0, 1e-5, 3)
     root = rng.normal(0.0, 1.0, (3, 3))
-    edge = Edges([1], [0], mean[None], (root @ root.T)[None], [1])
+    edge = Factors([1], [0], mean[None], (root @ root.T)[None], [1])
     turned = forward(edge)
     assert (turned.i[0], turned.j[0]) == (0, 1)
-    before, after = (energies(edge_errors(poses, each), each.information)
+    before, after = (energies(errors(poses, each), each.information)
                      for each in (edge, turned))
     assert after[0] == pytest.approx(before[0], rel=1e-3)
     assert forward(turned) is turned

@@ -26,7 +26,7 @@ from pose_graph_ros.core.judgement.verdicts import (
 CLOSURE = Verdict(
     'loop_closure/17', Judged.LOOP_CLOSURE, 'loop_closure', 1_695_250_000_000,
     1_600_000_000_000, State.DOUBTED, 1_700_500_000_000, Decision.AUTO,
-    np.array([4.0, -3.0, 0.2]), 14.25, (), ('loop_closure/3', 'odometry'), edge=True, number=40)
+    np.array([4.0, -3.0, 0.2]), 14.25, (), ('loop_closure/3', 'odometry'), number=40)
 
 
 def test_a_sentence_says_state_and_reason() -> None:

@@ -8,12 +8,11 @@ from numpy.testing import assert_allclose
 import pytest
 
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.tracks import (
-    biased_observations,
     LEAST_SIGMA,
     Observation,
     observations,
@@ -38,9 +37,9 @@ def random_chain(rng: np.random.Generator, n: int) -> OdometryChain:
     graph = Graph()
     means = rng.normal((1.0, 0.0, 0.0), (0.3, 0.2, 0.8), (n - 1, 3))
     information = np.array([np.linalg.inv(random_covariance(rng, 3, 0.01)) for _ in means])
-    graph.apply(GraphUpdate(hidden=np.zeros((n, 3)), fix=[0], edges=Edges(
+    graph.apply(GraphUpdate(hidden=np.zeros((n, 3)), fix=[0], factors=Factors(
         np.arange(n - 1), np.arange(1, n), means, information,
-        [EdgeKind.ODOMETRY] * (n - 1))))
+        [FactorKind.ODOMETRY] * (n - 1))))
     chain = OdometryChain()
     chain.extend(graph)
     chain.noise_factor = rng.uniform(1.0, 9.0)
@@ -95,14 +94,14 @@ def test_an_observation_is_taken_in(seed: int, size: int) -> None:
 @given(seed=seeds)
 def test_observations_have_their_covariances_in_map_axes_with_floors(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    kinds = rng.choice([ObservedKind.POSITION, ObservedKind.GLOBAL_POSE], 6)
+    kinds = rng.choice([FactorKind.POSITION, FactorKind.GLOBAL_POSE], 6)
     covs = np.array([random_covariance(rng, 3, rng.choice((1e-6, 1.0))) for _ in kinds])
-    covs[kinds == ObservedKind.POSITION, 2, :2] = covs[kinds == ObservedKind.POSITION, :2, 2] = 0.0
+    covs[kinds == FactorKind.POSITION, 2, :2] = covs[kinds == FactorKind.POSITION, :2, 2] = 0.0
     means = np.array([random_track(rng).pose for _ in kinds])
-    table = ObservedNodes(np.arange(6), np.zeros((6, 3)), means, np.linalg.inv(covs), kinds)
+    table = Factors.on(np.arange(6), np.zeros((6, 3)), means, np.linalg.inv(covs), kinds)
     least = np.square((LEAST_SIGMA[0], LEAST_SIGMA[0], LEAST_SIGMA[1]))
     for k, seen in enumerate(observations(table)):
-        size = 2 if kinds[k] == ObservedKind.POSITION else 3
+        size = 2 if kinds[k] == FactorKind.POSITION else 3
         expected = BELIEF.stated * covariance.turned(covs[k, :size, :size], -means[k, 2])
         expected = covariance.floored(expected, least[:size])
         assert (seen.node, seen.size) == (k, size)
@@ -111,9 +110,9 @@ def test_observations_have_their_covariances_in_map_axes_with_floors(seed: int) 
 
 def test_an_observation_of_a_biased_edge_has_the_variance_of_the_bias_as_well() -> None:
     information = np.array((np.eye(3), np.diag((4.0, 4.0, 0.0)), np.diag((0.0, 0.0, 1.0))))
-    edges = Edges([1, 2, 3], [4, 4, 4], np.zeros((3, 3)), information, [EdgeKind.BIAS] * 3,
-                  bias=np.tile((0.1, 0.2, 2.0, 0.5 * STRETCH), (3, 1)))
-    pose, position, heading = biased_observations(edges)
+    edges = Factors([1, 2, 3], [4, 4, 4], np.zeros((3, 3)), information, [FactorKind.BIAS] * 3,
+                  constants=np.tile((0.1, 0.2, 2.0, 0.5 * STRETCH), (3, 1)))
+    pose, position, heading = observations(edges)
     assert heading is None
     assert pose is not None
     assert position is not None

@@ -12,7 +12,7 @@ from random_graphs import dense_system, random_information, random_poses
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
 
@@ -49,7 +49,7 @@ class Prior:
     def system_of(self, sparse: SparsePrior) -> tuple[FloatArray, FloatArray]:
         """Return information and vector of the constraints that stand for the prior."""
         graph = Graph()
-        graph.apply(GraphUpdate(hidden=self.poses, edges=sparse.edges, observed=sparse.observed))
+        graph.apply(GraphUpdate(hidden=self.poses, factors=sparse.factors))
         H, b = dense_system(graph)
         return H, -b
 
@@ -65,8 +65,8 @@ class Prior:
 
     def tree(self, sparse: SparsePrior) -> Tree:
         """Return the pairs of nodes of a tree; k stands for the map."""
-        edges = zip(sparse.edges.i.tolist(), sparse.edges.j.tolist(), strict=True)
-        return [*edges, *((node, self.k) for node in sparse.observed.node.tolist())]
+        edges = zip(sparse.factors.edges.i.tolist(), sparse.factors.edges.j.tolist(), strict=True)
+        return [*edges, *((node, self.k) for node in sparse.factors.observed.i.tolist())]
 
     def measured(self, tree: Tree) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return Jacobians of the pairs of a tree and their covariances by the prior."""
@@ -98,10 +98,10 @@ class Prior:
         return float(sum(np.linalg.slogdet(C)[1] for C in self.measured(tree)[1]))
 
 
-def noisy_edges(rng: np.random.Generator, poses: FloatArray, ends: Tree) -> Edges:
+def noisy_edges(rng: np.random.Generator, poses: FloatArray, ends: Tree) -> Factors:
     i, j = np.array(ends).T
     mean = se2.between(poses[i], poses[j]) + 0.02 * rng.standard_normal((len(i), 3))
-    return Edges(i, j, mean, random_information(rng, len(i)), np.ones(len(i), dtype=np.uint8))
+    return Factors(i, j, mean, random_information(rng, len(i)), np.ones(len(i), dtype=np.uint8))
 
 
 def prior_of(seed: int, k: int, anchor: str, n_gone: int = 4) -> Prior:
@@ -113,11 +113,12 @@ def prior_of(seed: int, k: int, anchor: str, n_gone: int = 4) -> Prior:
     ends += [tuple(rng.choice(n, 2, replace=False).tolist()) for _ in range(n)]
     diagonals = np.array(ANCHORS[anchor]).reshape(-1, 3)
     node = np.arange(n - len(diagonals), n)
-    observed = ObservedNodes(
+    observed = Factors.on(
         node, mean=poses[node] + 0.1, information=diagonals[:, None] * np.eye(3),
-        kind=np.zeros(len(node), dtype=np.uint8))
+        kind=[FactorKind.GLOBAL_POSE] * len(node))
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, edges=noisy_edges(rng, poses, ends), observed=observed))
+    graph.apply(GraphUpdate(
+        hidden=poses, factors=Factors.joined([noisy_edges(rng, poses, ends), observed])))
     return Prior(graph, k, anchored=len(node) > 0)
 
 
@@ -167,7 +168,7 @@ def test_the_null_space_is_kept(seed: int, k: int, anchor: str) -> None:
     assert rank(prior.scaled(approximation)) == rank(prior.scaled(prior.information))
     assert len(prior.tree(sparse)) == k - 1 + (1 if prior.anchored else 0)
     if not prior.anchored:
-        assert len(sparse.observed) == 0
+        assert len(sparse.factors.observed) == 0
         motions = np.tile(np.eye(3), (k, 1))
         motions[0::3, 2], motions[1::3, 2] = -prior.poses[:, 1], prior.poses[:, 0]
         np.testing.assert_allclose(
@@ -195,11 +196,12 @@ def test_a_prior_that_is_a_tree_is_exact(seed: int, k: int, anchored: bool) -> N
     rng = np.random.default_rng(seed)
     poses = random_poses(rng, 2 * k - 1)
     ends = [end for m in range(k - 1) for end in ((m, k + m), (k + m, m + 1))]
-    observed = ObservedNodes(
-        [0], mean=poses[:1] + 0.1, information=np.eye(3)[None], kind=[0]) if anchored else (
-            ObservedNodes())
+    observed = Factors.on(
+        [0], mean=poses[:1] + 0.1, information=np.eye(3)[None],
+        kind=[FactorKind.GLOBAL_POSE]) if anchored else Factors()
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, edges=noisy_edges(rng, poses, ends), observed=observed))
+    graph.apply(GraphUpdate(
+        hidden=poses, factors=Factors.joined([noisy_edges(rng, poses, ends), observed])))
     prior = Prior(graph, k, anchored=anchored)
     sparse = prior.sparsified()
     approximation, vector = prior.system_of(sparse)
@@ -208,7 +210,7 @@ def test_a_prior_that_is_a_tree_is_exact(seed: int, k: int, anchored: bool) -> N
     np.testing.assert_allclose(
         (vector - prior.vector) * prior.sigmas, 0.0, atol=1e-6)
     assert sparse.divergence == pytest.approx(0.0, abs=ROUNDING)
-    assert len(sparse.edges) == k - 1
+    assert len(sparse.factors.edges) == k - 1
 
 
 @given(seeds, st.integers(3, 6), anchors)
@@ -246,7 +248,7 @@ def test_biases_have_priors_with_one_pose_each(
     assert [prior.nodes[1] for prior in sparse.priors] == list(range(k, n))
     assert all(prior.nodes[0] < k for prior in sparse.priors)
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses[:k], edges=sparse.edges, observed=sparse.observed))
+    graph.apply(GraphUpdate(hidden=poses[:k], factors=sparse.factors))
     H, b = dense_system(graph)
     approximation, right = np.zeros_like(information), np.zeros(3 * n)
     approximation[:3 * k, :3 * k], right[:3 * k] = H, -b
@@ -270,7 +272,7 @@ def test_biases_have_priors_with_one_pose_each(
 def test_a_single_pose_becomes_an_observed_node() -> None:
     prior = prior_of(1, 1, 'pose')
     sparse = prior.sparsified()
-    assert (len(sparse.edges), len(sparse.observed)) == (0, 1)
+    assert (len(sparse.factors.edges), len(sparse.factors.observed)) == (0, 1)
     approximation, vector = prior.system_of(sparse)
     np.testing.assert_allclose(approximation, prior.information, rtol=ROUNDING)
     np.testing.assert_allclose(vector, prior.vector, rtol=1e-6)
@@ -280,7 +282,7 @@ def test_poses_that_nothing_connects_stay_apart() -> None:
     rng = np.random.default_rng(5)
     poses = random_poses(rng, 4)
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, edges=noisy_edges(rng, poses, [(0, 1), (2, 3)])))
+    graph.apply(GraphUpdate(hidden=poses, factors=noisy_edges(rng, poses, [(0, 1), (2, 3)])))
     prior = Prior(graph, 4, anchored=False)
     sparse = prior.sparsified()
     assert sorted(prior.tree(sparse)) == [(0, 1), (2, 3)]
@@ -300,8 +302,8 @@ def test_headings_that_are_next_to_unknown_do_not_turn(known: float) -> None:
     prior.information[3 * k:, 3 * k:] = np.diag((1.0, 1.0, known))
     prior.vector[3 * k:] = 0.4, -0.3, 1e3 * known
     sparse = prior.sparsified(3)
-    moved = sparse.observed.mean[sparse.observed.node == k] - prior.poses[-1]
+    moved = sparse.factors.observed.mean[sparse.factors.observed.i == k] - prior.poses[-1]
     np.testing.assert_allclose(moved[:, :2], [(0.4, -0.3)], atol=1e-6)
     assert np.all(np.abs(se2.wrap(moved[:, 2])) <= 0.5 + ROUNDING)
-    others = sparse.edges.rows(np.flatnonzero(sparse.edges.j < k))
-    np.testing.assert_allclose(others.mean, whole.edges.mean, atol=1e-6)
+    others = sparse.factors.edges.rows(np.flatnonzero(sparse.factors.edges.j < k))
+    np.testing.assert_allclose(others.mean, whole.factors.edges.mean, atol=1e-6)

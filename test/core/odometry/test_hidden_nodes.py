@@ -14,7 +14,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import Edges
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 
@@ -83,7 +83,7 @@ class Made:
 def grown(
     arrivals: Sequence[tuple[str, OdometrySample]], config: BackendConfig = CONFIG,
     refuse: Sequence[int] = (), *, finish: bool = True,
-) -> tuple[HiddenNodes, Made, list[tuple[str, Edges]]]:
+) -> tuple[HiddenNodes, Made, list[tuple[str, Factors]]]:
     made = Made()
     nodes = HiddenNodes(config, made)
     for k, (source, sample) in enumerate(arrivals):
@@ -291,7 +291,7 @@ def test_nodes_and_edges_do_not_depend_on_the_order_of_arrival(
     for a, b in zip(made.information[1:], made_too.information[1:], strict=True):
         np.testing.assert_array_equal(a, b)
 
-    def table(edges: list[tuple[str, Edges]]) -> list[tuple[object, ...]]:
+    def table(edges: list[tuple[str, Factors]]) -> list[tuple[object, ...]]:
         return sorted((source, int(edge.i[0]), int(edge.j[0]), edge.mean.tobytes(),
                        edge.information.tobytes()) for source, edge in edges)
 

@@ -10,7 +10,7 @@ import numpy as np
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Measured
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
@@ -116,10 +116,10 @@ def chain_graph(means: np.ndarray, informations: np.ndarray) -> IncrementalSmoot
         poses.append(se2.compose(poses[-1], mean))
     ends = np.arange(n)
     smoother.update(GraphUpdate(
-        hidden=np.array(poses), fix=(0,), edges=Edges(
+        hidden=np.array(poses), fix=(0,), factors=Factors(
             np.append(ends, 0), np.append(ends + 1, n), np.vstack((means, poses[n] + 0.1)),
             np.concatenate((informations, 10.0 * np.eye(3)[None])),
-            [EdgeKind.ODOMETRY] * n + [EdgeKind.LOOP_CLOSURE])))
+            [FactorKind.ODOMETRY] * n + [FactorKind.LOOP_CLOSURE])))
     return smoother
 
 
@@ -135,17 +135,17 @@ def test_a_graph_with_other_edges_is_the_one_made_with_them(
     measured = Measured(np.arange(n), *known)
     before = smoother.graph.poses.copy()
     smoother.graph.begin()
-    smoother.graph.apply(GraphUpdate(measure_edges=[measured]))
+    smoother.graph.apply(GraphUpdate(measure=[measured]))
     smoother.graph.rollback()
-    np.testing.assert_array_equal(smoother.graph.edges.mean[:n], means)
+    np.testing.assert_array_equal(smoother.graph.factors.edges.mean[:n], means)
     np.testing.assert_array_equal(smoother.graph.poses, before)
-    smoother.update(GraphUpdate(measure_edges=[measured]))
-    np.testing.assert_allclose(smoother.graph.edges.mean[:n], known[0])
-    np.testing.assert_allclose(smoother.graph.edges.information, new.graph.edges.information,
-                               rtol=1e-12)
-    closed = smoother.graph.edges.mean[n]
-    new.graph.apply(GraphUpdate(measure_edges=[Measured(
-        np.array((n,)), closed[None], smoother.graph.edges.information[n:])]))
+    smoother.update(GraphUpdate(measure=[measured]))
+    np.testing.assert_allclose(smoother.graph.factors.edges.mean[:n], known[0])
+    np.testing.assert_allclose(smoother.graph.factors.edges.information,
+                               new.graph.factors.edges.information, rtol=1e-12)
+    closed = smoother.graph.factors.edges.mean[n]
+    new.graph.apply(GraphUpdate(measure=[Measured(
+        np.array((n,)), closed[None], smoother.graph.factors.edges.information[n:])]))
     for each in (smoother, new):
         for _ in range(30):
             each.update(GraphUpdate())
@@ -166,8 +166,8 @@ def test_a_chain_follows_the_edges(
     for errors in (before, after):
         graph, ends = Graph(), np.arange(len(means))
         known = changed(means, np.linalg.inv(noise), seconds, AS_CLAIMED, errors)
-        graph.apply(GraphUpdate(hidden=np.zeros((len(means) + 1, 3)), fix=(0,), edges=Edges(
-            ends, ends + 1, *known, [EdgeKind.ODOMETRY] * len(means))))
+        graph.apply(GraphUpdate(hidden=np.zeros((len(means) + 1, 3)), fix=(0,), factors=Factors(
+            ends, ends + 1, *known, [FactorKind.ODOMETRY] * len(means))))
         chains.append(OdometryChain())
         chains[-1].extend(graph)
     chains[0].correct(before, after, stamps_ns, np.ones(len(means), dtype=bool))

@@ -10,7 +10,7 @@ from slow_smoother import driven, EXACT, SlowGraph
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import error_functions
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother import covariances
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -31,7 +31,7 @@ def linearized(seed: int, steps: int) -> IncrementalSmoother:
 
 def dense(smoother: IncrementalSmoother) -> np.ndarray:
     graph = smoother.graph
-    return SlowGraph(graph.poses, graph.fixed, graph.edges, graph.observed).covariance()
+    return SlowGraph(graph.poses, graph.fixed, graph.factors).covariance()
 
 
 def off(actual: np.ndarray, expected: np.ndarray) -> float:
@@ -85,8 +85,8 @@ def chain(n: int, *, bend: float = 0.1) -> GraphUpdate:
         poses.append(se2.wrapped(se2.compose(poses[-1], step)))
     return GraphUpdate(
         hidden=np.array(poses), fix=[0],
-        edges=Edges(range(n - 1), range(1, n), mean, [pose_information()] * (n - 1),
-                    [EdgeKind.ODOMETRY] * (n - 1)))
+        factors=Factors(range(n - 1), range(1, n), mean, [pose_information()] * (n - 1),
+                    [FactorKind.ODOMETRY] * (n - 1)))
 
 
 def test_nodes_in_different_parts_are_not_correlated() -> None:
@@ -94,9 +94,10 @@ def test_nodes_in_different_parts_are_not_correlated() -> None:
     smoother.update(chain(4))
     smoother.update(GraphUpdate(
         hidden=np.zeros((2, 3)),
-        edges=Edges([4], [5], np.zeros((1, 3)), [pose_information()], [EdgeKind.ODOMETRY]),
-        observed=ObservedNodes([4], None, np.zeros((1, 3)), [pose_information()],
-                               [ObservedKind.GLOBAL_POSE])))
+        factors=Factors.joined([
+            Factors([4], [5], np.zeros((1, 3)), [pose_information()], [FactorKind.ODOMETRY]),
+            Factors.on([4], None, np.zeros((1, 3)), [pose_information()],
+                       [FactorKind.GLOBAL_POSE])])))
     joint = smoother.joint_covariance(2, 5)
     np.testing.assert_array_equal(joint[:3, 3:], np.zeros((3, 3)))
     np.testing.assert_allclose(joint[3:, 3:], 2.0 * np.linalg.inv(pose_information()), rtol=1e-12)
@@ -117,19 +118,19 @@ def test_covariances_require_that_edits_are_solved_for() -> None:
     assert smoother.covariances().shape == (4, 3, 3)
 
 
-def candidates(smoother: IncrementalSmoother, rng: np.random.Generator, n: int) -> Edges:
+def candidates(smoother: IncrementalSmoother, rng: np.random.Generator, n: int) -> Factors:
     """Return random edges, also to biases, of any consistency."""
     graph, sigma = smoother.graph, (2.0, 2.0, 1.0)
     poses, biases = np.flatnonzero(~graph.is_bias), np.flatnonzero(graph.is_bias)
     pairs = [rng.choice(poses, 2, replace=False) for _ in range(n if len(poses) > 1 else 0)]
-    kinds = [EdgeKind.LOOP_CLOSURE] * len(pairs)
+    kinds = [FactorKind.LOOP_CLOSURE] * len(pairs)
     if len(biases) > 0:
         pairs += [(rng.choice(poses), rng.choice(biases)) for _ in range(n)]
-        kinds += [EdgeKind.BIAS] * n
+        kinds += [FactorKind.BIAS] * n
     i, j = np.reshape(pairs, (-1, 2)).T.astype(np.int64)
     root = rng.normal(size=(len(i), 3, 3))
-    return Edges(i, j, rng.normal(size=(len(i), 3)) * sigma, root @ np.swapaxes(root, 1, 2), kinds,
-                 bias=rng.normal(size=(len(i), 4)))
+    return Factors(i, j, rng.normal(size=(len(i), 3)) * sigma, root @ np.swapaxes(root, 1, 2),
+                   kinds, constants=rng.normal(size=(len(i), 4)))
 
 
 @given(seeds, st.integers(0, 25))
@@ -139,8 +140,8 @@ def test_innovations_are_those_of_the_dense_inverse(seed: int, steps: int) -> No
     poses, P = smoother.poses, dense(smoother).reshape(len(smoother.poses), 3, -1, 3)
     edges = candidates(smoother, np.random.default_rng(seed), 5)
     linear = jacobians.linearize_edges(poses, edges)
-    errors, actual = smoother.edge_innovations(edges)
-    np.testing.assert_allclose(errors, error_functions.edge_errors(poses, edges), atol=1e-12)
+    errors, actual = smoother.innovations(edges)
+    np.testing.assert_allclose(errors, error_functions.errors(poses, edges), atol=1e-12)
     for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
         J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
         joint = np.block([[P[i, :, i], P[i, :, j]], [P[j, :, i], P[j, :, j]]])
@@ -155,7 +156,7 @@ def test_distances_are_those_by_the_inverse_also_without_information_on_the_head
 ) -> None:
     smoother = linearized(seed, 10)
     edges = candidates(smoother, np.random.default_rng(seed), 5)
-    found = smoother.edge_innovations(edges)
+    found = smoother.innovations(edges)
     total = found.covariances + np.linalg.inv(edges.information)
     np.testing.assert_allclose(
         found.squared_distances(edges.information),
@@ -171,6 +172,6 @@ def test_distances_are_those_by_the_inverse_also_without_information_on_the_head
 def test_neighbours_far_from_what_fixes_them_have_an_exact_relative_covariance() -> None:
     smoother = IncrementalSmoother(EXACT)
     smoother.update(chain(2000, bend=1e-3))
-    edges = smoother.graph.edges_at(np.array([1990]))
-    covariance = smoother.edge_innovations(edges).covariances[0]
+    edges = smoother.graph.factors_at(np.array([1990]))
+    covariance = smoother.innovations(edges).covariances[0]
     np.testing.assert_allclose(covariance, np.linalg.inv(edges.information[0]), rtol=1e-12)

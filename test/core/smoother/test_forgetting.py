@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes that leave take nothing along: not from the tree, and not as a pure function."""
 
-from dataclasses import replace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -16,7 +15,7 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import model
 from pose_graph_ros.core.marginalization.marginalize import marginalize
@@ -34,7 +33,7 @@ def at_rest(seed: int) -> tuple[IncrementalSmoother, World]:
     """Return a smoother at the minimum of a world with closures, fixes, biases and doubts."""
     smoother, _, here = driven(seed, 11)
     smoother.update(here.joined(
-        here.new_nodes(2), observed=here.observed([0, 1], position=True)))
+        here.new_nodes(2), factors=here.observed([0, 1], position=True)))
     return smoother, here
 
 
@@ -50,11 +49,7 @@ def copied(smoother: IncrementalSmoother) -> IncrementalSmoother:
 def system(graph: Graph, poses: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
     """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes at poses, by dense matrices."""
     poses = graph.poses if poses is None else poses
-    edges, observed = graph.edges, graph.observed
-    slow = SlowGraph(
-        poses, graph.fixed,
-        replace(edges, i=graph.node_rows(edges.i), j=graph.node_rows(edges.j)),
-        replace(observed, node=graph.node_rows(observed.node)))
+    slow = SlowGraph(poses, graph.fixed, graph.factors_by_row)
     H, b = slow.system()
     for prior in graph.priors:
         rows = graph.node_rows(prior.nodes)
@@ -92,23 +87,21 @@ def test_the_nodes_that_remain_do_not_move(seed: int, pure: bool, with_priors: b
         leaving = some(here.rng, smoother.graph, 0.3)
         smoother.forget(leaving)
         here.gone.update(leaving)
-        more = here.joined(here.new_nodes(3), edges=here.edges(here.pairs(3)),
-                           observed=here.observed(here.poses[:1]))
+        more = here.joined(here.new_nodes(3), factors=Factors.joined([
+            here.edges(here.pairs(3)), here.observed(here.poses[:1])]))
         assert smoother.update(more).status is not Status.FAILED
     smoother = copied(smoother)     # as the Jacobians of a smoother may lag a little
     graph, leaving = smoother.graph, some(here.rng, smoother.graph)
     kept = np.setdiff1d(graph.node_ids, leaving)
-    poses, chi2, edges, observed = (
-        graph.poses_of(kept), smoother.chi2(), graph.edges, graph.observed)
+    poses, chi2, factors = graph.poses_of(kept), smoother.chi2(), graph.factors
     covariances = smoother.covariances()[graph.node_rows(kept)]
     if pure:
         assert smoother.update(marginalize(graph, leaving)).status is Status.CONVERGED
     else:
         forgotten = smoother.forget(leaving)
         assert forgotten.nodes.tolist() == sorted(leaving)
-        gone = np.isin(edges.i, leaving) | np.isin(edges.j, leaving)
-        assert len(forgotten.edges) == np.sum(gone)
-        assert len(forgotten.observed) == np.sum(np.isin(observed.node, leaving))
+        gone = np.isin(factors.i, leaving) | np.isin(factors.j, leaving)
+        assert len(forgotten.factors) == np.sum(gone)
         # of what leaves as a whole nothing remains, not even its energy
         assert smoother.chi2() <= chi2 * (1.0 + 1e-6) + 1e-6
     for each in (smoother, copied(smoother)):   # also optimised again, from scratch
@@ -125,7 +118,7 @@ def test_the_gauge_keeps_its_dimension(seed: int, tree: bool) -> None:
     smoother = IncrementalSmoother(EXACT)
     smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
     smoother.update(here.new_nodes(12))
-    smoother.update(GraphUpdate(edges=here.edges(here.pairs(4))))
+    smoother.update(GraphUpdate(factors=here.edges(here.pairs(4))))
     leaving = [node for node in some(here.rng, smoother.graph) if node != 0]
     if tree:
         smoother.forget(leaving)
@@ -149,12 +142,12 @@ def test_a_chain_node_leaves_one_edge() -> None:
     smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
     for k in range(1, 6):
         smoother.update(GraphUpdate(
-            hidden=here.drive(k - 1)[None], edges=here.edges([(k - 1, k)])))
+            hidden=here.drive(k - 1)[None], factors=here.edges([(k - 1, k)])))
     update = marginalize(smoother.graph, [3])
-    assert (update.edges.i.tolist(), update.edges.j.tolist()) == ([2], [4])
-    assert len(update.observed) == len(update.priors) == 0
+    assert (update.factors.edges.i.tolist(), update.factors.edges.j.tolist()) == ([2], [4])
+    assert len(update.factors.observed) == len(update.priors) == 0
     expected = se2.between(smoother.graph.poses[2], smoother.graph.poses[4])
-    np.testing.assert_allclose(update.edges.mean[0], expected, atol=1e-9)
+    np.testing.assert_allclose(update.factors.edges.mean[0], expected, atol=1e-9)
 
 
 @given(seeds)
@@ -165,13 +158,13 @@ def test_a_graph_that_turns_by_a_radian_keeps_what_it_knows(seed: int) -> None:
     smoother = IncrementalSmoother(EXACT)
     smoother.update(GraphUpdate(hidden=np.array(here.truth), fix=[0]))
     smoother.update(here.new_nodes(12))
-    smoother.update(GraphUpdate(edges=here.edges(here.pairs(4))))
+    smoother.update(GraphUpdate(factors=here.edges(here.pairs(4))))
     leaving = [node for node in some(here.rng, smoother.graph, 0.4) if node != 0]
     whole = copied(smoother)
     smoother.forget(leaving)
     turned = se2.compose(np.array((3.0, -1.0, 1.0)), smoother.graph.poses[0])
-    update = GraphUpdate(free=[0], observed=ObservedNodes(
-        [0], None, turned[None], [1e4 * np.eye(3)], [ObservedKind.GLOBAL_POSE]))
+    update = GraphUpdate(free=[0], factors=Factors.on(
+        [0], None, turned[None], [1e4 * np.eye(3)], [FactorKind.GLOBAL_POSE]))
     for each in (smoother, whole):
         assert each.update(update).status is Status.CONVERGED
     np.testing.assert_allclose(smoother.chi2(), whole.chi2(), rtol=1e-6, atol=1e-6)
@@ -221,19 +214,19 @@ def _laps_with_a_window(seed: int, n: int, *, per_lap: int, lag: int) -> float:
     rng = np.random.default_rng(seed)
     sigma, turn = np.array((0.05, 0.05, 0.02)), 2.0 * np.pi / per_lap
     smoother, whole, oldest = IncrementalSmoother(), Graph(), 0
-    held = ObservedNodes(
-        [0], None, [[0.0, 0.0, 0.0]], [1e10 * np.eye(3)], [ObservedKind.GLOBAL_POSE])
-    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), observed=held))
-    updates = [GraphUpdate(hidden=np.zeros((1, 3)), observed=held)]
+    held = Factors.on(
+        [0], None, [[0.0, 0.0, 0.0]], [1e10 * np.eye(3)], [FactorKind.GLOBAL_POSE])
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), factors=held))
+    updates = [GraphUpdate(hidden=np.zeros((1, 3)), factors=held)]
     for k in range(1, n):
         move = se2.compose(np.array((1.0, 0.0, turn)), rng.normal(size=3) * sigma)
-        edges = [Edges([k - 1], [k], move[None], [np.diag(sigma**-2)], [EdgeKind.ODOMETRY])]
+        edges = [Factors([k - 1], [k], move[None], [np.diag(sigma**-2)], [FactorKind.ODOMETRY])]
         if k >= per_lap and k % 5 == 0:
             poor = np.array((0.1, 0.1, 0.05))
-            edges.append(Edges([k - per_lap], [k], (rng.normal(size=3) * poor)[None],
-                               [np.diag(poor**-2)], [EdgeKind.LOOP_CLOSURE]))
+            edges.append(Factors([k - per_lap], [k], (rng.normal(size=3) * poor)[None],
+                               [np.diag(poor**-2)], [FactorKind.LOOP_CLOSURE]))
         updates.append(GraphUpdate(hidden=se2.compose(smoother.poses[-1], move)[None],
-                                   edges=Edges.joined(edges)))
+                                   factors=Factors.joined(edges)))
         smoother.update(updates[-1])
         if k - oldest >= lag + 10:
             smoother.forget(range(oldest, oldest + 10))
@@ -264,11 +257,12 @@ def test_memory_stays_flat_while_nodes_come_and_go() -> None:
         smoother.extend(MOTION, INFORMATION)
         oldest = k - n
         if oldest >= 0:
-            edges = Edges([k - int(rng.integers(2, n - 2))], [k], [rng.normal(size=3) * 0.1],
-                          [0.01 * INFORMATION], [EdgeKind.LOOP_CLOSURE],
+            edges = Factors([k - int(rng.integers(2, n - 2))], [k], [rng.normal(size=3) * 0.1],
+                          [0.01 * INFORMATION], [FactorKind.LOOP_CLOSURE],
                           weight=[float(k % 3 == 0)])
             assert smoother.update(GraphUpdate(
-                edges=edges, remove_nodes=[oldest], fix=[oldest + 1])).status is not Status.FAILED
+                factors=edges, remove_nodes=[oldest],
+                fix=[oldest + 1])).status is not Status.FAILED
         if k in (2000, 3999):
             head = smoother.graph.memory.head
             sizes.append([len(smoother.graph.memory[name]) for name in tb.NAMES] + head[[

@@ -15,7 +15,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -77,35 +77,32 @@ class Edits(RuleBasedStateMachine):
     @rule(seed=seeds, count=st.integers(1, 3))
     def close_loops(self, seed: int, count: int) -> None:
         self.world.rng = np.random.default_rng(seed)
-        self.update(GraphUpdate(edges=self.world.edges(self.world.pairs(count))))
+        self.update(GraphUpdate(factors=self.world.edges(self.world.pairs(count))))
 
     @rule(seed=seeds, position=st.booleans(), offset=st.booleans())
     def observe(self, seed: int, position: bool, offset: bool) -> None:
         self.world.rng = np.random.default_rng(seed)
         nodes = self.world.rng.choice(self.world.poses, 2).tolist()
         self.update(GraphUpdate(
-            observed=self.world.observed(nodes, position=position, offset=offset)))
+            factors=self.world.observed(nodes, position=position, offset=offset)))
 
     @rule(seed=seeds, count=st.integers(0, 2), measurements=st.integers(0, 3))
     def measure_with_biases(self, seed: int, count: int, measurements: int) -> None:
         self.world.rng = np.random.default_rng(seed)
         self.update(self.world.new_biases(count, measurements))
 
-    @rule(seed=seeds, weight=st.sampled_from([0.0, 0.1, 1.0, 7.0]), of_edge=st.booleans())
-    def weigh(self, seed: int, weight: float, of_edge: bool) -> None:
-        table = self.slow.has_edges() if of_edge else self.slow.has_observed()
+    @rule(seed=seeds, weight=st.sampled_from([0.0, 0.1, 1.0, 7.0]))
+    def weigh(self, seed: int, weight: float) -> None:
+        table = self.slow.has_factors()
         if len(table) > 0:
-            row = table[seed % len(table)]
-            self.update(GraphUpdate(
-                **{'weigh_edges' if of_edge else 'weigh_observed': {row: weight}}))
+            self.update(GraphUpdate(weigh={table[seed % len(table)]: weight}))
 
-    @rule(seed=seeds, of_edge=st.booleans())
-    def remove(self, seed: int, of_edge: bool) -> None:
-        table = self.slow.has_edges() if of_edge else self.slow.has_observed()
+    @rule(seed=seeds)
+    def remove(self, seed: int) -> None:
+        table = self.slow.has_factors()
         if len(table) > 0:
             rows = table[sorted({seed % len(table), seed // 7 % len(table)})].tolist()
-            self.update(GraphUpdate(
-                **{'remove_edges' if of_edge else 'remove_observed': rows}))
+            self.update(GraphUpdate(remove=rows))
 
     @rule(seed=seeds)
     def fix(self, seed: int) -> None:
@@ -144,8 +141,7 @@ class Edits(RuleBasedStateMachine):
         if len(poses) == 0:
             return
         assert graph.node_ids.tolist() == np.flatnonzero(self.slow.present).tolist()
-        assert graph.edge_ids.tolist() == self.slow.has_edges().tolist()
-        assert graph.observed_ids.tolist() == self.slow.has_observed().tolist()
+        assert graph.factor_ids.tolist() == self.slow.has_factors().tolist()
         assert poses.tobytes() == self.spared.poses.tobytes()
         optimum = self.slow.optimized()
         off = se2.wrapped(optimum.poses[optimum.present] - poses)
@@ -201,25 +197,26 @@ def test_hard_worlds_end_at_the_minimum_as_well(name: str, seed: int) -> None:
 POSE_INFORMATION = np.array([[100.0, 10.0, 5.0], [10.0, 80.0, -7.0], [5.0, -7.0, 400.0]])
 
 
-def seen(node: int, pose: object, information: object = POSE_INFORMATION) -> ObservedNodes:
-    return ObservedNodes([node], None, [pose], [information], [ObservedKind.GLOBAL_POSE])
+def seen(node: int, pose: object, information: object = POSE_INFORMATION) -> Factors:
+    return Factors.on([node], None, [pose], [information], [FactorKind.GLOBAL_POSE])
 
 
-def link(i: int, j: int, mean: object, information: object = POSE_INFORMATION) -> Edges:
-    return Edges([i], [j], [mean], [information], [EdgeKind.ODOMETRY])
+def link(i: int, j: int, mean: object, information: object = POSE_INFORMATION) -> Factors:
+    return Factors([i], [j], [mean], [information], [FactorKind.ODOMETRY])
 
 
 @pytest.mark.parametrize('step', [0.7, -1.3])
 def test_a_node_may_turn_by_many_turns(step: float) -> None:
     # each new heading is a bit further, and the last one no longer counts
     smoother, slow = IncrementalSmoother(EXACT), SlowGraph()
-    first = GraphUpdate(hidden=np.zeros((2, 3)), edges=link(0, 1, [1.0, 0.0, 0.0]),
-                        observed=seen(0, np.zeros(3)))
+    first = GraphUpdate(hidden=np.zeros((2, 3)), factors=Factors.joined([
+        seen(0, np.zeros(3)), link(0, 1, [1.0, 0.0, 0.0])]))
     smoother.update(first)
     slow = slow.edited(first)
     for k in range(1, 40):
         update = GraphUpdate(
-            observed=seen(0, [0.0, 0.0, float(se2.wrap(k * step))]), remove_observed=[k - 1])
+            factors=seen(0, [0.0, 0.0, float(se2.wrap(k * step))]),
+            remove=[k if k > 1 else 0])
         assert smoother.update(update).status is Status.CONVERGED
         slow = slow.edited(update).at(smoother.poses)
         assert np.max(np.abs(slow.step())) < CLOSE
@@ -234,7 +231,8 @@ def street(n: int, seed: int = 1) -> tuple[IncrementalSmoother, SlowGraph]:
     smoother, slow, here = IncrementalSmoother(), SlowGraph(), world(seed, turn=0.2)
     first = GraphUpdate(hidden=np.array(here.truth), fix=[0])
     for update in (first, here.new_nodes(n - 1),
-                   GraphUpdate(edges=here.edges([(k, k + n // 3) for k in range(0, n // 2, 7)]))):
+                   GraphUpdate(factors=here.edges(
+                       [(k, k + n // 3) for k in range(0, n // 2, 7)]))):
         assert smoother.update(update).status is Status.CONVERGED
         slow = slow.edited(update)
     return smoother, slow
@@ -244,18 +242,19 @@ SINGULAR = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
 BAD = {
     'a node that nothing holds': lambda n, slow: GraphUpdate(hidden=np.zeros((1, 3))),
     'a node of a position alone': lambda n, slow: GraphUpdate(
-        hidden=np.zeros((1, 3)), observed=ObservedNodes(
-            [n], None, np.zeros((1, 3)), [SINGULAR], [ObservedKind.POSITION])),
+        hidden=np.zeros((1, 3)), factors=Factors.on(
+            [n], None, np.zeros((1, 3)), [SINGULAR], [FactorKind.POSITION])),
     'an edge that knows no heading': lambda n, slow: GraphUpdate(
-        hidden=np.zeros((1, 3)), edges=link(n - 1, n, [1.0, 0.0, 0.0], SINGULAR)),
+        hidden=np.zeros((1, 3)), factors=link(n - 1, n, [1.0, 0.0, 0.0], SINGULAR)),
     'a node that loses its only edge': lambda n, slow: GraphUpdate(
-        hidden=np.zeros((1, 3)), edges=link(n - 1, n, [1.0, 0.0, 0.0]),
-        remove_edges=[len(slow.edges)]),
+        hidden=np.zeros((1, 3)), factors=link(n - 1, n, [1.0, 0.0, 0.0]),
+        remove=[len(slow.factors)]),
     'all that holds the newest node is removed': lambda n, slow: GraphUpdate(
-        remove_edges=np.flatnonzero((slow.edges.i == n - 1) | (slow.edges.j == n - 1)).tolist()),
+        remove=np.flatnonzero(
+            (slow.factors.i == n - 1) | (slow.factors.j == n - 1)).tolist()),
     'the only anchor is freed': lambda n, slow: GraphUpdate(free=[0]),
     'a part of two nodes without anchor': lambda n, slow: GraphUpdate(
-        hidden=np.zeros((2, 3)), edges=link(n, n + 1, [1.0, 0.0, 0.0])),
+        hidden=np.zeros((2, 3)), factors=link(n, n + 1, [1.0, 0.0, 0.0])),
 }
 
 
@@ -268,7 +267,7 @@ def test_a_bad_update_leaves_no_trace(name: str, n: int) -> None:
     # with much good in it, so that the whole tree is taken apart before it fails
     rng = np.random.default_rng(3)
     far = [(int(i), int(j)) for i, j in rng.integers(0, n, (20, 2)) if i != j]
-    bad = bad._replace(edges=Edges.joined([bad.edges, *(
+    bad = bad._replace(factors=Factors.joined([bad.factors, *(
         link(i, j, rng.normal(size=3)) for i, j in far if n - 1 not in (i, j))]))
     before, poses, chi2 = state(smoother.graph), smoother.poses.copy(), smoother.chi2()
     covariances = smoother.covariances()
@@ -282,9 +281,9 @@ def test_a_bad_update_leaves_no_trace(name: str, n: int) -> None:
     assert smoother.poses.tobytes() == poses.tobytes()
     assert smoother.chi2() == chi2
     assert smoother.covariances().tobytes() == covariances.tobytes()
-    for update in (GraphUpdate(edges=link(0, n - 1, slow.poses[n - 1] + 0.3)),
-                   GraphUpdate(hidden=[[0.0, 0.0, 0.0]], edges=link(n - 1, n, [1.0, 0.0, 0.5])),
-                   GraphUpdate(remove_edges=[0], weigh_edges={1: 0.5}, fix=[1])):
+    for update in (GraphUpdate(factors=link(0, n - 1, slow.poses[n - 1] + 0.3)),
+                   GraphUpdate(hidden=[[0.0, 0.0, 0.0]], factors=link(n - 1, n, [1.0, 0.0, 0.5])),
+                   GraphUpdate(remove=[0], weigh={1: 0.5}, fix=[1])):
         assert smoother.update(update)[:5] == spared.update(update)[:5]
         assert smoother.poses.tobytes() == spared.poses.tobytes()
 
@@ -294,7 +293,7 @@ def left_over() -> tuple[IncrementalSmoother, SlowGraph]:
     smoother, here = IncrementalSmoother(replace(EXACT, max_iterations=1)), world(4)
     slow = SlowGraph()
     for update in (GraphUpdate(hidden=np.array(here.truth), fix=[0]), here.new_nodes(12),
-                   GraphUpdate(edges=here.edges([(11, 2), (3, 9), (1, 12)]))):
+                   GraphUpdate(factors=here.edges([(11, 2), (3, 9), (1, 12)]))):
         smoother.update(update)
         slow = slow.edited(update)
     return smoother, slow
@@ -321,32 +320,32 @@ def test_what_is_left_over_is_done_in_the_next_updates() -> None:
 @pytest.mark.parametrize('config', [SmootherConfig(), EXACT], ids=['default', 'exact'])
 def test_extending_equals_updating(config: SmootherConfig) -> None:
     extended, updated, here = IncrementalSmoother(config), IncrementalSmoother(config), world(3)
-    first = GraphUpdate(hidden=np.array(here.truth), observed=seen(0, here.truth[0]))
+    first = GraphUpdate(hidden=np.array(here.truth), factors=seen(0, here.truth[0]))
     extended.update(first)
     updated.update(first)
     for k in range(1, 80):
         here.truth.append(se2.compose(here.truth[-1], np.array([1.0, 0.0, 0.2])))
         mean, information = here.edges([(k - 1, k)]).mean[0], here.informative()
         observed = seen(k, here.disturbed(here.truth[k], here.noise)) if k % 10 == 0 else (
-            ObservedNodes())
+            Factors())
         update = GraphUpdate(
             hidden=se2.compose(updated.poses[-1], mean)[None],
-            edges=link(k - 1, k, mean, information), observed=observed)
+            factors=Factors.joined([link(k - 1, k, mean, information), observed]))
         updated.update(update)
         extended.extend(mean, information)
         if k % 10 == 0:
-            extended.update(GraphUpdate(observed=observed))
+            extended.update(GraphUpdate(factors=observed))
         if k % 25 == 0:
             # a loop closure, after which the newest node still ends the chain
             for smoother in (extended, updated):
-                smoother.update(GraphUpdate(edges=link(
+                smoother.update(GraphUpdate(factors=link(
                     k - 20, k, se2.between(here.truth[k - 20], here.truth[k]))))
         # both are within their budget of the minimum
         np.testing.assert_allclose(extended.poses, updated.poses, atol=(
             1e-7 if config is EXACT else 0.03))
         assert extended.chi2() == pytest.approx(updated.chi2(), abs=(
             1e-6 if config is EXACT else 0.05))
-    assert extended.graph.edges.mean.tobytes() == updated.graph.edges.mean.tobytes()
+    assert extended.graph.factors.mean.tobytes() == updated.graph.factors.mean.tobytes()
     scale = np.sqrt(np.einsum('nii->ni', updated.covariances()))
     off = (extended.covariances() - updated.covariances()) / scale[:, :, None] / scale[:, None]
     assert np.max(np.abs(off)) < 0.05
@@ -357,15 +356,15 @@ def test_a_chain_made_with_another_weight_follows_what_pulls_at_it(weight: float
     extended, updated = IncrementalSmoother(), IncrementalSmoother()
     mean = np.array([1.0, 0.0, 0.05])
     for smoother in (extended, updated):
-        smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), observed=seen(0, np.zeros(3))))
+        smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), factors=seen(0, np.zeros(3))))
     for k in range(1, 60):
         extended.extend(mean, POSE_INFORMATION, weight)
         updated.update(GraphUpdate(
             hidden=se2.compose(updated.poses[-1], mean)[None],
-            edges=replace(link(k - 1, k, mean), weight=np.array([weight]))))
+            factors=replace(link(k - 1, k, mean), weight=np.array([weight]))))
     for smoother in (extended, updated):
         # odometry counts as claimed again, and a fix moves the end
-        smoother.update(GraphUpdate(weigh_edges=dict.fromkeys(range(59), 1.0)))
-        smoother.update(GraphUpdate(observed=seen(
+        smoother.update(GraphUpdate(weigh=dict.fromkeys(range(1, 60), 1.0)))
+        smoother.update(GraphUpdate(factors=seen(
             59, smoother.poses[59] + np.array([3.0, 3.0, 0.0]))))
     np.testing.assert_allclose(extended.poses, updated.poses, rtol=0.0, atol=1e-3)

@@ -10,7 +10,7 @@ from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -30,9 +30,9 @@ def streets(n: int, *, seed: int = 0, observed: bool = False) -> IncrementalSmoo
         if k % 3 == 0 and len(near) > 0:
             smoother.update(closure(int(near[0]), k, noisy(rng, truth[near[0]], truth[k])))
         if observed and k % 50 == 0:
-            smoother.update(GraphUpdate(observed=ObservedNodes(
+            smoother.update(GraphUpdate(factors=Factors.on(
                 [k], None, truth[k:k + 1] + SIGMA * rng.normal(size=3), INFORMATION[None],
-                [ObservedKind.GLOBAL_POSE])))
+                [FactorKind.GLOBAL_POSE])))
     return smoother
 
 
@@ -41,8 +41,8 @@ def noisy(rng: np.random.Generator, start: np.ndarray, end: np.ndarray) -> np.nd
 
 
 def closure(i: int, j: int, mean: np.ndarray) -> GraphUpdate:
-    return GraphUpdate(edges=Edges(
-        [i], [j], mean[None], INFORMATION[None], [EdgeKind.LOOP_CLOSURE]))
+    return GraphUpdate(factors=Factors(
+        [i], [j], mean[None], INFORMATION[None], [FactorKind.LOOP_CLOSURE]))
 
 
 def optimum(smoother: IncrementalSmoother) -> Graph:
@@ -84,26 +84,26 @@ def test_a_refinement_ends_at_the_batch_optimum(seed: int, observed: bool) -> No
 def test_a_refinement_costs_what_has_changed_and_a_second_one_nothing() -> None:
     smoother, n = IncrementalSmoother(), 5000
     rng, head = np.random.default_rng(3), smoother.graph.memory.head
-    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), observed=seen(0, np.zeros(3))))
+    smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), factors=seen(0, np.zeros(3))))
     for k in range(1, n):
         smoother.extend(np.array([1.0, 0.0, 0.0]) + SIGMA * rng.normal(size=3), INFORMATION)
         if k % 10 == 0:
             smoother.update(GraphUpdate(
-                observed=seen(k, [k, 0.0, 0.0] + SIGMA * rng.normal(size=3))))
+                factors=seen(k, [k, 0.0, 0.0] + SIGMA * rng.normal(size=3))))
     refined(smoother)
     head = smoother.graph.memory.head
     assert smoother.refine() == (True, 0.0)
     assert head[tb.N_VISITED] <= 2
     smoother.extend(np.array([1.0, 0.0, 0.0]), INFORMATION)
-    smoother.update(GraphUpdate(observed=seen(n, [n + 0.1, 0.1, 0.0])))
+    smoother.update(GraphUpdate(factors=seen(n, [n + 0.1, 0.1, 0.0])))
     refined(smoother)
     assert 2 < head[tb.N_VISITED] < 0.1 * n
     assert off(smoother)[1] < 1e-5
 
 
-def seen(node: int, pose: object) -> ObservedNodes:
-    return ObservedNodes([node], None, np.array([pose], dtype=float), INFORMATION[None],
-                         [ObservedKind.GLOBAL_POSE])
+def seen(node: int, pose: object) -> Factors:
+    return Factors.on([node], None, np.array([pose], dtype=float), INFORMATION[None],
+                         [FactorKind.GLOBAL_POSE])
 
 
 def test_an_interruption_leaves_no_trace_and_the_next_call_goes_on() -> None:

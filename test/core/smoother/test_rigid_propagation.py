@@ -9,7 +9,7 @@ from slow_smoother import EXACT
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -22,9 +22,9 @@ RING_NODES = np.setdiff1d(np.arange(RING + TAIL), TAIL_NODES)
 LINEAR = SmootherConfig(budget=1e-12, budget_share=1e-12, max_iterations=30)
 
 
-def edges(pairs: list[tuple[int, int]], mean: FloatArray) -> Edges:
-    return Edges([i for i, _ in pairs], [j for _, j in pairs], np.tile(mean, (len(pairs), 1)),
-                 [np.diag(SIGMA**-2.0)] * len(pairs), [EdgeKind.LOOP_CLOSURE] * len(pairs))
+def edges(pairs: list[tuple[int, int]], mean: FloatArray) -> Factors:
+    return Factors([i for i, _ in pairs], [j for _, j in pairs], np.tile(mean, (len(pairs), 1)),
+                 [np.diag(SIGMA**-2.0)] * len(pairs), [FactorKind.LOOP_CLOSURE] * len(pairs))
 
 
 def ring_with_a_tail(config: SmootherConfig) -> IncrementalSmoother:
@@ -36,18 +36,18 @@ def ring_with_a_tail(config: SmootherConfig) -> IncrementalSmoother:
         before = MIDDLE if k == MIDDLE + TAIL + 1 else k - 1
         pairs.append((before, k))
         poses.append(se2.wrapped(se2.compose(poses[before], STEP)))
-    smoother.update(GraphUpdate(hidden=np.array(poses), edges=edges(pairs, STEP), fix=[0]))
+    smoother.update(GraphUpdate(hidden=np.array(poses), factors=edges(pairs, STEP), fix=[0]))
     return smoother
 
 
-def closure(gap: FloatArray) -> Edges:
+def closure(gap: FloatArray) -> Factors:
     return edges([(RING + TAIL - 1, 0)], STEP + gap)
 
 
 def test_a_tail_moves_rigidly_when_the_ring_is_closed() -> None:
     smoother, exact = ring_with_a_tail(LINEAR), ring_with_a_tail(EXACT)
     before = smoother.poses.copy()
-    update = GraphUpdate(edges=closure(np.array([0.5, -1.0, 0.3])))
+    update = GraphUpdate(factors=closure(np.array([0.5, -1.0, 0.3])))
     exact.update(update)
     result = smoother.update(update)
     assert np.min(np.hypot(*(smoother.poses - before)[TAIL_NODES, :2].T)) > 0.01
@@ -66,11 +66,11 @@ def test_small_moves_do_not_get_lost(
     """A closure that gets stronger in many small steps bends the ring a little in each."""
     smoother, exact = ring_with_a_tail(config), ring_with_a_tail(EXACT)
     for engine in (smoother, exact):
-        engine.update(GraphUpdate(edges=closure(np.array([0.05, -0.1, 0.02]))))
-    number = smoother.graph.n_edges - 1
+        engine.update(GraphUpdate(factors=closure(np.array([0.05, -0.1, 0.02]))))
+    number = len(smoother.graph.factors.edges) - 1
     for weight in np.geomspace(1.0, 0.01, 150):
-        smoother.update(GraphUpdate(weigh_edges={number: weight}))
-    exact.update(GraphUpdate(weigh_edges={number: weight}))
+        smoother.update(GraphUpdate(weigh={number: weight}))
+    exact.update(GraphUpdate(weigh={number: weight}))
     off = se2.wrapped(smoother.poses - exact.poses)
     # along the tail an error of the heading grows with the distance from the ring
     assert np.max(np.abs(off[RING_NODES] / SIGMA)) < max(5.0 * config.alpha, 1e-6)

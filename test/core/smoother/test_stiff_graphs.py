@@ -35,10 +35,10 @@ def replay(made: StiffGraph, at_end: bool) -> IncrementalSmoother:
                for k in range(1, len(made.poses))]
     for k, rows in enumerate(updates, 1):
         pose = se2.compose(smoother.poses[k - 1], edges.mean[k - 1])
-        result = smoother.update(GraphUpdate(hidden=pose[None], edges=edges.rows(rows)))
+        result = smoother.update(GraphUpdate(hidden=pose[None], factors=edges.rows(rows)))
         assert result.reason == ''
     if at_end:
-        result = smoother.update(GraphUpdate(edges=edges.rows(np.flatnonzero(is_loop))))
+        result = smoother.update(GraphUpdate(factors=edges.rows(np.flatnonzero(is_loop))))
         assert result.reason == ''
     for _ in range(3):
         smoother.update(GraphUpdate())
@@ -74,7 +74,7 @@ def test_covariances_are_those_of_an_orthogonal_solver(decades: float, seed: int
     made = stiff_graph(seed, decades)
     poses, _, expected = made.optimum()
     smoother = IncrementalSmoother()
-    smoother.update(GraphUpdate(hidden=poses, edges=made.edges, fix=[0]))
+    smoother.update(GraphUpdate(hidden=poses, factors=made.edges, fix=[0]))
     sigmas = np.sqrt(np.einsum('nii->ni', expected[1:]))
     scale = sigmas[:, :, None] * sigmas[:, None, :]
     difference = np.abs(smoother.covariances()[1:] - expected[1:]) / scale
@@ -88,7 +88,7 @@ def test_covariances_are_those_of_an_orthogonal_solver(decades: float, seed: int
 def test_a_part_that_nothing_holds_is_still_refused(decades: float) -> None:
     made = stiff_graph(3, decades)
     smoother = IncrementalSmoother()
-    refused = [smoother.update(GraphUpdate(hidden=made.poses[:n], edges=made.edges.rows(
+    refused = [smoother.update(GraphUpdate(hidden=made.poses[:n], factors=made.edges.rows(
         np.flatnonzero(np.maximum(made.edges.i, made.edges.j) < n)))).status
         for n in range(2, len(made.poses))]
     assert set(refused) == {Status.FAILED}

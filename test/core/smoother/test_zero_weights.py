@@ -10,7 +10,7 @@ from slow_smoother import differences, state, World, world
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import chi2_of
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.graph.constraints import Edges, ObservedNodes
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -23,9 +23,7 @@ class Twins:
     def __init__(self, seed: int) -> None:
         self.here: World = world(seed, noise=(0.2, 0.2, 0.1))
         self.full, self.bare = IncrementalSmoother(), IncrementalSmoother()
-        self.edges, self.observed = [], []
-        """Rows of the bare graph in the full one."""
-        self.idle_edges, self.idle_observed = [], []
+        self.idle: list[int] = []
         """Rows of the full graph with weight 0."""
         first = GraphUpdate(hidden=np.array(self.here.truth), fix=[0])
         self.update(first)
@@ -34,30 +32,24 @@ class Twins:
         """Do an update in both, in one of them with false constraints of weight 0."""
         expected = self.bare.update(update)
         n = self.full.graph.n_nodes + len(update.hidden)
-        edges, observed = self.here.edges([]), self.here.observed([])
+        idle = self.here.edges([])
         if n > 2:
             rng = self.here.rng
-            edges = self.here.edges([tuple(rng.choice(n, 2, replace=False)) for _ in range(2)])
-            observed = self.here.observed([int(rng.integers(n))])
-        edges.mean[:] += 30.0
-        observed.mean[:] -= 30.0
-        edges.weight[:] = observed.weight[:] = 0.0
-        at = self.full.graph.n_edges, self.full.graph.n_observed
-        self.idle_edges += range(at[0], at[0] + len(edges))
-        self.idle_observed += range(at[1], at[1] + len(observed))
-        self.edges += range(at[0] + len(edges), at[0] + len(edges) + len(update.edges))
-        self.observed += range(
-            at[1] + len(observed), at[1] + len(observed) + len(update.observed))
+            idle = self.here.edges([tuple(rng.choice(n, 2, replace=False)) for _ in range(2)])
+            idle = Factors.joined([idle, self.here.observed([int(rng.integers(n))])])
+        idle.mean[:] += 30.0
+        idle.weight[:] = 0.0
+        at = self.full.graph.n_factors
+        self.idle += range(at, at + len(idle))
         actual = self.full.update(update._replace(
-            edges=Edges.joined([edges, update.edges]),
-            observed=ObservedNodes.joined([observed, update.observed])))
+            factors=Factors.joined([idle, update.factors])))
         assert actual == expected
 
     def drive(self, steps: int) -> None:
         for _ in range(steps):
             update = self.here.new_nodes(int(self.here.rng.integers(1, 3)))
             more = self.here.edges(self.here.pairs(int(self.here.rng.integers(0, 2))))
-            self.update(update._replace(edges=Edges.joined([update.edges, more])))
+            self.update(update._replace(factors=Factors.joined([update.factors, more])))
 
     def check(self) -> None:
         full, bare = self.full, self.bare
@@ -65,9 +57,7 @@ class Twins:
         np.testing.assert_allclose(full.covariances(), bare.covariances(), rtol=1e-9, atol=1e-15)
         assert chi2_of(full.graph) == pytest.approx(chi2_of(bare.graph), rel=1e-9, abs=1e-9)
         assert full.graph.energies().chi2 == pytest.approx(chi2_of(full.graph), abs=1e-6)
-        energies = full.graph.energies()
-        assert not np.any(energies.edges[self.idle_edges])
-        assert not np.any(energies.observed[self.idle_observed])
+        assert not np.any(full.graph.energies().factors[self.idle])
 
 
 @given(seeds, st.integers(1, 20))
@@ -92,10 +82,10 @@ def test_adding_them_solves_nothing() -> None:
     twins.drive(15)
     graph = twins.full.graph
     before, cliques = state(graph), graph.memory['clique_i'].copy()
-    edges, observed = twins.here.edges([(0, 9), (4, 12)]), twins.here.observed([7, 7])
-    edges.weight[:] = observed.weight[:] = 0.0
-    result = twins.full.update(GraphUpdate(edges=edges, observed=observed))
+    idle = Factors.joined([twins.here.edges([(0, 9), (4, 12)]), twins.here.observed([7, 7])])
+    idle.weight[:] = 0.0
+    result = twins.full.update(GraphUpdate(factors=idle))
     assert result[2:6] == (0, 0, 0, 0)
     np.testing.assert_array_equal(graph.memory['clique_i'], cliques)
     assert set(differences(before, state(graph))) == {
-        'edge_f', 'edge_i', 'edge_id', 'observed_f', 'observed_i', 'observed_id', 'next'}
+        'factor_f', 'factor_i', 'factor_id', 'next'}

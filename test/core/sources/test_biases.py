@@ -18,7 +18,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.io.g2o_writing import write_g2o
@@ -28,21 +28,23 @@ ODOMETRY = np.diag([400.0, 900.0, 2500.0])
 THOROUGH = SolverConfig(max_iterations=200, step_tolerance=1e-11)
 
 
-def prior(bias: int) -> ObservedNodes:
-    return ObservedNodes([bias], None, np.zeros((1, 3)), [np.eye(3)], [ObservedKind.GLOBAL_POSE])
+def prior(bias: int) -> Factors:
+    return Factors.on([bias], None, np.zeros((1, 3)), [np.eye(3)], [FactorKind.GLOBAL_POSE])
 
 
-def link(newer: int, older: int, phi: float) -> Edges:
+def link(newer: int, older: int, phi: float) -> Factors:
     """Return one step of a first-order Gauss-Markov process of unit variance."""
-    return Edges([newer], [older], np.zeros((1, 3)), [np.eye(3) / (1.0 - phi**2)],
-                 [EdgeKind.BIAS], bias=[[0.0, 0.0, phi, phi]])
+    return Factors([newer], [older], np.zeros((1, 3)), [np.eye(3) / (1.0 - phi**2)],
+                 [FactorKind.BIAS], constants=[[0.0, 0.0, phi, phi]])
 
 
-def fix(node: int, bias: int, where: FloatArray, offset: FloatArray, sigmas: FloatArray) -> Edges:
+def fix(
+    node: int, bias: int, where: FloatArray, offset: FloatArray, sigmas: FloatArray,
+) -> Factors:
     """Return the edge of a measured position, with the sigmas of white noise and bias."""
     weight = sigmas[0]**-2.0
-    return Edges([node], [bias], [[*where, 0.0]], [np.diag([weight, weight, 0.0])],
-                 [EdgeKind.BIAS], bias=[[*offset, sigmas[1], 0.0]])
+    return Factors([node], [bias], [[*where, 0.0]], [np.diag([weight, weight, 0.0])],
+                 [FactorKind.BIAS], constants=[[*offset, sigmas[1], 0.0]])
 
 
 # --- correlated noise ---------------------------------------------------------------------------
@@ -71,10 +73,11 @@ def test_a_chain_of_biases_is_noise_with_its_full_covariance(*, late: bool) -> N
 
     smoother = IncrementalSmoother(EXACT)
     smoother.update(GraphUpdate(
-        hidden=truth[:1], biases=np.zeros((1, 3)), observed=prior(1),
-        edges=fix(0, 1, fixes[0], lever, np.array([white, s])), fix=[0]))
-    smoother.update(GraphUpdate(free=[0], observed=ObservedNodes(
-        [0], None, truth[:1], [np.diag([1e-6, 1e-6, 100.0])], [ObservedKind.GLOBAL_POSE])))
+        hidden=truth[:1], biases=np.zeros((1, 3)),
+        factors=Factors.joined([
+            fix(0, 1, fixes[0], lever, np.array([white, s])), prior(1)]), fix=[0]))
+    smoother.update(GraphUpdate(free=[0], factors=Factors.on(
+        [0], None, truth[:1], [np.diag([1e-6, 1e-6, 100.0])], [FactorKind.GLOBAL_POSE])))
     nodes, bias = [0], 1
     for k in range(1, n):
         smoother.extend(odometry[k - 1], ODOMETRY)
@@ -88,9 +91,9 @@ def test_a_chain_of_biases_is_noise_with_its_full_covariance(*, late: bool) -> N
 
     def errors(x: FloatArray) -> FloatArray:
         poses = x.reshape(-1, 3)
-        moves = error_functions.edge_errors(poses, Edges(
+        moves = error_functions.errors(poses, Factors(
             np.arange(n - 1), np.arange(1, n), odometry, np.tile(ODOMETRY, (n - 1, 1, 1)),
-            [EdgeKind.ODOMETRY] * (n - 1)))
+            [FactorKind.ODOMETRY] * (n - 1)))
         off = fixes - se2.transform(poses, np.tile(lever, (n, 1)))
         first = np.array([1e-3, 1e-3, 10.0]) * (poses[0] - truth[0])
         return np.concatenate(((moves @ root.T).ravel(), (whiten @ off).ravel(), first))
@@ -116,7 +119,7 @@ def add_fix(  # noqa: PLR0917
 ) -> int:
     bias = smoother.graph.n_nodes
     result = smoother.update(GraphUpdate(
-        biases=phi * smoother.poses[before][None], edges=Edges.joined([
+        biases=phi * smoother.poses[before][None], factors=Factors.joined([
             link(bias, before, phi), fix(node, bias, where, lever, np.array([white, s]))])))
     assert result.status is Status.CONVERGED
     return bias
@@ -126,8 +129,8 @@ def test_the_estimate_is_good_all_along_a_drive_with_default_settings() -> None:
     rng, n, phi, s, white = np.random.default_rng(2), 400, 0.99, 1.0, 0.2
     truth, odometry = drive(n, rng)
     smoother, m, bias, nodes = IncrementalSmoother(), np.zeros(2), -1, [0]
-    smoother.update(GraphUpdate(hidden=truth[:1], observed=ObservedNodes(
-        [0], None, truth[:1], [np.diag([1.0, 1.0, 100.0])], [ObservedKind.GLOBAL_POSE])))
+    smoother.update(GraphUpdate(hidden=truth[:1], factors=Factors.on(
+        [0], None, truth[:1], [np.diag([1.0, 1.0, 100.0])], [FactorKind.GLOBAL_POSE])))
     for k in range(1, n):
         smoother.extend(odometry[k - 1], ODOMETRY)
         nodes.append(smoother.graph.newest_pose)
@@ -136,14 +139,16 @@ def test_the_estimate_is_good_all_along_a_drive_with_default_settings() -> None:
         if bias < 0:
             bias = smoother.graph.n_nodes
             smoother.update(GraphUpdate(
-                biases=np.zeros((1, 3)), observed=prior(bias),
-                edges=fix(nodes[k], bias, where, np.zeros(2), np.array([white, s]))))
+                biases=np.zeros((1, 3)),
+                factors=Factors.joined([
+                    fix(nodes[k], bias, where, np.zeros(2), np.array([white, s])),
+                    prior(bias)])))
         elif k % 3 == 0:
             bias = add_fix(smoother, nodes[k], bias, phi, where, np.zeros(2), white, s)
         if k % 90 == 0:     # a closure, which moves all newer nodes
-            assert smoother.update(GraphUpdate(edges=Edges(
+            assert smoother.update(GraphUpdate(factors=Factors(
                 [nodes[k - 80]], [nodes[k]], [se2.between(truth[k - 80], truth[k])], [ODOMETRY],
-                [EdgeKind.LOOP_CLOSURE]))).reason == ''
+                [FactorKind.LOOP_CLOSURE]))).reason == ''
         if k % 40 == 0:
             other = Graph()
             other.fill(smoother.graph.rows()._replace(poses=smoother.poses))
@@ -164,8 +169,8 @@ def test_a_file_has_no_biases_and_says_so(tmp_path: Path) -> None:
     read = read_g2o(tmp_path / 'graph.g2o').graph
     same = random_graph(seed=3, fix=(0,))
     np.testing.assert_array_equal(read.poses, same.poses)
-    np.testing.assert_array_equal(read.edges.mean, same.edges.mean)
-    assert (read.n_edges, read.n_observed) == (same.n_edges, same.n_observed)
+    np.testing.assert_array_equal(read.factors.edges.mean, same.factors.edges.mean)
+    assert read.n_factors == same.n_factors
 
 
 def test_a_file_has_measurements_with_correlated_errors_as_if_these_were_white(
@@ -173,16 +178,16 @@ def test_a_file_has_measurements_with_correlated_errors_as_if_these_were_white(
 ) -> None:
     graph = random_graph(seed=3, fix=(0,), n_biases=1)
     bias = int(np.flatnonzero(graph.rows().is_bias)[0])
-    white = ObservedNodes(
+    white = Factors.on(
         [2, 2], None, [[1.0, 2.0, 0.0], [30.0, 2.0, 0.0]],
-        np.tile(np.diag((4.0, 4.0, 0.0)), (2, 1, 1)), [ObservedKind.POSITION] * 2)
-    first = graph.n_observed
-    graph.apply(GraphUpdate(observed=white))
+        np.tile(np.diag((4.0, 4.0, 0.0)), (2, 1, 1)), [FactorKind.POSITION] * 2)
+    first = graph.n_factors
+    graph.apply(GraphUpdate(factors=white))
     # an edge to the bias holds the first of them; the second is doubted
     graph.apply(GraphUpdate(
-        weigh_observed={first: 0.0, first + 1: 0.0}, edges=Edges(
-            [2], [bias], white.mean[:1], np.diag((9.0, 9.0, 0.0))[None], [EdgeKind.BIAS],
-            bias=[(0.0, 0.0, 0.5, 0.0)])))
+        weigh={first: 0.0, first + 1: 0.0}, factors=Factors(
+            [2], [bias], white.mean[:1], np.diag((9.0, 9.0, 0.0))[None], [FactorKind.BIAS],
+            constants=[(0.0, 0.0, 0.5, 0.0)])))
     write_g2o(graph, tmp_path / 'graph.g2o')
     lines = (tmp_path / 'graph.g2o').read_text(encoding='ascii').splitlines()
     names = np.cumsum(~graph.rows().is_bias) - 1

@@ -10,11 +10,10 @@ import pytest
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import (
-    EdgeKind,
-    Edges,
-    ObservedKind,
-    ObservedNodes,
+    FactorKind,
+    Factors,
     upper,
 )
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -188,17 +187,24 @@ def line(n: int) -> Graph:
     """Return nodes at every metre, each with a position, the odd ones with a second edge."""
     graph, ahead = Graph(), np.arange(n - 1)
     graph.apply(GraphUpdate(
-        hidden=np.column_stack((np.arange(n), np.zeros((n, 2)))), fix=(0,), edges=Edges(
-            np.append(ahead, ahead[::2]), np.append(ahead + 1, ahead[::2] + 1),
-            np.tile((1.0, 0.0, 0.0), (n - 1 + len(ahead[::2]), 1)),
-            np.concatenate((np.tile(100.0 * np.eye(3), (n - 1, 1, 1)),
-                            np.tile(np.eye(3), (len(ahead[::2]), 1, 1)))),
-            [EdgeKind.ODOMETRY] * (n - 1 + len(ahead[::2]))),
-        observed=ObservedNodes(
-            np.arange(n), np.tile((0.2, 0.1, 0.0), (n, 1)),
-            np.column_stack((np.arange(n) + 0.2, np.full(n, 0.1), np.zeros(n))),
-            np.tile(np.diag((4.0, 4.0, 0.0)), (n, 1, 1)), [ObservedKind.POSITION] * n)))
+        hidden=np.column_stack((np.arange(n), np.zeros((n, 2)))), fix=(0,),
+        factors=Factors.joined([
+            Factors(
+                np.append(ahead, ahead[::2]), np.append(ahead + 1, ahead[::2] + 1),
+                np.tile((1.0, 0.0, 0.0), (n - 1 + len(ahead[::2]), 1)),
+                np.concatenate((np.tile(100.0 * np.eye(3), (n - 1, 1, 1)),
+                                np.tile(np.eye(3), (len(ahead[::2]), 1, 1)))),
+                [FactorKind.ODOMETRY] * (n - 1 + len(ahead[::2]))),
+            Factors.on(
+                np.arange(n), np.tile((0.2, 0.1, 0.0), (n, 1)),
+                np.column_stack((np.arange(n) + 0.2, np.full(n, 0.1), np.zeros(n))),
+                np.tile(np.diag((4.0, 4.0, 0.0)), (n, 1, 1)), [FactorKind.POSITION] * n)])))
     return graph
+
+
+def positions(graph: Graph) -> IntArray:
+    """Return the ids of the positions of a graph."""
+    return graph.factor_ids[graph.factors.j < 0]
 
 
 def odometry_of(n: int, **errors: float) -> PathOdometry:
@@ -210,7 +216,8 @@ def test_a_path_has_the_motions_of_the_primary_odometry_in_the_order_of_stamps()
     graph, rng = line(30), np.random.default_rng(0)
     rows = np.sort(rng.choice(30, 12, replace=False))
     some = rng.permutation(rows)
-    found = to_the_end(measured_path(graph, odometry_of(30), SECOND * (some + 5), some))
+    found = to_the_end(measured_path(
+        graph, odometry_of(30), SECOND * (some + 5), positions(graph)[some]))
     np.testing.assert_allclose(found.seconds, rows - rows[0])
     np.testing.assert_allclose(found.position, np.column_stack((rows + 0.2, np.full(12, 0.1))))
     np.testing.assert_allclose(found.variance, 0.25)
@@ -259,7 +266,8 @@ def test_a_path_without_known_errors_is_as_likely_with_them_as_states() -> None:
     graph, ids = line(40), np.arange(40)
     values = []
     for errors in ({}, {'rate': 1e-5, 'scale': 1e-4}):
-        path = to_the_end(measured_path(graph, odometry_of(40, **errors), SECOND * ids, ids))
+        path = to_the_end(measured_path(
+            graph, odometry_of(40, **errors), SECOND * ids, positions(graph)))
         value, _, rate, scale, *_ = filtered(
             *path, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, True)
         values.append((value, rate, scale))
@@ -271,7 +279,8 @@ def test_of_many_positions_the_newest_and_a_sample_of_the_others_are_used(
 ) -> None:
     monkeypatch.setattr(error_estimate, 'SOURCES', replace(
         SOURCES, newest_positions=10, older_positions=5))
+    graph = line(40)
     found = to_the_end(measured_path(
-        line(40), odometry_of(40), SECOND * np.arange(40), np.arange(40)))
+        graph, odometry_of(40), SECOND * np.arange(40), positions(graph)))
     assert len(found.seconds) == 15
     np.testing.assert_allclose(found.seconds[-10:], np.arange(30, 40))

@@ -17,7 +17,7 @@ from pose_graph_ros.core.config import (
     WindowConfig,
 )
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
@@ -98,7 +98,7 @@ def test_a_robot_that_is_turned_while_its_wheels_stand_is_not_at_rest() -> None:
                       for t in times[::5].tolist()]
     events += [('gyro', YawRate(EPOCH + round(t * 1e9), 0.5)) for t in times.tolist()]
     events.sort(key=lambda event: event[1].stamp_ns)
-    observed = finished(events).graph.observed
+    observed = finished(events).graph.factors.observed
     assert len(observed) == 1   # the prior of the bias alone
 
 
@@ -119,8 +119,8 @@ def test_a_gap_leaves_rotations_out_and_is_counted(short: Drive) -> None:
     begin, end = EPOCH + 20 * SECOND, EPOCH + 24 * SECOND
     backend = finished([(source, event) for source, event in short.events
                         if source != 'gyro' or not begin < event.stamp_ns < end])
-    edges, stamps = backend.graph.edges, backend.node_stamps_ns
-    turns = edges.rows(edges.kind == EdgeKind.TURN)
+    edges, stamps = backend.graph.factors.edges, backend.node_stamps_ns
+    turns = edges.rows(edges.kind == FactorKind.TURN)
     ends = stamps[np.searchsorted(backend._nodes.ids, turns.j)]
     missing = len(stamps) - 1 - len(turns)
     assert backend.counts['gyro', 'gap'] == missing == np.sum(
@@ -156,8 +156,8 @@ def test_no_rotation_spans_the_step_to_a_pose_that_is_set(short: Drive) -> None:
                    and each[0] != 'fix'])
     backend.update()
     moved = backend._nodes.ids[max(backend._nodes.relocated)]
-    edges = backend.graph.edges
-    turns = edges.rows(edges.kind == EdgeKind.TURN)
+    edges = backend.graph.factors.edges
+    turns = edges.rows(edges.kind == FactorKind.TURN)
     assert moved >= before
     assert not np.any(turns.j == moved)
     assert np.any(turns.i == moved)
@@ -190,8 +190,8 @@ def test_with_another_period_the_chain_of_the_bias_goes_on(
     graph = restored.graph
     biases = np.flatnonzero(graph.is_bias)
     assert len(biases) >= n_before + 5
-    kinds = graph.edges.kind
-    assert np.count_nonzero(kinds == EdgeKind.BIAS) == len(biases) - 1
+    kinds = graph.factors.edges.kind
+    assert np.count_nonzero(kinds == FactorKind.BIAS) == len(biases) - 1
 
 
 def test_rotations_that_come_after_their_nodes_have_left_are_counted(short: Drive) -> None:
@@ -203,7 +203,7 @@ def test_rotations_that_come_after_their_nodes_have_left_are_counted(short: Driv
     feed(backend, [each for each in short.events if each[0] == 'gyro'])
     backend.optimize()
     assert backend.counts['gyro', 'before_window'] == frozen
-    turns = np.count_nonzero(backend.graph.edges.kind == EdgeKind.TURN)
+    turns = np.count_nonzero(backend.graph.factors.edges.kind == FactorKind.TURN)
     assert turns == len(backend.node_stamps_ns) - 1 - frozen
 
 

@@ -10,7 +10,7 @@ from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise,
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     HeadingOnly,
@@ -68,7 +68,7 @@ def truth(stamp: int) -> FloatArray:
     return se2.compose(T_MAP_ODOM, PLAIN.streams['odom'].timeline.pose(stamp))
 
 
-def covariance_of(constraint: Edges | ObservedNodes) -> FloatArray:
+def covariance_of(constraint: Factors | Factors) -> FloatArray:
     return np.linalg.inv(constraint.information[0])
 
 
@@ -99,12 +99,12 @@ def test_a_true_measurement_in_the_map_has_no_error_at_the_true_nodes(
     pose, lever_arm = truth(stamp), np.array([x, y])
     position = se2.transform(pose, lever_arm)
     for measurement, kind, rows in (
-            (GlobalPose(stamp, pose, np.eye(3)), ObservedKind.GLOBAL_POSE, [0, 1, 2]),
-            (Position(stamp, position, np.eye(2), lever_arm), ObservedKind.POSITION, [0, 1]),
-            (HeadingOnly(stamp, float(pose[2]), 1.0), ObservedKind.HEADING, [2])):
+            (GlobalPose(stamp, pose, np.eye(3)), FactorKind.GLOBAL_POSE, [0, 1, 2]),
+            (Position(stamp, position, np.eye(2), lever_arm), FactorKind.POSITION, [0, 1]),
+            (HeadingOnly(stamp, float(pose[2]), 1.0), FactorKind.HEADING, [2])):
         constraint = measurement_constraints.absolute_constraint(measurement, anchored(stamp))
         assert constraint.kind[0] == kind
-        error = error_functions.observed_errors(NODES, constraint)
+        error = error_functions.errors(NODES, constraint)
         np.testing.assert_allclose(error[:, rows], 0.0, atol=ROUNDING)
         np.testing.assert_allclose(
             error_functions.energies(error, constraint.information), 0.0, atol=ROUNDING)
@@ -116,8 +116,8 @@ def test_a_true_loop_closure_has_no_error_at_the_true_nodes(stamp: int, other: i
     z = se2.between(truth(other), truth(stamp))
     constraint = measurement_constraints.loop_closure_constraint(
         LoopClosure(stamp, z, np.eye(3), reference_ns=other), anchored(other), anchored(stamp))
-    assert constraint.kind[0] == EdgeKind.LOOP_CLOSURE
-    np.testing.assert_allclose(error_functions.edge_errors(NODES, constraint), 0.0, atol=ROUNDING)
+    assert constraint.kind[0] == FactorKind.LOOP_CLOSURE
+    np.testing.assert_allclose(error_functions.errors(NODES, constraint), 0.0, atol=ROUNDING)
 
 
 # --- the right noise -------------------------------------------------------------------------
@@ -197,7 +197,7 @@ def test_the_noise_of_a_heading_is_that_of_samples() -> None:
     errors = se2.wrap(moved[:, 2] - heading - 0.01 * rng.standard_normal(N_SAMPLES))
     constraint = measurement_constraints.absolute_constraint(
         HeadingOnly(STAMP, heading, 1e-4), attachment)
-    assert constraint.kind[0] == ObservedKind.HEADING
+    assert constraint.kind[0] == FactorKind.HEADING
     assert np.var(errors) == pytest.approx(1.0 / constraint.information[0, 2, 2], rel=SAMPLING)
     np.testing.assert_array_equal(constraint.information[0, :2], 0.0)
     np.testing.assert_array_equal(constraint.information[0, :, :2], 0.0)
@@ -212,7 +212,7 @@ def test_a_relative_heading_does_not_constrain_the_position(stamp: int, other: i
     closure = LoopClosure(stamp, np.array([7.0, -9.0, turn]), np.diag([np.inf, np.inf, 1e-4]),
                           reference_ns=other)
     constraint = measurement_constraints.loop_closure_constraint(closure, reference, attachment)
-    error = error_functions.edge_errors(NODES, constraint)
+    error = error_functions.errors(NODES, constraint)
     assert error[0, 2] == pytest.approx(0.0, abs=ROUNDING)
     information = constraint.information[0].copy()
     expected = np.var(0.01 * rng.standard_normal(N_SAMPLES)

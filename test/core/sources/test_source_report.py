@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.core.sources.source_report import report
@@ -32,9 +32,9 @@ def observed(residuals: np.ndarray, sigma: float, *, turn: float = 0.0) -> Graph
     information = np.zeros((n, 3, 3))
     information[:, 0, 0] = information[:, 1, 1] = sigma**-2
     graph.apply(GraphUpdate(
-        hidden=np.column_stack((residuals, np.full(n, turn))), observed=ObservedNodes(
+        hidden=np.column_stack((residuals, np.full(n, turn))), factors=Factors.on(
             np.arange(n), None, np.tile((0.0, 0.0, turn), (n, 1)), information,
-            [ObservedKind.POSITION] * n)))
+            [FactorKind.POSITION] * n)))
     return graph
 
 
@@ -45,7 +45,7 @@ def in_time(n: int) -> np.ndarray:
 @pytest.mark.parametrize('turn', [0.0, 2.0])
 def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) -> None:
     residuals = np.random.default_rng(1).normal(0.0, 1.0, (200, 2))
-    found = report(observed(residuals, 0.5, turn=turn), in_time(200), biased=False, in_use=None)
+    found = report(observed(residuals, 0.5, turn=turn), in_time(200), in_use=None)
     assert found.n == 200
     assert found.energy == pytest.approx(np.mean(residuals**2) / 0.25)
     assert not found.errors.significant
@@ -60,7 +60,7 @@ def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) ->
 def test_errors_that_are_treated_as_white_but_are_not_are_noticed(
     white: bool, sigma: float, tau: float, wrong: bool,
 ) -> None:
-    found = report(observed(gauss_markov(600, tau), sigma), in_time(600), biased=False,
+    found = report(observed(gauss_markov(600, tau), sigma), in_time(600),
                    in_use=None if white else KNOWN)
     assert found.wrongly_white is wrong
 
@@ -76,11 +76,11 @@ def test_of_a_biased_source_the_whole_error_counts_not_the_white_rest() -> None:
     poses = np.column_stack((error, np.linspace(-3.0, 3.0, n)))
     arm = np.array([0.5, -0.2])
     graph.apply(GraphUpdate(
-        hidden=poses, biases=np.column_stack((-bias, np.zeros(n))), edges=Edges(
+        hidden=poses, biases=np.column_stack((-bias, np.zeros(n))), factors=Factors(
             np.arange(n), n + np.arange(n),
             np.column_stack((se2.transform(poses, arm) - error, np.zeros(n))), information,
-            [EdgeKind.BIAS] * n, bias=np.tile((*arm, factor, 0.0), (n, 1)))))
-    found = report(graph, in_time(n), biased=True, in_use=KNOWN)
+            [FactorKind.BIAS] * n, constants=np.tile((*arm, factor, 0.0), (n, 1)))))
+    found = report(graph, in_time(n), in_use=KNOWN)
     variance = np.mean(error**2)
     assert found.energy == pytest.approx(variance, rel=0.02)
     assert found.errors.significant

@@ -8,7 +8,7 @@ from test_gauss_markov import position, SECOND, TAU
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
@@ -25,7 +25,7 @@ class Chain:
     """A bias with the information of its states, of which the oldest can leave."""
 
     def __init__(self) -> None:
-        self.bias, self.next = GaussMarkovBias(ERRORS), NextIds(0, 0, 0)
+        self.bias, self.next = GaussMarkovBias(ERRORS), NextIds(0, 0)
         self.bins: dict[int, int] = {}
         """Bin of each state."""
         self.edges: dict[int, tuple[int, int, float, float]] = {}
@@ -37,20 +37,18 @@ class Chain:
         self.bias.begin()
         edge = self.bias.add(second * SECOND, absolute_constraint(
             position(second), NOWHERE), np.zeros(2), additions)
-        for number, one in enumerate(additions.edges, self.next.edge):
-            if number == edge:
+        for number, one in enumerate(additions.factors, self.next.factor):
+            if one.j[0] < 0:
+                self.priors[number] = int(one.i[0])
+            elif number == edge:
                 self.bins.setdefault(int(one.j[0]), second)
             else:
-                self.edges[number] = (int(one.i[0]), int(one.j[0]), float(one.bias[0, 2]),
+                self.edges[number] = (int(one.i[0]), int(one.j[0]), float(one.constants[0, 2]),
                                       float(one.information[0, 0, 0]))
-        for number, prior in enumerate(additions.observed, self.next.observed):
-            self.priors[number] = int(prior.node[0])
-        for number in additions.remove_edges:
-            del self.edges[number]
-        for number in additions.remove_observed:
-            del self.priors[number]
+        for number in additions.remove:
+            del (self.edges if number in self.edges else self.priors)[number]
         self.next = NextIds(*(n + len(new) for n, new in zip(self.next, (
-            additions.biases, additions.edges, additions.observed), strict=True)))
+            additions.biases, additions.factors), strict=True)))
 
     def forget(self, oldest: int) -> None:
         """Let the states leave that nothing needs if there is a measurement in this bin."""
@@ -105,14 +103,15 @@ def drive(seed: int, n: int) -> tuple[Graph, np.ndarray, np.ndarray]:
     root = rng.normal(size=(n - 1, 3, 3)) * (0.05, 0.03, 0.02)
     noise = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
     nodes = np.flatnonzero(rng.random(n) < 0.6)
-    graph.apply(GraphUpdate(hidden=np.zeros((n, 3)), edges=Edges(
-        np.arange(n - 1), np.arange(1, n), rng.normal(size=(n - 1, 3)), np.linalg.inv(noise),
-        np.full(n - 1, EdgeKind.ODOMETRY)), observed=ObservedNodes(
+    graph.apply(GraphUpdate(hidden=np.zeros((n, 3)), factors=Factors.joined([
+        Factors(np.arange(n - 1), np.arange(1, n), rng.normal(size=(n - 1, 3)),
+                np.linalg.inv(noise), np.full(n - 1, FactorKind.ODOMETRY)),
+        Factors.on(
             nodes, rng.normal(size=(len(nodes), 3)) * (1.0, 1.0, 0.0),
             rng.normal(size=(len(nodes), 3)) * (9.0, 9.0, 0.0),
             np.tile(np.diag((1.0, 1.0, 0.0)), (len(nodes), 1, 1)),
-            np.full(len(nodes), ObservedKind.POSITION))))
-    return graph, nodes * SECOND, np.arange(len(nodes))
+            np.full(len(nodes), FactorKind.POSITION))])))
+    return graph, nodes * SECOND, n - 1 + np.arange(len(nodes))
 
 
 ODOMETRY = PathOdometry(np.arange(100), SECOND * np.arange(100), AS_CLAIMED, AS_CLAIMED)

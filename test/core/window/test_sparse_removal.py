@@ -9,7 +9,7 @@ from random_graphs import consistent_graph
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.marginalization.marginalize import equations, marginalize
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -78,15 +78,15 @@ def test_fewer_edges_take_the_place_of_many() -> None:
     poses = np.column_stack((rng.uniform(0.0, 5.0, (8, 2)), rng.uniform(-3.0, 3.0, 8)))
     i, j = np.triu_indices(8, 1)
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, fix=[0], edges=Edges(
+    graph.apply(GraphUpdate(hidden=poses, fix=[0], factors=Factors(
         i, j, se2.between(poses[i], poses[j]), np.tile(np.eye(3), (len(i), 1, 1)),
-        np.full(len(i), EdgeKind.PRIOR))))
+        np.full(len(i), FactorKind.PRIOR))))
     before = covariances(graph)
     assert with_fewer_edges(graph, 5.0) is None
     update = with_fewer_edges(graph, 2.0)
     assert update is not None
     IncrementalSmoother(EXACT, graph).update(update)
-    assert graph.n_edges == 7 + 4
+    assert len(graph.factors.edges) == 7 + 4
     assert np.min(np.linalg.eigvalsh(covariances(graph) - before)) > -1e-9
 
 
@@ -107,15 +107,15 @@ def drive(seed: int, tau: float, *, headings: bool) -> tuple[Graph, GaussMarkovB
         poses[k + 1] = se2.compose(poses[k], step)
     i = np.arange(N - 1)
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, edges=Edges.joined([
-        Edges(i, i + 1, steps, np.tile(np.diag((400.0, 900.0, 1e4)), (N - 1, 1, 1)), 0 * i),
-        Edges([1], [N - 3], se2.between(poses[[1]], poses[[N - 3]]), np.diag((50.0, 20.0, 100.0))[
-            None], [EdgeKind.LOOP_CLOSURE])])))
+    graph.apply(GraphUpdate(hidden=poses, factors=Factors.joined([
+        Factors(i, i + 1, steps, np.tile(np.diag((400.0, 900.0, 1e4)), (N - 1, 1, 1)), 0 * i),
+        Factors([1], [N - 3], se2.between(poses[[1]], poses[[N - 3]]),
+                np.diag((50.0, 20.0, 100.0))[None], [FactorKind.LOOP_CLOSURE])])))
     model, additions = GaussMarkovBias(CorrelatedErrors(tau, 1.0, 0.1)), Additions(graph.next_ids)
     for k in range(N):
-        kind = ObservedKind.GLOBAL_POSE if headings else ObservedKind.POSITION
+        kind = FactorKind.GLOBAL_POSE if headings else FactorKind.POSITION
         mean = poses[[k]] if headings else np.append(poses[k, :2], 0.0)[None]
-        model.add(k * 1_000_000_000, ObservedNodes(
+        model.add(k * 1_000_000_000, Factors.on(
             [k], mean=mean, information=[np.diag((1.0, 1.0, 25.0 * headings))], kind=[kind]),
             np.array((0.01, 0.001)), additions)
     graph.apply(additions.update())
@@ -150,8 +150,8 @@ def test_where_a_chain_is_cut_no_covariance_becomes_smaller(
         assert cuts is not None
         assert len(cuts.cuts) == 1
         leaving = leaving[np.isin(leaving, segment.poses)]
-        update = sparse_removal(graph, np.sort(np.append(leaving, biases)), segment.edges,
-                                segment.observed, cuts)
+        update = sparse_removal(
+            graph, np.sort(np.append(leaving, biases)), segment.factors, cuts)
         assert update is not None
         smoother.update(update)
         model.forget(set(biases.tolist()))

@@ -10,7 +10,7 @@ import pytest
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.offline.certificate.certify import certify, examined, Verdict
 from pose_graph_ros.offline.certificate.objective import (
@@ -30,7 +30,7 @@ def ring(n: int, winding: int) -> Graph:
     poses[:, 2] = se2.wrap(i * turn * (1 + winding))
     graph = Graph()
     graph.apply(GraphUpdate(
-        poses, Edges(i, (i + 1) % n, np.tile((1.0, 0.0, turn), (n, 1)),
+        poses, Factors(i, (i + 1) % n, np.tile((1.0, 0.0, turn), (n, 1)),
                      np.tile(np.diag((1.0, 1.0, 10.0)), (n, 1, 1)), np.zeros(n, np.int64)),
         fix=[0]))
     return graph
@@ -47,7 +47,7 @@ def random_graph(seed: int, noise: float, n: int = 12) -> Graph:
     root = np.triu(rng.normal(size=(m, 3, 3))) + 2.0 * np.eye(3)
     information = np.swapaxes(root, 1, 2) @ root
     error = rng.normal(size=(m, 3)) * noise
-    kind = np.full(m, EdgeKind.LOOP_CLOSURE)
+    kind = np.full(m, FactorKind.LOOP_CLOSURE)
     node, offset = rng.integers(0, n, n_observed), rng.uniform(-1.0, 1.0, (n_observed, 3))
     mean = se2.compose(truth[node], offset) + rng.normal(size=(n_observed, 3)) * noise
     mean[0, 2] = offset[0, 2] = 0.0
@@ -55,9 +55,10 @@ def random_graph(seed: int, noise: float, n: int = 12) -> Graph:
     weights[0, 2, 2] = 0.0
     graph = Graph()
     graph.apply(GraphUpdate(
-        truth, Edges(i, j, se2.between(truth[i], truth[j]) + error, information, kind),
-        ObservedNodes(node, offset, mean, weights, [
-            ObservedKind.POSITION, *[ObservedKind.GLOBAL_POSE] * (n_observed - 1)]),
+        truth, Factors.joined([
+            Factors(i, j, se2.between(truth[i], truth[j]) + error, information, kind),
+            Factors.on(node, offset, mean, weights, [
+                FactorKind.POSITION, *[FactorKind.GLOBAL_POSE] * (n_observed - 1)])]),
         fix=[2, 5] if seed % 2 else [0]))
     return graph
 
@@ -65,10 +66,11 @@ def random_graph(seed: int, noise: float, n: int = 12) -> Graph:
 def slow_cost(graph: Graph, poses: FloatArray) -> float:
     """Return the objective at poses, from the errors (3.48) and (3.52)."""
     total = 0.0
-    observed = graph.observed
-    found = se2.compose(poses[observed.node], observed.offset)
+    observed = graph.factors.observed
+    found = se2.compose(poses[observed.i], observed.offset)
+    edges = graph.factors.edges
     rows = [(e, matrix) for e, matrix in zip(
-        graph.edge_errors(graph.edges, poses), graph.edges.weighted_information, strict=True)]
+        graph.errors(edges, poses), edges.weighted_information, strict=True)]
     rows += [(e, matrix) for e, matrix in zip(
         found - observed.mean, observed.weighted_information, strict=True)]
     for error, matrix in rows:
@@ -201,13 +203,13 @@ def test_no_start_leads_below_the_bound(seed: int) -> None:
 def test_the_objective_is_nowhere_above_chi2_if_it_says_so(seed: int) -> None:
     graph = random_graph(seed, 0.5)
     assert not formulate(graph).below_chi2
-    edges, observed = graph.edges, graph.observed
+    edges, observed = graph.factors.edges, graph.factors.observed
     rng = np.random.default_rng(seed)
     isotropic = Graph()
     isotropic.apply(GraphUpdate(
-        graph.poses.copy(),
-        replace(edges, information=np.eye(3) * rng.uniform(0.1, 9.0, (len(edges), 1, 1))),
-        observed, fix=np.flatnonzero(graph.fixed).tolist()))
+        graph.poses.copy(), Factors.joined([
+            replace(edges, information=np.eye(3) * rng.uniform(0.1, 9.0, (len(edges), 1, 1))),
+            observed]), fix=np.flatnonzero(graph.fixed).tolist()))
     form = formulate(isotropic)
     assert form.below_chi2
     quadratic = QuadraticForm(form)

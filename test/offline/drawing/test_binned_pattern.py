@@ -22,7 +22,7 @@ def blocks_of(graph: Graph) -> np.ndarray:
     order = np.concatenate((np.flatnonzero(graph.is_pose), np.flatnonzero(~graph.is_pose)))
     place = np.argsort(order)
     blocks = np.eye(graph.n_nodes, dtype=bool)
-    edges = graph.edges_by_row
+    edges = graph.factors_by_row.edges
     for i, j, weight in zip(place[edges.i], place[edges.j], edges.weight, strict=True):
         blocks[i, j] |= weight > 0.0
         blocks[j, i] |= weight > 0.0

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from random_graphs import random_graph
 
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges, ObservedKind, ObservedNodes
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization.marginalize import equations
@@ -34,7 +34,8 @@ seeds = st.integers(0, 2**31)
 def small_graph() -> Graph:
     """Return x0 to x3 with a closure, a gyro with its bias 5, a landmark 6, and observed nodes."""
     graph, eye = Graph(), np.eye(3)
-    kinds = [EdgeKind.ODOMETRY] * 3 + [EdgeKind.LOOP_CLOSURE, EdgeKind.TURN] + [EdgeKind.POINT] * 2
+    kinds = [*[FactorKind.ODOMETRY] * 3, FactorKind.LOOP_CLOSURE, FactorKind.TURN,
+             *[FactorKind.POINT] * 2]
     information = np.stack([eye] * 4 + [np.diag((0.0, 0.0, 1.0))] + [np.diag((1.0, 1.0, 0.0))] * 2)
     mean = np.zeros((7, 3))
     mean[:4, 0] = 1.0
@@ -42,11 +43,12 @@ def small_graph() -> Graph:
         hidden=np.column_stack((np.arange(4.0), np.zeros((4, 2)))), biases=np.zeros((1, 3)),
         dimensions=[1], landmarks=np.array([[1.0, 2.0]]), fix=(0,)))
     graph.apply(GraphUpdate(
-        edges=Edges([0, 1, 2, 3, 1, 0, 2], [1, 2, 3, 0, 2, 5, 5], mean, information, kinds,
+        factors=Factors.joined([
+            Factors([0, 1, 2, 3, 1, 0, 2], [1, 2, 3, 0, 2, 5, 5], mean, information, kinds,
                     weight=np.ones(7), k=[-1, -1, -1, -1, 4, -1, -1],
-                    bias=[[0.0] * 4] * 4 + [[0.0, 0.0, 0.0, 1.0]] + [[0.0] * 4] * 2),
-        observed=ObservedNodes([1, 2], mean=np.zeros((2, 3)), information=np.stack((eye, eye)),
-                               kind=[ObservedKind.GLOBAL_POSE] * 2, weight=[1.0, 0.0])))
+                    constants=[[0.0] * 4] * 4 + [[0.0, 0.0, 0.0, 1.0]] + [[0.0] * 4] * 2),
+            Factors.on([1, 2], mean=np.zeros((2, 3)), information=np.stack((eye, eye)),
+                       kind=[FactorKind.GLOBAL_POSE] * 2, weight=[1.0, 0.0])])))
     return graph
 
 

@@ -23,7 +23,7 @@ def made(errors: np.ndarray, sigma: float, taken: float = 0.0) -> SourceResidual
         'fix', 'map', np.arange(n) * 10**9, every, np.tile((True, True, False), (n, 1)),
         np.tile(sigma**2 * np.diag((1.0, 1.0, 0.0)), (n, 1, 1)),
         np.tile(taken * np.eye(3), (n, 1, 1)), np.ones(n, dtype=bool), np.ones(n),
-        np.arange(n), np.zeros(n, dtype=bool))
+        np.arange(n))
 
 
 def autoregressive(n: int, phi: float, seed: int) -> np.ndarray:

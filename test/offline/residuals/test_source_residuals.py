@@ -26,16 +26,15 @@ def engine(correlation_time: float, seed: int = 1, **settings: float) -> PoseGra
 
 
 def stacked_errors(graph: Graph, poses: FloatArray) -> FloatArray:
-    """Return all errors, of edges and then of observed nodes, shape (M, 3)."""
-    return np.vstack((graph.edge_errors(graph.edges, poses),
-                      graph.observed_errors(graph.observed, poses)))
+    """Return all errors, shape (M, 3)."""
+    return graph.errors(graph.factors, poses)
 
 
 def dense(graph: Graph) -> tuple[FloatArray, FloatArray]:
     """Return the Jacobians of all errors, shape (M, 3, 3 N), and the covariance of all nodes."""
     poses = graph.poses.copy()
     n = poses.size
-    jacobian = np.empty((graph.n_edges + graph.n_observed, 3, n))
+    jacobian = np.empty((graph.n_factors, 3, n))
     for k in range(n):
         ahead, behind = poses.copy(), poses.copy()
         ahead.flat[k] += STEP
@@ -43,8 +42,7 @@ def dense(graph: Graph) -> tuple[FloatArray, FloatArray]:
         change = stacked_errors(graph, ahead) - stacked_errors(graph, behind)
         change[:, 2] = se2.wrap(change[:, 2])
         jacobian[:, :, k] = change / (2.0 * STEP)
-    information = np.concatenate((graph.edges.weighted_information,
-                                  graph.observed.weighted_information))
+    information = graph.factors.weighted_information
     hessian = np.einsum('mia,mij,mjb->ab', jacobian, information, jacobian)
     free = np.repeat(~graph.fixed, 3)
     covariance = np.zeros((n, n))
@@ -61,8 +59,7 @@ def test_what_the_fit_takes_is_that_of_dense_matrices() -> None:
     assert {source: each.kind for source, each in found.items()} == {
         'global_pose': 'map', 'odom': 'odometry', 'loop_closure': 'loop_closure'}
     for each in found.values():
-        rows = np.where(each.is_edge, graph.edge_rows(each.ids),
-                        graph.n_edges + graph.observed_rows(each.ids))
+        rows = graph.factor_rows(each.ids)
         both = each.measured[:, :, None] & each.measured[:, None, :]
         # positions are in map axes in both
         np.testing.assert_allclose(np.where(both, each.taken, 0.0),
@@ -81,12 +78,12 @@ def test_of_correlated_errors_the_whole_error_counts() -> None:
     graph = backend.graph
     assert np.any(graph.is_bias)
     found = analyse(backend.parts).residuals['global_pose']
-    assert np.all(found.is_edge)
+    assert np.all(graph.factors_at(found.ids).j >= 0)
     assert np.all(found.measured == (True, True, False))
     # the error of a fix is its place less that of its node, whatever the bias explains
-    edges = graph.edges_at(found.ids)
+    edges = graph.factors_at(found.ids)
     nodes = graph.poses_of(edges.i)
-    offsets = np.einsum('kij,kj->ki', se2.rotation(nodes[:, 2]), edges.bias[:, :2])
+    offsets = np.einsum('kij,kj->ki', se2.rotation(nodes[:, 2]), edges.constants[:, :2])
     np.testing.assert_allclose(
         found.errors[:, :2], edges.mean[:, :2] - nodes[:, :2] - offsets, atol=1e-9)
     # its covariance that of the fix, and of the motion since the node

@@ -10,7 +10,7 @@ import pytest
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.replay import CLOSURES
 from pose_graph_ros.cli.run.document import read_document
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.offline.residuals import variance_components as vc
 from pose_graph_ros.offline.residuals.source_residuals import inverse
@@ -30,9 +30,9 @@ def laps(seed: int, times: tuple[float, float]) -> vc.Constraints:
     mean = np.column_stack((np.cos(turn) * chord[:, 0] + np.sin(turn) * chord[:, 1],
                             np.cos(turn) * chord[:, 1] - np.sin(turn) * chord[:, 0],
                             poses[j, 2] - turn))
-    kinds = np.where(j - i == 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE)
+    kinds = np.where(j - i == 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, fix=[0], edges=Edges(
+    graph.apply(GraphUpdate(hidden=poses, fix=[0], factors=Factors(
         i, j, mean + factors * sigmas * rng.normal(size=mean.shape),
         np.array([np.diag(each**-2.0) for each in sigmas]), kinds)))
     return vc.constraints(graph)

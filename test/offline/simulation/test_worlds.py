@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
 from pose_graph_ros.offline.simulation.recording import course
 from pose_graph_ros.offline.simulation.settings import (
@@ -87,10 +87,10 @@ def test_chi2_at_the_truth_is_distributed_as_chi_square(world: str) -> None:
 def test_the_edges_of_a_graph_lead_along_the_path_and_to_where_it_was_before() -> None:
     found = simulated('grid', fixes=None)
     n = len(found.truth)
-    odometry = found.edges.rows(found.edges.kind == EdgeKind.ODOMETRY)
+    odometry = found.edges.rows(found.edges.kind == FactorKind.ODOMETRY)
     np.testing.assert_array_equal(odometry.j, np.arange(1, n))
     np.testing.assert_array_equal(odometry.i, np.arange(n - 1))
-    loops = found.edges.rows(found.edges.kind == EdgeKind.LOOP_CLOSURE)
+    loops = found.edges.rows(found.edges.kind == FactorKind.LOOP_CLOSURE)
     assert len(loops) > 20
     assert np.all(found.group == -1)
     there = found.truth.poses[loops.i] - found.truth.poses[loops.j]
@@ -111,12 +111,12 @@ def test_disturbances_of_a_graph() -> None:
         return replace(setup, fixes=Fixes(), **changes)
     found = graph_of(course(WORLDS['grid'], 1, 400.0, change), 1.0)
     time = (found.truth.stamps_ns - START_NS) * 1e-9
-    seen = time[found.observed.node]
+    seen = time[found.observed.i]
     assert np.sum((seen > 50.5) & (seen < 99.5)) == 0
     assert np.sum((seen > 20.0) & (seen < 50.0)) > 20
-    assert np.all((time[found.observed.node[found.wrong]] > 199.0)
-                  & (time[found.observed.node[found.wrong]] < 231.0))
-    loops = found.edges.rows(found.edges.kind == EdgeKind.LOOP_CLOSURE)
+    assert np.all((time[found.observed.i[found.wrong]] > 199.0)
+                  & (time[found.observed.i[found.wrong]] < 231.0))
+    loops = found.edges.rows(found.edges.kind == FactorKind.LOOP_CLOSURE)
     assert np.all(time[loops.j] >= 199.9)
     steps = se2.between(usual.edges.mean[:len(time) - 1], found.edges.mean[:len(time) - 1])
     at, = np.flatnonzero(np.abs(steps).max(axis=1) > 1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import EdgeKind, Edges
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.odometry.motion import Motion, odometry_covariance
 from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures
@@ -35,9 +35,9 @@ def found(odometry: float, closures: float, seed: int) -> dict[Role, Found]:
     information = np.concatenate((np.tile(np.linalg.inv(claimed), (N - 1, 1, 1)),
                                   np.tile(np.linalg.inv(covariance), (len(ends), 1, 1))))
     graph = Graph()
-    graph.apply(GraphUpdate(hidden=poses, fix=(0,), edges=Edges(
+    graph.apply(GraphUpdate(hidden=poses, fix=(0,), factors=Factors(
         i, j, means, information,
-        np.where(np.arange(len(i)) < N - 1, EdgeKind.ODOMETRY, EdgeKind.LOOP_CLOSURE))))
+        np.where(np.arange(len(i)) < N - 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE))))
     # the cost is that of the linear problem, the same at the truth and at the optimum
     return {each.parameter.role: each for each in fit_closures(ClosureProblem(graph)).found}
 
