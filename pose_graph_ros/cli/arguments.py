@@ -140,8 +140,6 @@ def tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--folds', metavar='N', type=number(2, 50, whole=True), default=4,
                         help='parts of the drive that are held out in turn '
                              '(default: %(default)s)')
-    parser.add_argument('--budget', metavar='SECONDS', type=number(0.001), default=600.0,
-                        help='with less time, fewer parts are held out (default: %(default)g)')
     parser.add_argument('--json', action='store_true', help='print the results as JSON')
     _add_span(parser)
     _add_inputs(parser, hold_out=False)

@@ -12,7 +12,6 @@ import numba
 from pose_graph_ros.core.compiled import jit
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.warm_up import warm_up
-from pose_graph_ros.offline.tuning import likelihood  # noqa: F401  has kernels of its own
 
 
 def execute(_: argparse.Namespace) -> int:

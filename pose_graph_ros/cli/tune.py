@@ -16,7 +16,6 @@ from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
 from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
-from pose_graph_ros.offline.tuning.fit import CONTRADICTION
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -35,7 +34,7 @@ def execute(options: argparse.Namespace) -> int:
         truth = None if options.truth is None else read_truth(bag, options.truth)
         tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values, _show)
     try:
-        outcome = tuning.tune(options.folds, start + options.budget, truth)
+        outcome = tuning.tune(options.folds, truth)
     finally:
         _show('')
     names = ' '.join(each.name for each in options.bags)
@@ -60,15 +59,12 @@ def _show(text: str) -> None:
 
 def _notes(outcome: Outcome, tuning: Tuning) -> list[str]:
     """Return what is to be known of the estimate."""
-    notes = [f'{outcome.measured}; {outcome.folds_done} of {outcome.folds} parts of the drive '
-             f'held out in turn, in stretches of {outcome.stretch:.3g} s']
+    notes = [f'{outcome.measured}; {outcome.folds} parts of the drive held out in turn, in '
+             f'stretches of {outcome.stretch:.3g} s']
     if tuning.is_cut:
         notes.append('the bag is long: only its first part was read')
     if outcome.n_doubted > 0:
         notes.append(f'{outcome.n_doubted} measurements contradict the others and were left out')
-    if outcome.contradiction > CONTRADICTION:
-        notes.append('stretches of the drive contradict each other: odometry has errors that are '
-                     'no random walk, and intervals are wider')
     return [*notes, outcome.verdict.value]
 
 
@@ -113,8 +109,7 @@ def _facts(
         'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
         'to_truth': _plain(dict(zip(
             ('before', 'after'), outcome.to_truth, strict=False))) or None,
-        'folds': outcome.folds, 'folds_done': outcome.folds_done, 'stretch_s': outcome.stretch,
-        'doubted': outcome.n_doubted, 'contradiction': outcome.contradiction,
+        'folds': outcome.folds, 'stretch_s': outcome.stretch, 'doubted': outcome.n_doubted,
         'is_cut': tuning.is_cut, 'seconds': seconds}
 
 

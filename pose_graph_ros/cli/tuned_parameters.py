@@ -5,14 +5,14 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-from pose_graph_ros.offline.tuning import likelihood as lk
-from pose_graph_ros.offline.tuning.drive_rows import SourceOfPoses
-from pose_graph_ros.offline.tuning.fit import Fit, Found
-from pose_graph_ros.offline.tuning.likelihood import Role
+from pose_graph_ros.core.quantities import Metres, Radians
+from pose_graph_ros.offline.tuning.noise import Found
 
-ODOMETRY = ('sigma_distance', 'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn')
+# Sigmas of odometry, and whether they are of its turns.
+ODOMETRY = {'sigma_distance': False, 'sigma_lateral': False, 'sigma_heading_distance': True,
+            'sigma_heading_turn': True}
 LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters
 
 
@@ -38,123 +38,76 @@ class Tuned:
         return self.name.partition('.')[0]
 
 
-def odometry_parameters(source: str, found: Fit, values: Mapping[str, Any]) -> Iterator[Tuned]:
-    """Yield the parameters of a source of odometry by a fit."""
-    own = [each for each in found.found if each.parameter.role is Role.ODOMETRY]
-    scale = math.sqrt(values[f'{source}.covariance_scale'])
-    before, changed = values[f'{source}.sigma_scale'], any(not each.kept for each in own)
-    for each in sorted(own, key=lambda one: one.parameter.index):
-        if each.parameter.index == lk.GIVEN:
-            yield _one(f'{source}.covariance_scale', each, values, lambda sigma: sigma**2)
-            continue
-        one = _one(f'{source}.{ODOMETRY[each.parameter.index]}', each, values,
-                   lambda sigma: min(sigma / scale, LARGEST_SIGMA))
-        if each.kept and changed and before not in (0.0, 1.0):
-            # the sigma stays, and sigma_scale becomes 1
-            one = replace(one, after=_rounded(min(before * one.before, LARGEST_SIGMA)),
-                          note=f'times sigma_scale; {one.note}')
-        yield one
-    if changed:
-        yield Tuned(f'{source}.sigma_scale', before, 1.0,
-                    note='the sigmas are those of this odometry')
-
-
-def closure_parameters(
-    odometry: str, closures: Sequence[str], found: Fit, values: Mapping[str, Any],
+def odometry_parameters(
+    source: str, way: Found, turn: Found, values: Mapping[str, Any],
 ) -> Iterator[Tuned]:
-    """Yield the parameters of odometry and of loop closures by factors on their sigmas."""
-    by_role = {each.parameter.role: each for each in found.found}
-    own, of_closures = by_role[Role.ODOMETRY], by_role[Role.CLOSURE]
-    scale = values[f'{odometry}.sigma_scale'] or 1.0
-    if values[f'{odometry}.noise'] == 'model':
-        for leaf in ODOMETRY:
-            at = scale * values[f'{odometry}.{leaf}']
-            one = _one(f'{odometry}.{leaf}', own, values,
-                       lambda factor, at=at: min(at * factor, LARGEST_SIGMA))
-            yield replace(one, note=f'all four by one factor; {one.note}')
+    """Yield the parameters of a source of odometry by the noise of the way and of turns."""
+    if values[f'{source}.noise'] == 'twist':
+        yield _one(f'{source}.covariance_scale', max(way, turn), values, 1.0)
     else:
-        at = scale**2 * values[f'{odometry}.covariance_scale']
-        yield _one(f'{odometry}.covariance_scale', own, values, lambda factor: at * factor**2)
-    if not own.kept:
-        yield Tuned(f'{odometry}.sigma_scale', values[f'{odometry}.sigma_scale'], 1.0,
+        for leaf, of_turn in ODOMETRY.items():
+            yield _one(f'{source}.{leaf}', turn if of_turn else way, values, 0.5, LARGEST_SIGMA)
+    if values[f'{source}.sigma_scale'] not in (0.0, 1.0):
+        yield Tuned(f'{source}.sigma_scale', values[f'{source}.sigma_scale'], 1.0,
                     note='the sigmas are those of this odometry')
-    for source in closures:
-        at = values[f'{source}.covariance_scale']
-        yield _one(f'{source}.covariance_scale', of_closures, values,
-                   lambda factor, at=at: at * factor**2)
+
+
+class Claims(NamedTuple):
+    """The covariances that a source claims for what it measures in the map."""
+
+    is_constant: bool  # whether they are always the same
+    is_scalable: bool  # whether they are valid and not at a bound, so that a factor helps
+    sigma: Metres  # median of a coordinate; 0 without positions
+    sigma_heading: Radians  # median; 0 without headings
 
 
 def source_parameters(
-    source: SourceOfPoses, index: int, found: Fit, values: Mapping[str, Any],
+    source: str, claims: Claims, values: Mapping[str, Any], *, size: Found | None,
+    heading: Found | None = None,
 ) -> Iterator[Tuned]:
-    """Yield the parameters of a source of measurements in the map by a fit."""
-    of = {each.parameter.role: each for each in found.found
-          if each.parameter.index == index and each.parameter.role is not Role.ODOMETRY}
-    size, heading = of.get(Role.CORRELATED) or of.get(Role.WHITE), of.get(Role.HEADING)
-    share, more = 0.0, ''
-    if Role.TAU in of:
-        share = of[Role.SHARE].value
-        if share > 1.0:     # parameters cannot say it
-            more = '; errors are correlated as well, which the node finds'
-    if size is not None:
-        factor = 1.0 + share if share > 1.0 else 1.0
-        size = size._replace(value=size.value * factor, low=size.low * factor,
-                             high=size.high * factor)
-    yield from _sizes(source, size, heading, values, more)
-    if Role.TAU in of and share <= 1.0:
-        yield _one(f'{source.name}.correlation_time', of[Role.TAU], values, float)
-
-
-def _sizes(
-    source: SourceOfPoses, size: Found | None, heading: Found | None, values: Mapping[str, Any],
-    more: str,
-) -> Iterator[Tuned]:
-    """Yield the factor on the covariances that a source claims, or what replaces these."""
+    """Yield the parameters of a source by the size of its errors, of positions and headings."""
     leading = heading if size is None else size
     if leading is None:
         return
-    scale, override = f'{source.name}.covariance_scale', f'{source.name}.covariance_override'
+    scale, override = f'{source}.covariance_scale', f'{source}.covariance_override'
     # factors of positions and headings that both need a number
-    apart = size is not None and heading is not None and source.is_constant and (
-        max(heading.value, size.value) > 1.3 * min(heading.value, size.value))
-    if source.is_scalable and not apart:
-        at_scale = values[scale]
-        one = _one(scale, leading, values, lambda ratio: at_scale * ratio)
-        if source.is_constant and source.sigma > 0.0 and one.changes:
-            one = replace(one, note=f'{one.note}; sigma {_number(source.sigma)} m claimed, '
-                          f'{_number(source.sigma * math.sqrt(leading.value))} m found')
-        if one.changes and size is not None and heading is not None and (
-                heading.value != size.value):
-            more += (f'; of headings by themselves it would be '
-                     f'{_number(at_scale * heading.value)}')
-        yield replace(one, note=one.note + more)
-        return
-    if leading.kept and (heading is None or heading.kept):
-        yield Tuned(override, values[override], values[override],
-                    source.sigma * math.sqrt(leading.low),
-                    source.sigma * math.sqrt(leading.high), note=_kept_note(leading) + more)
-        return
-    sigmas = [] if size is None else [source.sigma * math.sqrt(size.value)]
-    if heading is not None or source.sigma_heading > 0.0:
-        ratio = 1.0 if heading is None else heading.value
-        sigmas = [*(sigmas or [1.0]), source.sigma_heading * math.sqrt(ratio)]
-    of = source.sigma if size is not None else source.sigma_heading
-    yield Tuned(override, values[override], [_rounded(each) for each in sigmas],
-                of * math.sqrt(leading.low), of * math.sqrt(leading.high),
-                note='instead of covariances that are not valid' + more
-                if not source.is_scalable else 'of position and heading' + more)
-    if values[scale] != 1.0:
-        yield Tuned(scale, values[scale], 1.0, note='part of covariance_override')
+    apart = size is not None and heading is not None and claims.is_constant and (
+        max(heading.value, size.value) > 1.3**2 * min(heading.value, size.value))
+    if claims.is_scalable and not apart:
+        one = _one(scale, leading, values, 1.0)
+        if claims.is_constant and claims.sigma > 0.0 and one.changes:
+            one = replace(one, note=f'{one.note}; sigma {_number(claims.sigma)} m claimed, '
+                          f'{_number(claims.sigma * math.sqrt(leading.value))} m found')
+        if one.changes and size is not None and heading is not None:
+            one = replace(one, note=f'{one.note}; of headings by themselves it would be '
+                          f'{_number(values[scale] * heading.value)}')
+        yield one
+    else:
+        sigmas = [claims.sigma * math.sqrt(size.value)] if size is not None else [1.0]
+        if claims.sigma_heading > 0.0:
+            ratio = 1.0 if heading is None else heading.value
+            sigmas.append(claims.sigma_heading * math.sqrt(ratio))
+        of = claims.sigma if size is not None else claims.sigma_heading
+        kept = leading.kept and (heading is None or heading.kept)
+        yield Tuned(override, values[override],
+                    values[override] if kept else [_rounded(each) for each in sigmas],
+                    of * math.sqrt(leading.low), of * math.sqrt(leading.high),
+                    _kept_note(leading) if kept else 'of position and heading'
+                    if claims.is_scalable else 'instead of covariances that are not valid')
+        if not kept and values[scale] != 1.0:
+            yield Tuned(scale, values[scale], 1.0, note='part of covariance_override')
 
 
-def _one(name: str, found: Found, values: Mapping[str, Any], value: Any) -> Tuned:
-    """Return a parameter by its estimate."""
+def _one(
+    name: str, found: Found, values: Mapping[str, Any], power: float, largest: float = math.inf,
+) -> Tuned:
+    """Return a parameter by the factor on the variances, of which it is a power."""
     before = values[name]
-    after = before if found.kept else _rounded(value(found.value))
-    note = _kept_note(found) if found.kept else ''
-    if not found.kept and found.is_wide:
-        note = 'the data tell this one only roughly'
-    return Tuned(name, before, after, float(value(found.low)), float(value(found.high)), note)
+    low, after, high = (min(before * factor**power, largest)
+                        for factor in (found.low, found.value, found.high))
+    note = _kept_note(found) if found.kept else (
+        'the data tell this one only roughly' if found.is_wide else '')
+    return Tuned(name, before, before if found.kept else _rounded(after), low, high, note)
 
 
 def _kept_note(found: Found) -> str:

@@ -3,11 +3,10 @@
 """
 Tune with all measurements of a drive, and find out how well that does on stretches held out.
 
-For each part of the drive in turn the noise is estimated from all others, and the engine runs with
-all others, with the settings before and after. So the estimate in the file is from all
-measurements, and the errors in the table are those of estimates that are made in the same way, at
-fixes that took no part in these. If they are worse, the same is done with the noise of odometry,
-or that of the other sources, as it was.
+For each part of the drive in turn the engine runs with all others, with the settings before and
+with those that this run shows. So the estimate in the file is from all measurements, and the
+errors in the table are those of estimates that are made in the same way, at fixes that took no
+part in these.
 """
 
 from collections import Counter
@@ -15,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import islice
-import time
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,43 +26,47 @@ from pose_graph_ros.adapters.sources import backend_config, Kind, ODOMETRY_KINDS
 from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.cli.tuned_parameters import (
     changed,
-    closure_parameters,
+    Claims,
     odometry_parameters,
     source_parameters,
     Tuned,
 )
+from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import Covariances
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.texts import states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import Fix, LoopClosure, Measurement, OdometrySample
-from pose_graph_ros.core.quantities import Metres, Seconds
-from pose_graph_ros.offline.tuning import held_out
-from pose_graph_ros.offline.tuning.closure_fit import ClosureProblem, fit_closures, MOST_NODES
-from pose_graph_ros.offline.tuning.drive_rows import (
+from pose_graph_ros.core.measurements import (
     Absolute,
-    drive_rows,
-    Key,
-    LEAST,
-    source_of_poses,
-    SourceOfPoses,
-    timeline,
+    Fix,
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    Measurement,
+    OdometrySample,
 )
-from pose_graph_ros.offline.tuning.fit import estimate, Fit
-from pose_graph_ros.offline.tuning.held_out import Errors, NO_ERRORS, proven, Summary
-from pose_graph_ros.offline.tuning.likelihood import Role
+from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
+from pose_graph_ros.core.sources.validation import validate, Validated
+from pose_graph_ros.offline.residuals.scale import RowFit, ScaleFit
+from pose_graph_ros.offline.residuals.variance_components import analyse
+from pose_graph_ros.offline.tuning import held_out, noise
+from pose_graph_ros.offline.tuning.held_out import Errors, NO_ERRORS, Summary
+from pose_graph_ros.offline.tuning.noise import Found, Noise
+
+Key = tuple[str, StampNs]  # source and stamp of a measurement
+LEAST = 20  # measurements of a source whose noise is estimated
+IN_MEMORY = 1_000_000  # measurements, of 700 bytes each
+OF_CLOSURES = Claims(is_constant=False, is_scalable=True, sigma=0.0, sigma_heading=0.0)
+NOT_SHOWN = Found(1.0, 0.0, math.inf, kept=True)
 
 
 class Run(NamedTuple):
     """Result of a run of the engine."""
 
+    backend: PoseGraphBackend
     path: Trajectory
     covariances: Covariances  # of the path, in map axes
-    factors: Mapping[str, float]  # of the engine on the variances that a source claims
-    doubted: frozenset[Key]  # measurements that contradict the others
-    graph: Graph
 
 
 class Verdict(Enum):
@@ -84,11 +87,9 @@ class Outcome:
     after: Summary
     to_truth: Sequence[Metres]  # rms of the paths before and after; empty if it is not known
     folds: int
-    folds_done: int
     stretch: Seconds  # length of those that were held out
     measured: str  # how much was
     n_doubted: int
-    contradiction: float
 
 
 class _Tried(NamedTuple):
@@ -106,27 +107,24 @@ class Tuning:
     ) -> None:
         self._inputs, self._values, self._show = inputs, values, show
         self._step, self._steps = 0, 0
-        self._config, self._path = backend_config(values), bag.path
+        self._path = bag.path
         stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
-        self._measurements = _in_the_map(list(islice(stream, 1_000_000)))  # of 700 bytes each
+        self._measurements = _in_the_map(list(islice(stream, IN_MEMORY)))
         self.is_cut = next(stream, None) is not None  # whether the bag has more
-        self._odometry = {}
-        for name in inputs.of(*ODOMETRY_KINDS):
-            found = timeline([each for of, each in self._measurements
-                              if of == name and isinstance(each, OdometrySample)],
-                             self._config.odometry_source(name))
-            if len(found) > 1:
-                self._odometry[name] = found
-        if len(self._odometry) == 0:
+        counts = Counter(name for name, each in self._measurements
+                         if isinstance(each, OdometrySample))
+        self._odometries = [name for name in inputs.of(*ODOMETRY_KINDS) if counts[name] > 1]
+        if len(self._odometries) == 0:
             topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
             raise BagError(f'{self._path}: no usable odometry on {topics}')
-        stamps = next(iter(self._odometry.values())).stamps_ns
-        self._start_ns, self._duration = int(stamps[0]), float(stamps[-1] - stamps[0]) * 1e-9
-        self._sources = [each for each in self._sources_of_poses(values)
-                         if each.measured.has_positions or each.measured.has_headings]
+        stamps = [each.stamp_ns for name, each in self._measurements
+                  if name == self._odometries[0]]
+        self._start_ns, self._duration = min(stamps), (max(stamps) - min(stamps)) * 1e-9
+        self._sources = {name: some for name, some in self._valid(values).items()
+                         if len(some) >= LEAST}
         self._closures: list[tuple[str, LoopClosure]] = []
-        if not any(each.measured.has_positions for each in self._sources):
-            self._sources, self._closures = [], [
+        if all(isinstance(each, HeadingOnly) for some in self._sources.values() for each in some):
+            self._sources, self._closures = {}, [
                 (name, each) for name, each in self._measurements
                 if isinstance(each, LoopClosure)]
             if len(self._closures) < LEAST:
@@ -136,71 +134,172 @@ class Tuning:
                     f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
                     f'poses or loop closures are needed; used are {topics}')
 
-    def tune(self, folds: int, deadline: Seconds, truth: Trajectory | None) -> Outcome:
+    def tune(self, folds: int, truth: Trajectory | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
-        self._steps = 2 + 3 * folds
-        tuned, fits = self._estimate(frozenset(), 'estimating noise')
-        start = time.monotonic()
-        self._begin('running with it')
-        run = self._run(self._with(tuned))
-        seconds = time.monotonic() - start
-        doubted = frozenset() if run is None else run.doubted
+        # what the settings before say is not looked for by the engine: it shows in other runs
+        self._looking = {**self._values, **{
+            f'{name}.correlation_time': -1.0 for name in self._sources
+            if self._values[f'{name}.correlation_time'] > 0.0}}
+        self._is_shown_before = self._looking == self._values and len(self._odometries) == 1
+        more = 0 if self._is_shown_before else len(self._odometries)
+        self._steps = 2 + more + (2 + more) * folds
+        runs = self._runs('all')[1]
+        tuned, tau = self._estimate(runs, frozenset())
+        after = self._run(self._with(tuned), 'all, with the settings after')
+        doubted = frozenset(
+            (source, stamp) for (source, stamp, reference), state
+            in states_by_stamps(after.backend.verdicts()).items()
+            if state is State.DOUBTED and reference is None)
         if len(doubted) > 0:
-            self._steps += 1
-            tuned, fits = self._estimate(doubted, 'estimating noise again')
-        fit_seconds = time.monotonic() - start - seconds
-        primary = next(iter(fits.values()))
-        tau = max((each.value for each in primary.found if each.parameter.role is Role.TAU),
-                  default=0.0)
-        stretch = held_out.stretch_length(self._duration, self._period(), tau, folds)
-        per_fold = 2.5 * seconds + fit_seconds + 1.0
-        n_done = int(np.clip((deadline - time.monotonic()) / per_fold, 1, folds))
-        changes = len(changed(tuned)) > 0
-        self._steps -= 3 * folds - (3 if changes else 1) * n_done
-        tried = [self._fold(k, folds, stretch, doubted, truth, is_tuned=changes)
-                 for k in range(n_done)]
+            tuned, tau = self._estimate(runs, doubted)
+        period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
+                      for some in self._sources.values()), default=1.0)
+        stretch = held_out.stretch_length(self._duration, period, tau, folds)
+        tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
         one, other = self._common(tried, doubted)
         verdict = Verdict.SAME
-        if changes:
+        if len(changed(tuned)) > 0:
             verdict = Verdict.BETTER if held_out.is_better(
                 one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [] if truth is None else np.sqrt(np.mean(np.square(
             [[each.to_truth for each in pair] for pair in tried]), axis=0)).tolist()
         return Outcome(tuned, verdict, held_out.summary(one), held_out.summary(other), errors,
-                       folds, n_done, stretch, self._measured(), len(doubted),
-                       max(each.contradiction for each in fits.values()))
+                       folds, stretch, self._measured(), len(doubted))
 
-    def _sources_of_poses(self, values: Mapping[str, Any]) -> list[SourceOfPoses]:
-        """Return the sources with enough valid measurements in the map, by some parameters."""
-        config, found = backend_config(values), []
+    def _valid(self, values: Mapping[str, Any]) -> dict[str, list[Absolute]]:
+        """Return the valid measurements in the map of each source by stamp, by some parameters."""
+        config, found = backend_config(values), {}
         for name in self._inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
-            kept = [each for of, each in self._measurements
-                    if of == name and isinstance(each, Absolute)]
-            source = None if len(kept) == 0 else source_of_poses(
-                name, kept, config.measurement_source(name, type(kept[0])))
-            if source is not None:
-                found.append(source)
+            valid = []
+            for of, each in self._measurements:
+                if of == name and isinstance(each, Absolute):
+                    one = validate(each, config.measurement_source(name, type(each)).covariance)
+                    if isinstance(one, Validated) and isinstance(one.measurement, Absolute):
+                        valid.append(one.measurement)
+            found[name] = sorted(valid, key=lambda each: each.stamp_ns)
         return found
 
-    def _run(self, values: Mapping[str, Any], without: Collection[Key] = ()) -> Run | None:
-        """Return the result of the engine without some measurements; None if it has no path."""
+    def _run(
+        self, values: Mapping[str, Any], text: str, without: Collection[Key] = (),
+        odometry: str = '',
+    ) -> Run:
+        """Run the engine, as a step that is shown, without some measurements or other odometry."""
+        self._step += 1
+        self._show(f'step {self._step} of {self._steps}: {text}')
         backend, _ = run_measurements((
             (name, each) for name, each in self._measurements
+            if odometry in ('', name) or not isinstance(each, OdometrySample)
             if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
         estimate = backend.estimate()
         if estimate is None:
-            return None
-        factors = {
-            name: 1.0 if report.in_use is None else report.in_use.correlated + report.in_use.white
-            for name, report in backend.reports().items()}
-        doubted = frozenset(
-            (name, stamp) for (name, stamp, _), state
-            in states_by_stamps(backend.verdicts()).items() if state is State.DOUBTED)
-        return Run(estimate.path, backend.path_covariances(estimate), factors, doubted,
-                   backend.graph)
+            raise BagError(f'{self._path}: the odometry makes no path')
+        return Run(backend, estimate.path, backend.path_covariances(estimate))
+
+    def _runs(self, text: str, left_out: Collection[Key] = ()) -> tuple[Run, list[Run]]:
+        """Return a run with the settings before, and those that show the noise of odometries."""
+        before = self._run(self._values, f'{text}, with the settings before', left_out)
+        return before, [before] if self._is_shown_before else [
+            self._run(self._looking, f'{text}, by {name}', left_out, name)
+            for name in self._odometries]
+
+    def _with(self, tuned: Sequence[Tuned]) -> dict[str, Any]:
+        """Return all parameters, with those that were tuned."""
+        return checked({**self._values, **changed(tuned)})
+
+    def _estimate(
+        self, runs: Sequence[Run], without: Collection[Key],
+    ) -> tuple[list[Tuned], Seconds]:
+        """Return what runs show, but for some measurements, and the longest time constant."""
+        tuned, longest = list[Tuned](), 0.0
+        for name, run in zip(self._odometries, runs, strict=True):
+            parts, by_residuals = run.backend.parts, dict[str, ScaleFit]()
+            if len(self._closures) > 0 or any(
+                    len(_heading_variances(some)) > 0 for some in self._sources.values()):
+                by_residuals |= analyse(parts).together
+            found: dict[str, Noise] = {}
+            for source, some in self._sources.items():
+                is_placed = not all(isinstance(each, HeadingOnly) for each in some)
+                one = noise.noise_of(parts, source, {
+                    stamp for of, stamp in without if of == source}) if is_placed else None
+                if one is not None:
+                    found[source] = one
+            proven = {source: each.proven for source, each in found.items()}
+            way, turn = noise.proven_odometry(found.values()) if len(found) > 0 else (
+                _proven(by_residuals.get(name), axis) for axis in (0, 2))
+            tuned += odometry_parameters(name, way, turn, self._values)
+            if run is not runs[0]:
+                continue
+            longest = max((0.0 if each.tau is None else each.tau.value
+                           for each in found.values()), default=0.0)
+            for source, some in self._sources.items():
+                tuned += source_parameters(
+                    source, self._claims(source, some), self._values, size=proven.get(source),
+                    heading=_of_residuals(by_residuals.get(source), 2))
+            for source in dict.fromkeys(of for of, _ in self._closures):
+                size = None if source not in by_residuals else _found(by_residuals[source])
+                if size is not None:
+                    # their constraints share noise of odometry up to the hidden nodes
+                    tuned += source_parameters(
+                        source, OF_CLOSURES, self._values,
+                        size=size.written(max(size.value, 1.0)))
+        return tuned, longest
+
+    def _claims(self, name: str, some: Sequence[Absolute]) -> Claims:
+        policy = backend_config(self._values).measurement_source(name, type(some[0])).covariance
+        repaired = any(isinstance(one := validate(each, policy), Validated)
+                       and len(one.repairs) > 0 for of, each in self._measurements
+                       if of == name and isinstance(each, Absolute))
+        positions = np.array([0.5 * np.trace(each.covariance[:2, :2]) for each in some
+                              if not isinstance(each, HeadingOnly)])
+        headings = _heading_variances(some)
+        inside = len(positions) == 0 or bool(
+            np.min(positions) > 1.01 * policy.position_floor**2
+            and np.max(positions) < 0.99 * policy.position_ceiling**2)
+        return Claims(
+            all(np.ptp(each) < 0.05 * np.min(each) for each in (positions, headings)
+                if len(each) > 0),
+            inside and not repaired and len(policy.override) == 0,
+            *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0
+              for each in (positions, headings)))
+
+    def _fold(
+        self, k: int, folds: int, stretch: Seconds, doubted: Collection[Key],
+        truth: Trajectory | None,
+    ) -> tuple[_Tried, _Tried]:
+        """Return what a part that is held out shows of the settings before and after."""
+        every = [(name, each.stamp_ns) for name, some in self._sources.items() for each in some
+                 if not isinstance(each, HeadingOnly)]
+        every += [(name, each.stamp_ns) for name, each in self._closures]
+        folds_of = held_out.fold_of(
+            np.array([stamp for _, stamp in every]), self._start_ns, stretch, folds)
+        left_out = {key for key, of in zip(every, folds_of.tolist(), strict=True) if of == k}
+        text = f'part {k + 1} of {folds} held out'
+        before, runs = self._runs(text, left_out)
+        tuned, _ = self._estimate(runs, doubted)
+        after = self._run(self._with(tuned), f'{text}, with the settings after', left_out)
+        return (self._tried(self._values, before, left_out, truth),
+                self._tried(self._with(tuned), after, left_out, truth))
+
+    def _tried(
+        self, values: Mapping[str, Any], run: Run, left_out: Collection[Key],
+        truth: Trajectory | None,
+    ) -> _Tried:
+        reports, valid = run.backend.reports(), self._valid(values)
+        errors = [self._closure_errors(run, left_out)] if len(self._closures) > 0 else []
+        for name in self._sources:
+            in_use = reports[name].in_use if name in reports else None
+            errors.append(held_out.errors_at(
+                run.path, run.covariances,
+                [each for each in valid[name] if (name, each.stamp_ns) in left_out
+                 and not isinstance(each, HeadingOnly)],
+                1.0 if in_use is None else in_use.correlated + in_use.white))
+        if truth is None or not np.any(inside := run.path.covers(truth.stamps_ns)):
+            return _Tried(errors, np.nan)
+        apart = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
+        return _Tried(errors, float(np.sqrt(np.mean(np.sum(apart**2, axis=1)))))
 
     def _closure_errors(self, run: Run, left_out: Collection[Key]) -> Errors:
-        """Return the errors of a path at closures, in the frames of their references."""
+        """Return the errors of a path at loop closures; their covariances are not known."""
         chosen = [each for name, each in self._closures
                   if (name, each.stamp_ns) in left_out and each.reference_ns is not None]
         stamps = np.array([(each.reference_ns, each.stamp_ns) for each in chosen],
@@ -210,104 +309,6 @@ class Tuning:
         measured_poses = np.array([each.pose for each in chosen]).reshape(-1, 3)[inside]
         errors = measured_poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
         return Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))
-
-    def _begin(self, text: str) -> str:
-        """Show what is done next, as which step of all, and return that."""
-        self._step += 1
-        text = f'step {self._step} of {self._steps}: {text}'
-        self._show(text)
-        return text
-
-    def _with(self, tuned: Sequence[Tuned]) -> dict[str, Any]:
-        """Return all parameters, with those that were tuned."""
-        return checked({**self._values, **changed(tuned)})
-
-    def _estimate(
-        self, without: Collection[Key], text: str,
-    ) -> tuple[list[Tuned], dict[str, Fit]]:
-        """Return what is the most likely without some measurements."""
-        text, count = self._begin(text), 0
-
-        def tick() -> None:
-            nonlocal count
-            count += 1
-            if count % 100 == 0:
-                self._show(f'{text}: {count} evaluations')
-        if len(self._closures) > 0:
-            return self._estimate_by_closures(without, tick)
-        sources = [each._replace(measured=each.measured.rows(~each.is_among(without)))
-                   for each in self._sources]
-        measured = {each.name: each.measured for each in sources}
-        fits = estimate(self._odometry, measured, self._config, tick)
-        if len(fits) == 0:
-            raise BagError(f'{self._path}: nothing to tune by: no fix or global pose was measured '
-                           'while there was odometry')
-        rows = drive_rows(self._odometry[next(iter(fits))], measured, self._config)
-        shown = held_out.shown_variances(rows, len(measured))
-        tuned: list[Tuned] = []
-        for name, found in proven(fits, shown, self._duration).items():
-            tuned += odometry_parameters(name, found, self._values)
-            if name == next(iter(fits)):
-                for k, source in enumerate(sources):
-                    tuned += source_parameters(source, k, found, self._values)
-        return tuned, fits
-
-    def _estimate_by_closures(
-        self, without: Collection[Key], tick: Callable[[], None],
-    ) -> tuple[list[Tuned], dict[str, Fit]]:
-        """Do the same by loop closures alone."""
-        run, primary = self._run(self._values, without), next(iter(self._odometry))
-        if run is None or run.graph.n_nodes > MOST_NODES:
-            raise BagError(f'{self._path}: too many hidden nodes to tune by loop closures; '
-                           f'expected at most {MOST_NODES}')
-        problem = ClosureProblem(run.graph, tick)
-        if problem.n_closures < LEAST // 2:
-            raise BagError(f'{self._path}: nothing to tune by: only '
-                           f'{problem.n_closures} loop closures are believed')
-        found = proven({primary: fit_closures(problem)}, (), self._duration)[primary]
-        sources = list(dict.fromkeys(name for name, _ in self._closures))
-        return list(closure_parameters(primary, sources, found, self._values)), {primary: found}
-
-    def _period(self) -> float:
-        """Return the longest median time between measurements of a source of positions [s]."""
-        return max((float(np.median(np.diff(each.measured.stamps_ns))) * 1e-9
-                    for each in self._sources if each.measured.has_positions), default=1.0)
-
-    def _fold(
-        self, k: int, folds: int, stretch: Seconds, doubted: Collection[Key],
-        truth: Trajectory | None, *, is_tuned: bool,
-    ) -> tuple[_Tried, _Tried]:
-        """Return what a part that is held out shows of the settings before and after."""
-        every = [(source.name, source.measured.stamps_ns) for source in self._sources
-                 if source.measured.has_positions]
-        every += [(name, np.array([each.stamp_ns], dtype=np.int64))
-                  for name, each in self._closures]
-        left_out = frozenset(
-            (name, stamp) for name, stamps in every for stamp in stamps[held_out.fold_of(
-                stamps, self._start_ns, stretch, folds) == k].tolist())
-        text = f'part {k + 1} of {folds} held out'
-        tuned = self._estimate(left_out | frozenset(doubted), text)[0] if is_tuned else []
-        self._begin(f'{text}: running with the settings before')
-        before = after = self._try(self._values, left_out, truth)
-        if is_tuned:
-            self._begin(f'{text}: running with the settings after')
-            after = self._try(self._with(tuned), left_out, truth)
-        return before, after
-
-    def _try(
-        self, values: Mapping[str, Any], left_out: Collection[Key], truth: Trajectory | None,
-    ) -> _Tried:
-        run = self._run(values, left_out)
-        if run is None:
-            return _Tried([], np.nan)
-        errors = [self._closure_errors(run, left_out)] if len(self._closures) > 0 else [
-            held_out.errors_at(
-                run.path, run.covariances, source.measured.rows(source.is_among(left_out)),
-                run.factors.get(source.name, 1.0)) for source in self._sources_of_poses(values)]
-        if truth is None or not np.any(inside := run.path.covers(truth.stamps_ns)):
-            return _Tried(errors, np.nan)
-        apart = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
-        return _Tried(errors, float(np.sqrt(np.mean(np.sum(apart**2, axis=1)))))
 
     def _common(
         self, tried: Sequence[tuple[_Tried, _Tried]], doubted: Collection[Key],
@@ -326,9 +327,31 @@ class Tuning:
 
     def _measured(self) -> str:
         """Return how much was measured, in words."""
-        counts = ', '.join([f'{len(each.measured.stamps_ns)} of {each.name}'
-                            for each in self._sources] or [f'{len(self._closures)} closures'])
+        counts = ', '.join([f'{len(some)} of {name}' for name, some in self._sources.items()]
+                           or [f'{len(self._closures)} closures'])
         return f'{self._duration:.0f} s of odometry, {counts}'
+
+
+def _heading_variances(some: Sequence[Absolute]) -> FloatArray:
+    return np.array([each.variance if isinstance(each, HeadingOnly) else each.covariance[2, 2]
+                     for each in some if isinstance(each, HeadingOnly | GlobalPose)])
+
+
+def _proven(found: ScaleFit | None, axis: int) -> Found:
+    shown = _of_residuals(found, axis)
+    return NOT_SHOWN if shown is None else shown.proven(shown.high)
+
+
+def _of_residuals(found: ScaleFit | None, axis: int) -> Found | None:
+    """Return the noise of a coordinate that residuals show; None if they show nothing."""
+    rows = [] if found is None else [row for row in found.rows if row.coordinate == axis]
+    return _found(rows[0]) if len(rows) > 0 else None
+
+
+def _found(of: RowFit | ScaleFit) -> Found | None:
+    if math.isnan(of.ratio):
+        return None
+    return Found(of.ratio**2, of.low**2, of.high**2, kept=of.low <= 1.0 <= of.high)
 
 
 def _in_the_map(

@@ -18,11 +18,10 @@ import yaml
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.tuned_parameters import changed, ODOMETRY, odometry_parameters
+from pose_graph_ros.cli.tuned_parameters import changed, odometry_parameters
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.tuning.fit import Fit, Found
-from pose_graph_ros.offline.tuning.likelihood import Parameter, Role
+from pose_graph_ros.offline.tuning.noise import Found
 
 
 @pytest.fixture(scope='module')
@@ -97,16 +96,30 @@ def test_wrong_input_is_one_line(args, message, overconfident, tmp_path, capsys)
     assert error.count('\n') == 1
 
 
-def test_a_sigma_that_is_kept_stays_when_its_factor_becomes_a_part_of_it() -> None:
+def test_sigmas_follow_the_noise_of_way_and_turn_and_replace_a_scale_set_by_hand() -> None:
     values = checked({'odom.sigma_scale': 2.0})
-    sigmas = [2.0 * values[f'odom.{name}'] for name in ODOMETRY]
-    found = [Found(Parameter(Role.ODOMETRY, k, sigma), 3.0 * sigma if k == 0 else sigma,
-                   0.9 * sigma, 4.0 * sigma, k > 0) for k, sigma in enumerate(sigmas)]
-    after = changed(odometry_parameters('odom', Fit(tuple(found), 1.0), values))
-    assert after.pop('odom.sigma_scale') == 1.0
-    expected = [3.0 * sigmas[0], *sigmas[1:]]
-    assert after == pytest.approx({
-        f'odom.{name}': sigma for name, sigma in zip(ODOMETRY, expected, strict=True)}, rel=0.01)
+    way, turn = Found(9.0, 4.0, 16.0, kept=False), Found(1.0, 0.5, 1.5, kept=True)
+    after = changed(odometry_parameters('odom', way, turn, values))
+    assert after == pytest.approx({'odom.sigma_distance': 3.0 * values['odom.sigma_distance'],
+                                   'odom.sigma_lateral': 3.0 * values['odom.sigma_lateral'],
+                                   'odom.sigma_scale': 1.0})
+    twist = checked({'odom.noise': 'twist', 'odom.covariance_scale': 2.0})
+    assert changed(odometry_parameters('odom', way, turn, twist)) == {
+        'odom.covariance_scale': 18.0}
+
+
+def test_loop_closures_alone_show_the_noise_of_odometry(tmp_path, capsys) -> None:
+    bag, out = tmp_path / 'grid', tmp_path / 'tuned.yaml'
+    assert main(['simulate', str(bag), '--world', 'grid', '--duration', '300', '--seed', '101',
+                 '--closures', '1']) == 0
+    capsys.readouterr()
+    sure = ('sigma_heading_distance:=0.001', 'sigma_heading_turn:=0.005')
+    assert main(['tune', str(bag), *(word for each in sure for word in ('-p', f'odom.{each}')),
+                 '--folds', '2', '--json', '-o', str(out)]) in (0, 1)
+    found = {each['name']: each for each in json.loads(capsys.readouterr().out)['parameters']}
+    for each in ('odom.sigma_heading_distance', 'odom.sigma_heading_turn'):
+        assert 1.5 < found[each]['after'] / found[each]['before'] < 6.0
+    assert found['loop_closure.covariance_scale']['after'] >= 1.0
 
 
 def test_a_truth_at_other_times_is_null_in_json(tmp_path, capsys) -> None:
@@ -121,7 +134,7 @@ def test_a_truth_at_other_times_is_null_in_json(tmp_path, capsys) -> None:
                            (0.0,) * 6),
         *fix_messages('/fix', np.array([each.stamp_ns for each in fixes]), geodetic, 1.0)))
     assert main(['tune', str(tmp_path / 'bag'), '--odom', '/odom', '--truth', '/truth', '--json',
-                 '--budget', '1', '-o', str(tmp_path / 'tuned.yaml')]) in (0, 1)
+                 '--folds', '2', '-o', str(tmp_path / 'tuned.yaml')]) in (0, 1)
     facts = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert facts['to_truth'] == {'before': None, 'after': None}
 

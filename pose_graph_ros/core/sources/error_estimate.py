@@ -15,7 +15,7 @@ The result depends on the measurements and on odometry alone, not on the estimat
 and so not on the order of arrival. Searches are generators: each step takes a bounded time.
 """
 
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 import math
 from typing import NamedTuple
 
@@ -81,7 +81,7 @@ class _Edges(NamedTuple):
     seconds: FloatArray
 
 
-class _Minimum(NamedTuple):
+class Minimum(NamedTuple):
     value: float
     point: Point
 
@@ -207,33 +207,54 @@ def search(positions: MeasuredPath, *, correlated: bool = False) -> Search:
     """
     if len(positions.seconds) < SOURCES.least_positions:
         return NOTHING
-    evaluate = _Evaluation(positions)
+    evaluate = Evaluation(positions)
+    best = (yield from most_likely(evaluate, correlated=correlated)).point
+    odometry, *sigmas = yield from _odometry_errors(evaluate, best)
+    return Estimate(errors_of(best), odometry, *sigmas)
+
+
+def errors_of(point: Point) -> CorrelatedErrors | None:
+    """Return the statistics of errors at a point; None for white errors."""
+    if len(point) <= 3:
+        return None
+    tau, part, *_, white_part = (2.0 ** exponent for exponent in point)
+    return CorrelatedErrors(tau, part, white_part)
+
+
+def most_likely(
+    evaluate: 'Evaluation', *, correlated: bool = False,
+) -> Generator[None, None, Minimum]:
+    """
+    Return the best point: of correlated errors only if these are much more likely than white ones.
+
+    Where they were found to be `correlated` before, it is enough that they are more likely.
+    """
+    positions = evaluate.path
     yield from evaluate.find_heading()
-    white = yield from _descend(evaluate, [(at, at, 0.0) for at in SOURCES.white_beginnings])
+    white = yield from descend(evaluate, [(at, at, 0.0) for at in SOURCES.white_beginnings])
     period = float(np.median(np.diff(positions.seconds)))
     shortest, longest = (
         math.ceil(math.log2(max(time, 1e-3)) / SOURCES.finest) * SOURCES.finest
         for time in (period, SOURCES.longest_time * float(positions.seconds[-1])))
     evaluate.bounds = shortest, longest
-    found = _Minimum(math.inf, white.point)
+    found = Minimum(math.inf, white.point)
     for odometry in {*SOURCES.odometry_beginnings, white.point[:2]}:
-        found = min(found, (yield from _descend(evaluate, [
+        found = min(found, (yield from descend(evaluate, [
             (time, part, *odometry, white_part)
             for time in np.arange(shortest, longest + 0.1, 1.0).tolist()
             for part, white_part in SOURCES.beginnings])))
-    tau, part, *_, white_part = (2.0 ** exponent for exponent in found.point)
-    errors = CorrelatedErrors(tau, part, white_part)
-    correlation = part * math.exp(-period / tau) / (part + white_part)
+    errors = errors_of(found.point)
+    assert errors is not None
+    correlation = errors.correlated * math.exp(-period / errors.tau) / (
+        errors.correlated + errors.white)
     needed = (0.0 if correlated else SOURCES.significant) + SOURCES.per_lost * max(
         evaluate.lost[white.point], evaluate.lost[found.point])
     significant = white.value - found.value > needed and correlation > SOURCES.least_shared
-    odometry, *sigmas = yield from _odometry_errors(
-        evaluate, (found if significant else white).point)
-    return Estimate(errors if significant else None, odometry, *sigmas)
+    return found if significant else white
 
 
 def _odometry_errors(
-    evaluate: '_Evaluation', best: Point,
+    evaluate: 'Evaluation', best: Point,
 ) -> Generator[None, None, tuple[OdometryErrors, float, float]]:
     """
     Return the errors of odometry, as claimed unless others are much more likely.
@@ -242,7 +263,7 @@ def _odometry_errors(
     correlated ones show too little of what odometry does over longer times.
     """
     *errors, way, turn, white = best
-    claimed = yield from _descend(evaluate, [(*errors, 0.0, white)], fixed=ODOMETRY)
+    claimed = yield from descend(evaluate, [(*errors, 0.0, white)], fixed=(ODOMETRY,))
     least = yield from evaluate.value(best)
     needed = SOURCES.significant if len(errors) > 0 else SOURCES.significant_odometry
     if claimed.value - least > needed:
@@ -257,19 +278,24 @@ def _odometry_errors(
         rate, scale, rate_variance, scale_variance = evaluate.constants[best]
         return (OdometryErrors(2.0 ** best[-3], 2.0 ** best[ODOMETRY], rate, scale),
                 math.sqrt(rate_variance), math.sqrt(scale_variance))
-    found = yield from _descend(evaluate, [(*errors, at, white) for at in (way, turn, 0.0)])
+    found = yield from descend(evaluate, [(*errors, at, white) for at in (way, turn, 0.0)])
     exponent = found.point[ODOMETRY]
     if claimed.value - found.value <= SOURCES.significant_scale or exponent < 0.0:
         return AS_CLAIMED, math.inf, math.inf
     return OdometryErrors.scaled(2.0 ** (0.5 * exponent)), math.inf, math.inf
 
 
-class _Evaluation:
+class Evaluation:
     """Evaluates points of the lattice, at most once each."""
 
-    def __init__(self, positions: MeasuredPath) -> None:
+    def __init__(
+        self, positions: MeasuredPath, spread: float = SOURCES.spread,
+        smaller_spread: float = SOURCES.smaller_spread, finest: float = SOURCES.finest,
+    ) -> None:
+        """Take sigmas of the logarithm of the variance, also of a small one, and the lattice."""
+        self._spread, self._smaller_spread, self.finest = spread, smaller_spread, finest
         # the kernel takes no other layout, which arrays of the past may have
-        self._path = MeasuredPath(*map(np.ascontiguousarray, positions))
+        self.path = MeasuredPath(*map(np.ascontiguousarray, positions))
         self._heading = 0.0
         self._values: dict[Point, float] = {}
         self.lost: dict[Point, int] = {}  # how often the filter was lost
@@ -283,7 +309,7 @@ class _Evaluation:
         """Find the heading at the first position that makes white errors the most likely."""
         best = math.inf
         for angle in (2.0 * math.pi / SOURCES.headings * np.arange(SOURCES.headings)).tolist():
-            value, *_ = filtered(*self._path, 1.0, 0.0, 1.0, 1.0, 1.0, angle, True)
+            value, *_ = filtered(*self.path, 1.0, 0.0, 1.0, 1.0, 1.0, angle, True)
             if value < best:
                 best, self._heading = value, angle
             yield from self._pause()
@@ -303,10 +329,10 @@ class _Evaluation:
                 (2.0 ** point[0], 2.0 ** point[1]) if len(point) > 3 else (1.0, 0.0))
             white = 2.0 ** point[-1]
             value, self.lost[point], *self.constants[point] = filtered(
-                *self._path, tau, correlated, 2.0 ** way, 2.0 ** turn, white, self._heading,
+                *self.path, tau, correlated, 2.0 ** way, 2.0 ** turn, white, self._heading,
                 constant)
             total = math.log2(correlated + white)
-            spread = SOURCES.spread if len(point) > 3 or total > 0.0 else SOURCES.smaller_spread
+            spread = self._spread if len(point) > 3 or total > 0.0 else self._smaller_spread
             self._values[point] = value + LOG_2**2 * (
                 (total / spread) ** 2 + (way / SOURCES.way_spread) ** 2
                 + (turn / SOURCES.turn_spread) ** 2)
@@ -314,7 +340,7 @@ class _Evaluation:
         return self._values[point]
 
     def _pause(self) -> Generator[None, None, None]:
-        self._left -= len(self._path.seconds)
+        self._left -= len(self.path.seconds)
         if self._left < 0:
             self._left = SOURCES.per_step
             yield
@@ -326,24 +352,28 @@ class _Evaluation:
                      for low, high in [bounds[axis >= times]])
 
 
-def _descend(
-    evaluate: _Evaluation, beginnings: list[Point], fixed: int = 0,
-) -> Generator[None, None, _Minimum]:
-    """Return the best point near the best beginning, by steps that are halved."""
-    values: list[_Minimum] = []
+def descend(
+    evaluate: Evaluation, beginnings: list[Point], fixed: Collection[int] = (),
+) -> Generator[None, None, Minimum]:
+    """
+    Return the best point near the best beginning, by steps that are halved.
+
+    Axes are counted from the end; those that are `fixed` stay as they are.
+    """
+    values: list[Minimum] = []
     for point in beginnings:
-        values.append(_Minimum((yield from evaluate.value(point)), point))
+        values.append(Minimum((yield from evaluate.value(point)), point))
     best, step = min(values), 1.0
-    while step >= SOURCES.finest:
+    while step >= evaluate.finest:
         before = best
         for axis in range(-len(best.point), 0):
-            if axis == fixed:
+            if axis in fixed:
                 continue
             for move in (step, -step):
                 moved = list(best.point)
                 moved[axis] += move
                 point = evaluate.clipped(tuple(moved))
-                best = min(best, _Minimum((yield from evaluate.value(point)), point))
+                best = min(best, Minimum((yield from evaluate.value(point)), point))
         if best.value == before.value:
             step /= 2.0
     return best

@@ -1,0 +1,238 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How noisy odometry and the sources of positions are, by all that a drive shows of both.
+
+The factors are those with the largest likelihood that the engine finds as well. A factor of 1 that
+is as likely, by a likelihood ratio, is kept, and all others are found again. The interval of a
+factor is where the likelihood, with all others at their best, falls by half of `RISE`.
+
+The likelihood knows what changes between measurements. It is blind to errors of a source that
+last longer than the drive, and takes slower ones than it models for motion. So a source claims
+less than before only as far as odometry, laid over its positions without any model of noise,
+shows: there its errors are all that is left, slow ones too, and only as many pieces of the drive
+as these can change in are independent. Less noise of odometry is proven with the upper end of
+its interval. The path depends on ratios of noise: where a source keeps more than was found,
+odometry keeps as much more.
+"""
+
+from collections.abc import Collection
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from pose_graph_ros.core.batch.optimizer import to_the_end
+from pose_graph_ros.core.parts import Parts
+from pose_graph_ros.core.quantities import Metres, StampNs
+from pose_graph_ros.core.sources.error_estimate import (
+    descend,
+    Evaluation,
+    measured_path,
+    Minimum,
+    most_likely,
+    PathOdometry,
+    Point,
+)
+from pose_graph_ros.core.sources.error_likelihood import MeasuredPath
+from pose_graph_ros.core.sources.settings import SOURCES
+
+# Rise of twice the negative logarithm of the likelihood at the ends of an interval of 95 %, and
+# that which makes a factor of 1 unlikely enough to be changed (99 %).
+RISE, CHANGE_RISE = 3.84, 6.63
+# Sigma of the logarithm of the variance of a source before it is seen: what claims are is found.
+CLAIM_SPREAD = 3.0
+# Smallest step of an exponent of 2.
+FINEST = 1.0 / 16.0
+# An interval with a larger ratio of its ends says nothing.
+WIDE = 10.0
+# Smallest part of a variance that is what a source claims.
+SMALLEST = 0.01
+# Exponents of 2 of multiples of claimed variances.
+MULTIPLES = -12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0
+# Largest exponent of 2, from the best one, at which the end of an interval is looked for.
+REACH = 6.0
+# Axes of a point, from its end; those of correlated errors, from its beginning.
+WAY, TURN, WHITE = -3, -2, -1
+TAU, CORRELATED = 0, 1
+# Time in which slow errors of a receiver change: satellites, ionosphere, reflections [s].
+SLOW = 300.0
+# Probability that a variance is larger than the end of its interval.
+TAIL = 0.025
+# Time constants in a drive from which on these and their variance are known to a factor of `WIDE`.
+KNOWN_FROM = 7.0
+
+
+class Found(NamedTuple):
+    """A variance in units of the claimed one, or a time constant [s]."""
+
+    value: float
+    # ends of the interval of 95 %; 0 or infinite where the data give no bound
+    low: float
+    high: float
+    kept: bool  # whether the setting is as likely, and so stays
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the data hardly tell."""
+        return not self.high < WIDE * self.low
+
+    def written(self, value: float) -> 'Found':
+        """Return it with the value that is proven."""
+        return self._replace(value=value, high=max(self.high, value), kept=value == 1.0)
+
+    def proven(self, high: float) -> 'Found':
+        """Return what is proven: more by the lower end, less by an upper one."""
+        return self.written(max(self.low, 1.0) if self.value > 1.0
+                            else max(self.value, min(high, 1.0)))
+
+
+class Noise(NamedTuple):
+    """What the positions of a source and odometry show together."""
+
+    way: Found  # of odometry, see `OdometryErrors`
+    turn: Found
+    size: Found  # of the errors of the source
+    tau: Found | None  # their time constant; None for white ones
+    sigma: Metres  # median of what the source claims
+    shown: float  # how large the variance of the source can be at most, in units of the claimed
+    seconds: float  # from the first to the last position
+
+    @property
+    def proven(self) -> Found:
+        """The size of the errors that a drive proves."""
+        if self.tau is not None and (
+                self.tau.is_wide or self.seconds < KNOWN_FROM * self.tau.value):
+            return self.size.written(1.0)
+        return self.size.written(
+            max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
+
+    @property
+    def excess(self) -> float:
+        """By what the variance that is proven is larger than that which was found."""
+        return max(self.proven.value / self.size.value, 1.0)
+
+
+def noise_of(
+    parts: Parts, source: str, without: Collection[StampNs] = (),
+) -> Noise | None:
+    """
+    Return the noise by the positions of a source in an engine, but for some stamps [ns].
+
+    None if there are too few positions.
+    """
+    graph, nodes = parts.graph, parts.nodes
+    constraints = parts.factors.constraints(source)
+    order = np.argsort(constraints.rows.values[:, 0], kind='stable')
+    rows, moved = constraints.rows.values[order], constraints.noise.values[order, 0]
+    used = ~np.isin(rows[:, 0], np.array([*without], dtype=np.int64))
+    rows, moved = rows[used], moved[used]
+    path = to_the_end(measured_path(
+        graph, PathOdometry(nodes.ids, nodes.stamps_ns, nodes.errors, nodes.errors),
+        rows[:, 0], rows[:, 1]))
+    if len(path.seconds) < 2 * SOURCES.least_positions:
+        return None
+    # a factor on what is claimed is none on what the motion since the node adds
+    stamps_ns = rows[0, 0] + np.rint(1e9 * path.seconds).astype(np.int64)
+    added = moved[np.searchsorted(rows[:, 0], stamps_ns)]
+    return fitted(path._replace(variance=np.maximum(
+        path.variance - added, SMALLEST * path.variance)))
+
+
+def fitted(path: MeasuredPath) -> Noise:
+    """Return the noise that makes positions on a path the most likely."""
+    # claims may be wrong by more than the search goes: it begins with the best of some multiples
+    multiple = _multiple(path)
+    evaluate = Evaluation(
+        path._replace(variance=2.0**multiple * path.variance), CLAIM_SPREAD, CLAIM_SPREAD, FINEST)
+    likely = best = to_the_end(most_likely(evaluate))
+    kept: tuple[int, ...] = ()
+    axes = (WAY, TURN, WHITE) if len(best.point) == 3 else (WAY, TURN)
+    while len(kept) < len(axes):
+        least, axis = min(
+            (_at(evaluate, best.point, axis, -multiple if axis == WHITE else 0.0, (*kept, axis)),
+             axis) for axis in axes if axis not in kept)
+        if least.value - likely.value > CHANGE_RISE:
+            break
+        best, kept = least, (*kept, axis)
+
+    def found(axis: int, unit: float = 1.0) -> Found:
+        if axis not in kept:
+            return _interval(evaluate, best, axis, kept, unit)
+        each = _interval(evaluate, likely, axis, (), unit)
+        return Found(1.0, min(each.low, 1.0), max(each.high, 1.0), kept=True)
+    if len(best.point) == 3:
+        size, tau = found(WHITE, 2.0**multiple), None
+    else:
+        axis = CORRELATED - len(best.point)
+        # with the white part
+        size = found(axis, 2.0**multiple * (1.0 + 2.0**(best.point[WHITE] - best.point[axis])))
+        tau = found(TAU - len(best.point))
+    return Noise(found(WAY), found(TURN), size, tau, float(np.sqrt(np.median(path.variance))),
+                 _shown(path), float(path.seconds[-1]))
+
+
+def _at(
+    evaluate: Evaluation, point: Point, axis: int, exponent: float, fixed: Collection[int],
+) -> Minimum:
+    """Return the minimum near a point with another exponent on an axis."""
+    moved = list(point)
+    moved[axis] = exponent
+    return to_the_end(descend(evaluate, [tuple(moved)], fixed))
+
+
+def _multiple(path: MeasuredPath) -> float:
+    evaluate = Evaluation(path)
+    to_the_end(evaluate.find_heading())
+    return min(MULTIPLES, key=lambda exponent: to_the_end(
+        evaluate.value((0.0, 0.0, exponent))))
+
+
+def _interval(
+    evaluate: Evaluation, best: Minimum, axis: int, kept: Collection[int], unit: float,
+) -> Found:
+    """Return the exponent on an axis with its interval, as a number of units."""
+    ends = []
+    for sign in (-1.0, 1.0):
+        point, at = best.point, best.point[axis]
+        for far in np.arange(SOURCES.finest, REACH + 0.1, SOURCES.finest).tolist():
+            least = _at(evaluate, point, axis, at + sign * far, (*kept, axis))
+            point = least.point
+            if least.value - best.value > RISE:
+                ends.append(unit * 2.0**point[axis])
+                break
+        else:
+            ends.append(0.0 if sign < 0.0 else math.inf)
+    low, high = ends
+    return Found(unit * 2.0**best.point[axis], low, high, kept=False)
+
+
+def _shown(path: MeasuredPath) -> float:
+    """Return how large the variance of positions can be at most, in units of the claimed one."""
+    headings = np.cumsum(path.motion[:, 2])
+    before = np.concatenate(([0.0], headings[:-1]))
+    here = np.cumsum((path.motion[:, 0] + 1j * path.motion[:, 1]) * np.exp(1j * before))
+    here += (path.offset[:, 0] + 1j * path.offset[:, 1]) * np.exp(1j * headings)
+    there = path.position[:, 0] + 1j * path.position[:, 1]
+    here, there = here - np.mean(here), there - np.mean(there)
+    turn = np.angle(np.sum(np.conj(here) * there))
+    errors = np.abs(there - here * np.exp(1j * turn))**2
+    # two coordinates, without the three numbers by which odometry was laid there
+    pieces = float(path.seconds[-1]) / SLOW
+    return largest_ratio(float(np.mean(errors / (2.0 * path.variance))), 2.0 * pieces - 3.0)
+
+
+def largest_ratio(squares: float, degrees: float) -> float:
+    """Return the upper end of the interval of a variance from a mean of squared errors."""
+    if degrees <= 0.0:
+        return math.inf
+    quantile = 2.0 * float(gammaincinv(0.5 * degrees, TAIL))
+    return squares * degrees / quantile if quantile > 0.0 else math.inf
+
+
+def proven_odometry(found: Collection[Noise]) -> tuple[Found, Found]:
+    """Return the proven noise of odometry, of way and turn, as most of the drive shows it."""
+    excess = max(each.excess for each in found)
+    most = max(found, key=lambda each: each.seconds)
+    return most.way.proven(excess * most.way.high), most.turn.proven(excess * most.turn.high)
