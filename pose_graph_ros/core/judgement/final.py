@@ -35,18 +35,24 @@ from pose_graph_ros.core.smoother.covariances import Innovations, innovations
 
 def select(problem: TruncatedProblem) -> Generator[None, None, BoolArray | None]:
     """
-    Return a set of believed constraints, shape (M,); None if the graph cannot be solved.
+    Return a set of believed constraints, shape (M,), and lower the limits of the problem.
 
     With S the covariance of the error that a constraint would have by what is believed already, it
     passes the gate if `e^T S^-1 e` is small. A wrong one, whose error could be anything, passes
     with a chance that is proportional to the volume of the gate, and so to sqrt(det S). So they
     are believed in the order of this volume: first those that span little odometry, then those
     that these make sure. Wrong ones meet a narrow gate in the end, also where many of them agree.
+
+    What is believed also shows how large errors really are. Where covariances are far too large,
+    the limits are lowered; else a wrong one would fit wherever the graph is claimed to be soft.
+
+    None if the graph cannot be solved.
     """
     believed = np.zeros(len(problem), dtype=bool)
     if not (yield from problem.solve(believed.astype(np.float64))):
         return None
     gates, thrown = _Gates(problem), np.zeros(len(problem), dtype=np.int64)
+    limits, seen = problem.limits, np.zeros(len(problem))
     for _ in range(BELIEF.most_rounds):
         waiting = gates.plausible(np.flatnonzero(~believed & (thrown < BELIEF.thrown_out)))
         waiting = waiting[np.argsort(gates.volume[waiting], kind='stable')]
@@ -59,10 +65,15 @@ def select(problem: TruncatedProblem) -> Generator[None, None, BoolArray | None]
         if len(passing) == 0:
             break
         volume = gates.volume[passing]
-        believed[passing[volume <= BELIEF.round_factor * np.min(volume)]] = True
+        new = passing[volume <= BELIEF.round_factor * np.min(volume)]
+        believed[new], seen[new] = True, gates.squared[new] / limits[new]
+        if np.sum(believed) >= BELIEF.limits_from:
+            shown = np.quantile(seen[believed], BELIEF.limits_share) * GATE / BELIEF.limits_chi2
+            problem.limits = limits * np.clip(
+                BELIEF.limits_margin * shown, BELIEF.least_limits, 1.0)
         if not (yield from problem.solve(believed.astype(np.float64), go_on=True)):
             return None
-        wrong = believed & (problem.energies() > problem.limits)
+        wrong = believed & (problem.energies() > limits)
         if np.any(wrong):
             thrown[wrong] += 1
             believed[wrong] = False
@@ -85,6 +96,7 @@ class _Gates:
         # J P J^T of each; they never grow while more is believed
         self._covariances = np.full((len(problem), 3, 3), np.nan)
         self.volume = np.zeros(len(problem))
+        self.squared = np.zeros(len(problem))  # Mahalanobis distances
         self._begin_with_odometry()
 
     def _begin_with_odometry(self) -> None:
@@ -116,8 +128,8 @@ class _Gates:
             errors, covariances = innovations(
                 self._problem.graph.memory.head, self._problem.edges.rows(part))
             self._set(part, covariances)
-            inside[begin:begin + len(part)] = (
-                self._squared(part, errors) <= self._problem.limits[part])
+            self.squared[part] = self._squared(part, errors)
+            inside[begin:begin + len(part)] = self.squared[part] <= self._problem.limits[part]
             yield
         return waiting[inside]
 

@@ -60,6 +60,13 @@ class BeliefSettings:
     round_factor: float = 4.0  # volumes up to this times the smallest one count as equal
     most_rounds: int = 200
     thrown_out: int = 2  # times after which one is doubted
+    # limits are lowered by so many believed closures, and this share of them with its chi2 of
+    # three degrees of freedom; they stay above what these show by a factor, and above the least
+    limits_from: int = 50
+    limits_share: float = 0.9
+    limits_chi2: float = 6.25
+    limits_margin: float = 3.0
+    least_limits: float = 0.02
     # the smallest so many volumes, or this share of them, are looked at before all others
     first_volumes: int = 200
     first_volumes_share: float = 0.125
