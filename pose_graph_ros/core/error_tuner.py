@@ -18,7 +18,6 @@ import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status, to_the_end
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Measured
@@ -93,7 +92,7 @@ class ErrorTuner:
         graph = self._smoother.graph
         if graph.has_touched:
             return 0.0  # an update has failed
-        ends = graph.memory['factor_i'][:graph.n_factors, tb.END_J]
+        ends = graph.factor_records['ends'][:, 1]
         if self._change is not None or (
                 self._odometry_is_due() and np.count_nonzero(ends >= 0) <= most_edges):
             before = graph.poses.copy()
@@ -267,11 +266,12 @@ class ErrorTuner:
     def _primary_rows(self) -> IntArray:
         """Return the rows of the edges that the hidden nodes were made with."""
         graph = self._smoother.graph
-        primary = graph.memory['factor_i'][:graph.n_factors, tb.FACTOR_KIND] == FactorKind.ODOMETRY
+        factors = graph.factor_records
+        primary = factors['kind'] == FactorKind.ODOMETRY
         others = np.concatenate([[], *self._factors.pose_edges().values()]).astype(np.int64)
         primary[graph.factor_rows(others)] = False
-        ends = graph.node_ids[graph.memory['factor_i'][:graph.n_factors, tb.END_J]]
-        primary &= ~np.isin(ends, self._nodes.relocated_ids)
+        later = graph.node_ids[factors['ends'][:, 1]]
+        primary &= ~np.isin(later, self._nodes.relocated_ids)
         return np.flatnonzero(primary)
 
     def _next_search(self) -> _Search | None:

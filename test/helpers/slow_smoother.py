@@ -159,13 +159,13 @@ def _with_weight(table: Any, weight: FloatArray) -> Any:
 
 def frame_turn(graph: Graph, c: int) -> float:
     """Return the angle of a clique's frame: the mean turn of its separator, unless anchored."""
-    row = graph.memory['clique_i'][c]
-    begin = row[tb.NODES] + row[tb.N_FRONTAL]
-    separator = graph.memory['pool_i'][begin:begin + row[tb.N_SEPARATOR]]
-    if row[tb.ANCHORED] != 0 or len(separator) == 0:
+    row = graph.memory['cliques'][c]
+    begin = row['members'] + row['n_frontal']
+    separator = graph.memory['pool_i'][begin:begin + row['n_separator']]
+    if row['anchored'] != 0 or len(separator) == 0:
         return 0.0
-    turns = graph.memory['node_f'][separator, tb.DELTA + 2]
-    return float(np.mean(turns) - graph.memory['clique_f'][c, tb.TURN_ZERO])
+    turns = graph.node_records['delta'][separator, 2]
+    return float(np.mean(turns) - row['turn_zero'])
 
 
 def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
@@ -181,21 +181,19 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
         observed = _with_weight(observed, observed.weight * np.isin(observed.i, nodes))
     m, k = len(edges), len(observed)
     is_edge = graph.factors_by_row.j >= 0
-    table = graph.memory['factor_f'][:m + k]
+    table, headings = graph.factor_records, graph.node_records['reference'][:, 2]
     rows, unary = table[is_edge], table[~is_edge]
     ends, hidden = np.zeros((2 * m, 3)), np.zeros((k, 3))
     # the constraints of a clique turn with its frame
-    owners = graph.memory['factor_i'][:m + k][is_edge, tb.OWNER]
-    turn = np.array([frame_turn(graph, c) for c in owners])
-    ends[:m, 2] = (np.arctan2(rows[:, tb.LIN_SIN], rows[:, tb.LIN_COS]) - edges.mean[:, 2] + turn)
+    turn = np.array([frame_turn(graph, c) for c in rows['owner']])
+    ends[:m, 2] = np.arctan2(rows['lin_sin'], rows['lin_cos']) - edges.mean[:, 2] + turn
     # an edge to a bias has the factors in place of a frame
     to_bias = edges.kind == FactorKind.BIAS
     assert np.all(turn[to_bias & (edges.weight > 0.0)] == 0.0)
-    ends[:m][to_bias, 2] = (graph.memory['node_f'][edges.i, tb.REF + 2] + rows[:, tb.LIN_TH])[
-        to_bias]
-    difference = rows[:, tb.LIN_ARM:tb.LIN_ARM + 2]
+    ends[:m][to_bias, 2] = (headings[edges.i] + rows['lin_th'])[to_bias]
+    difference = rows['lin_arm']
     ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
-    hidden[:, 2] = graph.memory['node_f'][observed.i, tb.REF + 2] + unary[:, tb.LIN_TH]
+    hidden[:, 2] = headings[observed.i] + unary['lin_th']
     edge = jacobians.linearize_edges(ends, Factors(
         np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind,
         constants=edges.constants))
@@ -427,9 +425,8 @@ def driven(
 
 # --- the tables ---------------------------------------------------------------------------------
 
-_USED = {'node_f': tb.N_NODES, 'node_i': tb.N_NODES, 'factor_f': tb.N_FACTORS,
-         'factor_i': tb.N_FACTORS, 'touched': tb.N_TOUCHED, 'waiting': tb.N_WAITING,
-         'node_id': tb.N_NODES, 'factor_id': tb.N_FACTORS}
+_USED = {'nodes': tb.N_NODES, 'factors': tb.N_FACTORS, 'touched': tb.N_TOUCHED,
+         'waiting': tb.N_WAITING, 'node_id': tb.N_NODES, 'factor_id': tb.N_FACTORS}
 
 
 @dataclass(frozen=True)
@@ -457,21 +454,21 @@ def triangle(values: FloatArray, rows: int, n: int) -> tuple[FloatArray, int]:
 def cliques(graph: Graph) -> dict[int, Clique]:
     """Return all cliques by row."""
     memory, found = graph.memory, {}
-    for c, row in enumerate(memory['clique_i'][:memory.head[tb.N_CLIQUES]]):
-        n_frontal, n_separator = int(row[tb.N_FRONTAL]), int(row[tb.N_SEPARATOR])
+    for c, row in enumerate(memory['cliques'][:memory.head[tb.N_CLIQUES]]):
+        n_frontal, n_separator = int(row['n_frontal']), int(row['n_separator'])
         if n_frontal <= 0:
             continue    # a prior, or an unused row
-        nodes = memory['pool_i'][row[tb.NODES]:][:n_frontal + n_separator].tolist()
+        nodes = memory['pool_i'][row['members']:][:n_frontal + n_separator].tolist()
         rows, rest = 3 * n_frontal, 3 * n_separator
-        values = memory['pool_f'][row[tb.VALUES]:]
+        values = memory['pool_f'][row['values']:]
         block, n_numbers = triangle(values, rows, rows + rest)
         R = block[:, :-1]
         R[np.diag_indices(rows)] = 1.0 / R[np.diag_indices(rows)]
         update = triangle(values[n_numbers:], rest, rest)[0][:, :-1]
-        children, child = [], int(row[tb.CHILD])
+        children, child = [], int(row['child'])
         while child >= 0:
             children.append(child)
-            child = int(memory['clique_i'][child, tb.SIBLING])
+            child = int(memory['cliques']['sibling'][child])
         # R and the update matrix are in the frame of the clique
         M = np.eye(3 * len(nodes))
         M.reshape(len(nodes), 3, len(nodes), 3)[
@@ -479,7 +476,7 @@ def cliques(graph: Graph) -> dict[int, Clique]:
                 se2.rotation(frame_turn(graph, c)).T)
         rest = M[rows:, rows:]
         found[c] = Clique(
-            int(row[tb.PARENT]), children, nodes[:n_frontal], nodes[n_frontal:], R @ M,
+            int(row['parent']), children, nodes[:n_frontal], nodes[n_frontal:], R @ M,
             block[:, -1].copy(), rest.T @ (update + np.triu(update, 1).T) @ rest)
     return found
 
@@ -488,10 +485,10 @@ def state(graph: Graph) -> dict[str, bytes]:
     """Return all numbers that later steps depend on as bytes, for comparison bit by bit."""
     memory = graph.memory
     copies = {name: memory[name][:memory.head[count]].copy() for name, count in _USED.items()}
-    for name, columns in tb.STAMPS.items():
-        if name in copies:
-            copies[name][:, columns] = 0
-    copies['node_i'][:, tb.INDEX] = 0  # work space
+    for name, fields in tb.STAMPS.items():
+        for stamp in fields if name in copies else ():
+            copies[name][stamp] = 0
+    copies['nodes']['index'] = 0  # work space
     parts = {name: table.tobytes() for name, table in copies.items()}
     parts['cliques'] = b''.join(
         np.array([row, c.parent, -1, *c.children, -1, *c.frontal, -1, *c.separator]).tobytes()

@@ -32,18 +32,19 @@ from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tab
 
 def put_poses(memory: tb.Memory, poses: Poses) -> None:
     """Write the poses of all nodes, shape (N, 3), unchanged, and make them the references."""
-    rows = memory['node_f'][:len(poses)]
-    rows[:, tb.POSE:tb.POSE + 3] = rows[:, tb.REF:tb.REF + 3] = poses
-    rows[:, tb.DELTA:tb.CHECKED_TURN + 1] = 0.0
+    rows = memory['nodes'][:len(poses)]
+    rows['pose'] = rows['reference'] = poses
+    for field in ('delta', 'seen', 'checked_turn'):
+        rows[field] = 0.0
 
 
 @kernel(signature=(tb.HEAD,))
 def linearize(head):  # type: ignore[no-untyped-def]
     """Make the poses the references and linearize all factors there."""
     for v in range(head[tb.N_NODES]):
-        factors.refer_to_pose(tb.node_f(head)[v])
+        factors.refer_to_pose(tb.nodes(head)[v])
     for e in range(head[tb.N_FACTORS]):
-        if tb.factor_f(head)[e, tb.WEIGHT] > 0.0:
+        if tb.factors(head)[e].weight > 0.0:
             factors.linearize(head, e)
 
 
@@ -55,38 +56,38 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     `terms` says what constraints add; see `assembly`. Return False if a node is not determined,
     which is `BAD_NODE` of the head.
     """
-    scalars = tb.scalars(head)
-    scalars[tb.DAMPING] = damping
+    scalars = tb.scalars(head)[0]
+    scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
         bad = eliminate_clique(head, c, terms)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             break
-    scalars[tb.DAMPING] = 0.0
+    scalars.damping = 0.0
     return bad < 0
 
 
 @kernel
 def _update_pose(f):  # type: ignore[no-untyped-def]
     """Set the pose of a node, given as its row, to reference plus solution."""
-    f[tb.POSE] = f[tb.REF] + f[tb.DELTA]
-    f[tb.POSE + 1] = f[tb.REF + 1] + f[tb.DELTA + 1]
-    f[tb.POSE + 2] = factors.wrap(f[tb.REF + 2] + f[tb.DELTA + 2])
+    f.pose[0] = f.reference[0] + f.delta[0]
+    f.pose[1] = f.reference[1] + f.delta[1]
+    f.pose[2] = factors.wrap(f.reference[2] + f.delta[2])
 
 
 @kernel(forceinline=True)
 def _clique(head, c, right):  # type: ignore[no-untyped-def]
     """Return the nodes of a clique, how many are frontal, its values, and `right` of them."""
-    row = tb.clique_i(head)[c]
-    n = row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
-    nodes = tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + n]
+    row = tb.cliques(head)[c]
+    n = row.n_frontal + row.n_separator
+    members = tb.pool_i(head)[row.members:row.members + n]
     x = tb.work_f(head)[:3 * n]
     for k in range(n):
-        v = nodes[k]
+        v = members[k]
         for m in range(3):
             x[3 * k + m] = right[v, m]
-    return nodes, row[tb.N_FRONTAL], tb.pool_f(head)[row[tb.VALUES]:], x
+    return members, row.n_frontal, tb.pool_f(head)[row.values:], x
 
 
 @kernel(signature=(tb.HEAD, ROWS, FLAG))
@@ -97,32 +98,32 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
     It is the one of the last factorisation, or a chord step from the present poses with it. Then
     `right` is -b there, from `evaluate`, shape (N, 3). The step overwrites it.
     """
-    node_f, node_i = tb.node_f(head), tb.node_i(head)
+    nodes = tb.nodes(head)
     n_priors, n_cliques = head[tb.N_PRIORS], head[tb.N_CLIQUES]
     for c in range(n_priors, n_cliques if chord else n_priors):
-        nodes, n_frontal, values, x = _clique(head, c, right)
+        members, n_frontal, values, x = _clique(head, c, right)
         forward_rows(values, 3 * n_frontal, len(x), x)
-        for k in range(len(nodes)):
-            v = nodes[k]
+        for k in range(len(members)):
+            v = members[k]
             for m in range(3):
                 right[v, m] = x[3 * k + m]
     largest = 0.0
     for c in range(n_cliques - 1, n_priors - 1, -1):
-        nodes, n_frontal, values, x = _clique(head, c, right)
+        members, n_frontal, values, x = _clique(head, c, right)
         if chord:
             backward_rows(values, 3 * n_frontal, len(x), x)
         else:
             solve_rows(values, 3 * n_frontal, len(x), x)
         for k in range(n_frontal):
-            v = nodes[k]
-            f = node_f[v]
-            if node_i[v, tb.FIXED] != 0:    # known, and zero but in a linear start
+            v = members[k]
+            f = nodes[v]
+            if f.fixed != 0:    # known, and zero but in a linear start
                 for m in range(3):
-                    right[v, m] = f[tb.DELTA + m]
+                    right[v, m] = f.delta[m]
                 continue
             for m in range(3):
                 right[v, m] = x[3 * k + m]
-                f[tb.DELTA + m] += right[v, m]
+                f.delta[m] += right[v, m]
                 largest = _larger(largest, right[v, m])
             _update_pose(f)
     return largest
@@ -142,11 +143,11 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
 
     `right`, shape (N, 3), receives -b: half the gradient of chi2, with negative sign.
     """
-    node_f = tb.node_f(head)
+    nodes = tb.nodes(head)
     right[:] = 0.0
     chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_FACTORS]):
-        if tb.factor_f(head)[e, tb.WEIGHT] > 0.0:
+        if tb.factors(head)[e].weight > 0.0:
             energy, size, terms = normal_equations.gradient(head, e, right)
             chi2 += energy
             gradient_sum += size
@@ -156,7 +157,7 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     gradient_sum += size
     cancelled += terms
     for v in range(head[tb.N_NODES]):
-        reach = max(reach, abs(node_f[v, tb.POSE]), abs(node_f[v, tb.POSE + 1]))
+        reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
     # rounding of a sum of many numbers, and of coordinates
     return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (
         reach * gradient_sum + cancelled)
@@ -170,17 +171,17 @@ def _add_priors(head, right):  # type: ignore[no-untyped-def]
     Return their energies, the sum of the magnitudes of their gradients by a position, and that of
     the terms that cancel each other in their energies.
     """
-    clique_i, pool_i, work = tb.clique_i(head), tb.pool_i(head), tb.work_f(head)
+    cliques, pool_i, work = tb.cliques(head), tb.pool_i(head), tb.work_f(head)
     energies = gradients = cancelled = 0.0
     for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
         if not prior_rows.is_prior(head, c):
             continue
-        row = clique_i[c]
-        n = row[tb.N_SEPARATOR]
+        row = cliques[c]
+        n = row.n_separator
         energies += prior_rows.gradient(head, c, work)
         d, g = work[:3 * n], work[3 * n:6 * n]
         for k in range(n):
-            v = pool_i[row[tb.NODES] + k]
+            v = pool_i[row.members + k]
             gradients += abs(g[3 * k]) + abs(g[3 * k + 1])
             for m in range(3):
                 right[v, m] -= g[3 * k + m]
@@ -196,28 +197,28 @@ def settle(head):  # type: ignore[no-untyped-def]
     If the sum of the squared linearization errors exceeds the smoother's budget, the factors
     with large errors are listed in `waiting`, to be linearized again in its next step.
     """
-    node_f, scalars, waiting = tb.node_f(head), tb.scalars(head), tb.waiting(head)
+    nodes, scalars, waiting = tb.nodes(head), tb.scalars(head)[0], tb.waiting(head)
     for v in range(head[tb.N_NODES]):
         for k in range(3):
-            node_f[v, tb.SEEN + k] = node_f[v, tb.DELTA + k]
+            nodes[v].seen[k] = nodes[v].delta[k]
     chi2 = error2 = 0.0
-    factor_f, factor_i = tb.factor_f(head), tb.factor_i(head)
     for e in range(head[tb.N_FACTORS]):
-        f = factor_f[e]
-        factor_i[e, tb.FACTOR_WAITS] = 0
-        if f[tb.WEIGHT] > 0.0:
+        f = tb.factors(head)[e]
+        f.waits = 0
+        if f.weight > 0.0:
             factors.check(head, e, factors.NO_TURN)
-            chi2 += f[tb.ENERGY]
-            error2 += f[tb.ERROR2]
-    scalars[tb.CHI2] = chi2
+            chi2 += f.energy
+            error2 += f.error2
+    scalars.chi2 = chi2
     prior_rows.add_energies(head)
     head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
-    if not 0.0 < scalars[tb.SETTING_BUDGET] < error2:
+    if not 0.0 < scalars.budget < error2:
         return
-    threshold = factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+    threshold = factors.LEAST_FRACTION * scalars.share
     for e in range(head[tb.N_FACTORS]):
-        if factor_f[e, tb.ERROR2] > threshold:
-            factor_i[e, tb.FACTOR_WAITS] = 1
+        f = tb.factors(head)[e]
+        if f.error2 > threshold:
+            f.waits = 1
             waiting[head[tb.N_WAITING]] = e
             head[tb.N_WAITING] += 1
 
@@ -227,19 +228,19 @@ class CompiledSystem:
 
     def __init__(self, memory: tb.Memory) -> None:
         self._memory, self._head = memory, memory.head
-        self._rows = memory['node_f'][:memory.head[tb.N_NODES]]
+        self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
         # -b, which a chord step overwrites
         self._right = np.zeros((len(self._rows), 3))
         self.keep_poses()
 
     def keep_poses(self) -> None:
-        self._best = self._rows[:, tb.POSE:tb.POSE + 3].copy()
+        self._best = self._rows['pose'].copy()
 
     def restore_poses(self) -> None:
         put_poses(self._memory, self._best)
 
     def halve_step(self) -> None:
-        step = self._rows[:, tb.POSE:tb.POSE + 3] - self._best
+        step = self._rows['pose'] - self._best
         step[:, 2] = se2.wrap(step[:, 2])
         put_poses(self._memory, se2.wrapped(self._best + 0.5 * step))
 
@@ -256,7 +257,7 @@ class CompiledSystem:
         return float(step(self._head, np.zeros_like(self._right), False))
 
     def decrease(self) -> float:
-        return float(np.sum(self._right * self._rows[:, tb.DELTA:tb.DELTA + 3]))
+        return float(np.sum(self._right * self._rows['delta']))
 
     def settle(self) -> None:
         settle(self._head)
@@ -266,23 +267,26 @@ class CompiledChordal:
     """The `ChordalSystem` of `linear_starts` for a graph in tables; changes its poses."""
 
     def __init__(self, memory: tb.Memory) -> None:
-        n, self._head = memory.head[tb.N_NODES], memory.head
-        self._rows, self._fixed = memory['node_f'][:n], memory['node_i'][:n, tb.FIXED] != 0
+        self._head = memory.head
+        self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
+        self._fixed = self._rows['fixed'] != 0
 
     def headings(self, known: ComplexArray) -> ComplexArray:
         return self._solved(HEADINGS, known)
 
     def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
-        self._rows[~self._fixed, tb.POSE + 2] = np.angle(u[:-1])[~self._fixed]
+        self._rows['pose'][~self._fixed, 2] = np.angle(u[:-1])[~self._fixed]
         return self._solved(POSITIONS, known)
 
     def _solved(self, terms: int, known: ComplexArray) -> ComplexArray:
         rows, fixed = self._rows, self._fixed
         # the unknowns are the solutions of the nodes
-        rows[:, tb.REF:] = rows[:, tb.DELTA:tb.CHECKED_TURN + 1] = 0.0
-        rows[fixed, tb.DELTA] = known.real[:-1][fixed]
-        rows[fixed, tb.DELTA + 1] = known.imag[:-1][fixed]
+        delta = rows['delta']
+        for field in ('reference', 'delta', 'seen', 'checked_turn'):
+            rows[field] = 0.0
+        delta[fixed, 0] = known.real[:-1][fixed]
+        delta[fixed, 1] = known.imag[:-1][fixed]
         if not eliminate(self._head, 0.0, terms):
             raise LinearSolveError('chordal start: singular')
         step(self._head, np.zeros((len(rows), 3)), False)
-        return np.append(rows[:, tb.DELTA] + 1j * rows[:, tb.DELTA + 1], known[-1])
+        return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])

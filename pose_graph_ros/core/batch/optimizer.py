@@ -210,9 +210,9 @@ def loose_nodes(graph: Graph, cliques: symbolic.Cliques) -> IntArray:
     part = symbolic.trees(cliques, graph.n_nodes)
     held = np.zeros(len(cliques.n_frontal), dtype=bool)
     held[part[graph.fixed]] = True
-    table = graph.memory['factor_i'][:graph.n_factors]
-    holds = (table[:, tb.END_J] < 0) & (graph.weights > 0.0)
-    held[part[table[holds, tb.END_I]]] = True
+    ends = graph.factor_records['ends']
+    holds = (ends[:, 1] < 0) & (graph.weights > 0.0)
+    held[part[ends[holds, 0]]] = True
     for prior in graph.priors if graph.n_priors > 0 else ():
         held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
     return graph.node_ids[~held[part]]

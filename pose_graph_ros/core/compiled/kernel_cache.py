@@ -130,7 +130,7 @@ def fingerprint(dispatcher: Dispatcher) -> bytes:
             todo += value
         elif isinstance(value, np.ndarray | np.generic):
             parts += [str(value.dtype), value.shape, value.tobytes().hex()]
-        elif isinstance(value, numba.types.Type):
+        elif isinstance(value, numba.types.Type | np.dtype):
             parts.append(str(value))
         elif isinstance(value, type):
             members = value if issubclass(value, Enum) else ()

@@ -13,7 +13,7 @@ from pose_graph_ros.core.graph import (
     tables as tb,
     transaction_log,
 )
-from pose_graph_ros.core.graph.factors import anchors, dimension_of
+from pose_graph_ros.core.graph.factors import anchors
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 
 # Where factors are stiff in one direction and weak in another, as those of a turn on the spot,
@@ -46,37 +46,34 @@ def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
 @kernel
 def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
     """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
-    node_f = tb.node_f(head)
-    pool_f, work_f, scalars = tb.pool_f(head), tb.work_f(head), tb.scalars(head)
-    node_i, factor_i, pool_i = tb.node_i(head), tb.factor_i(head), tb.pool_i(head)
-    clique_f, clique_i = tb.clique_f(head), tb.clique_i(head)
-    row = clique_i[c]
-    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    nodes, pool_f, work_f = tb.nodes(head), tb.pool_f(head), tb.work_f(head)
+    scalars, pool_i, cliques = tb.scalars(head)[0], tb.pool_i(head), tb.cliques(head)
+    row = cliques[c]
+    n_frontal, n_separator = row.n_frontal, row.n_separator
     n_all = n_frontal + n_separator
     rows, n = 3 * n_frontal, 3 * n_all
     ld = padded(n)
-    nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_all]
+    members = pool_i[row.members:row.members + n_all]
     front = work_f[:n * ld]
     least = work_f[n * ld:n * ld + rows]
     front[:] = 0.0
     serial = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = serial
     for k in range(n_all):
-        node_i[nodes[k], tb.INDEX] = 3 * k
-        node_i[nodes[k], tb.FRONT] = serial
+        nodes[members[k]].index = 3 * k
+        nodes[members[k]].front = serial
     any_fixed, any_padded, anchored = False, False, 0
     for k in range(n_frontal):
-        v = nodes[k]
-        at = node_i[v, tb.FACTOR_LIST]
+        v = members[k]
+        at = nodes[v].factor_list
         while at >= 0:
             e, side = at >> 2, at & 3
-            ends = factor_i[e]
-            at = ends[tb.NEXT_I + side]
-            at_i, at_j = _place(head, ends[tb.END_I]), _place(head, ends[tb.END_J])
-            at_k = _place(head, ends[tb.END_K])
+            f = tb.factors(head)[e]
+            at = f.next[side]
+            at_i, at_j = _place(head, f.ends[0]), _place(head, f.ends[1])
+            at_k = _place(head, f.ends[2])
             # one between frontal nodes is in all their lists: added from the first of its ends
-            if (at_i < 0 or (ends[tb.END_J] >= 0 and at_j < 0)
-                    or (ends[tb.END_K] >= 0 and at_k < 0)
+            if (at_i < 0 or (f.ends[1] >= 0 and at_j < 0) or (f.ends[2] >= 0 and at_k < 0)
                     or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
                 continue
             if terms > RELINEARIZED:
@@ -85,85 +82,85 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
             if terms == RELINEARIZED:
                 transaction_log.log_factor(head, e)
                 factors.linearize(head, e)
-            ends[tb.OWNER] = c
-            anchored |= anchors(ends[tb.FACTOR_KIND])
+            f.owner = c
+            anchored |= anchors(f.kind)
             normal_equations.add(head, e, at_i, at_j, at_k, front, ld)
-        scale_t = node_f[v, tb.SCALE_T] * node_f[v, tb.SCALE_T]
-        scale_r = node_f[v, tb.SCALE_R] * node_f[v, tb.SCALE_R]
+        scale_t = nodes[v].scale_t * nodes[v].scale_t
+        scale_r = nodes[v].scale_r * nodes[v].scale_r
         least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
         least[3 * k + 2] = LEAST_PIVOT * scale_r
         if terms > RELINEARIZED:
             least[3 * k:3 * k + 3] = 0.0
         if by_weakest:
             _lower_bounds(head, v, least[3 * k:3 * k + 3])
-        damping = scalars[tb.DAMPING]
+        damping = scalars.damping
         if damping > 0.0:
             for m in range(3):
                 more = damping * (scale_t if m < 2 else scale_r)
                 front[(3 * k + m) * ld + 3 * k + m] += more
-                front[(3 * k + m + 1) * ld - 1] += more * node_f[v, tb.DELTA + m]
-        if node_i[v, tb.FIXED] != 0:
+                front[(3 * k + m + 1) * ld - 1] += more * nodes[v].delta[m]
+        if nodes[v].fixed != 0:
             any_fixed, anchored = True, 1
-        for m in range(dimension_of(node_i[v]), 3):
+        for m in range(nodes[v].dimension, 3):
             front[(3 * k + m) * (ld + 1)] += 1.0
             any_padded = True
-    child = row[tb.CHILD]
+    child = row.child
     while child >= 0:
         _extend_add(head, child, front, ld)
-        anchored |= clique_i[child, tb.ANCHORED]
-        child = clique_i[child, tb.SIBLING]
-    row[tb.ANCHORED] = anchored
-    clique_f[c, tb.TURN_SEEN] = 0.0
-    clique_f[c, tb.TURN_ZERO] = clique_frames.mean_turn(head, c)
+        anchored |= cliques[child].anchored
+        child = cliques[child].sibling
+    row.anchored = anchored
+    cliques[c].turn_seen = 0.0
+    cliques[c].turn_zero = clique_frames.mean_turn(head, c)
     if any_fixed:
         for k in range(n_frontal):
-            if node_i[nodes[k], tb.FIXED] != 0:
-                substitute_fixed(head, nodes[k], 3 * k, front, n, ld)
+            if nodes[members[k]].fixed != 0:
+                substitute_fixed(head, members[k], 3 * k, front, n, ld)
                 least[3 * k:3 * k + 3] = 0.0
     bad = factorize(front, rows, n, ld, least)
     if bad >= 0:
-        return nodes[bad // 3]
+        return members[bad // 3]
     if any_padded:
         # 0 for the reciprocal of the pivot: the coordinate is 0, without uncertainty
         for k in range(n_frontal):
-            for m in range(3 * k + dimension_of(node_i[nodes[k]]), 3 * k + 3):
+            for m in range(3 * k + nodes[members[k]].dimension, 3 * k + 3):
                 front[m * (ld + 1)] = 0.0
     # the rows of R, directly followed by the update matrix
-    write_rows(front, n, ld, pool_f, row[tb.VALUES])
+    write_rows(front, n, ld, pool_f, row.values)
     # the squared error of the parent's linear model of a slip beta is about SLIP_SCALE beta^4
-    scale, first = 0.0, node_f[nodes[n_frontal]] if n_separator > 0 else node_f[nodes[0]]
+    scale, first = 0.0, nodes[members[n_frontal]] if n_separator > 0 else nodes[members[0]]
     for k in range(n_frontal + 1, n_all):
-        f, i = node_f[nodes[k]], 3 * k * ld + 3 * k
-        arm2 = (f[tb.POSE] - first[tb.POSE]) ** 2 + (f[tb.POSE + 1] - first[tb.POSE + 1]) ** 2
+        f, i = nodes[members[k]], 3 * k * ld + 3 * k
+        arm2 = (f.pose[0] - first.pose[0]) ** 2 + (f.pose[1] - first.pose[1]) ** 2
         scale += arm2 * (front[i] + front[i + ld + 1])
-    clique_f[c, tb.SLIP_SCALE] = 0.25 * scale
+    cliques[c].slip_scale = 0.25 * scale
     return -1
 
 
 @kernel
 def _place(head, v):  # type: ignore[no-untyped-def]
     """Return the row of the present front at which the block of a node begins, or -1."""
-    node_i = tb.node_i(head)
+    nodes = tb.nodes(head)
     if v < 0:
         return -1
-    return node_i[v, tb.INDEX] if node_i[v, tb.FRONT] == head[tb.FRONT_SERIAL] else -1
+    return nodes[v].index if nodes[v].front == head[tb.FRONT_SERIAL] else -1
 
 
 @kernel
 def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     """Lower the bounds of a node's pivots, shape (3,), where its factors are weak."""
-    clique_i, at = tb.clique_i(head), tb.node_i(head)[v, tb.FACTOR_LIST]
+    cliques, at = tb.cliques(head), tb.nodes(head)[v].factor_list
     weak_t = weak_r = 0.0
     while at >= 0:
-        t, r = normal_equations.weakest(tb.factor_f(head)[at >> 2])
+        t, r = normal_equations.weakest(tb.factors(head)[at >> 2])
         weak_t, weak_r = weak_t + t, weak_r + r
-        at = tb.factor_i(head)[at >> 2, tb.NEXT_I + (at & 3)]
-    c = clique_i[tb.node_i(head)[v, tb.CLIQUE], tb.CHILD]
+        at = tb.factors(head)[at >> 2].next[at & 3]
+    c = cliques[tb.nodes(head)[v].clique].child
     while c >= 0:
-        if clique_i[c, tb.N_FRONTAL] == 0:
+        if cliques[c].n_frontal == 0:
             t, r = prior_rows.weakest(head, c, v)
             weak_t, weak_r = weak_t + t, weak_r + r
-        c = clique_i[c, tb.SIBLING]
+        c = cliques[c].sibling
     for m in range(3):
         weak = LEAST_WEAK_PIVOT * (weak_t if m < 2 else weak_r)
         if weak > 0.0:
@@ -173,20 +170,19 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
 @kernel
 def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     """Add the update matrix of a child to the front; INDEX of the front's nodes must be set."""
-    pool_f, node_i, clique_f = tb.pool_f(head), tb.node_i(head), tb.clique_f(head)
-    node_f, work_f, clique_i = tb.node_f(head), tb.work_f(head), tb.clique_i(head)
-    pool_i = tb.pool_i(head)
-    row = clique_i[child]
-    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    pool_f, nodes, cliques = tb.pool_f(head), tb.nodes(head), tb.cliques(head)
+    work_f, pool_i = tb.work_f(head), tb.pool_i(head)
+    row = cliques[child]
+    n_frontal, n_separator = row.n_frontal, row.n_separator
     size = 3 * n_separator
     if n_separator == 0:
         return
-    update = pool_f[row[tb.VALUES] + triangle_size(3 * n_frontal, 3 * n_frontal + size):]
-    nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n_separator]
+    update = pool_f[row.values + triangle_size(3 * n_frontal, 3 * n_frontal + size):]
+    members = pool_i[row.members + n_frontal:row.members + n_frontal + n_separator]
     phi = clique_frames.present_turn(head, child)
-    if phi != clique_f[child, tb.TURN_SEEN]:
+    if phi != cliques[child].turn_seen:
         transaction_log.log_clique(head, child)
-    clique_f[child, tb.TURN_SEEN] = phi
+    cliques[child].turn_seen = phi
     if n_frontal == 0:
         linear = work_f[len(front) + len(front) // ld:]
         clique_frames.linearize_prior(
@@ -194,12 +190,12 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
         update = linear
     elif phi != 0.0:
         turned = work_f[len(front) + len(front) // ld:]
-        clique_frames.turned_update(update, n_separator, nodes, node_f, phi, turned)
+        clique_frames.turned_update(update, n_separator, members, nodes, phi, turned)
         update = turned
     index = tb.work_i(head)[head[tb.NODE_ROOM]:]
     in_order = True
     for a in range(n_separator):
-        index[a] = node_i[nodes[a], tb.INDEX]
+        index[a] = nodes[members[a]].index
         in_order = in_order and (a == 0 or index[a] > index[a - 1])
     for k in range(size):
         front[(index[k // 3] + k % 3) * ld + ld - 1] += update[row_start(k, size) + size]
@@ -249,11 +245,11 @@ def _add_in_other_order(update, n_separator, index, front, ld):  # type: ignore[
 @kernel
 def substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
     """Substitute the known solution of a fixed node: move its columns to the right-hand side."""
-    node_f = tb.node_f(head)
+    nodes = tb.nodes(head)
     right = ld - 1
     for m in range(3):
         r = at + m
-        x = node_f[v, tb.DELTA + m]
+        x = nodes[v].delta[m]
         for k in range(r):
             front[k * ld + right] -= front[k * ld + r] * x
             front[k * ld + r] = 0.0

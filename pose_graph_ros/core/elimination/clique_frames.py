@@ -39,41 +39,41 @@ from pose_graph_ros.core.graph.pools import row_start, triangle_size
 @kernel
 def mean_turn(head, c):  # type: ignore[no-untyped-def]
     """Return the mean heading solution (DELTA) of a clique's separator [rad]."""
-    clique_i, pool_i, node_f = tb.clique_i(head), tb.pool_i(head), tb.node_f(head)
-    row = clique_i[c]
-    begin, n = row[tb.NODES] + row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    cliques, pool_i, nodes = tb.cliques(head), tb.pool_i(head), tb.nodes(head)
+    row = cliques[c]
+    begin, n = row.members + row.n_frontal, row.n_separator
     total = 0.0
     for k in range(begin, begin + n):
-        total += node_f[pool_i[k], tb.DELTA + 2]
+        total += nodes[pool_i[k]].delta[2]
     return total / n if n > 0 else 0.0
 
 
 @kernel
 def present_turn(head, c):  # type: ignore[no-untyped-def]
     """Return the angle of a clique's frame at the present estimate of its separator [rad]."""
-    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
-    if clique_i[c, tb.N_FRONTAL] == 0:
+    cliques = tb.cliques(head)
+    if cliques[c].n_frontal == 0:
         phi = prior_rows.present_frame(head, c)
-    elif clique_i[c, tb.ANCHORED] != 0:
+    elif cliques[c].anchored != 0:
         phi = 0.0
     else:
-        phi = mean_turn(head, c) - clique_f[c, tb.TURN_ZERO]
+        phi = mean_turn(head, c) - cliques[c].turn_zero
     return phi if abs(phi) > 1e-12 else 0.0     # rounding
 
 
 @kernel
 def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
     """Return the solution delta' of a node, by its row, in a clique's frame of angle phi."""
-    x, y = f[tb.REF] + f[tb.DELTA] - px, f[tb.REF + 1] + f[tb.DELTA + 1] - py
-    return (cos * x + sin * y + px - f[tb.REF], cos * y - sin * x + py - f[tb.REF + 1],
-            f[tb.DELTA + 2] - phi)
+    x, y = f.reference[0] + f.delta[0] - px, f.reference[1] + f.delta[1] - py
+    return (cos * x + sin * y + px - f.reference[0], cos * y - sin * x + py - f.reference[1],
+            f.delta[2] - phi)
 
 
 @kernel
 def map_delta(f, x, y, px, py, cos, sin):  # type: ignore[no-untyped-def]
     """Return the position of a node's solution in map axes, the inverse of `local_delta`."""
-    x, y = x + f[tb.REF] - px, y + f[tb.REF + 1] - py
-    return cos * x - sin * y + px - f[tb.REF], sin * x + cos * y + py - f[tb.REF + 1]
+    x, y = x + f.reference[0] - px, y + f.reference[1] - py
+    return cos * x - sin * y + px - f.reference[0], sin * x + cos * y + py - f.reference[1]
 
 
 @kernel
@@ -89,7 +89,7 @@ def add_product(update, size, x, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped-def]
+def turned_update(update, n, members, nodes, phi, to):  # type: ignore[no-untyped-def]
     """
     Transform an update matrix of n nodes from a clique's frame, of angle phi, into map axes.
 
@@ -97,14 +97,14 @@ def turned_update(update, n, nodes, node_f, phi, to):  # type: ignore[no-untyped
     """
     size = 3 * n
     cos, sin = math.cos(phi), math.sin(phi)
-    first = node_f[nodes[0]]
-    px, py = first[tb.POSE], first[tb.POSE + 1]
+    first = nodes[members[0]]
+    px, py = first.pose[0], first.pose[1]
     # u - U m in local axes, with m of the module's docstring
     work = to[triangle_size(size, size):]
     shift, right = work[:size], work[size:2 * size]
     for a in range(n):
-        f = node_f[nodes[a]]
-        x, y = f[tb.REF] - px, f[tb.REF + 1] - py
+        f = nodes[members[a]]
+        x, y = f.reference[0] - px, f.reference[1] - py
         shift[3 * a], shift[3 * a + 1] = x - cos * x - sin * y, y - cos * y + sin * x
         shift[3 * a + 2] = phi
     for i in range(size):
@@ -146,11 +146,11 @@ def rotated_triangle(update, n, cos, sin, to):  # type: ignore[no-untyped-def]
 @kernel
 def frame_slip(head, c):  # type: ignore[no-untyped-def]
     """Return a clique's slip [rad], which is 0 if it does not turn or has no parent."""
-    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
-    f, parent = clique_f[c], clique_i[c, tb.PARENT]
-    if parent < 0 or (clique_i[c, tb.ANCHORED] != 0 and clique_i[c, tb.N_FRONTAL] > 0):
+    cliques = tb.cliques(head)
+    f, parent = cliques[c], cliques[c].parent
+    if parent < 0 or (cliques[c].anchored != 0 and cliques[c].n_frontal > 0):
         return 0.0
-    return present_turn(head, c) - f[tb.TURN_SEEN] - present_turn(head, parent)
+    return present_turn(head, c) - f.turn_seen - present_turn(head, parent)
 
 
 @kernel
@@ -164,24 +164,24 @@ def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
     as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U. Work space is 9
     numbers for each separator node.
     """
-    clique_i = tb.clique_i(head)
-    pool_i, pool_f, node_f = tb.pool_i(head), tb.pool_f(head), tb.node_f(head)
-    row = clique_i[c]
-    n_frontal, n = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
-    nodes = pool_i[row[tb.NODES] + n_frontal:row[tb.NODES] + n_frontal + n]
+    cliques, pool_i, pool_f = tb.cliques(head), tb.pool_i(head), tb.pool_f(head)
+    nodes = tb.nodes(head)
+    row = cliques[c]
+    n_frontal, n = row.n_frontal, row.n_separator
+    members = pool_i[row.members + n_frontal:row.members + n_frontal + n]
     size = 3 * n
-    update = pool_f[row[tb.VALUES] + triangle_size(3 * n_frontal, 3 * (n_frontal + n)):]
+    update = pool_f[row.values + triangle_size(3 * n_frontal, 3 * (n_frontal + n)):]
     phi = present_turn(head, c)
     cos, sin = math.cos(phi), math.sin(phi)
-    first = node_f[nodes[0]]
-    px, py = first[tb.POSE], first[tb.POSE + 1]
+    first = nodes[members[0]]
+    px, py = first.pose[0], first.pose[1]
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
     w, local, gradient = work[:size], work[size:2 * size], work[2 * size:3 * size]
     for a in range(n):
-        f = node_f[nodes[a]]
+        f = nodes[members[a]]
         x, y, th = local_delta(f, px, py, cos, sin, phi)
         local[3 * a], local[3 * a + 1], local[3 * a + 2] = x, y, th
-        x, y = x + f[tb.REF] - px, y + f[tb.REF + 1] - py
+        x, y = x + f.reference[0] - px, y + f.reference[1] - py
         w[3 * a], w[3 * a + 1] = versine * x - lag * y, versine * y + lag * x
         w[3 * a + 2] = 0.0
     for i in range(size):
@@ -206,10 +206,10 @@ def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
 
     They are linearized at the present poses. Work space is 12 numbers for each node.
     """
-    node_f, pool_i, pool_f = tb.node_f(head), tb.pool_i(head), tb.pool_f(head)
-    row = tb.clique_i(head)[c]
-    n, begin = 3 * row[tb.N_SEPARATOR], row[tb.NODES]
-    update = pool_f[row[tb.VALUES]:]
+    nodes, pool_i, pool_f = tb.nodes(head), tb.pool_i(head), tb.pool_f(head)
+    row = tb.cliques(head)[c]
+    n, begin = 3 * row.n_separator, row.members
+    update = pool_f[row.values:]
     prior_rows.evaluate(head, c, phi, work)
     g, r, z = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
     prior_rows.product(head, c, r, z)
@@ -228,11 +228,11 @@ def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
             to[at + k] = update[at + k] - z[i] * of_k - of_i * z[k] + stiff * of_i * of_k
         to[at + n] = g[i] - of_i * turned
     if phi != 0.0:
-        rotated_triangle(to, row[tb.N_SEPARATOR], math.cos(phi), math.sin(phi), to)
+        rotated_triangle(to, row.n_separator, math.cos(phi), math.sin(phi), to)
     # the unknowns are the solutions of the nodes, not changes of them
     for i in range(n):
         g[i] = -to[row_start(i, n) + n]
-        z[i] = node_f[pool_i[begin + i // 3], tb.DELTA + i % 3]
+        z[i] = nodes[pool_i[begin + i // 3]].delta[i % 3]
     add_product(to, n, z, g)
     for i in range(n):
         to[row_start(i, n) + n] = g[i]
@@ -249,14 +249,14 @@ def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
     turned: that of the nodes by beta, as in `interface_error2`, and that of the
     frame by `m g^T S D`. A large change of S D against p would falsify covariances in any case.
     """
-    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
-    n = 3 * row[tb.N_SEPARATOR]
+    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
+    n = 3 * row.n_separator
     beta = frame_slip(head, c)
     prior_rows.evaluate(head, c, present_turn(head, c), work)
     g, r, w = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
     change = work[4 * n:5 * n]
     prior_rows.change_of_frame(head, c, r, change)
-    if row[tb.ANCHORED] != 0:
+    if row.anchored != 0:
         prior_rows.add_reference_arms(head, c, r)
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
     of_nodes = of_frame = compliance = moved = arms = 0.0
@@ -264,9 +264,9 @@ def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
         w[i] = versine * r[i + 1] + lag * r[i] - beta * change[i]
         w[i + 1] = -versine * r[i] + lag * r[i + 1] - beta * change[i + 1]
         w[i + 2] = 0.0
-        k = row[tb.VALUES] + row_start(i, n) + i
-        iso = 0.5 * (pool_f[k] + pool_f[row[tb.VALUES] + row_start(i + 1, n) + i + 1])
-        heading = pool_f[row[tb.VALUES] + row_start(i + 2, n) + i + 2]
+        k = row.values + row_start(i, n) + i
+        iso = 0.5 * (pool_f[k] + pool_f[row.values + row_start(i + 1, n) + i + 1])
+        heading = pool_f[row.values + row_start(i + 2, n) + i + 2]
         if iso > 0.0:
             of_nodes += (g[i] ** 2 + g[i + 1] ** 2) / iso
         if heading > 0.0:

@@ -77,10 +77,10 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _other_ends(factor_i, e, side):  # type: ignore[no-untyped-def]
+def _other_ends(factors, e, side):  # type: ignore[no-untyped-def]
     """Return the nodes at the other ends of a factor; -1 where there is none."""
-    return (factor_i[e, tb.END_J if side == 0 else tb.END_I],
-            factor_i[e, tb.END_J if side == 2 else tb.END_K])
+    ends = factors[e].ends
+    return ends[1 if side == 0 else 0], ends[1 if side == 2 else 2]
 
 
 @kernel(allocates=True)
@@ -92,31 +92,31 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     Marked cliques have FRONT_SERIAL of the head in their column MARKED. The graph is given as
     `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
     """
-    node_i, factor_i = tb.node_i(head), tb.factor_i(head)
-    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
+    cliques = tb.cliques(head)
+    nodes, factors, pool_i = tb.nodes(head), tb.factors(head), tb.pool_i(head)
     n = len(affected)
     serial = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = serial
     for k in range(n):
-        node_i[affected[k], tb.INDEX] = k
-        node_i[affected[k], tb.FRONT] = serial
+        nodes[affected[k]].index = k
+        nodes[affected[k]].front = serial
     stamp = serial - 1
     n_orphans = len(loose)
     for k in range(len(marked)):
-        c = clique_i[marked[k], tb.CHILD]
+        c = cliques[marked[k]].child
         while c >= 0:
-            if clique_i[c, tb.MARKED] != stamp:
+            if cliques[c].marked != stamp:
                 n_orphans += 1
-            c = clique_i[c, tb.SIBLING]
+            c = cliques[c].sibling
     orphans = np.empty(n_orphans, np.int32)
     n_orphans = 0
     for k in range(len(marked)):
-        c = clique_i[marked[k], tb.CHILD]
+        c = cliques[marked[k]].child
         while c >= 0:
-            if clique_i[c, tb.MARKED] != stamp:
+            if cliques[c].marked != stamp:
                 orphans[n_orphans] = c
                 n_orphans += 1
-            c = clique_i[c, tb.SIBLING]
+            c = cliques[c].sibling
     for k in range(len(loose)):
         orphans[n_orphans + k] = loose[k]
     n_orphans = len(orphans)
@@ -124,23 +124,23 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     first = np.zeros(n + 1, np.int32)
     n_entries = 0
     for k in range(n_orphans):
-        row = clique_i[orphans[k]]
-        begin = row[tb.NODES] + row[tb.N_FRONTAL]
-        for m in range(begin, begin + row[tb.N_SEPARATOR]):
-            first[node_i[pool_i[m], tb.INDEX] + 1] += 1
+        row = cliques[orphans[k]]
+        begin = row.members + row.n_frontal
+        for m in range(begin, begin + row.n_separator):
+            first[nodes[pool_i[m]].index + 1] += 1
             n_entries += 2
     for k in range(n):
         first[k + 1] += first[k]
-        entry = node_i[affected[k], tb.FACTOR_LIST]
+        entry = nodes[affected[k]].factor_list
         while entry >= 0:
             n_entries += 2
-            entry = factor_i[entry >> 2, tb.NEXT_I + (entry & 3)]
+            entry = factors[entry >> 2].next[entry & 3]
     orphans_of, filled = np.empty(first[n], np.int32), first.copy()
     for k in range(n_orphans):
-        row = clique_i[orphans[k]]
-        begin = row[tb.NODES] + row[tb.N_FRONTAL]
-        for m in range(begin, begin + row[tb.N_SEPARATOR]):
-            i = node_i[pool_i[m], tb.INDEX]
+        row = cliques[orphans[k]]
+        begin = row.members + row.n_frontal
+        for m in range(begin, begin + row.n_separator):
+            i = nodes[pool_i[m]].index
             orphans_of[filled[i]] = n + k
             filled[i] += 1
     start = np.empty(n + n_orphans + 1, np.int32)
@@ -152,23 +152,23 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
         for m in range(first[k], first[k + 1]):
             adjacency[end] = orphans_of[m]
             end += 1
-        entry = node_i[affected[k], tb.FACTOR_LIST]
+        entry = nodes[affected[k]].factor_list
         while entry >= 0:
             e, side = entry >> 2, entry & 3
-            for other in _other_ends(factor_i, e, side):
-                if other >= 0 and node_i[other, tb.FRONT] == serial:
-                    i = node_i[other, tb.INDEX]
+            for other in _other_ends(factors, e, side):
+                if other >= 0 and nodes[other].front == serial:
+                    i = nodes[other].index
                     if last_seen[i] != k:   # each neighbour once
                         last_seen[i] = k
                         adjacency[end] = i
                         end += 1
-            entry = factor_i[e, tb.NEXT_I + side]
+            entry = factors[e].next[side]
     for k in range(n_orphans):
         start[n + k] = end
-        row = clique_i[orphans[k]]
-        begin = row[tb.NODES] + row[tb.N_FRONTAL]
-        for m in range(begin, begin + row[tb.N_SEPARATOR]):
-            adjacency[end] = node_i[pool_i[m], tb.INDEX]
+        row = cliques[orphans[k]]
+        begin = row.members + row.n_frontal
+        for m in range(begin, begin + row.n_separator):
+            adjacency[end] = nodes[pool_i[m]].index
             end += 1
     start[n + n_orphans] = end
     return orphans, start, adjacency
@@ -287,7 +287,7 @@ def _memory_of_all(head, cliques):  # type: ignore[no-untyped-def]
     """Return what cliques and priors need in both pools, and work space of the largest front."""
     need_f, need_i, largest = required_memory(cliques)
     for c in prior_rows.all_priors(head):
-        n_separator = np.int64(tb.clique_i(head)[c, tb.N_SEPARATOR])
+        n_separator = np.int64(tb.cliques(head)[c].n_separator)
         need_f += pools.rounded(pools.n_values(0, n_separator))
         need_i += pools.rounded(n_separator)
     return need_f, need_i, largest
@@ -355,18 +355,18 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
 
     The last parents are those of the orphans, rows of cliques that there are already.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    nodes, pool_i = tb.nodes(head), tb.pool_i(head)
     first, n_frontal, parent = cliques.first, cliques.n_frontal, cliques.parent
     rows = np.empty(len(n_frontal), np.int32)
     for k in range(len(rows)):
         rows[k] = transaction_log.take_clique(
             head, np.int64(n_frontal[k]), np.int64(first[k + 1] - first[k] - n_frontal[k]))
-        at = clique_i[rows[k], tb.NODES]
+        at = tb.cliques(head)[rows[k]].members
         for m in range(first[k], first[k + 1]):
             pool_i[at + m - first[k]] = cliques.nodes[m]
         for m in range(first[k], first[k] + n_frontal[k]):
             transaction_log.log_node(head, cliques.nodes[m])
-            node_i[cliques.nodes[m], tb.CLIQUE] = rows[k]
+            nodes[cliques.nodes[m]].clique = rows[k]
     for k in range(len(orphans)):
         transaction_log.log_clique(head, orphans[k])
     for m in range(len(parent)):
@@ -374,9 +374,9 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
         k = len(rows) - 1 - m if m < len(rows) else m
         if parent[k] >= 0:
             child = rows[k] if k < len(rows) else orphans[k - len(rows)]
-            row, above = clique_i[child], clique_i[rows[parent[k]]]
-            row[tb.PARENT], row[tb.SIBLING] = rows[parent[k]], above[tb.CHILD]
-            above[tb.CHILD] = child
+            row, above = tb.cliques(head)[child], tb.cliques(head)[rows[parent[k]]]
+            row.parent, row.sibling = rows[parent[k]], above.child
+            above.child = child
     head[tb.LOOSE] = -1
     return rows
 
@@ -390,10 +390,10 @@ def plant_all(head, cliques):  # type: ignore[no-untyped-def]
     elimination, behind those of the priors. No node is touched afterwards, and the log of the
     update is empty: a rollback is not possible.
     """
-    node_i, touched = tb.node_i(head), tb.touched(head)
+    nodes, touched = tb.nodes(head), tb.touched(head)
     prior_rows.remove_cliques(head)
     for s in range(head[tb.N_TOUCHED]):
-        node_i[touched[s], tb.TOUCHED] = 0
+        nodes[touched[s]].touched = 0
     head[tb.N_TOUCHED] = head[tb.STRUCTURE] = 0
     plant(head, cliques, prior_rows.all_priors(head))
-    head[tb.LOG_F_END] = head[tb.LOG_I_END] = head[tb.N_FREED] = 0
+    head[tb.LOG_END] = head[tb.N_FREED] = 0

@@ -19,7 +19,7 @@ from pose_graph_ros.core.graph.tables import Memory
 
 # Number of rows and next id of each table.
 COUNTERS = {'node': (tb.N_NODES, tb.NEXT_NODE), 'factor': (tb.N_FACTORS, tb.NEXT_FACTOR)}
-# By kind, whether factors have each column of `Factors.constants`, which are those from OFFSET on.
+# By kind, whether factors have each column of `Factors.constants`.
 _HAS_CONSTANTS = np.array([np.isin(range(4), factor.constants) for factor in FACTORS.values()])
 
 # By kind, whether factors are between nodes that are no biases.
@@ -40,6 +40,16 @@ class GraphContents:
     def __init__(self) -> None:
         self.memory = Memory()
 
+    @property
+    def node_records(self) -> npt.NDArray[Any]:
+        """Hidden nodes as `tables.NODE`, by row, a view."""
+        return self.memory['nodes'][:self.n_nodes]
+
+    @property
+    def factor_records(self) -> npt.NDArray[Any]:
+        """Factors as `tables.FACTOR`, by row, with rows for ends, a view."""
+        return self.memory['factors'][:self.n_factors]
+
     # --- numbers and ids ------------------------------------------------------------------------
 
     @property
@@ -55,8 +65,7 @@ class GraphContents:
     @property
     def n_edges(self) -> int:
         """Number of factors between nodes that are no biases, removed ones included."""
-        kinds = self.memory['factor_i'][:self.n_factors, tb.FACTOR_KIND]
-        return int(np.count_nonzero(_ARE_EDGES[kinds]))
+        return int(np.count_nonzero(_ARE_EDGES[self.factor_records['kind']]))
 
     @property
     def n_priors(self) -> int:
@@ -105,15 +114,13 @@ class GraphContents:
         """Return the ids of the factors with an end in some nodes."""
         chosen = np.zeros(self.n_nodes + 1, dtype=bool)    # the last one is for no end, -1
         chosen[self.node_rows(nodes)] = True
-        ends = self.memory['factor_i'][:self.n_factors, tb.END_I:tb.END_K + 1]
-        return self.factor_ids[np.any(chosen[ends], axis=1)]
+        return self.factor_ids[np.any(chosen[self.factor_records['ends']], axis=1)]
 
     def leaving(self) -> GraphUpdate:
         """Return what leaves the graph with the present update; it keeps its rows until then."""
-        nodes, factors = (
-            ids[self.memory[table][:len(ids), column] == tb.LEAVES].tolist()
-            for ids, table, column in ((self.node_ids, 'node_i', tb.FACTOR_LIST),
-                                       (self.factor_ids, 'factor_i', tb.NEXT_I)))
+        nodes, factors = (ids[links == tb.LEAVES].tolist() for ids, links in (
+            (self.node_ids, self.node_records['factor_list']),
+            (self.factor_ids, self.factor_records['next'][:, 0])))
         return GraphUpdate(remove_nodes=nodes, drop=factors)
 
     # --- hidden nodes ---------------------------------------------------------------------------
@@ -121,19 +128,19 @@ class GraphContents:
     @property
     def poses(self) -> Poses:
         """Estimates of all hidden nodes in the map, a read-only view."""
-        view = self.memory['node_f'][:self.n_nodes]
+        view = self.node_records['pose']
         view.flags.writeable = False
-        return view[:, tb.POSE:tb.POSE + 3]
+        return view
 
     def poses_of(self, ids: npt.ArrayLike) -> FloatArray:
         """Return the estimates of hidden nodes, shape (K, 3) for K ids, (3,) for one."""
         rows = self._ids('node').known(ids, 'hidden node')
-        return self.memory['node_f'][rows, tb.POSE:tb.POSE + 3]
+        return np.asarray(self.node_records['pose'][rows])
 
     @property
     def fixed(self) -> BoolArray:
         """Whether hidden nodes keep their pose."""
-        return self.memory['node_i'][:self.n_nodes, tb.FIXED] != 0
+        return np.asarray(self.node_records['fixed'] != 0)
 
     @property
     def is_bias(self) -> BoolArray:
@@ -146,19 +153,17 @@ class GraphContents:
         return self._is(NodeKind.POSE)
 
     def _is(self, kind: NodeKind) -> BoolArray:
-        # a byte for each node, as an estimate asks for it
-        types = self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE].astype(np.uint8)
-        return np.asarray(types & np.uint8(3) == np.uint8(kind))
+        return np.asarray(self.node_records['kind'] == np.uint8(kind))
 
     @property
     def node_kind(self) -> npt.NDArray[Any]:
         """`NodeKind` of hidden nodes."""
-        return self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE] & 3
+        return self.node_records['kind'].copy()
 
     @property
     def dimension(self) -> npt.NDArray[Any]:
         """Numbers of coordinates of hidden nodes, 1 to 3."""
-        return 3 - (self.memory['node_i'][:self.n_nodes, tb.NODE_TYPE] >> 2)
+        return self.node_records['dimension'].astype(np.int64)
 
     @property
     def extent(self) -> FloatArray:
@@ -184,13 +189,12 @@ class GraphContents:
 
     def _factors_in(self, rows: IntArray | slice) -> Factors:
         """Return the factors in some rows, with rows for ends."""
-        numbers, integers = self.memory['factor_f'][rows], self.memory['factor_i'][rows]
-        kind = integers[:, tb.FACTOR_KIND]
-        constants = np.where(_HAS_CONSTANTS[kind], numbers[:, tb.OFFSET:tb.OFFSET + 4], 0.0)
+        found = self.factor_records[rows]
+        kind, ends = found['kind'], found['ends']
         return Factors(
-            integers[:, tb.END_I], integers[:, tb.END_J], numbers[:, tb.MEAN:tb.MEAN + 3].copy(),
-            full(numbers[:, tb.INFO:tb.INFO + 6]), kind, numbers[:, tb.WEIGHT].copy(), constants,
-            integers[:, tb.END_K])
+            ends[:, 0], ends[:, 1], found['mean'].copy(), full(found['information']), kind,
+            found['weight'].copy(), np.where(_HAS_CONSTANTS[kind], found['constants'], 0.0),
+            ends[:, 2])
 
     def _with_ids(self, table: Factors) -> Factors:
         """Return a table with the ids of the nodes in place of their rows."""
@@ -206,7 +210,7 @@ class GraphContents:
     @property
     def weights(self) -> FloatArray:
         """Weights of all factors."""
-        return self.memory['factor_f'][:self.n_factors, tb.WEIGHT].copy()
+        return self.factor_records['weight'].copy()
 
     @property
     def priors(self) -> tuple[Prior, ...]:

@@ -32,16 +32,12 @@ DROPPED = -1.0
 def _start_nodes(head, first, first_other, types):  # type: ignore[no-untyped-def]
     """Initialise rows of new hidden nodes: poses, then from `first_other` on the others."""
     for v in range(first, first_other + len(types)):
-        f, i = tb.node_f(head)[v], tb.node_i(head)[v]
-        factors.refer_to_pose(f)
-        f[tb.SCALE_T] = f[tb.SCALE_R] = 0.0
-        i[:] = 0
-        i[tb.CLIQUE] = i[tb.FACTOR_LIST] = -1
-        i[tb.NODE_LOGGED] = head[tb.UPDATE]
+        rows.start_node(head, v)
         tb.node_id(head)[v] = head[tb.NEXT_NODE]
         head[tb.NEXT_NODE] += 1
         if v >= first_other:
-            i[tb.NODE_TYPE] = types[v - first_other]
+            node = tb.nodes(head)[v]
+            node.kind, node.dimension = rows.kind_and_dimension(types[v - first_other])
         touch(head, v)
         head[tb.STRUCTURE] = 1
     if first_other > first:
@@ -51,18 +47,18 @@ def _start_nodes(head, first, first_other, types):  # type: ignore[no-untyped-de
 @kernel
 def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
     """Tell whether a clique that one end of a factor is frontal in has all its ends."""
-    ends, n_ends = tb.factor_i(head)[e, tb.END_I:tb.END_K + 1], 0
+    ends, n_ends = tb.factors(head)[e].ends, 0
     for end in ends:
         n_ends += end >= 0
     for end in ends:
         if end < 0:
             continue
-        c, n = tb.node_i(head)[end, tb.CLIQUE], 0
+        c, n = tb.nodes(head)[end].clique, 0
         if c < 0:
             return False
-        row = tb.clique_i(head)[c]
-        n_nodes = row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]
-        for v in tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + n_nodes]:
+        clique = tb.cliques(head)[c]
+        n_nodes = clique.n_frontal + clique.n_separator
+        for v in tb.pool_i(head)[clique.members:clique.members + n_nodes]:
             if v == ends[0] or v == ends[1] or v == ends[2]:
                 n += 1
         if n == n_ends:
@@ -73,10 +69,10 @@ def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
 @kernel
 def _touch_ends(head, e):  # type: ignore[no-untyped-def]
     """Log and touch the ends of a factor; ask for a new ordering if no clique has all."""
-    row = tb.factor_i(head)[e]
-    if row[tb.END_J] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
+    f = tb.factors(head)[e]
+    if f.ends[1] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
         head[tb.STRUCTURE] = 1
-    for v in row[tb.END_I:tb.END_K + 1]:
+    for v in f.ends:
         if v >= 0:
             transaction_log.log_node(head, v)
             touch(head, v)
@@ -85,30 +81,29 @@ def _touch_ends(head, e):  # type: ignore[no-untyped-def]
 @kernel
 def _link(head, e):  # type: ignore[no-untyped-def]
     """Put a factor at the heads of the lists of its ends; the caller has logged all rows."""
-    node_i, row = tb.node_i(head), tb.factor_i(head)[e]
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
     for side in range(3):
-        v = row[side]
+        v = f.ends[side]
         if v >= 0:
-            row[tb.NEXT_I + side], node_i[v, tb.FACTOR_LIST] = (
-                node_i[v, tb.FACTOR_LIST], 4 * e + side)
+            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
 
 
 @kernel
 def unlink(head, e, side):  # type: ignore[no-untyped-def]
     """Take a factor out of the list of one of its ends, whose row has been logged."""
-    node_i, factor_i = tb.node_i(head), tb.factor_i(head)
-    v, after = factor_i[e, side], factor_i[e, tb.NEXT_I + side]
-    at = node_i[v, tb.FACTOR_LIST]
+    factors = tb.factors(head)
+    node, after = tb.nodes(head)[factors[e].ends[side]], factors[e].next[side]
+    at = node.factor_list
     if at == 4 * e + side:
-        node_i[v, tb.FACTOR_LIST] = after
+        node.factor_list = after
         return
     while True:
-        before, link = at >> 2, tb.NEXT_I + (at & 3)
-        at = factor_i[before, link]
-        if at == 4 * e + side:
-            transaction_log.log_factor(head, before)
-            factor_i[before, link] = after
+        f, link = factors[at >> 2], at & 3
+        if f.next[link] == 4 * e + side:
+            transaction_log.log_factor(head, at >> 2)
+            f.next[link] = after
             return
+        at = f.next[link]
 
 
 @kernel
@@ -116,43 +111,43 @@ def _evaluate(head, e):  # type: ignore[no-untyped-def]
     """Linearize a factor, and add its energy to chi2."""
     factors.linearize(head, e)
     factors.check(head, e, factors.NO_TURN)
-    tb.scalars(head)[tb.CHI2] += tb.factor_f(head)[e, tb.ENERGY]
+    tb.scalars(head)[0].chi2 += tb.factors(head)[e].energy
 
 
 @kernel
 def weigh(head, e, weight):  # type: ignore[no-untyped-def]
     """Change the weight of a factor; at 0 it is in no list."""
-    f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
-    before = f[tb.WEIGHT]
+    f = tb.factors(head)[e]
+    before = f.weight
     if weight == before:
         return
     transaction_log.log_factor(head, e)
     _touch_ends(head, e)
     rows.scale_by(head, e, weight - before)
-    tb.scalars(head)[tb.CHI2] -= f[tb.ENERGY]
-    f[tb.WEIGHT] = weight
+    tb.scalars(head)[0].chi2 -= f.energy
+    f.weight = weight
     if weight > 0.0:
         if before == 0.0:
             _link(head, e)
         _evaluate(head, e)
         return
-    f[tb.ERROR2] = f[tb.ENERGY] = 0.0
+    f.error2 = f.energy = 0.0
     for side in range(3):
-        if row[side] >= 0:
+        if f.ends[side] >= 0:
             unlink(head, e, side)
 
 
 @kernel
 def _start(head, e):  # type: ignore[no-untyped-def]
     """Initialise the new row of a factor, and add it to the graph if it has a weight."""
-    f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
-    factors.prepare(f, row[tb.FACTOR_KIND])
-    f[tb.ERROR2] = f[tb.ENERGY] = 0.0
-    row[tb.FACTOR_CHECKED] = row[tb.FACTOR_WAITS] = 0
-    row[tb.NEXT_I], row[tb.FACTOR_LOGGED] = -1, head[tb.UPDATE]
+    f = tb.factors(head)[e]
+    factors.prepare(f, f.kind)
+    f.error2 = f.energy = 0.0
+    f.checked = f.waits = 0
+    f.next[0], f.logged = -1, head[tb.UPDATE]
     tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
     head[tb.NEXT_FACTOR] += 1
-    weight, f[tb.WEIGHT] = f[tb.WEIGHT], 0.0
+    weight, f.weight = f.weight, 0.0
     weigh(head, e, weight)
 
 
@@ -162,10 +157,10 @@ def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
     for m in range(len(ids)):
         e = rows.factor_row(head, ids[m])
         weigh(head, e, max(weights[m], 0.0))
-        row = tb.factor_i(head)[e]
-        if weights[m] == DROPPED and row[tb.NEXT_I] != tb.LEAVES:
+        f = tb.factors(head)[e]
+        if weights[m] == DROPPED and f.next[0] != tb.LEAVES:
             transaction_log.log_factor(head, e)
-            row[tb.NEXT_I] = tb.LEAVES
+            f.next[0] = tb.LEAVES
             head[tb.N_LEAVING] += 1
 
 
@@ -174,24 +169,24 @@ def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
     """Give factors, by id, other measurements."""
     for m in range(len(ids)):
         e = rows.factor_row(head, ids[m])
-        f = tb.factor_f(head)[e]
-        weight = f[tb.WEIGHT]
+        f = tb.factors(head)[e]
+        weight = f.weight
         transaction_log.log_factor(head, e)
         weigh(head, e, 0.0)
         rows.write_measurement(f, means[m], informations[m])
-        factors.prepare(f, tb.factor_i(head)[e, tb.FACTOR_KIND])
+        factors.prepare(f, f.kind)
         weigh(head, e, weight)
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, FLAG))
-def set_fixed(head, nodes, fixed):  # type: ignore[no-untyped-def]
+def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
     """Fix hidden nodes, by id, at their present poses, or free them."""
-    node_i = tb.node_i(head)
-    for node in nodes:
-        v = rows.node_row(head, node)
-        if (node_i[v, tb.FIXED] != 0) != fixed:
+    nodes = tb.nodes(head)
+    for number in ids:
+        v = rows.node_row(head, number)
+        if (nodes[v].fixed != 0) != fixed:
             transaction_log.log_node(head, v)
-            node_i[v, tb.FIXED] = 1 if fixed else 0
+            nodes[v].fixed = 1 if fixed else 0
             touch(head, v)
 
 
@@ -213,7 +208,7 @@ def add_rows(  # type: ignore[no-untyped-def]
 
     NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and
     `checks.check` has not accepted them (`checked`). `others` are values of new nodes that are no
-    poses, with their NODE_TYPEs; the columns of factors follow.
+    poses, with their `checks.node_types`; the columns of factors follow.
     """
     columns = i, j, mean, information, kind, weight, constants, k
     first = head[tb.N_NODES]
@@ -242,18 +237,18 @@ def add_rows(  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD,), allocates=True)
 def restart(head):  # type: ignore[no-untyped-def]
     """Remove all cliques but the priors, linearize all factors anew and touch all nodes."""
-    node_i = tb.node_i(head)
+    nodes = tb.nodes(head)
     prior_rows.remove_cliques(head)
     head[tb.N_TOUCHED] = head[tb.N_WAITING] = 0
-    tb.scalars(head)[tb.CHI2] = 0.0
+    tb.scalars(head)[0].chi2 = 0.0
     head[tb.STRUCTURE] = 1
     for v in range(head[tb.N_NODES]):
-        factors.refer_to_pose(tb.node_f(head)[v])
-        node_i[v, tb.CLIQUE] = -1
-        node_i[v, tb.TOUCHED] = 0
+        factors.refer_to_pose(tb.nodes(head)[v])
+        nodes[v].clique = -1
+        nodes[v].touched = 0
         touch(head, v)
     for e in range(head[tb.N_FACTORS]):
-        tb.factor_i(head)[e, tb.FACTOR_WAITS] = 0
-        if tb.factor_f(head)[e, tb.WEIGHT] > 0.0:
+        tb.factors(head)[e].waits = 0
+        if tb.factors(head)[e].weight > 0.0:
             _evaluate(head, e)
     prior_rows.add_energies(head)

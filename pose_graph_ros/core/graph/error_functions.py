@@ -15,9 +15,9 @@ import numpy.typing as npt
 from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.factors import model, prepare
+from pose_graph_ros.core.graph.tables import FACTOR
 
 
 def errors(poses: Poses, factors: Factors) -> FloatArray:
@@ -43,17 +43,18 @@ def _writable(column: Any) -> npt.NDArray[Any]:
 
 @kernel
 def write_data(f, kind, mean, constants):  # type: ignore[no-untyped-def]
-    """Write what the error of a factor depends on into a row as of `factor_f`."""
-    f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2] = mean[0], mean[1], mean[2]
+    """Write what the error of a factor depends on into its record."""
+    f.mean[0], f.mean[1], f.mean[2] = mean[0], mean[1], mean[2]
     for m in range(4):
-        f[tb.OFFSET + m] = constants[m]
+        f.constants[m] = constants[m]
     prepare(f, kind)
 
 
 @kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS), allocates=True)
 def _write_errors(poses, i, j, k, mean, kind, constants, error):  # type: ignore[no-untyped-def]
-    f = np.empty(tb.FACTOR_F)
+    record = np.empty(1, FACTOR)
     for e in range(len(i)):
+        f = record[0]   # in here, as Numba frees the array after its last use
         write_data(f, kind[e], mean[e], constants[e])
         third = constants[e, 3] * poses[k[e], 0] if k[e] >= 0 else 0.0
         error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(

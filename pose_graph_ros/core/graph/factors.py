@@ -87,43 +87,36 @@ def anchors(kind):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def dimension_of(row):  # type: ignore[no-untyped-def]
-    """Return the number of coordinates of a node, given as its row of node_i."""
-    return 3 - (row[tb.NODE_TYPE] >> 2)
-
-
-@kernel
 def prepare(f, kind):  # type: ignore[no-untyped-def]
-    """Set what a row of `factor_f` needs of its mean: `R_z^T t_z`."""
+    """Set what a factor needs of its mean: `R_z^T t_z`."""
     if is_relative(kind):
-        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
-        f[tb.OWN] = c * f[tb.MEAN] + s * f[tb.MEAN + 1]
-        f[tb.OWN + 1] = c * f[tb.MEAN + 1] - s * f[tb.MEAN]
+        c, s = math.cos(f.mean[2]), math.sin(f.mean[2])
+        f.constants[0] = c * f.mean[0] + s * f.mean[1]
+        f.constants[1] = c * f.mean[1] - s * f.mean[0]
 
 
 @kernel(forceinline=True)
 def rotation(f, kind, heading):  # type: ignore[no-untyped-def]
     """Return cosine and sine of what an error needs of th_i: th_i + th_z, or th_i."""
     if is_relative(kind):
-        heading += f[tb.MEAN + 2]
-    elif f[tb.OFFSET] == 0.0 and f[tb.OFFSET + 1] == 0.0:
+        heading += f.mean[2]
+    elif f.constants[0] == 0.0 and f.constants[1] == 0.0:
         return 1.0, 0.0     # no arm
     return math.cos(heading), math.sin(heading)
 
 
 @kernel(forceinline=True)
-def parts(head, e):  # type: ignore[no-untyped-def]
-    """Return row, kind, and ends i, j and k of a factor; i = j where a node is observed."""
-    row = tb.factor_i(head)[e]
-    i, j = row[tb.END_I], row[tb.END_J]
-    return tb.factor_f(head)[e], row[tb.FACTOR_KIND], i, j if j >= 0 else i, row[tb.END_K]
+def kind_and_ends(f):  # type: ignore[no-untyped-def]
+    """Return kind and ends i, j, k of a factor; i = j where a node is observed."""
+    i, j = f.ends[0], f.ends[1]
+    return f.kind, i, j if j >= 0 else i, f.ends[2]
 
 
 @kernel(forceinline=True)
 def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
     """Return f_t and f_th of node j."""
     if kind == BIAS:
-        return f[tb.BIAS_T], f[tb.BIAS_TH]
+        return f.constants[2], f.constants[3]
     return (1.0, 1.0) if kind < OBSERVED else (0.0, 0.0)
 
 
@@ -131,34 +124,34 @@ def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
 def heading_offset(f, kind):  # type: ignore[no-untyped-def]
     """Return the constant part of the heading's error [rad]."""
     if kind == BIAS:
-        return f[tb.MEAN + 2]
-    return -f[tb.MEAN + 2] if kind < OBSERVED else f[tb.MEAN + 2] - f[tb.OFFSET + 2]
+        return f.mean[2]
+    return -f.mean[2] if kind < OBSERVED else f.mean[2] - f.constants[2]
 
 
 @kernel(forceinline=True)
 def frame(f, kind):  # type: ignore[no-untyped-def]
     """Return cosine and sine of the frame at the linearization."""
     if frame_moves(kind):
-        return f[tb.LIN_COS], f[tb.LIN_SIN]
-    if kind < OBSERVED or f[tb.MEAN + 2] == 0.0:
+        return f.lin_cos, f.lin_sin
+    if kind < OBSERVED or f.mean[2] == 0.0:
         return 1.0, 0.0
-    return math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+    return math.cos(f.mean[2]), math.sin(f.mean[2])
 
 
 @kernel(forceinline=True)
 def constant(f, kind, c, s, ax, ay):  # type: ignore[no-untyped-def]
     """Return `R e_t - d`, in map axes, for cosine and sine of the frame R, and the arm a."""
     if is_relative(kind):
-        return s * f[tb.OWN + 1] - c * f[tb.OWN], -s * f[tb.OWN] - c * f[tb.OWN + 1]
+        return s * f.constants[1] - c * f.constants[0], -s * f.constants[0] - c * f.constants[1]
     if kind == RANGE:
-        return -ax - c * f[tb.MEAN], -ay - s * f[tb.MEAN]
-    return f[tb.MEAN] - ax, f[tb.MEAN + 1] - ay
+        return -ax - c * f.mean[0], -ay - s * f.mean[0]
+    return f.mean[0] - ax, f.mean[1] - ay
 
 
 @kernel(forceinline=True)
 def relative_error(f, x, y):  # type: ignore[no-untyped-def]
     """Return e_t of a relative error, for d in the axes of its frame."""
-    return x - f[tb.OWN], y - f[tb.OWN + 1]
+    return x - f.constants[0], y - f.constants[1]
 
 
 @kernel(forceinline=True)
@@ -167,7 +160,7 @@ def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     if is_relative(kind):
         ex, ey = relative_error(f, c * dx + s * dy, c * dy - s * dx)
         return ex, ey, c, s, dx, dy
-    ox, oy = f[tb.OFFSET], f[tb.OFFSET + 1]
+    ox, oy = f.constants[0], f.constants[1]
     ax, ay = c * ox - s * oy, s * ox + c * oy
     c, s = 1.0, 0.0
     if kind == RANGE:
@@ -175,8 +168,8 @@ def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
         length = math.sqrt(vx * vx + vy * vy)
         if length > 0.0:
             c, s = vx / length, vy / length
-    elif kind >= OBSERVED and f[tb.MEAN + 2] != 0.0:
-        c, s = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+    elif kind >= OBSERVED and f.mean[2] != 0.0:
+        c, s = math.cos(f.mean[2]), math.sin(f.mean[2])
     kx, ky = constant(f, kind, c, s, ax, ay)
     ex, ey = dx + kx, dy + ky
     return c * ex + s * ey, c * ey - s * ex, c, s, ax, ay
@@ -193,34 +186,34 @@ def wrap(angle):  # type: ignore[no-untyped-def]
 
 @kernel
 def refer_to_pose(f):  # type: ignore[no-untyped-def]
-    """Set the reference of a node, given as its row of node_f, to its pose."""
+    """Set the reference of a node, to its pose."""
     for k in range(3):
-        f[tb.REF + k] = f[tb.POSE + k]
-        f[tb.DELTA + k] = f[tb.SEEN + k] = 0.0
-    f[tb.CHECKED_TURN] = 0.0
+        f.reference[k] = f.pose[k]
+        f.delta[k] = f.seen[k] = 0.0
+    f.checked_turn = 0.0
 
 
 @kernel(forceinline=True)
 def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
-    """Return the error of a factor, the cosine and sine of its frame, and its arm."""
+    """Return the error of a factor at poses, cosine and sine of its frame, and its arm."""
     ft, fth = factors_of_end(f, kind)
-    c, s = rotation(f, kind, start[tb.POSE + 2])
+    c, s = rotation(f, kind, start[2])
     ex, ey, c, s, ax, ay = error(
-        f, kind, ft * end[tb.POSE] - start[tb.POSE], ft * end[tb.POSE + 1] - start[tb.POSE + 1],
-        c, s)
-    eth = fth * end[tb.POSE + 2] - start[tb.POSE + 2] + heading_offset(f, kind) + third
+        f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
+    eth = fth * end[2] - start[2] + heading_offset(f, kind) + third
     return ex, ey, wrap(eth), c, s, ax, ay
 
 
 @kernel(forceinline=True)
-def _linearize(f, kind, start, end, pose_k, delta_k):  # type: ignore[no-untyped-def]
-    """Linearize a factor; the last two are f_th times POSE and DELTA of the third node."""
-    _, _, eth, c, s, ax, ay = model(f, kind, start, end, pose_k)
+def _linearize(f, kind, start, end, third):  # type: ignore[no-untyped-def]
+    """Linearize a factor, given its nodes i and j, and what the third one adds."""
+    pose_k, delta_k = third
+    _, _, eth, c, s, ax, ay = model(f, kind, start.pose, end.pose, pose_k)
     _, fth = factors_of_end(f, kind)
     if frame_moves(kind):
-        f[tb.LIN_COS], f[tb.LIN_SIN] = c, s
-    f[tb.LIN_ARM], f[tb.LIN_ARM + 1], f[tb.LIN_TH] = ax, ay, start[tb.DELTA + 2]
-    f[tb.LIN_K] = eth - (fth * end[tb.DELTA + 2] - start[tb.DELTA + 2] + delta_k)
+        f.lin_cos, f.lin_sin = c, s
+    f.lin_arm[0], f.lin_arm[1], f.lin_th = ax, ay, start.delta[2]
+    f.lin_k = eth - (fth * end.delta[2] - start.delta[2] + delta_k)
 
 
 @kernel(forceinline=True)
@@ -238,18 +231,18 @@ def _versine_and_sine(turn):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untyped-def]
+def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-def]
     """Set the squared linearization error and the energy, as `check`."""
-    phi, cos, sin = clique_turn
+    (phi, cos, sin), (_, delta_k) = clique_turn, third
     ft, fth = factors_of_end(f, kind)
-    dx, dy = ft * end[tb.POSE] - start[tb.POSE], ft * end[tb.POSE + 1] - start[tb.POSE + 1]
+    dx, dy = ft * end.pose[0] - start.pose[0], ft * end.pose[1] - start.pose[1]
     if phi != 0.0:
         dx, dy = cos * dx + sin * dy, cos * dy - sin * dx
-    th = start[tb.DELTA + 2]
-    turn = th - phi - f[tb.LIN_TH]
+    th = start.delta[2]
+    turn = th - phi - f.lin_th
     # S a_bar turn, and the linear model, in the axes of the error
     c_bar, s_bar = frame(f, kind)
-    bx, by = f[tb.LIN_ARM], f[tb.LIN_ARM + 1]
+    bx, by = f.lin_arm[0], f.lin_arm[1]
     gx, gy = c_bar * bx + s_bar * by, c_bar * by - s_bar * bx
     turned = turn * turn
     if is_relative(kind):
@@ -260,7 +253,7 @@ def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untype
         ex, ey = relative_error(f, qx + px, qy + py)
         rx, ry = px - gy * turn, py + gx * turn
     else:   # its clique is anchored, so phi is zero
-        c, s = rotation(f, kind, start[tb.POSE + 2])
+        c, s = rotation(f, kind, start.pose[2])
         kx, ky = constant(f, kind, c_bar, s_bar, bx, by)
         lx = c_bar * (dx + kx) + s_bar * (dy + ky)
         ly = c_bar * (dy + ky) - s_bar * (dx + kx)
@@ -269,32 +262,34 @@ def _check(f, kind, start, end, delta_k, clique_turn):  # type: ignore[no-untype
         ex, ey, c, s, _, _ = error(f, kind, dx, dy, c, s)
         rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
         turned += (c - c_bar) ** 2 + (s - s_bar) ** 2
-    linear = f[tb.LIN_K] + fth * end[tb.DELTA + 2] - th + delta_k
+    linear = f.lin_k + fth * end.delta[2] - th + delta_k
     eth = wrap(linear)
     if kind == BIAS:    # a factor times a heading that is wrapped
-        eth = wrap(fth * end[tb.POSE + 2] - start[tb.POSE + 2] + heading_offset(f, kind))
+        eth = wrap(fth * end.pose[2] - start.pose[2] + heading_offset(f, kind))
     rth = eth - linear
     if abs(rth) < 1.0:
         rth = 0.0  # rounding of the wrap; at a jump it is a multiple of 2 pi
-    w = f[tb.WEIGHT]
+    w = f.weight
     energy = w * _form(f, ex, ey, eth)
-    f[tb.ENERGY] = energy
+    f.energy = energy
     if not is_relative(kind):
-        f[tb.ERROR2] = w * _form(f, rx, ry, rth) + turned * energy
+        f.error2 = w * _form(f, rx, ry, rth) + turned * energy
         return
     # the arm has changed, too; a large change would falsify the covariances even where the energy
     # is zero
-    iso = 0.5 * (f[tb.INFO] + f[tb.INFO + 3])
-    longer = (ex + f[tb.OWN] - gx) ** 2 + (ey + f[tb.OWN + 1] - gy) ** 2
-    longer *= iso / (f[tb.INFO + 5] + iso * (gx * gx + gy * gy) + 1e-300)
-    f[tb.ERROR2] = w * _form(f, rx, ry, rth) + (turned + longer) * energy + (
+    iso = 0.5 * (f.information[0] + f.information[3])
+    longer = (ex + f.constants[0] - gx) ** 2 + (ey + f.constants[1] - gy) ** 2
+    longer *= iso / (f.information[5] + iso * (gx * gx + gy * gy) + 1e-300)
+    f.error2 = w * _form(f, rx, ry, rth) + (turned + longer) * energy + (
         longer if longer > MUCH_LONGER else 0.0)
 
 
 @kernel(forceinline=True)
-def third(node_f, f, k, column):  # type: ignore[no-untyped-def]
-    """Return f_th times a number of the third node k, 0 without one."""
-    return f[tb.BIAS_TH] * node_f[k, column] if k >= 0 else 0.0
+def third(nodes, f, k):  # type: ignore[no-untyped-def]
+    """Return what pose and solution of the third node k add to the heading's error."""
+    if k < 0:
+        return 0.0, 0.0
+    return f.constants[3] * nodes[k].pose[0], f.constants[3] * nodes[k].delta[0]
 
 
 # Nearly all constraints have the error of odometry. What is derived from errors is compiled into
@@ -303,12 +298,12 @@ def third(node_f, f, k, column):  # type: ignore[no-untyped-def]
 @kernel
 def linearize(head, e):  # type: ignore[no-untyped-def]
     """Linearize a factor at the present estimate; the caller has logged its row."""
-    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, e)
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, k = kind_and_ends(f)
     if kind < BIAS:
-        _linearize(f, ODOMETRY, node_f[i], node_f[j], 0.0, 0.0)
+        _linearize(f, ODOMETRY, nodes[i], nodes[j], (0.0, 0.0))
     else:
-        _linearize(f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.POSE),
-                   third(node_f, f, k, tb.DELTA))
+        _linearize(f, kind, nodes[i], nodes[j], third(nodes, f, k))
 
 
 @kernel
@@ -320,27 +315,29 @@ def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
     `clique_frames`, with its cosine and sine; `NO_TURN` at the linearization, in anchored cliques
     and for observed nodes.
     """
-    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, e)
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, k = kind_and_ends(f)
     if kind < BIAS:
-        _check(f, ODOMETRY, node_f[i], node_f[j], 0.0, clique_turn)
+        _check(f, ODOMETRY, nodes[i], nodes[j], (0.0, 0.0), clique_turn)
     else:
-        _check(f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.DELTA), clique_turn)
+        _check(f, kind, nodes[i], nodes[j], third(nodes, f, k), clique_turn)
 
 
 @kernel(forceinline=True)
 def _form(f, x, y, th):  # type: ignore[no-untyped-def]
     """Return e^T information e."""
-    i = tb.INFO
-    return (x * (f[i] * x + 2.0 * (f[i + 1] * y + f[i + 2] * th))
-            + y * (f[i + 3] * y + 2.0 * f[i + 4] * th) + th * f[i + 5] * th)
+    w = f.information
+    return (x * (w[0] * x + 2.0 * (w[1] * y + w[2] * th))
+            + y * (w[3] * y + 2.0 * w[4] * th) + th * w[5] * th)
 
 
 @kernel(signature=(tb.HEAD, NUMBERS))
 def energies(head, out):  # type: ignore[no-untyped-def]
     """Write the unweighted energies of all factors at the present poses [sigma^2]."""
-    node_f = tb.node_f(head)
+    nodes = tb.nodes(head)
     for e in range(head[tb.N_FACTORS]):
-        f, kind, i, j, k = parts(head, e)
-        ex, ey, eth, _, _, _, _ = model(
-            f, kind, node_f[i], node_f[j], third(node_f, f, k, tb.POSE))
+        f = tb.factors(head)[e]
+        kind, i, j, k = kind_and_ends(f)
+        pose_k, _ = third(nodes, f, k)
+        ex, ey, eth, _, _, _, _ = model(f, kind, nodes[i].pose, nodes[j].pose, pose_k)
         out[e] = _form(f, ex, ey, eth)

@@ -140,18 +140,15 @@ class Graph(GraphContents):
         if n_nodes <= head[tb.NODE_ROOM] and n_factors <= head[tb.FACTOR_ROOM]:
             return
         for name, needed in (('node', n_nodes), ('factor', n_factors)):
-            for suffix in ('_f', '_i', '_id'):
-                memory.ensure(name + suffix, needed, keep=int(head[COUNTERS[name][0]]))
-        nodes, factors = (len(memory[name]) for name in ('node_f', 'factor_f'))
+            for table in (f'{name}s', f'{name}_id'):
+                memory.ensure(table, needed, keep=int(head[COUNTERS[name][0]]))
+        nodes, factors = (len(memory[name]) for name in ('nodes', 'factors'))
         # the rest costs address space: little of the log and the work space is ever written to
         for name, needed, used in (
-                ('clique_f', 2 * nodes, tb.N_CLIQUES), ('clique_i', 2 * nodes, tb.N_CLIQUES),
+                ('cliques', 2 * nodes, tb.N_CLIQUES),
                 ('touched', nodes, tb.N_TOUCHED), ('freed', 4 * nodes, tb.N_FREED),
                 ('waiting', factors, tb.N_WAITING),
-                ('log_f', nodes * (tb.NODE_F + tb.SCALE_T + tb.CLIQUE_F)
-                 + factors * (tb.FACTOR_F + 2) + tb.N_SCALARS, tb.LOG_F_END),
-                ('log_i', nodes * (tb.NODE_I + tb.CLIQUE_I + 16) + factors * (tb.FACTOR_I + 6),
-                 tb.LOG_I_END)):
+                ('log', transaction_log.largest(nodes, factors), tb.LOG_END)):
             memory.ensure(name, needed, keep=int(head[used]))
         memory.ensure('work_i', 4 * nodes)
         head[tb.NODE_ROOM], head[tb.FACTOR_ROOM] = nodes, factors
@@ -166,8 +163,7 @@ class Graph(GraphContents):
         if poses.shape != (self.n_nodes, 3) or not np.all(np.isfinite(poses)):
             raise GraphUpdateError(
                 f'expected finite poses, shape {(self.n_nodes, 3)}, got shape {poses.shape}')
-        rows = self.memory['node_f'][:self.n_nodes]
-        rows[:, tb.POSE:tb.POSE + 3] = se2.wrapped(poses)
+        self.node_records['pose'] = se2.wrapped(poses)
         self.n_moves += 1
         editing.restart(self.memory.head)
 
@@ -179,13 +175,13 @@ class Graph(GraphContents):
         Raises GraphUpdateError if they are not, or a row is invalid.
         """
         self._append('node', GraphUpdate(hidden=rows.poses), rows.node_ids, rows.next_ids.node)
-        memory, begin = self.memory, self.n_nodes - len(rows.poses)
-        new = memory['node_i'][begin:self.n_nodes]
-        new[:, tb.NODE_TYPE] = checks.node_types(
-            rows.node_kind, rows.dimension if rows.dimension is not None else np.where(
-                rows.node_kind == NodeKind.LANDMARK, 2, 3))
+        begin = self.n_nodes - len(rows.poses)
+        new = self.node_records[begin:]
+        new['kind'] = rows.node_kind
+        new['dimension'] = rows.dimension if rows.dimension is not None else np.where(
+            rows.node_kind == NodeKind.LANDMARK, 2, 3)
         poses = np.flatnonzero(self.is_pose)
-        memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
+        self.memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
         self._append('factor', GraphUpdate(factors=rows.factors), rows.factor_ids,
                      rows.next_ids.factor)
         self.apply(GraphUpdate(
@@ -212,7 +208,7 @@ class Graph(GraphContents):
 
     def commit(self) -> Left:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
-        if self.memory.head[tb.LOG_I_END] > 0:  # else a step has done so
+        if self.memory.head[tb.LOG_END] > 0:  # else a step has done so
             transaction_log.commit(self.memory.head)
         self._updating = False
         return removal.compact(self.memory)

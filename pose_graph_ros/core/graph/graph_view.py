@@ -10,19 +10,19 @@ it a small weight.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Points
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 
-# Columns of the tables: diagonal of the information, offset with the measured position.
-DIAGONAL = [tb.INFO, tb.INFO + 3, tb.INFO + 5]
-_OFFSET_AND_MEAN = [tb.OFFSET, tb.OFFSET + 1, tb.MEAN, tb.MEAN + 1]
+# Where the diagonal is in the upper triangle of an information matrix.
+DIAGONAL = [0, 3, 5]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,54 +71,52 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
         return None
     positions, is_bias = graph.poses[:, :2].copy(), ~graph.is_pose
     table = factor_table(graph)
-    sigmas = table.sigmas
+    sigmas, ends, kinds = table.sigmas, table.records['ends'], table.records['kind']
 
     def lines(rows: IntArray) -> Lines:
         # `take` is several times as fast as an index
-        return Lines(positions.take(table.integers[rows, tb.END_I:tb.END_J + 1], axis=0),
-                     sigmas[rows])
+        return Lines(positions.take(ends[rows, :2], axis=0), sigmas[rows])
 
-    in_graph, kinds = table.weights > 0.0, table.integers[:, tb.FACTOR_KIND]
+    in_graph = table.weights > 0.0
     weak, waiting, doubted, unused = (
         rows[rows >= 0] for part in drawn
         for rows in (graph.factor_rows(np.array(part, dtype=np.int64)),))
     in_graph[weak] = in_graph[doubted] = False
     # a measurement with a time-correlated error is an edge to a bias
     in_map = np.flatnonzero(
-        ((kinds == FactorKind.BIAS) | (table.integers[:, tb.END_J] < 0)) & table.tells_position
-        & ~is_bias[table.integers[:, tb.END_I]])
+        ((kinds == FactorKind.BIAS) | (ends[:, 1] < 0)) & table.tells_position
+        & ~is_bias[ends[:, 0]])
     return GraphView(
         nodes=positions.take(np.flatnonzero(~is_bias), axis=0),
         odometry=lines(np.flatnonzero(in_graph & (kinds == FactorKind.ODOMETRY))),
         loop_closures=lines(np.flatnonzero(in_graph & (kinds == FactorKind.LOOP_CLOSURE))),
         observed=_measured(graph, table, in_map), weak=lines(weak),
         waiting=lines(waiting), doubted=lines(doubted),
-        unused=_measured(graph, table, unused[table.numbers[unused, tb.INFO] > 0.0]))
+        unused=_measured(graph, table, unused[table.records['information'][unused, 0] > 0.0]))
 
 
 def _measured(graph: Graph, table: 'FactorTable', rows: IntArray) -> Lines:
     """Return measured positions, given the rows of their factors."""
-    offsets, measured = table.numbers[rows][:, _OFFSET_AND_MEAN].reshape(-1, 2, 2).swapaxes(0, 1)
-    predicted = se2.transform(graph.poses[table.integers[rows, tb.END_I]], offsets)
-    return Lines(np.stack((predicted, measured), axis=1), table.sigmas[rows])
+    found = table.records[rows]
+    predicted = se2.transform(graph.poses[found['ends'][:, 0]], found['constants'][:, :2])
+    return Lines(np.stack((predicted, found['mean'][:, :2]), axis=1), table.sigmas[rows])
 
 
 class FactorTable(NamedTuple):
-    """All factors: views of the graph's tables, with energies."""
+    """All factors, a view of the graph's table, with energies."""
 
-    numbers: FloatArray     # rows of factor_f
-    integers: IntArray      # rows of factor_i
+    records: npt.NDArray[Any]   # of `tables.FACTOR`
     energies: FloatArray    # unweighted [sigma^2]
 
     @property
     def weights(self) -> FloatArray:
         """What the information is multiplied by."""
-        return self.numbers[:, tb.WEIGHT]
+        return np.asarray(self.records['weight'])
 
     @property
     def tells_position(self) -> BoolArray:
         """Whether factors measure a position and are not removed."""
-        return (self.numbers[:, tb.INFO] > 0.0) & (self.weights > 0.0)
+        return (self.records['information'][:, 0] > 0.0) & (self.weights > 0.0)
 
     @property
     def sigmas(self) -> FloatArray:
@@ -128,12 +126,12 @@ class FactorTable(NamedTuple):
     @property
     def freedom(self) -> IntArray:
         """Degrees of freedom: how many coordinates each factor measures."""
-        return np.asarray(np.count_nonzero(self.numbers[:, DIAGONAL] > 0.0, axis=1))
+        diagonal = self.records['information'][:, DIAGONAL]
+        return np.asarray(np.count_nonzero(diagonal > 0.0, axis=1))
 
 
 def factor_table(graph: Graph) -> FactorTable:
     """Return the factors of a graph."""
     energies = np.empty(graph.n_factors)
     factors.energies(graph.memory.head, energies)
-    return FactorTable(graph.memory['factor_f'][:len(energies)],
-                       graph.memory['factor_i'][:len(energies)], energies)
+    return FactorTable(graph.factor_records, energies)

@@ -16,10 +16,10 @@ from pose_graph_ros.core.graph.factors import (
     constant,
     factors_of_end,
     frame,
+    kind_and_ends,
     model,
     OBSERVED,
     ODOMETRY,
-    parts,
     third,
 )
 
@@ -32,9 +32,9 @@ def weakest(f):  # type: ignore[no-untyped-def]
     The first is the smaller eigenvalue of the information on the position, the second that on the
     heading if the position is unknown; both are lower bounds, to rounding.
     """
-    i, w = tb.INFO, f[tb.WEIGHT]
-    position, heading = weakest_of(f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5])
-    return w * position, w * heading
+    w = f.information
+    position, heading = weakest_of(w[0], w[1], w[2], w[3], w[4], w[5])
+    return f.weight * position, f.weight * heading
 
 
 @kernel
@@ -50,8 +50,8 @@ def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
 @kernel(forceinline=True)
 def _turned(f, c, s):  # type: ignore[no-untyped-def]
     """Return the weighted information, rotated by the angle with cosine c and sine s."""
-    i, w = tb.INFO, f[tb.WEIGHT]
-    xx, xy, xt, yy, yt, tt = f[i], f[i + 1], f[i + 2], f[i + 3], f[i + 4], f[i + 5]
+    i, w = f.information, f.weight
+    xx, xy, xt, yy, yt, tt = i[0], i[1], i[2], i[3], i[4], i[5]
     cc, ss, cs = c * c, s * s, c * s
     return (w * (cc * xx - 2.0 * cs * xy + ss * yy), w * (cs * (xx - yy) + (cc - ss) * xy),
             w * (c * xt - s * yt), w * (ss * xx + 2.0 * cs * xy + cc * yy),
@@ -71,11 +71,11 @@ def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-de
     c, s = frame(f, kind)
     xx, xy, xt, yy, yt, tt = _turned(f, c, s)
     ft, fth = factors_of_end(f, kind)
-    px, py = -f[tb.LIN_ARM + 1], f[tb.LIN_ARM]  # S a
+    px, py = -f.lin_arm[1], f.lin_arm[0]  # S a
     kx, ky = constant(f, kind, c, s, py, -px)
-    hx = ft * end[tb.REF] - start[tb.REF] + kx + px * f[tb.LIN_TH]
-    hy = ft * end[tb.REF + 1] - start[tb.REF + 1] + ky + py * f[tb.LIN_TH]
-    hth = f[tb.LIN_K]
+    hx = ft * end.reference[0] - start.reference[0] + kx + px * f.lin_th
+    hy = ft * end.reference[1] - start.reference[1] + ky + py * f.lin_th
+    hth = f.lin_k
     # W T: the third column is W (S a, 1)
     wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
     gx = xx * hx + xy * hy + xt * hth
@@ -97,7 +97,7 @@ def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-de
     front[(b + 1) * ld + right] -= ft * gy
     front[(b + 2) * ld + right] -= fth * gth
     if k >= 0:
-        _add_third(front, ld, (a, b, k), f[tb.BIAS_TH], (xt, yt, wt), (xt, yt, tt), gth)
+        _add_third(front, ld, (a, b, k), f.constants[3], (xt, yt, wt), (xt, yt, tt), gth)
     # from here on with the columns of j multiplied by F
     xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
     wx, wy, wt = ft * wx, ft * wy, fth * wt
@@ -138,11 +138,12 @@ def add(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
     b and k may be -1. The front is an upper triangle, stored by rows of `ld` numbers, the last of
     which is the right-hand side.
     """
-    node_f, (f, kind, i, j, _) = tb.node_f(head), parts(head, e)
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, _ = kind_and_ends(f)
     if kind < BIAS:
-        _add(f, ODOMETRY, node_f[i], node_f[j], a, b, -1, front, ld)
+        _add(f, ODOMETRY, nodes[i], nodes[j], a, b, -1, front, ld)
     else:
-        _add(f, kind, node_f[i], node_f[j], a, b, k, front, ld)
+        _add(f, kind, nodes[i], nodes[j], a, b, k, front, ld)
 
 
 @kernel
@@ -153,22 +154,23 @@ def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-
     It is `v_j - f v_i = s`, or `v_i = s` where a node is observed, of complex numbers: v is u or t
     of `batch.linear_starts`. The third unknown of each node is 0.
     """
-    node_f, (f, _, i, _, _) = tb.node_f(head), parts(head, e)
-    kappa = weight = f[tb.WEIGHT] * f[tb.INFO + 5]
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    i = f.ends[0]
+    kappa = weight = f.weight * f.information[5]
     fx, fy, sx, sy = 1.0, 0.0, 0.0, 0.0
     if headings:
         if b >= 0:
-            fx, fy = math.cos(f[tb.MEAN + 2]), math.sin(f[tb.MEAN + 2])
+            fx, fy = math.cos(f.mean[2]), math.sin(f.mean[2])
         else:
-            th = f[tb.MEAN + 2] - f[tb.OFFSET + 2]
+            th = f.mean[2] - f.constants[2]
             sx, sy = math.cos(th), math.sin(th)
     else:
-        weight = 0.5 * f[tb.WEIGHT] * (f[tb.INFO] + f[tb.INFO + 3])
-        c, s = math.cos(node_f[i, tb.POSE + 2]), math.sin(node_f[i, tb.POSE + 2])
-        arm = tb.MEAN if b >= 0 else tb.OFFSET
-        sx, sy = c * f[arm] - s * f[arm + 1], s * f[arm] + c * f[arm + 1]
+        weight = 0.5 * f.weight * (f.information[0] + f.information[3])
+        c, s = math.cos(nodes[i].pose[2]), math.sin(nodes[i].pose[2])
+        x, y = (f.mean[0], f.mean[1]) if b >= 0 else (f.constants[0], f.constants[1])
+        sx, sy = c * x - s * y, s * x + c * y
         if b < 0:
-            sx, sy = f[tb.MEAN] - sx, f[tb.MEAN + 1] - sy
+            sx, sy = f.mean[0] - sx, f.mean[1] - sy
     for at in (a, b):
         if at >= 0:
             front[at * (ld + 1)] += weight
@@ -191,21 +193,21 @@ def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-
 
 
 @kernel(forceinline=True)
-def _gradient(f, kind, nodes, node_f, third, right):  # type: ignore[no-untyped-def]
+def _gradient(f, kind, ends, nodes, third, right):  # type: ignore[no-untyped-def]
     """
     Add -b of a factor to `right`, shape (N, 3); return its energy and two sums of magnitudes.
 
     These are of the gradient's coordinates of a position, and of the diagonal terms of the
     energy, which cancel each other where W is nearly singular.
     """
-    v, j = nodes
-    ex, ey, eth, c, s, ax, ay = model(f, kind, node_f[v], node_f[j], third)
-    i, w = tb.INFO, f[tb.WEIGHT]
-    gx = w * (f[i] * ex + f[i + 1] * ey + f[i + 2] * eth)
-    gy = w * (f[i + 1] * ex + f[i + 3] * ey + f[i + 4] * eth)
-    gth = w * (f[i + 2] * ex + f[i + 4] * ey + f[i + 5] * eth)
+    v, j = ends
+    ex, ey, eth, c, s, ax, ay = model(f, kind, nodes[v].pose, nodes[j].pose, third)
+    i, w = f.information, f.weight
+    gx = w * (i[0] * ex + i[1] * ey + i[2] * eth)
+    gy = w * (i[1] * ex + i[3] * ey + i[4] * eth)
+    gth = w * (i[2] * ex + i[4] * ey + i[5] * eth)
     energy = ex * gx + ey * gy + eth * gth
-    terms = w * (f[i] * ex * ex + f[i + 3] * ey * ey + f[i + 5] * eth * eth)
+    terms = w * (i[0] * ex * ex + i[3] * ey * ey + i[5] * eth * eth)
     gx, gy = c * gx - s * gy, s * gx + c * gy
     right[v, 0] += gx
     right[v, 1] += gy
@@ -223,12 +225,13 @@ def gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
     Return energy and the sums of `_gradient` of a factor after adding -b to `right`, (N, 3).
     """
-    node_f, (f, kind, i, j, k) = tb.node_f(head), parts(head, e)
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, k = kind_and_ends(f)
     if kind < BIAS:
-        energy, total, terms, _ = _gradient(f, ODOMETRY, (i, j), node_f, 0.0, right)
+        energy, total, terms, _ = _gradient(f, ODOMETRY, (i, j), nodes, 0.0, right)
         return energy, total, terms
-    energy, total, terms, gth = _gradient(
-        f, kind, (i, j), node_f, third(node_f, f, k, tb.POSE), right)
+    pose_k, _ = third(nodes, f, k)
+    energy, total, terms, gth = _gradient(f, kind, (i, j), nodes, pose_k, right)
     if k >= 0:
-        right[k, 0] -= f[tb.BIAS_TH] * gth
+        right[k, 0] -= f.constants[3] * gth
     return energy, total, terms

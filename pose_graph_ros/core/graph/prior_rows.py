@@ -38,31 +38,31 @@ _POSE = int(NodeKind.POSE)
 @kernel
 def is_prior(head, c):  # type: ignore[no-untyped-def]
     """Tell whether a row of the cliques is a prior of the graph."""
-    row = tb.clique_i(head)[c]
-    return row[tb.N_FRONTAL] == 0 and row[tb.PARENT] != REMOVED
+    row = tb.cliques(head)[c]
+    return row.n_frontal == 0 and row.parent != REMOVED
 
 
 @kernel
 def _references(row):  # type: ignore[no-untyped-def]
     """Return where in pool_f the reference poses of a prior begin, given its row."""
-    n = 3 * row[tb.N_SEPARATOR]
-    return row[tb.VALUES] + triangle_size(n, n)
+    n = 3 * row.n_separator
+    return row.values + triangle_size(n, n)
 
 
 @kernel(inline='always')
 def _nodes(head, c):  # type: ignore[no-untyped-def]
     """Return the nodes of a prior."""
-    row = tb.clique_i(head)[c]
-    return tb.pool_i(head)[row[tb.NODES]:row[tb.NODES] + row[tb.N_SEPARATOR]]
+    row = tb.cliques(head)[c]
+    return tb.pool_i(head)[row.members:row.members + row.n_separator]
 
 
 @kernel
 def turns(head, c):  # type: ignore[no-untyped-def]
     """Tell whether a prior has a frame that turns with its nodes; see `priors.turns`."""
-    if tb.clique_i(head)[c, tb.ANCHORED] == 0:
+    if tb.cliques(head)[c].anchored == 0:
         return True
     for v in _nodes(head, c):
-        if tb.node_i(head)[v, tb.NODE_TYPE] != _POSE:
+        if tb.nodes(head)[v].kind != _POSE:
             return False
     return len(_nodes(head, c)) > 1
 
@@ -70,13 +70,13 @@ def turns(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def mean_turn(head, c):  # type: ignore[no-untyped-def]
     """Return the mean turn of the nodes of a prior from their references [rad]."""
-    node_f, nodes = tb.node_f(head), _nodes(head, c)
-    reference = tb.pool_f(head)[_references(tb.clique_i(head)[c]):]
-    first = wrap(node_f[nodes[0], tb.POSE + 2] - reference[2])
+    nodes, members = tb.nodes(head), _nodes(head, c)
+    reference = tb.pool_f(head)[_references(tb.cliques(head)[c]):]
+    first = wrap(nodes[members[0]].pose[2] - reference[2])
     total = 0.0
-    for k in range(1, len(nodes)):
-        total += wrap(node_f[nodes[k], tb.POSE + 2] - reference[3 * k + 2] - first)
-    return first + total / len(nodes)
+    for k in range(1, len(members)):
+        total += wrap(nodes[members[k]].pose[2] - reference[3 * k + 2] - first)
+    return first + total / len(members)
 
 
 @kernel
@@ -86,25 +86,25 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
 
     phi is that of `present_frame`; r is zero if the prior does not turn.
     """
-    node_f, nodes, row = tb.node_f(head), _nodes(head, c), tb.clique_i(head)[c]
+    nodes, members, row = tb.nodes(head), _nodes(head, c), tb.cliques(head)[c]
     reference = tb.pool_f(head)[_references(row):]
     cos, sin = math.cos(phi), math.sin(phi)
-    first = node_f[nodes[0]]
-    turn = wrap(first[tb.POSE + 2] - reference[2])
-    anchored = row[tb.ANCHORED] != 0
+    first = nodes[members[0]]
+    turn = wrap(first.pose[2] - reference[2])
+    anchored = row.anchored != 0
     # the point about which it turns, and how much of a rigid turn about it is displacement
-    px = reference[0] if anchored else first[tb.POSE]
-    py = reference[1] if anchored else first[tb.POSE + 1]
+    px = reference[0] if anchored else first.pose[0]
+    py = reference[1] if anchored else first.pose[1]
     tangent = 1.0 if anchored else 0.0
     turning = 1.0 if turns(head, c) else 0.0
-    for k in range(len(nodes)):
-        f, i = node_f[nodes[k]], 3 * k
-        dx, dy = f[tb.POSE] - px, f[tb.POSE + 1] - py
+    for k in range(len(members)):
+        f, i = nodes[members[k]], 3 * k
+        dx, dy = f.pose[0] - px, f.pose[1] - py
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
         rx, ry = reference[i] - reference[0], reference[i + 1] - reference[1]
         d[i], d[i + 1] = x - rx - tangent * phi * ry, y - ry + tangent * phi * rx
         d[i + 2] = (turn - (1.0 - tangent) * phi
-                    + wrap(f[tb.POSE + 2] - reference[i + 2] - turn))
+                    + wrap(f.pose[2] - reference[i + 2] - turn))
         r[i], r[i + 1] = turning * (tangent * ry - y), turning * (x - tangent * rx)
         r[i + 2] = 1.0 - tangent
 
@@ -112,12 +112,12 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
 @kernel
 def keep_linearization(head, c, r):  # type: ignore[no-untyped-def]
     """Remember r (`displacement`) of a new linearization; a rollback restores the last one."""
-    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
-    n = 3 * row[tb.N_SEPARATOR]
+    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
+    n = 3 * row.n_separator
     at = _references(row) + n + 1
     transaction_log.log_clique(head, c)
-    if row[tb.VALUES_BORN] != head[tb.UPDATE]:
-        row[tb.VALUES_BORN] = head[tb.UPDATE]
+    if row.values_born != head[tb.UPDATE]:
+        row.values_born = head[tb.UPDATE]
         copied(pool_f[at:], pool_f[at + n:at + 2 * n])
     copied(r, pool_f[at:at + n])
 
@@ -125,8 +125,8 @@ def keep_linearization(head, c, r):  # type: ignore[no-untyped-def]
 @kernel
 def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
     """Write by how much r has changed since the linearization: S times relative positions."""
-    row = tb.clique_i(head)[c]
-    n = 3 * row[tb.N_SEPARATOR]
+    row = tb.cliques(head)[c]
+    n = 3 * row.n_separator
     before = tb.pool_f(head)[_references(row) + n + 1:]
     for k in range(n):
         out[k] = r[k] - before[k]
@@ -135,9 +135,9 @@ def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
 @kernel
 def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
     """Make r of an anchored prior the derivative of the coordinates in its frame by -phi."""
-    row = tb.clique_i(head)[c]
+    row = tb.cliques(head)[c]
     reference = tb.pool_f(head)[_references(row):]
-    for i in range(0, 3 * row[tb.N_SEPARATOR], 3):
+    for i in range(0, 3 * row.n_separator, 3):
         r[i] -= reference[i + 1] - reference[1]
         r[i + 1] += reference[i] - reference[0]
 
@@ -145,11 +145,11 @@ def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
 @kernel
 def product(head, c, x, out):  # type: ignore[no-untyped-def]
     """Write U x."""
-    row = tb.clique_i(head)[c]
-    n = 3 * row[tb.N_SEPARATOR]
+    row = tb.cliques(head)[c]
+    n = 3 * row.n_separator
     out[:n] = 0.0
     for i in range(n):
-        u = tb.pool_f(head)[row[tb.VALUES] + row_start(i, n):]
+        u = tb.pool_f(head)[row.values + row_start(i, n):]
         total = u[i] * x[i]
         for k in range(i + 1, n):
             total += u[k] * x[k]
@@ -165,14 +165,14 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
     The work space, 9 numbers for each node, receives the displacement d, half the gradient U d - u
     in the frame, and r.
     """
-    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
-    n = 3 * row[tb.N_SEPARATOR]
+    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
+    n = 3 * row.n_separator
     d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]
     displacement(head, c, phi, d, r)
     product(head, c, d, g)
     energy = pool_f[_references(row) + n]
     for i in range(n):
-        u = pool_f[row[tb.VALUES] + row_start(i, n) + n]
+        u = pool_f[row.values + row_start(i, n) + n]
         energy += d[i] * (g[i] - 2.0 * u)
         g[i] -= u
     return energy
@@ -193,7 +193,7 @@ def gradient(head, c, work):  # type: ignore[no-untyped-def]
     """
     phi = present_frame(head, c)
     energy = evaluate(head, c, phi, work)
-    n = 3 * tb.clique_i(head)[c, tb.N_SEPARATOR]
+    n = 3 * tb.cliques(head)[c].n_separator
     g, r = work[n:2 * n], work[2 * n:3 * n]
     turned = 0.0
     for i in range(n):
@@ -209,10 +209,10 @@ def gradient(head, c, work):  # type: ignore[no-untyped-def]
 @kernel
 def update_energy(head, c):  # type: ignore[no-untyped-def]
     """Set the energy of a prior to that at the present poses, and correct chi2 by the change."""
-    f, energy = tb.clique_f(head)[c], evaluate(
+    f, energy = tb.cliques(head)[c], evaluate(
         head, c, present_frame(head, c), tb.work_f(head))
-    tb.scalars(head)[tb.CHI2] += energy - f[tb.PRIOR_ENERGY]
-    f[tb.PRIOR_ENERGY] = energy
+    tb.scalars(head)[0].chi2 += energy - f.energy
+    f.energy = energy
 
 
 @kernel
@@ -220,15 +220,15 @@ def add_energies(head):  # type: ignore[no-untyped-def]
     """Evaluate all priors at the present poses and add their energies to chi2."""
     for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
         if is_prior(head, c):
-            tb.clique_f(head)[c, tb.PRIOR_ENERGY] = 0.0
+            tb.cliques(head)[c].energy = 0.0
             update_energy(head, c)
 
 
 @kernel
 def diagonal(head, c, k):  # type: ignore[no-untyped-def]
     """Return the mean information of a prior on the position of a node, and on its heading."""
-    row, pool_f = tb.clique_i(head)[c], tb.pool_f(head)
-    n, i, at = 3 * row[tb.N_SEPARATOR], 3 * k, row[tb.VALUES]
+    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
+    n, i, at = 3 * row.n_separator, 3 * k, row.values
     position = pool_f[at + row_start(i, n) + i] + pool_f[at + row_start(i + 1, n) + i + 1]
     return 0.5 * position, pool_f[at + row_start(i + 2, n) + i + 2]
 
@@ -236,9 +236,9 @@ def diagonal(head, c, k):  # type: ignore[no-untyped-def]
 @kernel
 def is_in_separator(head, c, v):  # type: ignore[no-untyped-def]
     """Tell whether a node is in the separator of a clique; a prior is nothing else."""
-    row = tb.clique_i(head)[c]
-    begin = row[tb.NODES] + row[tb.N_FRONTAL]
-    m, end = begin, begin + row[tb.N_SEPARATOR]
+    row = tb.cliques(head)[c]
+    begin = row.members + row.n_frontal
+    m, end = begin, begin + row.n_separator
     while m < end and tb.pool_i(head)[m] != v:
         m += 1
     return m < end
@@ -247,7 +247,7 @@ def is_in_separator(head, c, v):  # type: ignore[no-untyped-def]
 @kernel
 def weakest(head, c, v):  # type: ignore[no-untyped-def]
     """Return the information of a prior on a node in its weakest direction."""
-    pool_f, nodes, at = tb.pool_f(head), _nodes(head, c), tb.clique_i(head)[c, tb.VALUES]
+    pool_f, nodes, at = tb.pool_f(head), _nodes(head, c), tb.cliques(head)[c].values
     n = 3 * len(nodes)
     for k in range(len(nodes)):
         if nodes[k] == v:
@@ -262,24 +262,24 @@ def weakest(head, c, v):  # type: ignore[no-untyped-def]
 @kernel
 def start(head, c, anchored):  # type: ignore[no-untyped-def]
     """Initialise the row of a prior that has its nodes and numbers; add its energy to chi2."""
-    node_f, nodes, f = tb.node_f(head), _nodes(head, c), tb.clique_f(head)[c]
-    tb.clique_i(head)[c, tb.ANCHORED] = 1 if anchored else 0
-    f[tb.TURN_SEEN] = f[tb.DRIFT] = f[tb.PRIOR_ENERGY] = 0.0
-    scale, first = 0.0, node_f[nodes[0]]
-    for k in range(1, len(nodes)):
-        node = node_f[nodes[k]]
+    nodes, members, f = tb.nodes(head), _nodes(head, c), tb.cliques(head)[c]
+    f.anchored = 1 if anchored else 0
+    f.turn_seen = f.drift = f.energy = 0.0
+    scale, first = 0.0, nodes[members[0]]
+    for k in range(1, len(members)):
+        node = nodes[members[k]]
         position, _ = diagonal(head, c, k)
-        scale += 2.0 * position * ((node[tb.POSE] - first[tb.POSE]) ** 2
-                                   + (node[tb.POSE + 1] - first[tb.POSE + 1]) ** 2)
-    f[tb.SLIP_SCALE] = 0.25 * scale
+        scale += 2.0 * position * ((node.pose[0] - first.pose[0]) ** 2
+                                   + (node.pose[1] - first.pose[1]) ** 2)
+    f.slip_scale = 0.25 * scale
     update_energy(head, c)
 
 
 @kernel
 def make_loose(head, c):  # type: ignore[no-untyped-def]
     """Put a prior into the list of those without a parent."""
-    row = tb.clique_i(head)[c]
-    row[tb.PARENT], row[tb.SIBLING] = -1, head[tb.LOOSE]
+    row = tb.cliques(head)[c]
+    row.parent, row.sibling = -1, head[tb.LOOSE]
     head[tb.LOOSE] = c
 
 
@@ -298,8 +298,10 @@ def all_priors(head):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def remove_cliques(head):  # type: ignore[no-untyped-def]
     """Remove all cliques but the priors, which become loose and take the first rows."""
-    clique_i, clique_f, priors = tb.clique_i(head), tb.clique_f(head), all_priors(head)
-    rows, numbers = clique_i[priors], clique_f[priors]
+    priors = all_priors(head)
+    records = np.empty(len(priors), tb.CLIQUE)
+    for k in range(len(priors)):
+        records[k] = tb.cliques(head)[priors[k]]
     kept = 1 if len(priors) > 0 else 0
     nodes = tb.pool_i(head)[:kept * head[tb.POOL_I_END]].copy()
     values = tb.pool_f(head)[:kept * head[tb.POOL_F_END]].copy()
@@ -307,19 +309,18 @@ def remove_cliques(head):  # type: ignore[no-untyped-def]
     head[tb.FREE_CLIQUE] = head[tb.LOOSE] = -1
     head[tb.FREE_F:] = -1
     head[tb.N_PRIORS] = head[tb.N_FREED] = 0
-    end = head[tb.LOG_I_END]
-    for k in range(len(rows)):
-        old, before = rows[k], numbers[k]
-        c = transaction_log.take_clique(head, 0, old[tb.N_SEPARATOR])
-        at, size = clique_i[c, tb.VALUES], pools.n_values(0, old[tb.N_SEPARATOR])
-        copied(nodes[old[tb.NODES]:], _nodes(head, c))
-        copied(values[old[tb.VALUES]:], tb.pool_f(head)[at:at + size])
-        clique_i[c, tb.ANCHORED] = old[tb.ANCHORED]
-        f = clique_f[c]
-        f[tb.TURN_SEEN] = f[tb.DRIFT] = 0.0
-        f[tb.PRIOR_ENERGY], f[tb.SLIP_SCALE] = before[tb.PRIOR_ENERGY], before[tb.SLIP_SCALE]
+    end = head[tb.LOG_END]
+    for k in range(len(records)):
+        old = records[k]
+        c = transaction_log.take_clique(head, 0, old.n_separator)
+        row = tb.cliques(head)[c]
+        at, size = row.values, pools.n_values(0, old.n_separator)
+        copied(nodes[old.members:], _nodes(head, c))
+        copied(values[old.values:], tb.pool_f(head)[at:at + size])
+        row.turn_seen = row.drift = 0.0
+        row.anchored, row.energy, row.slip_scale = old.anchored, old.energy, old.slip_scale
         make_loose(head, c)
-    head[tb.LOG_I_END] = end    # nothing of this can be rolled back
+    head[tb.LOG_END] = end    # nothing of this can be rolled back
 
 
 # --- edits, within an update --------------------------------------------------------------------
@@ -341,7 +342,7 @@ def _touch_nodes(head, c, sign):  # type: ignore[no-untyped-def]
 def add(head, nodes, values, anchored):  # type: ignore[no-untyped-def]
     """Add a prior on nodes, by row, with numbers from `priors.packed`; tables have room."""
     c = transaction_log.take_clique(head, 0, len(nodes))
-    at = tb.clique_i(head)[c, tb.VALUES]
+    at = tb.cliques(head)[c].values
     copied(nodes, _nodes(head, c))
     copied(values, tb.pool_f(head)[at:at + len(values)])
     start(head, c, anchored)
@@ -352,20 +353,20 @@ def add(head, nodes, values, anchored):  # type: ignore[no-untyped-def]
 @kernel
 def _unlink(head, c):  # type: ignore[no-untyped-def]
     """Take a prior out of the list of its parent's children, or of the loose ones."""
-    clique_i = tb.clique_i(head)
-    parent, after = clique_i[c, tb.PARENT], clique_i[c, tb.SIBLING]
-    before = head[tb.LOOSE] if parent < 0 else clique_i[parent, tb.CHILD]
+    cliques = tb.cliques(head)
+    parent, after = cliques[c].parent, cliques[c].sibling
+    before = head[tb.LOOSE] if parent < 0 else cliques[parent].child
     if before == c:
         if parent < 0:
             head[tb.LOOSE] = after
         else:
             transaction_log.log_clique(head, parent)
-            clique_i[parent, tb.CHILD] = after
+            cliques[parent].child = after
         return
-    while clique_i[before, tb.SIBLING] != c:
-        before = clique_i[before, tb.SIBLING]
+    while cliques[before].sibling != c:
+        before = cliques[before].sibling
     transaction_log.log_clique(head, before)
-    clique_i[before, tb.SIBLING] = after
+    cliques[before].sibling = after
 
 
 @kernel
@@ -373,9 +374,9 @@ def remove(head, c):  # type: ignore[no-untyped-def]
     """Take a prior out of the graph."""
     transaction_log.log_clique(head, c)
     _touch_nodes(head, c, -1.0)
-    tb.scalars(head)[tb.CHI2] -= tb.clique_f(head)[c, tb.PRIOR_ENERGY]
+    tb.scalars(head)[0].chi2 -= tb.cliques(head)[c].energy
     _unlink(head, c)
-    tb.clique_i(head)[c, tb.PARENT] = REMOVED
+    tb.cliques(head)[c].parent = REMOVED
     transaction_log.drop_clique(head, c)
 
 
@@ -407,9 +408,9 @@ def priors_of(memory: tb.Memory, node_ids: IntArray) -> tuple[Prior, ...]:
     if memory.head[tb.N_PRIORS] == 0:
         return ()
     found = []
-    for row in memory['clique_i'][all_priors(memory.head)]:
-        k, nodes = int(row[tb.N_SEPARATOR]), int(row[tb.NODES])
+    for row in memory['cliques'][all_priors(memory.head)]:
+        k, nodes = int(row['n_separator']), int(row['members'])
         found.append(unpacked(
-            node_ids[memory['pool_i'][nodes:nodes + k]], memory['pool_f'][row[tb.VALUES]:],
-            anchored=bool(row[tb.ANCHORED])))
+            node_ids[memory['pool_i'][nodes:nodes + k]], memory['pool_f'][row['values']:],
+            anchored=bool(row['anchored'])))
     return tuple(found)

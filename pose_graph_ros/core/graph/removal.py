@@ -9,15 +9,20 @@ those that stay move up, in their order, and all that refers to a row is rewritt
 with any of its nodes. Cliques keep their rows.
 """
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import prior_rows, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.editing import weigh
 from pose_graph_ros.core.graph.graph_update import Left, NOTHING_LEFT
 from pose_graph_ros.core.graph.rows import touch
+
+_POSE = int(NodeKind.POSE)
 
 
 @kernel
@@ -28,49 +33,49 @@ def _touch_cliques_with(head, v):  # type: ignore[no-untyped-def]
     They are a subtree below the clique that it is frontal in. A clique may have it in the
     separator although no constraint below leads to it any more.
     """
-    clique_i, top = tb.clique_i(head), tb.node_i(head)[v, tb.CLIQUE]
+    cliques, top = tb.cliques(head), tb.nodes(head)[v].clique
     if top < 0:
         return
-    parent, c = top, clique_i[top, tb.CHILD]
+    parent, c = top, cliques[top].child
     while True:
         if c >= 0 and prior_rows.is_in_separator(head, c, v):
-            u = tb.pool_i(head)[clique_i[c, tb.NODES]]
+            u = tb.pool_i(head)[cliques[c].members]
             transaction_log.log_node(head, u)
             touch(head, u)
-            parent, c = c, clique_i[c, tb.CHILD]
+            parent, c = c, cliques[c].child
         elif c >= 0:
-            c = clique_i[c, tb.SIBLING]
+            c = cliques[c].sibling
         elif parent == top:
             return
         else:
-            c, parent = clique_i[parent, tb.SIBLING], clique_i[parent, tb.PARENT]
+            c, parent = cliques[parent].sibling, cliques[parent].parent
 
 
 @kernel
 def _forget_newest(head):  # type: ignore[no-untyped-def]
     """Let the newest pose be the last one that does not leave."""
-    node_i = tb.node_i(head)
+    nodes = tb.nodes(head)
     v = head[tb.NEWEST]
-    while v >= 0 and (node_i[v, tb.FACTOR_LIST] == tb.LEAVES or node_i[v, tb.NODE_TYPE] != 0):
+    while v >= 0 and (nodes[v].factor_list == tb.LEAVES or nodes[v].kind != _POSE):
         v -= 1
     head[tb.NEWEST] = v
 
 
 @kernel(signature=(tb.HEAD, INTEGERS))
-def remove_nodes(head, nodes):  # type: ignore[no-untyped-def]
+def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
     """Take hidden nodes, by id, out of the graph with all their factors; rows leave later."""
-    node_i = tb.node_i(head)
-    for node in nodes:
-        v = rows.node_row(head, node)
+    nodes = tb.nodes(head)
+    for number in ids:
+        v = rows.node_row(head, number)
         prior_rows.remove_of_node(head, v)
-        if node_i[v, tb.FACTOR_LIST] == tb.LEAVES:
+        if nodes[v].factor_list == tb.LEAVES:
             continue
         transaction_log.log_node(head, v)
-        while node_i[v, tb.FACTOR_LIST] >= 0:
-            weigh(head, node_i[v, tb.FACTOR_LIST] >> 2, 0.0)
+        while nodes[v].factor_list >= 0:
+            weigh(head, nodes[v].factor_list >> 2, 0.0)
         _touch_cliques_with(head, v)
         touch(head, v)
-        node_i[v, tb.FACTOR_LIST] = tb.LEAVES
+        nodes[v].factor_list = tb.LEAVES
         head[tb.N_LEAVING] += 1
         head[tb.STRUCTURE] = 1
     _forget_newest(head)
@@ -81,22 +86,22 @@ def compact(memory: tb.Memory) -> Left:
     head = memory.head
     if head[tb.N_LEAVING] == 0:
         return NOTHING_LEFT
-    node_i, factor_i = _rows_in_use(memory)
-    stays = node_i[:, tb.FACTOR_LIST] != tb.LEAVES
+    nodes, factors = _rows_in_use(memory)
+    stays = nodes['factor_list'] != tb.LEAVES
     with_ends = np.append(stays, True)  # -1: no such end
-    factor_stays = (factor_i[:, tb.NEXT_I] != tb.LEAVES) & np.all(
-        with_ends[factor_i[:, tb.END_I:tb.END_K + 1]], axis=1)
-    nodes, moved = _moved_up(memory, 'node', tb.N_NODES, stays)
-    gone, factors_moved = _moved_up(memory, 'factor', tb.N_FACTORS, factor_stays)
+    factor_stays = (factors['next'][:, 0] != tb.LEAVES) & np.all(
+        with_ends[factors['ends']], axis=1)
+    nodes_gone, moved = _moved_up(memory, 'node', tb.N_NODES, stays)
+    factors_gone, factors_moved = _moved_up(memory, 'factor', tb.N_FACTORS, factor_stays)
     _rewrite_rows(memory, moved, factors_moved)
     _rewrite_lists(memory, moved, factors_moved)
     head[tb.N_LEAVING] = 0
-    return Left(nodes, gone)
+    return Left(nodes_gone, factors_gone)
 
 
-def _rows_in_use(memory: tb.Memory) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    return (memory['node_i'][:memory.head[tb.N_NODES]],
-            memory['factor_i'][:memory.head[tb.N_FACTORS]])
+def _rows_in_use(memory: tb.Memory) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    return (memory['nodes'][:memory.head[tb.N_NODES]],
+            memory['factors'][:memory.head[tb.N_FACTORS]])
 
 
 def _moved_up(
@@ -106,37 +111,34 @@ def _moved_up(
     n, gone = len(stays), memory[f'{name}_id'][:len(stays)][~stays].astype(np.int64)
     if len(gone) > 0:
         first, left = int(np.argmin(stays)), n - len(gone)
-        for suffix in ('f', 'i', 'id'):
-            table = memory[f'{name}_{suffix}']
+        for table in (memory[f'{name}s'], memory[f'{name}_id']):
             table[first:left] = table[first:n][stays[first:]]
         memory.head[counter] = left
     # one more, so that -1 stays -1
     return gone, np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)
 
 
-def _rewrite_rows(memory: tb.Memory, nodes: IntArray, factors: IntArray) -> None:
+def _rewrite_rows(memory: tb.Memory, node_rows: IntArray, factor_rows: IntArray) -> None:
     """Rewrite ends of factors and the lists of the factors of each node."""
-    node_i, factor_i = _rows_in_use(memory)
+    nodes, factors = _rows_in_use(memory)
 
     def entries(old: npt.NDArray[np.int32]) -> IntArray:
-        return np.where(old >= 0, 4 * factors[old >> 2] + (old & 3), -1)
+        return np.where(old >= 0, 4 * factor_rows[old >> 2] + (old & 3), -1)
 
-    node_i[:, tb.FACTOR_LIST] = entries(node_i[:, tb.FACTOR_LIST])
-    ends, after = (factor_i[:, first:first + 3] for first in (tb.END_I, tb.NEXT_I))
-    ends[:] = nodes[ends]
+    nodes['factor_list'] = entries(nodes['factor_list'])
+    factors['ends'] = node_rows[factors['ends']]
     # those without a weight are in no list
-    has_weight = memory['factor_f'][:len(ends), tb.WEIGHT] > 0.0
-    listed = has_weight[:, None] & (ends >= 0)
-    after[listed] = entries(after[listed])
+    listed = (factors['weight'] > 0.0)[:, None] & (factors['ends'] >= 0)
+    factors['next'][listed] = entries(factors['next'][listed])
 
 
 def _rewrite_lists(memory: tb.Memory, nodes: IntArray, factors: IntArray) -> None:
     """Rewrite the nodes of cliques, what is touched or waits, and the newest pose."""
     head, pool_i = memory.head, memory['pool_i']
-    cliques = memory['clique_i'][:head[tb.N_CLIQUES]].astype(np.int64)
-    sizes = np.maximum(cliques[:, tb.N_FRONTAL] + cliques[:, tb.N_SEPARATOR], 0)  # -1 if unused
+    cliques = memory['cliques'][:head[tb.N_CLIQUES]]
+    sizes = np.maximum(cliques['n_frontal'] + cliques['n_separator'], 0)    # -1 if unused
     begins = np.cumsum(sizes) - sizes
-    at = np.arange(np.sum(sizes)) + np.repeat(cliques[:, tb.NODES] - begins, sizes)
+    at = np.arange(np.sum(sizes)) + np.repeat(cliques['members'] - begins, sizes)
     pool_i[at] = nodes[pool_i[at]]
     touched = nodes[memory['touched'][:head[tb.N_TOUCHED]]]
     waiting = factors[memory['waiting'][:head[tb.N_WAITING]]]

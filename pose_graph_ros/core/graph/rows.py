@@ -61,9 +61,9 @@ def factor_row(head, number):  # type: ignore[no-untyped-def]
 @kernel
 def touch(head, v):  # type: ignore[no-untyped-def]
     """Mark a node for elimination in the next iteration; the caller has logged its row."""
-    node_i, touched = tb.node_i(head), tb.touched(head)
-    if node_i[v, tb.TOUCHED] == 0:
-        node_i[v, tb.TOUCHED] = 1
+    nodes, touched = tb.nodes(head), tb.touched(head)
+    if nodes[v].touched == 0:
+        nodes[v].touched = 1
         touched[head[tb.N_TOUCHED]] = v
         head[tb.N_TOUCHED] += 1
 
@@ -73,26 +73,38 @@ def touch(head, v):  # type: ignore[no-untyped-def]
 @kernel
 def add_to_scale(head, v, position, heading):  # type: ignore[no-untyped-def]
     """Add information [1/m^2, 1/rad^2], or its change, to the squared scales of a node."""
-    f = tb.node_f(head)[v]
-    f[tb.SCALE_T] = math.sqrt(max(f[tb.SCALE_T] * f[tb.SCALE_T] + position, 0.0))
-    f[tb.SCALE_R] = math.sqrt(max(f[tb.SCALE_R] * f[tb.SCALE_R] + heading, 0.0))
+    f = tb.nodes(head)[v]
+    f.scale_t = math.sqrt(max(f.scale_t * f.scale_t + position, 0.0))
+    f.scale_r = math.sqrt(max(f.scale_r * f.scale_r + heading, 0.0))
 
 
 @kernel
 def scale_by(head, e, weight):  # type: ignore[no-untyped-def]
     """Add the information of a factor with a weight to the diagonal scales of its ends."""
-    f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
-    position = 0.5 * weight * (f[tb.INFO] + f[tb.INFO + 3])
-    heading = weight * f[tb.INFO + 5]
+    f = tb.factors(head)[e]
+    position = 0.5 * weight * (f.information[0] + f.information[3])
+    heading = weight * f.information[5]
     # of a relative error the length of the mean, of others that of the offset
-    arm2 = f[tb.OWN] * f[tb.OWN] + f[tb.OWN + 1] * f[tb.OWN + 1]
-    add_to_scale(head, row[tb.END_I], position, heading + position * arm2)
-    if row[tb.END_J] >= 0:
-        ft, fth = factors.factors_of_end(f, row[tb.FACTOR_KIND])
-        add_to_scale(head, row[tb.END_J], ft * ft * position, fth * fth * heading)
-    if row[tb.END_K] >= 0:
-        third = heading * (f[tb.BIAS_TH] * f[tb.BIAS_TH])
-        add_to_scale(head, row[tb.END_K], third, 0.0)
+    arm2 = f.constants[0] * f.constants[0] + f.constants[1] * f.constants[1]
+    add_to_scale(head, f.ends[0], position, heading + position * arm2)
+    if f.ends[1] >= 0:
+        ft, fth = factors.factors_of_end(f, f.kind)
+        add_to_scale(head, f.ends[1], ft * ft * position, fth * fth * heading)
+    if f.ends[2] >= 0:
+        third = heading * (f.constants[3] * f.constants[3])
+        add_to_scale(head, f.ends[2], third, 0.0)
+
+
+@kernel
+def start_node(head, v):  # type: ignore[no-untyped-def]
+    """Initialise a new node, of which the pose is known."""
+    node = tb.nodes(head)[v]
+    factors.refer_to_pose(node)
+    node.scale_t = node.scale_r = 0.0
+    node.clique = node.factor_list = -1
+    node.index = node.front = node.changed = node.solution_logged = 0
+    node.logged = head[tb.UPDATE]
+    node.kind, node.dimension, node.fixed, node.touched = 0, 3, 0, 0
 
 
 # --- new rows -----------------------------------------------------------------------------------
@@ -106,17 +118,16 @@ def _is_finite(x):  # type: ignore[no-untyped-def]
 @kernel
 def _pack_information(to, w):  # type: ignore[no-untyped-def]
     """
-    Write the upper triangle of an information matrix to a row of factor_f.
+    Write the upper triangle of an information matrix, shape (6,).
 
     Return whether the matrix is finite, symmetric, positive semidefinite and not zero.
     """
     # for symmetry and eigenvalues with the diagonal scaled to 1; a tenth of that in `checks.check`
     tolerance = 1e-6
-    at = tb.INFO
     xx, yy, tt = w[0, 0], w[1, 1], w[2, 2]
     xy, xt, yt = 0.5 * (w[0, 1] + w[1, 0]), 0.5 * (w[0, 2] + w[2, 0]), 0.5 * (w[1, 2] + w[2, 1])
-    to[at], to[at + 1], to[at + 2] = xx, xy, xt
-    to[at + 3], to[at + 4], to[at + 5] = yy, yt, tt
+    to[0], to[1], to[2] = xx, xy, xt
+    to[3], to[4], to[5] = yy, yt, tt
     total = xx + yy + tt
     if not (_is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
         return False
@@ -136,25 +147,24 @@ def _pack_information(to, w):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _copy_pose(to, at, pose):  # type: ignore[no-untyped-def]
-    """Write a pose to three columns of a row; return whether it is finite."""
-    to[at], to[at + 1], to[at + 2] = pose[0], pose[1], pose[2]
+def _copy_pose(to, pose):  # type: ignore[no-untyped-def]
+    """Write a pose; return whether it is finite."""
+    to[0], to[1], to[2] = pose[0], pose[1], pose[2]
     return _is_finite(pose[0]) and _is_finite(pose[1]) and _is_finite(pose[2])
 
 
 @kernel
 def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
-    """Write mean and information to a row; return whether both are valid."""
-    valid = _copy_pose(f, tb.MEAN, mean)
-    return _pack_information(f, information) and valid
+    """Write mean and information of a factor; return whether both are valid."""
+    valid = _copy_pose(f.mean, mean)
+    return _pack_information(f.information, information) and valid
 
 
 @kernel
 def write_row(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
     """Write a factor; return whether it is valid, its nodes, kind and constants apart."""
-    f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
-    row[tb.END_I], row[tb.END_J], row[tb.END_K], row[tb.FACTOR_KIND] = i, j, -1, kind
-    f[tb.WEIGHT] = weight
+    f = tb.factors(head)[e]
+    f.ends[0], f.ends[1], f.ends[2], f.kind, f.weight = i, j, -1, kind, weight
     valid = _is_finite(weight) and weight >= 0.0 and i != j
     return write_measurement(f, mean, information) and valid
 
@@ -164,10 +174,16 @@ def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
     """Write poses of new hidden nodes, headings wrapped; return whether all are finite."""
     valid = True
     for k in range(len(poses)):
-        f = tb.node_f(head)[first + k]
-        valid = _copy_pose(f, tb.POSE, poses[k]) and valid
-        f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2])
+        f = tb.nodes(head)[first + k]
+        valid = _copy_pose(f.pose, poses[k]) and valid
+        f.pose[2] = factors.wrap(f.pose[2])
     return valid
+
+
+@kernel
+def kind_and_dimension(code):  # type: ignore[no-untyped-def]
+    """Return `NodeKind` and number of coordinates from what `checks.node_types` returns."""
+    return code & 3, 3 - (code >> 2)
 
 
 @kernel
@@ -176,10 +192,8 @@ def _node(head, v, first_other, types):  # type: ignore[no-untyped-def]
     if v < 0:
         return _NO_NODE, 0
     if v < head[tb.N_NODES]:
-        node = tb.node_i(head)[v, tb.NODE_TYPE]
-    else:
-        node = types[v - first_other] if v >= first_other else 0
-    return node & 3, 3 - (node >> 2)
+        return np.int64(tb.nodes(head)[v].kind), np.int64(tb.nodes(head)[v].dimension)
+    return kind_and_dimension(types[v - first_other] if v >= first_other else 0)
 
 
 @kernel
@@ -187,7 +201,7 @@ def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
     """Tell whether information, and the mean if asked for, are zero but in some rows (bits)."""
     for m in range(3):
         if (rows >> m) & 1 == 0 and (
-                f[tb.INFO + (0, 3, 5)[m]] != 0.0 or (of_mean and f[tb.MEAN + m] != 0.0)):
+                f.information[(0, 3, 5)[m]] != 0.0 or (of_mean and f.mean[m] != 0.0)):
             return False
     return True
 
@@ -197,7 +211,7 @@ def write_rows(head, n_nodes, first_other, types, columns):  # type: ignore[no-u
     """
     Write new factors, columns of `Factors`, behind the last row; return whether all are valid.
 
-    The graph will have n_nodes nodes, those from row `first_other` on with these NODE_TYPEs.
+    The graph will have n_nodes nodes, from row `first_other` on with these `checks.node_types`.
     """
     i, j, mean, information, kind, weight, constants, third = columns
     valid = True
@@ -205,10 +219,10 @@ def write_rows(head, n_nodes, first_other, types, columns):  # type: ignore[no-u
         e = head[tb.N_FACTORS] + k
         a, b, c = node_row(head, i[k]), _end_row(head, j[k]), _end_row(head, third[k])
         valid = write_row(head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
-        f, row = tb.factor_f(head)[e], tb.factor_i(head)[e]
-        row[tb.END_K] = c
+        f = tb.factors(head)[e]
+        f.ends[2] = c
         for m in range(4):
-            f[tb.OFFSET + m] = constants[k, m]
+            f.constants[m] = constants[k, m]
             valid = _is_finite(constants[k, m]) and valid
         valid = (valid and 0 <= a < n_nodes and -1 <= b < n_nodes and -1 <= c < n_nodes
                  and kind[k] < len(_ROWS))

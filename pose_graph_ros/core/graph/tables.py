@@ -1,22 +1,20 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The memory of the engine: flat tables that grow, and how kernels access them.
+The memory of the engine: tables of records that grow, and how kernels access them.
 
-Nodes, factors and cliques are rows of 2-D arrays, one of floats (`node_f`) and one
-of integers (`node_i`) each, so that what a step needs of a row lies on two or three cache lines.
-The values of a clique (its rows of R and its update matrix) lie in one pool, its list of nodes in
-another.
+Each node, factor and clique is a record, so that what a step needs of it lies on two or three
+cache lines: `nodes[v].pose[2]` in a kernel, `memory.nodes['pose'][:n]` in Python. The values of a
+clique (its rows of R and its update matrix) lie in one pool, its list of nodes in another.
 
 Passing a dozen arrays to a kernel costs more than a step along a chain. A kernel that Python calls
 therefore gets one array, the *head*: address and capacity of each table, then counters. A kernel
-gets its tables from the head, which costs nothing: `tb.node_f(head)`. `Memory.ensure` alone makes
+gets its tables from the head, which costs nothing: `tb.nodes(head)`. `Memory.ensure` alone makes
 tables grow and updates their addresses.
 
-The comments below are the reference of all columns and counters. A *stamp* is the value that a
+The comments below are the reference of all fields and counters. A *stamp* is the value that a
 counter (UPDATE, ITERATION or FRONT_SERIAL) had when something was done to a row; -1 in a list or
-as a row means none. A name that stands for several columns is the first of them. The last name of
-each group is the number of columns. Units: sigma^2 is the unit of energies.
+as a row means none. Units: sigma^2 is the unit of energies.
 """
 
 from collections.abc import Callable
@@ -24,7 +22,7 @@ import contextlib
 import mmap
 from typing import Any, Final
 
-from numba import types
+from numba import from_dtype, types
 from numba.extending import intrinsic
 import numpy as np
 import numpy.typing as npt
@@ -34,113 +32,138 @@ from pose_graph_ros.core.compiled.numba_internals import populate_array
 
 HEAD = INTEGERS     # the type of the head, in signatures of kernels
 
-# --- columns ------------------------------------------------------------------------------------
+# --- records ------------------------------------------------------------------------------------
 
-# node_f; a solve changes the columns before SCALE_T only.
-#   POSE (3): pose in the map, theta in [-pi, pi) [m, m, rad]
-#   DELTA (3): solution, the pose minus REF, theta not wrapped [m, m, rad]
-#   SEEN (3): DELTA that the cliques below were last solved with [m, m, rad]
-#   CHECKED_TURN: DELTA of the heading minus the angle of the clique's frame, when the node's
-#       constraints were last checked [rad]
-#   SCALE_T, SCALE_R: diagonal scales, roots of the information that the node's constraints have on
-#       its position and on its heading [1/m, 1/rad]
-#   REF (3): reference pose, constant until all nodes are linearized anew [m, m, rad]
-POSE, DELTA, SEEN, CHECKED_TURN, SCALE_T, SCALE_R, REF, NODE_F = 0, 3, 6, 9, 10, 11, 12, 15
-# node_i
-#   CLIQUE: row of the clique that the node is frontal in
-#   FACTOR_LIST: head of the list of its factors with a weight above 0; an entry is
-#       4 * factor + side (0: END_I, 1: END_J, 2: END_K); LEAVES if `removal.compact` takes the
-#       node out later
-#   FIXED: 1 if the node keeps its pose
-#   TOUCHED: 1 if the node is in the table `touched`
-#   INDEX: place of the node in the present front; work space
-#   FRONT: stamp (FRONT_SERIAL) of the front that INDEX is valid for
-#   CHANGED: stamp (ITERATION) of the last move by more than alpha sigmas
-#   NODE_LOGGED, SOLUTION_LOGGED: stamps (UPDATE) of the last log of the row, and of the columns
-#       before SCALE_T alone
-#   NODE_TYPE: `NodeKind` + 4 * number of coordinates less than three, which are and stay 0; so 0
-#       for a pose
-(CLIQUE, FACTOR_LIST, FIXED, TOUCHED, INDEX, FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED,
- NODE_TYPE, NODE_I) = range(11)
+NODE: Final = np.dtype([
+    # of these a solve changes those up to `checked_turn`, the SOLUTION, only
+    ('pose', 'f8', (3,)),       # in the map, theta in [-pi, pi) [m, m, rad]
+    ('delta', 'f8', (3,)),      # solution, the pose minus `reference`, theta not wrapped
+    ('seen', 'f8', (3,)),       # `delta` that the cliques below were last solved with
+    # heading of `delta` minus the angle of the clique's frame, when the node's factors were last
+    # checked [rad]
+    ('checked_turn', 'f8'),
+    # diagonal scales: roots of the information that the factors of the node have on its position
+    # and on its heading [1/m, 1/rad]
+    ('scale_t', 'f8'),
+    ('scale_r', 'f8'),
+    ('reference', 'f8', (3,)),  # constant until all nodes are linearized anew [m, m, rad]
+    ('clique', 'i4'),           # row of the clique that the node is frontal in
+    # head of the list of its factors with a weight above 0, whose entries are 4 * factor + the
+    # index of the end; LEAVES if `removal.compact` takes the node out later
+    ('factor_list', 'i4'),
+    ('index', 'i4'),            # place of the node in the present front; work space
+    ('front', 'i4'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
+    ('changed', 'i4'),          # stamp (ITERATION) of the last move by more than alpha sigmas
+    # stamps (UPDATE) of the last log of the row, and of its solution alone
+    ('logged', 'i4'),
+    ('solution_logged', 'i4'),
+    ('kind', 'u1'),             # `NodeKind`
+    ('dimension', 'u1'),        # number of its coordinates; the others are and stay 0
+    ('fixed', 'u1'),            # 1 if the node keeps its pose
+    ('touched', 'u1'),          # 1 if it is in the table `touched`; see `tree_update` for 2
+], align=True)
 
-# factor_f; th is the DELTA of a heading, and "linearized" means at the last linearization.
-#   MEAN (3): measured pose of j in i, or of i in the map [m, m, rad]
-#   INFO (6): information xx, xy, xt, yy, yt, tt [1/m^2, 1/(m rad), 1/rad^2]
-#   WEIGHT: what the information is multiplied by, 0 for a removed factor
-#   OWN (2): translation of the mean in its own axes, R_z^T t_z [m], or the column OFFSET
-#   OFFSET (2, 3 with one end): measured position, or pose, in the frame of i [m, m, rad], where an
-#       error has one; its heading shares the column of LIN_COS
-#   LIN_COS, LIN_SIN: of the linearized frame of the error, where it moves with the nodes
-#   BIAS_T, BIAS_TH: what a bias that is the end j is multiplied by; BIAS_TH: of the third node;
-#       share the columns of LIN_COS and LIN_SIN
-#   LIN_ARM (2): linearized arm of the Jacobian [m]
-#   LIN_TH: linearized th of i [rad]
-#   LIN_K: linearized heading error without th of the nodes [rad]
-#   ERROR2: squared linearization error, weighted [sigma^2]
-#   ENERGY: e^T information e, weighted [sigma^2]
-(MEAN, INFO, WEIGHT, OWN, LIN_COS, LIN_SIN, LIN_ARM, LIN_TH, LIN_K, ERROR2, ENERGY, FACTOR_F) = (
-    0, 3, 9, 10, 12, 13, 14, 16, 17, 18, 19, 20)
-OFFSET, BIAS_T, BIAS_TH = OWN, LIN_COS, LIN_SIN
-# factor_i
-#   END_I, END_J: nodes that it starts from and leads to; END_J: -1 for one end, in the map
-#   END_K: third node, or -1
-#   NEXT_I, NEXT_J, NEXT_K: next entries of the lists of END_I, END_J and END_K; NEXT_I: LEAVES if
-#       `removal.compact` takes the factor out, as it does all factors of nodes that leave
-#   FACTOR_KIND: `FactorKind`
-#   FACTOR_CHECKED: stamp (ITERATION) of the last check of the linearization
-#   FACTOR_WAITS: 1 if the factor is in the table `waiting`
-#   FACTOR_LOGGED, ENERGY_LOGGED: stamps (UPDATE) of the last log of the row, and of ERROR2, ENERGY
-#       and FACTOR_WAITS alone
-#   OWNER: row of the clique that the factor was assembled in
-(END_I, END_J, END_K, NEXT_I, NEXT_J, NEXT_K, FACTOR_KIND, FACTOR_CHECKED, FACTOR_WAITS,
- FACTOR_LOGGED, ENERGY_LOGGED, OWNER, FACTOR_I) = range(13)
+# th is the heading of a node's `delta`, and "linearized" means at the last linearization.
+FACTOR: Final = np.dtype([
+    ('mean', 'f8', (3,)),       # measured pose of j in i, or of i in the map [m, m, rad]
+    ('information', 'f8', (6,)),    # xx, xy, xt, yy, yt, tt [1/m^2, 1/(m rad), 1/rad^2]
+    ('weight', 'f8'),           # what the information is multiplied by, 0 for a removed factor
+    # what else the error depends on, as in `constraints.Factors`; of a relative error the
+    # translation of the mean in its own axes, R_z^T t_z [m, m]
+    ('constants', 'f8', (4,)),
+    # cosine and sine of the linearized frame of the error, where it moves with the nodes
+    ('lin_cos', 'f8'),
+    ('lin_sin', 'f8'),
+    ('lin_arm', 'f8', (2,)),    # linearized arm of the Jacobian [m]
+    ('lin_th', 'f8'),           # linearized th of i [rad]
+    ('lin_k', 'f8'),            # linearized heading error without th of the nodes [rad]
+    ('ends', 'i4', (3,)),       # nodes i, j and k; j is -1 where it has one end, in the map
+    ('next', 'i4', (3,)),       # next entries of the lists of these; LEAVES: see `factor_list`
+    ('owner', 'i4'),            # row of the clique that the factor was assembled in
+    # stamps (UPDATE) of the last log of the row, and of its energy alone
+    ('logged', 'i4'),
+    ('energy_logged', 'i4'),
+    ('kind', 'i4'),             # `FactorKind`
+    # a check changes those from here on, the ENERGY, only
+    ('error2', 'f8'),           # squared linearization error, weighted [sigma^2]
+    ('energy', 'f8'),           # e^T information e, weighted [sigma^2]
+    ('checked', 'i4'),          # stamp (ITERATION) of the last check of the linearization
+    ('waits', 'i4'),            # 1 if the factor is in the table `waiting`
+], align=True)
 # In place of a list's head or next entry: the row leaves the graph, and is in no list.
-LEAVES = -2
+LEAVES: Final = -2
 
-# clique_i
-#   PARENT, CHILD, SIBLING: rows of the parent, the first child and the next child of the parent;
-#       in an unused row SIBLING is the next unused one
-#   N_FRONTAL, N_SEPARATOR: numbers of frontal nodes (0 for a prior, -1 in an unused row) and
-#       separator nodes
-#   NODES: index in pool_i of its nodes, frontal ones first
-#   VALUES: index in pool_f of its rows of R, with the update matrix behind them; see `prior_rows`
-#   MARKED: stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
-#       eliminated, the number of marked children that are left
-#   BUILT: stamp (ITERATION) of the last elimination or solution
-#   BORN, VALUES_BORN, CLIQUE_LOGGED: stamps (UPDATE) of taking the row, of taking the values, and
-#       of the last log of the row
-#   ANCHORED: 1 if a node at or below it is fixed or has a factor whose axes do not turn with
-#       its clique
-(PARENT, CHILD, SIBLING, N_FRONTAL, N_SEPARATOR, NODES, VALUES, MARKED, BUILT, BORN, VALUES_BORN,
- CLIQUE_LOGGED, ANCHORED, CLIQUE_I) = range(14)
-# clique_f; see `clique_frames`.
-#   TURN_SEEN: angle of the clique's frame that the parent was eliminated with [rad]
-#   TURN_ZERO: mean DELTA of the separator's headings at the elimination of the clique [rad]
-#   SLIP_ERROR2: squared error of the parent's linear model of the frame's turn since TURN_SEEN
-#       [sigma^2]
-#   TURN: angle of the frame during back-substitution [rad]; shares the column of SLIP_ERROR2
-#   SLIP_SCALE: diagonal scale of the update matrix: the estimate of SLIP_ERROR2 is
-#       SLIP_SCALE * turn^4 plus a term in turn^2 [sigma^2/rad^4]
-#   DRIFT: upper bound of how far the separator has deformed since the clique was solved [sigma]
-#   PRIOR_ENERGY: of a prior, its energy [sigma^2]; shares the column of TURN_ZERO
-TURN_SEEN, TURN_ZERO, SLIP_ERROR2, SLIP_SCALE, DRIFT, CLIQUE_F = range(6)
-TURN, PRIOR_ENERGY = SLIP_ERROR2, TURN_ZERO
+CLIQUE: Final = np.dtype([
+    # see `clique_frames`
+    ('turn_seen', 'f8'),        # angle of its frame that the parent was eliminated with [rad]
+    # mean heading of the separator's `delta` at the elimination of the clique [rad]
+    ('turn_zero', 'f8'),
+    ('turn', 'f8'),             # angle of its frame during back-substitution [rad]
+    # squared error of the parent's linear model of the frame's turn since `turn_seen` [sigma^2]
+    ('slip_error2', 'f8'),
+    # diagonal scale of the update matrix: the estimate of `slip_error2` is slip_scale * turn^4
+    # plus a term in turn^2 [sigma^2/rad^4]
+    ('slip_scale', 'f8'),
+    # upper bound of how far the separator has deformed since the clique was solved [sigma]
+    ('drift', 'f8'),
+    ('energy', 'f8'),           # of a prior [sigma^2]
+    ('parent', 'i4'),
+    ('child', 'i4'),            # the first child
+    ('sibling', 'i4'),          # next child of the parent; in an unused row the next unused one
+    ('n_frontal', 'i4'),        # number of frontal nodes: 0 for a prior, -1 in an unused row
+    ('n_separator', 'i4'),
+    ('members', 'i4'),          # index in pool_i of its nodes, frontal ones first
+    # index in pool_f of its rows of R, with the update matrix behind them; see `prior_rows`
+    ('values', 'i4'),
+    # stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
+    # eliminated, the number of marked children that are left
+    ('marked', 'i4'),
+    ('built', 'i4'),            # stamp (ITERATION) of the last elimination or solution
+    # stamps (UPDATE) of taking the row, of taking the values, and of the last log of the row
+    ('born', 'i4'),
+    ('values_born', 'i4'),
+    ('logged', 'i4'),
+    # 1 if a node at or below it is fixed or has a factor whose axes do not turn with its clique
+    ('anchored', 'i4'),
+], align=True)
 
-# Tables by name, with their numbers of columns. Those with one column are 1-D:
+SCALARS: Final = np.dtype([
+    # squared linearization errors that the last iteration checked, and the one before [sigma^2]
+    ('error2_sum', 'f8'),
+    ('error2_before', 'f8'),
+    ('n_moved', 'f8'),          # number of nodes that the last iteration moved
+    # settings: `alpha` [sigma], `budget` and `budget_share` [sigma^2] of `SmootherConfig`
+    ('alpha', 'f8'),
+    ('budget', 'f8'),
+    ('share', 'f8'),
+    # damping of Levenberg-Marquardt, as a factor on the squared diagonal scales
+    ('damping', 'f8'),
+    ('chi2', 'f8'),             # energy of all factors and priors, weighted [sigma^2]
+    ('lowest', 'f8'),           # lowest chi2 of the refinement so far [sigma^2]
+    # largest change of a coordinate of a position by the last iteration of the refinement [m]
+    ('largest_move', 'f8'),
+], align=True)
+
+# Tables by name, with the type of their rows:
+#   scalars: sums and settings, one record
 #   node_id, factor_id: ids of the rows, ascending
 #   pool_f, pool_i: values and node lists of cliques
-#   log_f, log_i: transaction log
+#   log: the transaction log, in words of eight bytes
 #   work_f, work_i: work space of kernels
-#   scalars: sums and settings
 #   touched: nodes to eliminate again in the next iteration
 #   freed: pairs (clique, index in pool_f) to release on commit; index -1: the whole clique
 #   waiting: factors to relinearize
-FLOAT_TABLES: Final = {'node_f': NODE_F, 'factor_f': FACTOR_F, 'pool_f': 1, 'log_f': 1,
-                       'work_f': 1, 'scalars': 1, 'clique_f': CLIQUE_F}
-INT_TABLES: Final = {'node_i': NODE_I, 'factor_i': FACTOR_I, 'clique_i': CLIQUE_I, 'pool_i': 1,
-                     'log_i': 1, 'work_i': 1, 'touched': 1, 'freed': 1, 'waiting': 1,
-                     'node_id': 1, 'factor_id': 1}
-NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
+TABLES: Final[dict[str, np.dtype[Any]]] = {
+    'nodes': NODE, 'factors': FACTOR, 'cliques': CLIQUE, 'scalars': SCALARS,
+    **{name: np.dtype(kind) for kind, names in (
+        ('f8', ('pool_f', 'work_f')), ('i8', ('log',)),
+        ('i4', ('pool_i', 'work_i', 'touched', 'freed', 'waiting', 'node_id', 'factor_id')),
+    ) for name in names}}
+NAMES: Final = tuple(TABLES)
+WORD: Final = 8     # bytes; the size of a record is a multiple of it
+# Words of a node up to the end of its solution, and of a factor before its energy.
+SOLUTION: Final[int] = NODE.fields['scale_t'][1] // WORD    # type: ignore[index]
+ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index]
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
 
@@ -148,7 +171,7 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #   FREE_CLIQUE: first unused row of the cliques
 #   POOL_F_END, POOL_I_END: ends of what has ever been taken from the pools
 #   N_TOUCHED, N_FREED, N_WAITING: numbers of entries of `touched`, `freed` and `waiting`
-#   LOG_F_END, LOG_I_END: ends of the log
+#   LOG_END: end of the log
 #   UPDATE, ITERATION, FRONT_SERIAL: number of the update, the iteration and the front
 #   STRUCTURE: 1 if the next elimination needs a new ordering
 #   NEED_F, NEED_I, NEED_WORK: capacities of pool_f, pool_i and work_f that a step lacks
@@ -170,11 +193,11 @@ NAMES: Final = (*FLOAT_TABLES, *INT_TABLES)
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 (N_NODES, N_FACTORS, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
- N_WAITING, LOG_F_END, LOG_I_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
+ N_WAITING, LOG_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
  NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
  N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, NEWEST, SINCE, REFINED, LISTED, ROUND,
  INTERRUPT, NEXT_NODE, NEXT_FACTOR, N_LEAVING, N_PRIORS, LOOSE, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 41)
+     2 * len(NAMES), 2 * len(NAMES) + 40)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -184,27 +207,14 @@ N_SIZES: Final = len(SIZES)
 FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
 HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
 
-# scalars
-#   ERROR2_SUM: sum of the squared linearization errors that the last iteration checked [sigma^2]
-#   N_MOVED: number of nodes that the last iteration moved
-#   SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE: `alpha` [sigma], `budget` and `budget_share`
-#       [sigma^2] of `SmootherConfig`
-#   DAMPING: damping of Levenberg-Marquardt, as a factor on the squared diagonal scales
-#   CHI2: energy of all constraints, weighted [sigma^2]
-#   ERROR2_BEFORE: ERROR2_SUM of the iteration before [sigma^2]
-#   LOWEST: lowest CHI2 of the refinement so far [sigma^2]
-#   LARGEST_MOVE: largest change of a coordinate of a position by the last iteration of it [m]
-(ERROR2_SUM, N_MOVED, SETTING_ALPHA, SETTING_BUDGET, SETTING_SHARE, DAMPING, CHI2, ERROR2_BEFORE,
- LOWEST, LARGEST_MOVE, N_SCALARS) = range(11)
-
 # Largest counter value that rows keep as a stamp of 32 bits; `restart_stamps` is due beyond it.
 # FRONT_SERIAL reaches it after hours, UPDATE after some hundred days.
 LAST_STAMP: Final = 2**30
 COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LISTED)
 STAMPS: Final = {
-    'node_i': (FRONT, CHANGED, NODE_LOGGED, SOLUTION_LOGGED),
-    'factor_i': (FACTOR_CHECKED, FACTOR_LOGGED, ENERGY_LOGGED),
-    'clique_i': (MARKED, BUILT, BORN, VALUES_BORN, CLIQUE_LOGGED),
+    'nodes': ('front', 'changed', 'logged', 'solution_logged'),
+    'factors': ('checked', 'logged', 'energy_logged'),
+    'cliques': ('marked', 'built', 'born', 'values_born', 'logged'),
 }
 
 # Capacity of a new table [rows]; rows never written to take no memory.
@@ -213,13 +223,16 @@ FIRST_ROWS: Final = 1024
 IntHead = npt.NDArray[np.int64]
 
 
-def _table(name: str) -> Callable[[Any], Any]:
-    """Return an intrinsic that makes the array of a table from the head, without a call."""
-    at, number, columns = 2 * NAMES.index(name), types.int32, INT_TABLES.get(name, 0)
-    if name in FLOAT_TABLES:
-        number, columns = types.float64, FLOAT_TABLES[name]
-    array_type = types.Array(number, 1 if columns == 1 else 2, 'C')
-    size = number.bitwidth // 8
+def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
+    """
+    Return an intrinsic that makes the array of a table from the head, without a call.
+
+    If a type of numbers of eight bytes is given, each record is a row of such numbers.
+    """
+    at, size = 2 * NAMES.index(name), TABLES[name].itemsize
+    item = from_dtype(TABLES[name]) if number is None else number
+    columns = 1 if number is None else size // WORD
+    array_type = types.Array(item, 1 if columns == 1 else 2, 'C')
 
     def table(typing_context: Any, head: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -231,10 +244,10 @@ def _table(name: str) -> Callable[[Any], Any]:
             rest = () if columns == 1 else (columns,)
             shape = [rows, *(context.get_constant(types.intp, n) for n in rest)]
             strides = [context.get_constant(types.intp, n)
-                       for n in (columns * size, *(size for _ in rest))]
+                       for n in (size, *(WORD for _ in rest))]
             populate_array(
                 array, builder.inttoptr(address, array.data.type), shape, strides,
-                context.get_constant(types.intp, size), None)
+                context.get_constant(types.intp, size // columns), None)
             return array._getvalue()  # noqa: SLF001  as all of Numba does
         return array_type(head), codegen
 
@@ -242,40 +255,42 @@ def _table(name: str) -> Callable[[Any], Any]:
     return made
 
 
-node_f = _table('node_f')
-factor_f = _table('factor_f')
-pool_f = _table('pool_f')
-log_f = _table('log_f')
-work_f = _table('work_f')
-scalars = _table('scalars')
-clique_f = _table('clique_f')
-node_i = _table('node_i')
-factor_i = _table('factor_i')
-clique_i = _table('clique_i')
-pool_i = _table('pool_i')
-log_i = _table('log_i')
-work_i = _table('work_i')
-touched = _table('touched')
-freed = _table('freed')
-waiting = _table('waiting')
-node_id = _table('node_id')
-factor_id = _table('factor_id')
+nodes = _array('nodes')
+factors = _array('factors')
+cliques = _array('cliques')
+scalars = _array('scalars')
+pool_f = _array('pool_f')
+work_f = _array('work_f')
+log = _array('log')
+pool_i = _array('pool_i')
+work_i = _array('work_i')
+touched = _array('touched')
+freed = _array('freed')
+waiting = _array('waiting')
+node_id = _array('node_id')
+factor_id = _array('factor_id')
+# the same memory as numbers of eight bytes
+node_words = _array('nodes', types.int64)
+factor_words = _array('factors', types.int64)
+clique_words = _array('cliques', types.int64)
+scalar_words = _array('scalars', types.int64)
+log_numbers = _array('log', types.float64)
 
 
-def _pages(shape: int | tuple[int, int], dtype: type[np.generic]) -> npt.NDArray[Any]:
+def _pages(rows: int, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     """
     Return an array of zeros; a large one has pages of its own, which take memory when written to.
 
     NumPy would allocate huge pages and keep them after a table has grown out of them. The pages
     are private: a process that is forked from this one gets copies of those that it writes to.
     """
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = rows * dtype.itemsize
     if size < 2**18:
-        return np.zeros(shape, dtype)
+        return np.zeros(rows, dtype)
     pages = mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with contextlib.suppress(OSError):  # a kernel without huge pages
         pages.madvise(mmap.MADV_NOHUGEPAGE)
-    return np.frombuffer(pages, dtype).reshape(shape)
+    return np.frombuffer(pages, dtype)
 
 
 class Memory:
@@ -287,8 +302,10 @@ class Memory:
         self.head[FREE_F:] = -1
         self._tables: dict[str, npt.NDArray[Any]] = {}
         for name in NAMES:
-            self.ensure(name, {'pool_f': 32, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
+            self.ensure(name, 1 if name == 'scalars' else {
+                'pool_f': 32, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
         self.ensure('work_f', 256)  # for `chain` and `relinearization`; fronts ask for more
+        self.ensure('log', 64)  # for `transaction_log.begin` of an empty graph
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         """Return a table with all its capacity; invalid after the next `ensure`."""
@@ -299,11 +316,9 @@ class Memory:
         at = 2 * NAMES.index(name)
         if name in self._tables and rows <= self.head[at + 1]:
             return
-        columns = FLOAT_TABLES.get(name, 0) or INT_TABLES[name]
-        dtype = np.float64 if name in FLOAT_TABLES else np.int32
         # unused pages cost address space only, so tables grow fast and are rarely copied
         capacity = max(rows, 4 * int(self.head[at + 1]))
-        grown = _pages(capacity if columns == 1 else (capacity, columns), dtype)
+        grown = _pages(capacity, TABLES[name])
         if keep > 0:
             grown[:keep] = self._tables[name][:keep]
         self._tables[name] = grown
@@ -311,6 +326,7 @@ class Memory:
 
     def restart_stamps(self) -> None:
         """Set the counters of stamps and all stamps to 0; allowed between two updates only."""
-        for name, columns in STAMPS.items():
-            self._tables[name][:, columns] = 0
+        for name, fields in STAMPS.items():
+            for field in fields:
+                self._tables[name][field] = 0
         self.head[list(COUNTERS_OF_STAMPS)] = 0

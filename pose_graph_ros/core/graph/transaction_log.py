@@ -12,16 +12,24 @@ the update began.
 
 from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.graph import pools, tables as tb
+from pose_graph_ros.core.graph.constraints import NodeKind
 
-# Kinds of entries of the log; an entry ends with its row (none of START) and its kind in log_i.
+# Kinds of entries of the log, which are words of a record, the row of it, and the kind; START has
+# its kind alone behind what `begin` logs.
 NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
-# Numbers of floats and of integers in the entries of each kind, but for START.
-_FLOATS = (tb.NODE_F, tb.FACTOR_F, tb.CLIQUE_F, 0, tb.SCALE_T, 2)
-_INTEGERS = (tb.NODE_I, tb.FACTOR_I, tb.CLIQUE_I, 0, 0, 1)
+_POSE = int(NodeKind.POSE)
 # Counters in the first entry.
 STARTED_WITH = (
     tb.N_NODES, tb.N_FACTORS, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST, tb.NEXT_NODE,
     tb.NEXT_FACTOR, tb.N_LEAVING, tb.N_PRIORS, tb.LOOSE)
+
+
+def largest(n_nodes: int, n_factors: int) -> int:
+    """Return how many words the log of one update may have."""
+    # for each node also its solution, a clique, new cliques, and the lists of `begin`
+    of_node = (tb.NODE.itemsize + tb.CLIQUE.itemsize) // tb.WORD + tb.SOLUTION + 16
+    of_factor = 2 * tb.FACTOR.itemsize // tb.WORD - tb.ENERGY + 6
+    return n_nodes * of_node + n_factors * of_factor + tb.SCALARS.itemsize
 
 
 @kernel
@@ -32,102 +40,117 @@ def copied(source, target):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _append(head, code, row, numbers, integers):  # type: ignore[no-untyped-def]
-    """Append an entry: floats and integers of a row."""
-    log_f, log_i = tb.log_f(head), tb.log_i(head)
-    end_f, end_i = head[tb.LOG_F_END] + len(numbers), head[tb.LOG_I_END] + len(integers)
-    copied(numbers, log_f[head[tb.LOG_F_END]:end_f])
-    copied(integers, log_i[head[tb.LOG_I_END]:end_i])
-    log_i[end_i], log_i[end_i + 1] = row, code
-    head[tb.LOG_F_END], head[tb.LOG_I_END] = end_f, end_i + 2
+def _append(head, kind, row, words):  # type: ignore[no-untyped-def]
+    """Append an entry."""
+    log, begin = tb.log(head), head[tb.LOG_END]
+    end = begin + len(words)
+    copied(words, log[begin:end])
+    log[end], log[end + 1] = row, kind
+    head[tb.LOG_END] = end + 2
 
 
-@kernel
-def _log_row(head, code, row, numbers, integers, stamp):  # type: ignore[no-untyped-def]
-    """Log a whole row, unless its stamp says that this update has done so."""
-    if integers[stamp] != head[tb.UPDATE]:
-        _append(head, code, row, numbers, integers)
-        integers[stamp] = head[tb.UPDATE]
+@kernel(inline='always')    # Numba returns no arrays but arguments otherwise
+def _words(head, kind, row):  # type: ignore[no-untyped-def]
+    """Return the words of a record that an entry of a kind holds."""
+    if kind == NODE:
+        return tb.node_words(head)[row]
+    if kind == SOLUTION:
+        return tb.node_words(head)[row, :tb.SOLUTION]
+    if kind == FACTOR:
+        return tb.factor_words(head)[row]
+    if kind == ENERGY:
+        return tb.factor_words(head)[row, tb.ENERGY:]
+    if kind == CLIQUE:
+        return tb.clique_words(head)[row]
+    return tb.clique_words(head)[row, :0]
 
 
 @kernel
 def log_node(head, v):  # type: ignore[no-untyped-def]
-    """Log the row of a node, before it changes."""
-    _log_row(head, NODE, v, tb.node_f(head)[v], tb.node_i(head)[v], tb.NODE_LOGGED)
+    """Log a node, before it changes."""
+    node = tb.nodes(head)[v]
+    if node.logged != head[tb.UPDATE]:
+        _append(head, NODE, v, tb.node_words(head)[v])
+        node.logged = head[tb.UPDATE]
 
 
 @kernel
 def log_solution(head, v):  # type: ignore[no-untyped-def]
-    """Log the columns of a node that a solve changes, before they change."""
-    row = tb.node_i(head)[v]
-    if row[tb.NODE_LOGGED] != head[tb.UPDATE] and row[tb.SOLUTION_LOGGED] != head[tb.UPDATE]:
-        row[tb.SOLUTION_LOGGED] = head[tb.UPDATE]
-        _append(head, SOLUTION, v, tb.node_f(head)[v, :tb.SCALE_T], row[:0])
+    """Log what a solve changes of a node, before it changes."""
+    node = tb.nodes(head)[v]
+    if node.logged != head[tb.UPDATE] and node.solution_logged != head[tb.UPDATE]:
+        node.solution_logged = head[tb.UPDATE]
+        _append(head, SOLUTION, v, tb.node_words(head)[v, :tb.SOLUTION])
 
 
 @kernel
 def log_energy(head, e):  # type: ignore[no-untyped-def]
-    """Log the linearization error and the energy of a factor, before they change."""
-    row = tb.factor_i(head)[e]
-    if row[tb.FACTOR_LOGGED] != head[tb.UPDATE] and row[tb.ENERGY_LOGGED] != head[tb.UPDATE]:
-        row[tb.ENERGY_LOGGED] = head[tb.UPDATE]
-        _append(head, ENERGY, e, tb.factor_f(head)[e, tb.ERROR2:tb.ENERGY + 1],
-                row[tb.FACTOR_WAITS:tb.FACTOR_WAITS + 1])
+    """Log what a check changes of a factor, before it changes."""
+    f = tb.factors(head)[e]
+    if f.logged != head[tb.UPDATE] and f.energy_logged != head[tb.UPDATE]:
+        f.energy_logged = head[tb.UPDATE]
+        _append(head, ENERGY, e, tb.factor_words(head)[e, tb.ENERGY:])
 
 
 @kernel
 def log_factor(head, e):  # type: ignore[no-untyped-def]
-    """Log the row of a factor, before it changes."""
-    _log_row(head, FACTOR, e, tb.factor_f(head)[e], tb.factor_i(head)[e], tb.FACTOR_LOGGED)
+    """Log a factor, before it changes."""
+    f = tb.factors(head)[e]
+    if f.logged != head[tb.UPDATE]:
+        _append(head, FACTOR, e, tb.factor_words(head)[e])
+        f.logged = head[tb.UPDATE]
 
 
 @kernel
 def log_clique(head, c):  # type: ignore[no-untyped-def]
-    """Log the row of a clique, before it changes."""
-    _log_row(head, CLIQUE, c, tb.clique_f(head)[c], tb.clique_i(head)[c], tb.CLIQUE_LOGGED)
+    """Log a clique, before it changes."""
+    clique = tb.cliques(head)[c]
+    if clique.logged != head[tb.UPDATE]:
+        _append(head, CLIQUE, c, tb.clique_words(head)[c])
+        clique.logged = head[tb.UPDATE]
 
 
 @kernel
 def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     """Return the row of a new clique with memory for its nodes and values."""
-    clique_i, c = tb.clique_i(head), head[tb.FREE_CLIQUE]
+    cliques, c = tb.cliques(head), head[tb.FREE_CLIQUE]
     if c >= 0:
-        head[tb.FREE_CLIQUE] = clique_i[c, tb.SIBLING]
+        head[tb.FREE_CLIQUE] = cliques[c].sibling
     else:
         c = head[tb.N_CLIQUES]
         head[tb.N_CLIQUES] = c + 1
-    row = clique_i[c]
-    row[tb.PARENT] = row[tb.CHILD] = row[tb.SIBLING] = -1
-    row[tb.N_FRONTAL], row[tb.N_SEPARATOR] = n_frontal, n_separator
+    row = cliques[c]
+    row.parent = row.child = row.sibling = -1
+    row.n_frontal, row.n_separator = n_frontal, n_separator
     if n_frontal == 0:
         head[tb.N_PRIORS] += 1
-    row[tb.NODES] = pools.take_nodes(head, n_frontal + n_separator)
-    row[tb.VALUES] = pools.take_values(head, pools.n_values(n_frontal, n_separator))
-    row[tb.MARKED] = row[tb.ANCHORED] = 0
-    row[tb.BUILT] = head[tb.ITERATION]
-    tb.clique_f(head)[c, tb.DRIFT] = 0.0
-    row[tb.BORN] = row[tb.VALUES_BORN] = row[tb.CLIQUE_LOGGED] = head[tb.UPDATE]
-    _append(head, TAKEN_CLIQUE, c, tb.clique_f(head)[c, :0], row[:0])
+    row.members = pools.take_nodes(head, n_frontal + n_separator)
+    row.values = pools.take_values(head, pools.n_values(n_frontal, n_separator))
+    row.marked = row.anchored = 0
+    row.built = head[tb.ITERATION]
+    row.drift = 0.0
+    row.born = row.values_born = row.logged = head[tb.UPDATE]
+    _append(head, TAKEN_CLIQUE, c, _words(head, TAKEN_CLIQUE, c))
     return c
 
 
 @kernel
 def give_clique(head, c):  # type: ignore[no-untyped-def]
     """Give the row of a clique and its memory back."""
-    row = tb.clique_i(head)[c]
-    pools.give_nodes(head, row[tb.NODES], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR])
-    pools.give_values(head, row[tb.VALUES], pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
-    if row[tb.N_FRONTAL] == 0:
+    row = tb.cliques(head)[c]
+    pools.give_nodes(head, row.members, row.n_frontal + row.n_separator)
+    pools.give_values(head, row.values, pools.n_values(row.n_frontal, row.n_separator))
+    if row.n_frontal == 0:
         head[tb.N_PRIORS] -= 1
-    row[tb.N_FRONTAL], row[tb.N_SEPARATOR] = -1, 0
-    row[tb.SIBLING] = head[tb.FREE_CLIQUE]
+    row.n_frontal, row.n_separator = -1, 0
+    row.sibling = head[tb.FREE_CLIQUE]
     head[tb.FREE_CLIQUE] = c
 
 
 @kernel
 def drop_clique(head, c):  # type: ignore[no-untyped-def]
     """Give a clique back: at once if this update has made it, else on commit."""
-    if tb.clique_i(head)[c, tb.BORN] == head[tb.UPDATE]:
+    if tb.cliques(head)[c].born == head[tb.UPDATE]:
         give_clique(head, c)
     else:
         _give_on_commit(head, c, -1)
@@ -145,14 +168,13 @@ def _give_on_commit(head, c, values):  # type: ignore[no-untyped-def]
 @kernel
 def renew_values(head, c):  # type: ignore[no-untyped-def]
     """Give a clique new memory, without contents, for its values, once in an update."""
-    row = tb.clique_i(head)[c]
-    if row[tb.VALUES_BORN] == head[tb.UPDATE]:
+    row = tb.cliques(head)[c]
+    if row.values_born == head[tb.UPDATE]:
         return
     log_clique(head, c)
-    _give_on_commit(head, c, row[tb.VALUES])
-    row[tb.VALUES] = pools.take_values(
-        head, pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
-    row[tb.VALUES_BORN] = head[tb.UPDATE]
+    _give_on_commit(head, c, row.values)
+    row.values = pools.take_values(head, pools.n_values(row.n_frontal, row.n_separator))
+    row.values_born = head[tb.UPDATE]
 
 
 @kernel(signature=(tb.HEAD,))
@@ -162,31 +184,34 @@ def begin(head):  # type: ignore[no-untyped-def]
 
     If they are not, `Memory.restart_stamps` is due, and `begin` again.
     """
-    log_i, n_touched = tb.log_i(head), head[tb.N_TOUCHED]
+    log, n_touched = tb.log(head), head[tb.N_TOUCHED]
     head[tb.UPDATE] += 1
-    copied(tb.scalars(head), tb.log_f(head)[:tb.N_SCALARS])
+    scalars = tb.scalar_words(head)[0]
+    copied(scalars, log[:len(scalars)])
+    lists = log[len(scalars):]
     end = n_touched + head[tb.N_WAITING]
-    copied(tb.touched(head), log_i[:n_touched])
-    copied(tb.waiting(head), log_i[n_touched:end])
+    copied(tb.touched(head), lists[:n_touched])
+    copied(tb.waiting(head), lists[n_touched:end])
     for counter in STARTED_WITH:
-        log_i[end] = head[counter]
+        lists[end] = head[counter]
         end += 1
-    log_i[end] = START
-    head[tb.LOG_F_END], head[tb.LOG_I_END], head[tb.N_FREED] = tb.N_SCALARS, end + 1, 0
+    lists[end] = START
+    head[tb.LOG_END], head[tb.N_FREED] = len(scalars) + end + 1, 0
     return head[tb.FRONT_SERIAL] <= tb.LAST_STAMP and head[tb.UPDATE] <= tb.LAST_STAMP + 1
 
 
 @kernel
 def _restore_start(head):  # type: ignore[no-untyped-def]
     """Restore counters, scalars and lists from the first entry, the only one left in the log."""
-    log_i, at = tb.log_i(head), head[tb.LOG_I_END] - 1 - len(STARTED_WITH)
-    copied(tb.log_f(head), tb.scalars(head)[:tb.N_SCALARS])
+    log, at = tb.log(head), head[tb.LOG_END] - 1 - len(STARTED_WITH)
     for counter in STARTED_WITH:
-        head[counter] = log_i[at]
+        head[counter] = log[at]
         at += 1
-    n_touched = head[tb.N_TOUCHED]
-    copied(log_i, tb.touched(head)[:n_touched])
-    copied(log_i[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
+    scalars, n_touched = tb.scalar_words(head)[0], head[tb.N_TOUCHED]
+    copied(log, scalars)
+    lists = log[len(scalars):]
+    copied(lists, tb.touched(head)[:n_touched])
+    copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
 
 
 @kernel(signature=(tb.HEAD,))
@@ -198,83 +223,71 @@ def commit(head):  # type: ignore[no-untyped-def]
         if values < 0:
             give_clique(head, c)
         else:
-            row = tb.clique_i(head)[c]
-            pools.give_values(head, values, pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
-    head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
+            row = tb.cliques(head)[c]
+            pools.give_values(head, values, pools.n_values(row.n_frontal, row.n_separator))
+    head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 
 @kernel
-def _restore_values(head, c, before):  # type: ignore[no-untyped-def]
-    """Restore a clique's values, which were at the index `before`, ahead of its row."""
-    pool_f, row = tb.pool_f(head), tb.clique_i(head)[c]
-    size = pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR])
-    if row[tb.N_FRONTAL] == 0 and row[tb.VALUES_BORN] == head[tb.UPDATE]:
+def _entry(head, end):  # type: ignore[no-untyped-def]
+    """Return where the words of the entry that ends at an index begin, its row and its kind."""
+    log = tb.log(head)
+    row, kind = log[end - 2], log[end - 1]
+    return end - 2 - len(_words(head, kind, row)), row, kind
+
+
+@kernel
+def _restore_clique(head, c, words):  # type: ignore[no-untyped-def]
+    """Restore a clique and its values from the words of its record."""
+    pool_f, row = tb.pool_f(head), tb.cliques(head)[c]
+    values, size = row.values, pools.n_values(row.n_frontal, row.n_separator)
+    if row.n_frontal == 0 and row.values_born == head[tb.UPDATE]:
         # where a prior was linearized before; see `prior_rows`
-        end, n = row[tb.VALUES] + size, 3 * row[tb.N_SEPARATOR]
+        end, n = values + size, 3 * row.n_separator
         copied(pool_f[end - n:], pool_f[end - 2 * n:end - n])
-    if row[tb.VALUES] != before:
-        pools.give_values(head, row[tb.VALUES], size)
+    copied(words, tb.clique_words(head)[c])
+    if row.values != values:
+        pools.give_values(head, values, size)
 
 
 @kernel(signature=(tb.HEAD,))
 def rollback(head):  # type: ignore[no-untyped-def]
-    """End an update: restore all rows logged since `begin`, the newest entry first."""
-    clique_i, log_f, log_i = tb.clique_i(head), tb.log_f(head), tb.log_i(head)
-    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
-    while end_i > 0:
-        row, code = log_i[end_i - 2], log_i[end_i - 1]
-        if code == START:
-            head[tb.LOG_I_END] = end_i
+    """End an update: restore all that was logged since `begin`, the newest entry first."""
+    log, end = tb.log(head), head[tb.LOG_END]
+    while end > 0:
+        if log[end - 1] == START:
+            head[tb.LOG_END] = end
             _restore_start(head)
             break
-        end_f -= _FLOATS[code]
-        end_i -= 2 + _INTEGERS[code]
-        numbers, integers = log_f[:0], log_i[:0]
-        if code == TAKEN_CLIQUE:
-            if clique_i[row, tb.N_FRONTAL] >= 0:  # else the same update has given it back
-                give_clique(head, row)
-        elif code == NODE:
-            numbers, integers = tb.node_f(head)[row], tb.node_i(head)[row]
-        elif code == SOLUTION:
-            numbers = tb.node_f(head)[row, :tb.SCALE_T]
-        elif code == FACTOR:
-            numbers, integers = tb.factor_f(head)[row], tb.factor_i(head)[row]
-        elif code == ENERGY:
-            numbers = tb.factor_f(head)[row, tb.ERROR2:tb.ENERGY + 1]
-            integers = tb.factor_i(head)[row, tb.FACTOR_WAITS:tb.FACTOR_WAITS + 1]
-        else:
-            _restore_values(head, row, log_i[end_i + tb.VALUES])
-            numbers, integers = tb.clique_f(head)[row], clique_i[row]
-        copied(log_f[end_f:], numbers)
-        copied(log_i[end_i:], integers)
-    head[tb.N_FREED] = head[tb.LOG_F_END] = head[tb.LOG_I_END] = 0
+        end, row, kind = _entry(head, end)
+        if kind == CLIQUE:
+            _restore_clique(head, row, log[end:])
+        elif kind != TAKEN_CLIQUE:
+            copied(log[end:], _words(head, kind, row))
+        elif tb.cliques(head)[row].n_frontal >= 0:  # else the same update has given it back
+            give_clique(head, row)
+    head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 
 @kernel(signature=(tb.HEAD, ROWS))
 def poses_before(head, poses):  # type: ignore[no-untyped-def]
     """Write the poses, shape (N, 3), as the update found them; those of new nodes as they are."""
-    node_f, log_f, log_i = tb.node_f(head), tb.log_f(head), tb.log_i(head)
+    nodes, log, end = tb.nodes(head), tb.log(head), head[tb.LOG_END]
     for v in range(head[tb.N_NODES]):
-        copied(node_f[v, tb.POSE:], poses[v])
-    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
-    while end_i > 0 and log_i[end_i - 1] != START:
-        row, code = log_i[end_i - 2], log_i[end_i - 1]
-        end_f -= _FLOATS[code]
-        end_i -= 2 + _INTEGERS[code]
-        if code in (NODE, SOLUTION):
-            copied(log_f[end_f + tb.POSE:], poses[row])
+        copied(nodes[v].pose, poses[v])
+    while end > 0 and log[end - 1] != START:
+        end, row, kind = _entry(head, end)
+        if kind in (NODE, SOLUTION):    # a record begins with the pose
+            copied(tb.log_numbers(head)[end:], poses[row])
 
 
 @kernel
 def largest_move(head):  # type: ignore[no-untyped-def]
     """Return by how much the update has moved poses: the largest change of a coordinate [m]."""
-    node_f, log_i, largest = tb.node_f(head), tb.log_i(head), 0.0
-    end_f, end_i = head[tb.LOG_F_END], head[tb.LOG_I_END]
-    while end_i > 0 and log_i[end_i - 1] != START:
-        row, code = log_i[end_i - 2], log_i[end_i - 1]
-        end_f -= _FLOATS[code]
-        end_i -= 2 + _INTEGERS[code]
-        if code in (NODE, SOLUTION) and tb.node_i(head)[row, tb.NODE_TYPE] == 0:
-            for k in range(tb.POSE, tb.POSE + 2):
-                largest = max(largest, abs(node_f[row, k] - tb.log_f(head)[end_f + k]))
+    nodes, log, end, largest = tb.nodes(head), tb.log(head), head[tb.LOG_END], 0.0
+    while end > 0 and log[end - 1] != START:
+        end, row, kind = _entry(head, end)
+        if kind in (NODE, SOLUTION) and nodes[row].kind == _POSE:
+            for k in range(2):
+                largest = max(largest, abs(nodes[row].pose[k] - tb.log_numbers(head)[end + k]))
     return largest

@@ -20,7 +20,7 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel, MATRICES, NUMBERS, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.odometry_chain import composed, inverted, OdometryChain
@@ -232,8 +232,8 @@ def residuals(graph: Graph, some: Closures) -> FloatArray:
 
 def are_above(graph: Graph, edges: IntArray, limit: float) -> BoolArray:
     """Tell which squared residuals of edges, by their own covariances, are above a limit."""
-    rows, table = graph.factor_rows(edges), graph.memory['factor_f']
-    return np.asarray(table[rows, tb.ENERGY] > limit * table[rows, tb.WEIGHT])
+    found = graph.factor_records[graph.factor_rows(edges)]
+    return np.asarray(found['energy'] > limit * found['weight'])
 
 
 class Support(NamedTuple):

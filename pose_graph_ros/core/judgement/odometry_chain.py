@@ -91,16 +91,16 @@ class OdometryChain:
             self._travel.append(np.zeros(1))
         head, begin = graph.memory.head, int(np.searchsorted(graph.factor_ids, self._next_edge))
         self._next_edge = graph.next_ids.factor
-        ends = graph.memory['factor_i'][begin:graph.n_factors]
+        factors = graph.factor_records[begin:]
         last = len(self) - 1
         end = int(self._nodes.values[last])
         if not self._by_row:
             end = int(graph.node_rows(end))
-        new = begin + np.flatnonzero((ends[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY)
-                                     & (ends[:, tb.END_J] > end))
+        later = factors['ends'][:, 1]
+        new = np.flatnonzero((factors['kind'] == FactorKind.ODOMETRY) & (later > end))
         if len(new) == 0:
             return
-        new = new[np.argsort(graph.memory['factor_i'][new, tb.END_J], kind='stable')]
+        new = begin + new[np.argsort(later[new], kind='stable')]
         size = graph.n_nodes - end - 1
         rows, travel = np.empty(size, np.int64), np.empty(size)
         poses, sums = np.empty((size, 3)), np.empty((size, 6))
@@ -196,16 +196,16 @@ class OdometryChain:
 
 def _first(graph: Graph) -> IntArray:
     """Return the row of the pose that odometry begins at, shape (1,), or (0,) without poses."""
-    ends = graph.memory['factor_i'][:graph.n_factors]
-    odometry = ends[ends[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY]
-    if len(odometry) == 0 or _has_left(graph):
+    factors = graph.factor_records
+    ends = factors['ends'][factors['kind'] == FactorKind.ODOMETRY]
+    if len(ends) == 0 or _has_left(graph):
         return np.flatnonzero(graph.is_pose)[:1]
-    return odometry[np.argmin(odometry[:, tb.END_J])][[tb.END_I]].copy()
+    return ends[np.argmin(ends[:, 1]), :1].copy()
 
 
 def _has_left(graph: Graph) -> bool:
     return graph.n_priors > 0 or bool(np.any(
-        graph.memory['factor_i'][:graph.n_factors, tb.FACTOR_KIND] == FactorKind.PRIOR))
+        graph.factor_records['kind'] == FactorKind.PRIOR))
 
 
 @kernel(signature=(
@@ -221,26 +221,26 @@ def _extend(  # type: ignore[no-untyped-def]
     and prefix sum of the last node. With `over_gaps` a pose without odometry is appended as well.
     Rows, poses, sums, and travel since the last node are written.
     """
-    factor_f, factor_i, node_i = tb.factor_f(head), tb.factor_i(head), tb.node_i(head)
+    factors, nodes = tb.factors(head), tb.nodes(head)
     n, m, length = 0, 0, 0.0
     x, y, th = pose[0], pose[1], pose[2]
     noise = np.empty(6)
     for v in range(last + 1, head[tb.N_NODES]):
-        if node_i[v, tb.NODE_TYPE] != NodeKind.POSE:
+        if nodes[v].kind != NodeKind.POSE:
             continue
         edge = -1
-        while m < len(edges) and factor_i[edges[m], tb.END_J] <= v:
+        while m < len(edges) and factors[edges[m]].ends[1] <= v:
             # others are of another source, between nodes that are chained already
-            ends = factor_i[edges[m]]
-            if edge < 0 and ends[tb.END_I] == last and ends[tb.END_J] == v:
+            ends = factors[edges[m]].ends
+            if edge < 0 and ends[0] == last and ends[1] == v:
                 edge = edges[m]
             m += 1
         if edge >= 0:
-            f = factor_f[edge]
-            step = f[tb.MEAN], f[tb.MEAN + 1], f[tb.MEAN + 2]
-            noise[:] = _inverse(f[tb.INFO:tb.INFO + 6])
+            f = factors[edge]
+            step = f.mean[0], f.mean[1], f.mean[2]
+            noise[:] = _inverse(f.information)
             if weighted:
-                noise /= max(f[tb.WEIGHT], _LEAST_WEIGHT)
+                noise /= max(f.weight, _LEAST_WEIGHT)
         elif over_gaps:
             step = composed(inverted(_pose(head, last)), _pose(head, v))
             far = math.sqrt(step[0] * step[0] + step[1] * step[1])
@@ -276,8 +276,8 @@ def _extend(  # type: ignore[no-untyped-def]
 
 @kernel
 def _pose(head, v):  # type: ignore[no-untyped-def]
-    pose = tb.node_f(head)[v]
-    return pose[tb.POSE], pose[tb.POSE + 1], pose[tb.POSE + 2]
+    pose = tb.nodes(head)[v].pose
+    return pose[0], pose[1], pose[2]
 
 
 @kernel

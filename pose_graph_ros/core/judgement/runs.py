@@ -25,7 +25,6 @@ import numpy as np
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import fit_motion
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
@@ -281,8 +280,8 @@ def odometry_between(graph: Graph, begin: int, end: int) -> IntArray:
     """
     Return the ids of odometry edges between two nodes, or of those around them if they are one.
     """
-    ends = graph.memory['factor_i'][:graph.n_factors]
-    odometry = np.flatnonzero(ends[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY)
-    i, j = (graph.node_ids[ends[odometry, column]] for column in (tb.END_I, tb.END_J))
+    factors = graph.factor_records
+    odometry = np.flatnonzero(factors['kind'] == FactorKind.ODOMETRY)
+    i, j, _ = graph.node_ids[factors['ends'][odometry]].T
     inside = (i < end) & (j > begin) if end > begin else (i == end) | (j == end)
     return np.asarray(graph.factor_ids[odometry[inside]])

@@ -236,13 +236,13 @@ def equations(graph: Graph) -> tuple[FloatArray, FloatArray]:
 @kernel(signature=(tb.HEAD, ROWS))
 def assemble(head, front):  # type: ignore[no-untyped-def]
     """Add all factors to H, of which (3N, 3N + 1) has the upper triangle, and last to b."""
-    factor_f, factor_i = tb.factor_f(head), tb.factor_i(head)
     flat, ld = front.reshape(front.size), front.shape[1]
     for e in range(head[tb.N_FACTORS]):
-        if factor_f[e, tb.WEIGHT] > 0.0:
+        f = tb.factors(head)[e]
+        if f.weight > 0.0:
             # a missing end has no block: -1
-            at_j, at_k = max(3 * factor_i[e, tb.END_J], -1), max(3 * factor_i[e, tb.END_K], -1)
-            normal_equations.add(head, e, 3 * factor_i[e, tb.END_I], at_j, at_k, flat, ld)
+            at_j, at_k = max(3 * f.ends[1], -1), max(3 * f.ends[2], -1)
+            normal_equations.add(head, e, 3 * f.ends[0], at_j, at_k, flat, ld)
 
 
 def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:

@@ -42,27 +42,27 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
 
     The frame of its clique has the angle phi.
     """
-    node_f, node_i, scalars = tb.node_f(head), tb.node_i(head), tb.scalars(head)
+    nodes, scalars = tb.nodes(head), tb.scalars(head)[0]
     work_i, room = tb.work_i(head), head[tb.NODE_ROOM]
-    f = node_f[v]
+    f = nodes[v]
     transaction_log.log_solution(head, v)
-    f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2] = dx, dy, dth
-    f[tb.POSE], f[tb.POSE + 1] = f[tb.REF] + dx, f[tb.REF + 1] + dy
-    f[tb.POSE + 2] = factors.wrap(f[tb.REF + 2] + dth)
-    moved = max(abs(dx - f[tb.SEEN]), abs(dy - f[tb.SEEN + 1])) * f[tb.SCALE_T]
-    turned = dth - f[tb.SEEN + 2]
-    if moved > alpha or abs(turned) * f[tb.SCALE_R] > alpha:
-        node_i[v, tb.CHANGED] = head[tb.ITERATION]
+    f.delta[0], f.delta[1], f.delta[2] = dx, dy, dth
+    f.pose[0], f.pose[1] = f.reference[0] + dx, f.reference[1] + dy
+    f.pose[2] = factors.wrap(f.reference[2] + dth)
+    moved = max(abs(dx - f.seen[0]), abs(dy - f.seen[1])) * f.scale_t
+    turned = dth - f.seen[2]
+    if moved > alpha or abs(turned) * f.scale_r > alpha:
+        nodes[v].changed = head[tb.ITERATION]
         work_i[3 * room + head[tb.N_CHANGED]] = v
         head[tb.N_CHANGED] += 1
     elif head[tb.SINCE] == head[tb.ITERATION]:
         return      # a refinement checks all nodes
     # approximate squared linearization error due to the turn since the last check
-    turn2 = (dth - phi - f[tb.CHECKED_TURN]) ** 2
-    error2 = turn2 * (turn2 * f[tb.SCALE_R] * f[tb.SCALE_R] + USUAL_ENERGY)
-    if (error2 > scalars[tb.SETTING_SHARE] or moved > 100.0 * alpha
+    turn2 = (dth - phi - f.checked_turn) ** 2
+    error2 = turn2 * (turn2 * f.scale_r * f.scale_r + USUAL_ENERGY)
+    if (error2 > scalars.share or moved > 100.0 * alpha
             or head[tb.SINCE] < head[tb.ITERATION]):
-        f[tb.CHECKED_TURN] = dth - phi
+        f.checked_turn = dth - phi
         work_i[room + head[tb.N_CHECKS]] = v
         head[tb.N_CHECKS] += 1
 
@@ -70,9 +70,9 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
 @kernel
 def _visit_pair(head, values, v, other, alpha):  # type: ignore[no-untyped-def]
     """Solve for the frontal node of a clique with one separator node, as along a chain."""
-    node_f, pool_f = tb.node_f(head), tb.pool_f(head)
-    r, f = pool_f[values:values + 18], node_f[other]
-    a, b, c = f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2]
+    nodes, pool_f = tb.nodes(head), tb.pool_f(head)
+    r, f = pool_f[values:values + 18], nodes[other]
+    a, b, c = f.delta[0], f.delta[1], f.delta[2]
     z = (r[17] - (r[14] * a + r[15] * b + r[16] * c)) * r[13]
     y = (r[12] - (r[9] * a + r[10] * b + r[11] * c) - r[8] * z) * r[7]
     x = (r[6] - (r[3] * a + r[4] * b + r[5] * c) - r[2] * z - r[1] * y) * r[0]
@@ -82,57 +82,57 @@ def _visit_pair(head, values, v, other, alpha):  # type: ignore[no-untyped-def]
 @kernel
 def _visit(head, c):  # type: ignore[no-untyped-def]
     """Solve for the frontal nodes of a clique."""
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    node_f, pool_f, work_f = tb.node_f(head), tb.pool_f(head), tb.work_f(head)
-    row = clique_i[c]
-    n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    pool_f, work_f = tb.pool_f(head), tb.work_f(head)
+    row = cliques[c]
+    n_frontal, n_separator = row.n_frontal, row.n_separator
     rows, n = 3 * n_frontal, 3 * (n_frontal + n_separator)
-    nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_frontal + n_separator]
-    phi = tb.clique_f(head)[c, tb.TURN]
-    alpha = tb.scalars(head)[tb.SETTING_ALPHA]
-    if row[tb.ANCHORED] == 0:
+    members = pool_i[row.members:row.members + n_frontal + n_separator]
+    phi = tb.cliques(head)[c].turn
+    alpha = tb.scalars(head)[0].alpha
+    if row.anchored == 0:
         alpha *= FREE_FRACTION
     if phi == 0.0 and n_frontal == 1 and n_separator == 1:
-        if node_i[nodes[0], tb.FIXED] == 0:
-            _visit_pair(head, row[tb.VALUES], nodes[0], nodes[1], alpha)
+        if nodes[members[0]].fixed == 0:
+            _visit_pair(head, row.values, members[0], members[1], alpha)
         return
     x = work_f[:n]
     cos, sin, px, py = 1.0, 0.0, 0.0, 0.0
     if phi != 0.0:
         cos, sin = math.cos(phi), math.sin(phi)
-        f = node_f[nodes[n_frontal]]
-        px, py = f[tb.POSE], f[tb.POSE + 1]
+        f = nodes[members[n_frontal]]
+        px, py = f.pose[0], f.pose[1]
     for k in range(n_frontal, n_frontal + n_separator):
-        f = node_f[nodes[k]]
+        f = nodes[members[k]]
         if phi == 0.0:
-            x[3 * k], x[3 * k + 1], x[3 * k + 2] = f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2]
+            x[3 * k], x[3 * k + 1], x[3 * k + 2] = f.delta[0], f.delta[1], f.delta[2]
         else:
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = clique_frames.local_delta(
                 f, px, py, cos, sin, phi)
-    solve_rows(pool_f[row[tb.VALUES]:], rows, n, x)
+    solve_rows(pool_f[row.values:], rows, n, x)
     for k in range(n_frontal):
-        v = nodes[k]
+        v = members[k]
         dx, dy, dth = x[3 * k], x[3 * k + 1], x[3 * k + 2]
         if phi != 0.0:
-            dx, dy = clique_frames.map_delta(node_f[v], dx, dy, px, py, cos, sin)
+            dx, dy = clique_frames.map_delta(nodes[v], dx, dy, px, py, cos, sin)
             dth += phi
-        if node_i[v, tb.FIXED] == 0:
+        if nodes[v].fixed == 0:
             _move(head, v, dx, dy, dth, phi, alpha)
 
 
 @kernel
 def _set_turn(head, c, parent_turn):  # type: ignore[no-untyped-def]
     """Set the angle of a clique's frame; list the clique if its slip is large."""
-    clique_i, clique_f, work_i = tb.clique_i(head), tb.clique_f(head), tb.work_i(head)
-    f = clique_f[c]
-    if clique_i[c, tb.ANCHORED] != 0:
-        f[tb.TURN] = 0.0
+    cliques, work_i = tb.cliques(head), tb.work_i(head)
+    f = cliques[c]
+    if cliques[c].anchored != 0:
+        f.turn = 0.0
         return
-    f[tb.TURN] = clique_frames.present_turn(head, c)
-    slip = f[tb.TURN] - f[tb.TURN_SEEN] - parent_turn
+    f.turn = clique_frames.present_turn(head, c)
+    slip = f.turn - f.turn_seen - parent_turn
     slip2 = slip * slip
-    error2 = slip2 * (slip2 * f[tb.SLIP_SCALE] + USUAL_ENERGY)
-    if error2 > tb.scalars(head)[tb.SETTING_SHARE]:
+    error2 = slip2 * (slip2 * f.slip_scale + USUAL_ENERGY)
+    if error2 > tb.scalars(head)[0].share:
         work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = c
         head[tb.N_TURNED] += 1
 
@@ -146,21 +146,20 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
     stops [sigma]; then its angle and the mean positions before and after it: it is
     `x -> R_turn (x - pivot) + goal`.
     """
-    node_f, node_i = tb.node_f(head), tb.node_i(head)
-    clique_i, pool_i = tb.clique_i(head), tb.pool_i(head)
-    begin = clique_i[c, tb.NODES] + clique_i[c, tb.N_FRONTAL]
-    n = clique_i[c, tb.N_SEPARATOR]
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    begin = cliques[c].members + cliques[c].n_frontal
+    n = cliques[c].n_separator
     iteration = head[tb.ITERATION]
     turn = pivot_x = pivot_y = goal_x = goal_y = 0.0
     for m in range(begin, begin + n):
         v = pool_i[m]
-        f = node_f[v]
-        goal_x += f[tb.POSE]
-        goal_y += f[tb.POSE + 1]
-        if node_i[v, tb.CHANGED] == iteration:
-            turn += f[tb.DELTA + 2] - f[tb.SEEN + 2]
-            pivot_x += f[tb.SEEN] - f[tb.DELTA]
-            pivot_y += f[tb.SEEN + 1] - f[tb.DELTA + 1]
+        f = nodes[v]
+        goal_x += f.pose[0]
+        goal_y += f.pose[1]
+        if nodes[v].changed == iteration:
+            turn += f.delta[2] - f.seen[2]
+            pivot_x += f.seen[0] - f.delta[0]
+            pivot_y += f.seen[1] - f.delta[1]
     weight = 1.0 / n
     turn *= weight
     goal_x, goal_y = goal_x * weight, goal_y * weight
@@ -171,16 +170,16 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
     deviation = 0.0
     for m in range(begin, begin + n):
         v = pool_i[m]
-        f = node_f[v]
+        f = nodes[v]
         dx = dy = dth = 0.0
-        if node_i[v, tb.CHANGED] == iteration:
-            dx, dy = f[tb.DELTA] - f[tb.SEEN], f[tb.DELTA + 1] - f[tb.SEEN + 1]
-            dth = f[tb.DELTA + 2] - f[tb.SEEN + 2]
-        x, y = f[tb.POSE] - dx - pivot_x, f[tb.POSE + 1] - dy - pivot_y
+        if nodes[v].changed == iteration:
+            dx, dy = f.delta[0] - f.seen[0], f.delta[1] - f.seen[1]
+            dth = f.delta[2] - f.seen[2]
+        x, y = f.pose[0] - dx - pivot_x, f.pose[1] - dy - pivot_y
         dx -= goal_x - pivot_x + versine * x - sine * y
         dy -= goal_y - pivot_y + sine * x + versine * y
-        deviation = max(deviation, max(abs(dx), abs(dy)) * f[tb.SCALE_T],
-                        abs(dth - turn) * f[tb.SCALE_R])
+        deviation = max(deviation, max(abs(dx), abs(dy)) * f.scale_t,
+                        abs(dth - turn) * f.scale_r)
         if deviation > limit:
             break
     return deviation, turn, pivot_x, pivot_y, goal_x, goal_y
@@ -189,7 +188,7 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
 @kernel
 def _propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
     """Return the number of nodes at or below a clique, after moving them by a rigid motion."""
-    node_f, clique_i, pool_i = tb.node_f(head), tb.clique_i(head), tb.pool_i(head)
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
     _, turn, pivot_x, pivot_y, goal_x, goal_y = motion
     cos, sin = math.cos(turn), math.sin(turn)
     bottom, moved = depth, 0
@@ -197,29 +196,29 @@ def _propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
     depth += 1
     while depth > bottom:
         depth -= 1
-        row = clique_i[stack[depth]]
-        for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
+        row = cliques[stack[depth]]
+        for m in range(row.members, row.members + row.n_frontal):
             v = pool_i[m]
             transaction_log.log_solution(head, v)
-            f = node_f[v]
-            x, y = f[tb.POSE] - pivot_x, f[tb.POSE + 1] - pivot_y
+            f = nodes[v]
+            x, y = f.pose[0] - pivot_x, f.pose[1] - pivot_y
             x, y = cos * x - sin * y + goal_x, sin * x + cos * y + goal_y
-            dx, dy = x - f[tb.POSE], y - f[tb.POSE + 1]
-            f[tb.POSE], f[tb.POSE + 1] = x, y
-            f[tb.POSE + 2] = factors.wrap(f[tb.POSE + 2] + turn)
-            f[tb.DELTA] += dx
-            f[tb.DELTA + 1] += dy
-            f[tb.DELTA + 2] += turn
-            f[tb.SEEN] += dx
-            f[tb.SEEN + 1] += dy
-            f[tb.SEEN + 2] += turn
-        moved += row[tb.N_FRONTAL]
-        child = row[tb.CHILD]
+            dx, dy = x - f.pose[0], y - f.pose[1]
+            f.pose[0], f.pose[1] = x, y
+            f.pose[2] = factors.wrap(f.pose[2] + turn)
+            f.delta[0] += dx
+            f.delta[1] += dy
+            f.delta[2] += turn
+            f.seen[0] += dx
+            f.seen[1] += dy
+            f.seen[2] += turn
+        moved += row.n_frontal
+        child = row.child
         while child >= 0:
-            if clique_i[child, tb.N_FRONTAL] > 0:
+            if cliques[child].n_frontal > 0:
                 stack[depth] = child
                 depth += 1
-            child = clique_i[child, tb.SIBLING]
+            child = cliques[child].sibling
     return moved
 
 
@@ -231,36 +230,35 @@ def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
     Return _AS_IT_IS: its separator has not moved; _PROPAGATED: that has moved as a rigid body, and
     all nodes at and below the clique were moved with it; or _SOLVED: it is to be solved for.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    clique_f = tb.clique_f(head)
-    row, iteration = clique_i[c], head[tb.ITERATION]
-    if row[tb.BUILT] >= head[tb.SINCE]:
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    row, iteration = cliques[c], head[tb.ITERATION]
+    if row.built >= head[tb.SINCE]:
         return _SOLVED
-    limit = FREE_FRACTION * tb.scalars(head)[tb.SETTING_ALPHA]
-    begin = row[tb.NODES] + row[tb.N_FRONTAL]
-    for m in range(begin, begin + row[tb.N_SEPARATOR]):
-        if node_i[pool_i[m], tb.CHANGED] == iteration:
-            if row[tb.ANCHORED] != 0:
+    limit = FREE_FRACTION * tb.scalars(head)[0].alpha
+    begin = row.members + row.n_frontal
+    for m in range(begin, begin + row.n_separator):
+        if nodes[pool_i[m]].changed == iteration:
+            if row.anchored != 0:
                 return _SOLVED
-            slack = limit - clique_f[c, tb.DRIFT]
+            slack = limit - cliques[c].drift
             motion = _rigid_motion(head, c, slack)
             if motion[0] > slack:
                 return _SOLVED
             if motion[0] > 0.0:
                 transaction_log.log_clique(head, c)
-                clique_f[c, tb.DRIFT] += motion[0]
-            tb.scalars(head)[tb.N_MOVED] += _propagate(head, c, motion, stack, depth)
+                cliques[c].drift += motion[0]
+            tb.scalars(head)[0].n_moved += _propagate(head, c, motion, stack, depth)
             return _PROPAGATED
-    return _SOLVED if clique_f[c, tb.DRIFT] > limit else _AS_IT_IS
+    return _SOLVED if cliques[c].drift > limit else _AS_IT_IS
 
 
 @kernel
 def _fetch_rows(head, c):  # type: ignore[no-untyped-def]
     """Prefetch the rows of R of a clique, which are used once and are not in the cache."""
-    clique_i, pool_f = tb.clique_i(head), tb.pool_f(head)
-    row = clique_i[c]
-    rows, begin = 3 * row[tb.N_FRONTAL], row[tb.VALUES]
-    size = triangle_size(rows, rows + 3 * row[tb.N_SEPARATOR])
+    cliques, pool_f = tb.cliques(head), tb.pool_f(head)
+    row = cliques[c]
+    rows, begin = 3 * row.n_frontal, row.values
+    size = triangle_size(rows, rows + 3 * row.n_separator)
     for at in range(begin, begin + size, 8):
         fetch(pool_f, at)
 
@@ -268,15 +266,15 @@ def _fetch_rows(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def back_substitute(head):  # type: ignore[no-untyped-def]
     """Visit the cliques from the roots on the stack down; list the nodes to be checked."""
-    clique_i, clique_f, work_i = tb.clique_i(head), tb.clique_f(head), tb.work_i(head)
-    node_f, scalars = tb.node_f(head), tb.scalars(head)
+    cliques = tb.cliques(head)
+    work_i, nodes, scalars = tb.work_i(head), tb.nodes(head), tb.scalars(head)[0]
     stack, depth = work_i, head[tb.N_ROOTS]
     refines = head[tb.SINCE] < head[tb.ITERATION]
     n_visited = 0
     for k in range(depth):
-        clique_f[stack[k], tb.TURN] = 0.0
+        cliques[stack[k]].turn = 0.0
     head[tb.N_TURNED] = head[tb.N_CHECKS] = head[tb.N_CHANGED] = 0
-    scalars[tb.N_MOVED] = 0.0
+    scalars.n_moved = 0.0
     while depth > 0:
         if refines and head[tb.INTERRUPT] != 0:
             break   # the caller rolls back
@@ -284,27 +282,27 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
         c = stack[depth]
         while c >= 0:
             _visit(head, c)
-            clique_i[c, tb.BUILT] = head[tb.ITERATION]
+            cliques[c].built = head[tb.ITERATION]
             n_visited += 1
-            turn = clique_f[c, tb.TURN]
-            drift = clique_f[c, tb.DRIFT]
+            turn = cliques[c].turn
+            drift = cliques[c].drift
             if drift > 0.0:
                 transaction_log.log_clique(head, c)
-                clique_f[c, tb.DRIFT] = 0.0
+                cliques[c].drift = 0.0
             # the first child to be solved for comes next, the others go on the stack
-            child, c = clique_i[c, tb.CHILD], -1
+            child, c = cliques[c].child, -1
             while child >= 0:
-                if clique_i[child, tb.N_FRONTAL] == 0:
+                if cliques[child].n_frontal == 0:
                     transaction_log.log_clique(head, child)
                     prior_rows.update_energy(head, child)
                     if prior_rows.turns(head, child):
                         work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = child
                         head[tb.N_TURNED] += 1
-                    child = clique_i[child, tb.SIBLING]
+                    child = cliques[child].sibling
                     continue
                 if drift > 0.0:
                     transaction_log.log_clique(head, child)
-                    clique_f[child, tb.DRIFT] += drift
+                    cliques[child].drift += drift
                 code = _update_child(head, child, stack, depth)
                 if code != _AS_IT_IS or refines:
                     _set_turn(head, child, turn)
@@ -314,11 +312,11 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                         stack[depth] = c
                         depth += 1
                     c = child
-                child = clique_i[child, tb.SIBLING]
+                child = cliques[child].sibling
     changed = work_i[3 * head[tb.NODE_ROOM]:]
     for k in range(head[tb.N_CHANGED]):
-        f = node_f[changed[k]]
-        f[tb.SEEN], f[tb.SEEN + 1], f[tb.SEEN + 2] = (
-            f[tb.DELTA], f[tb.DELTA + 1], f[tb.DELTA + 2])
-    scalars[tb.N_MOVED] += head[tb.N_CHANGED]
+        f = nodes[changed[k]]
+        f.seen[0], f.seen[1], f.seen[2] = (
+            f.delta[0], f.delta[1], f.delta[2])
+    scalars.n_moved += head[tb.N_CHANGED]
     head[tb.N_VISITED] += n_visited

@@ -93,17 +93,19 @@ def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
 @kernel(signature=(tb.HEAD, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS, MATRICES), allocates=True)
 def _write_innovations(head, i, j, mean, kind, constants, error, out):  # type: ignore[no-untyped-def]
     """Write errors, (M, 3), of edges given by columns of `Factors`, and J P J^T, (M, 3, 3)."""
-    node_f = tb.node_f(head)
-    f, start_j, end_j = np.empty(tb.FACTOR_F), np.empty((3, 3)), np.empty((3, 3))
+    nodes = tb.nodes(head)
+    record, start_j, end_j = np.empty(1, tb.FACTOR), np.empty((3, 3)), np.empty((3, 3))
     for k in range(len(i)):
+        f = record[0]   # in here, as Numba frees the array after its last use
         write_data(f, kind[k], mean[k], constants[k])
-        _edge_jacobians(f, kind[k], node_f[i[k]], node_f[j[k]], error[k], start_j, end_j)
+        _edge_jacobians(
+            f, kind[k], nodes[i[k]].pose, nodes[j[k]].pose, error[k], start_j, end_j)
         _write_covariance(head, i[k], start_j, j[k], end_j, out[k])
 
 
 @kernel
 def _edge_jacobians(f, kind, start, end, error, start_j, end_j):  # type: ignore[no-untyped-def]
-    """Write the error of an edge with row f, and its Jacobians, in map axes."""
+    """Write the error of an edge between two poses, and its Jacobians, in map axes."""
     error[0], error[1], error[2], c, s, ax, ay = factors.model(f, kind, start, end, 0.0)
     ft, fth = factors.factors_of_end(f, kind)
     start_j[:] = 0.0
@@ -118,14 +120,14 @@ def _edge_jacobians(f, kind, start, end, error, start_j, end_j):  # type: ignore
 @kernel(allocates=True)
 def _write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-def]
     """Write J P J^T, shape (m, m), of an error with Jacobians by two nodes, shape (m, 3)."""
-    node_i, clique_i, m = tb.node_i(head), tb.clique_i(head), len(out)
+    nodes, cliques, m = tb.nodes(head), tb.cliques(head), len(out)
     out[:] = 0.0
-    common = _lowest_common(clique_i, node_i[i, tb.CLIQUE], node_i[j, tb.CLIQUE])
+    common = _lowest_common(cliques, nodes[i].clique, nodes[j].clique)
     spare = np.empty((m, 96))
     first, spare, at_i = _begin(head, i, of_i, common, np.empty((m, 96)), spare, out)
     second, spare, at_j = _begin(head, j, of_j, common, np.empty((m, 96)), spare, out)
     if common >= 0:
-        n = 3 * (clique_i[common, tb.N_FRONTAL] + clique_i[common, tb.N_SEPARATOR])
+        n = 3 * (cliques[common].n_frontal + cliques[common].n_separator)
         for r in range(m):
             for q in range(n):
                 first[r, q] += second[r, q]
@@ -134,26 +136,26 @@ def _write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _depth(clique_i, c):  # type: ignore[no-untyped-def]
+def _depth(cliques, c):  # type: ignore[no-untyped-def]
     depth = 0
     while c >= 0:
         depth += 1
-        c = clique_i[c, tb.PARENT]
+        c = cliques[c].parent
     return depth
 
 
 @kernel
-def _lowest_common(clique_i, a, b):  # type: ignore[no-untyped-def]
+def _lowest_common(cliques, a, b):  # type: ignore[no-untyped-def]
     """Return the lowest clique on the paths of two cliques to their roots; -1 without one."""
-    depth_a, depth_b = _depth(clique_i, a), _depth(clique_i, b)
+    depth_a, depth_b = _depth(cliques, a), _depth(cliques, b)
     while depth_a > depth_b:
-        a = clique_i[a, tb.PARENT]
+        a = cliques[a].parent
         depth_a -= 1
     while depth_b > depth_a:
-        b = clique_i[b, tb.PARENT]
+        b = cliques[b].parent
         depth_b -= 1
     while a != b:
-        a, b = clique_i[a, tb.PARENT], clique_i[b, tb.PARENT]
+        a, b = cliques[a].parent, cliques[b].parent
     return a
 
 
@@ -165,12 +167,12 @@ def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped
     Add Y^T Y to the upper triangle of `out`. Return the right-hand sides of the clique, work
     space, and the number of its frontal nodes before the first with a nonzero right-hand side.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    c = node_i[v, tb.CLIQUE]
-    row = clique_i[c]
-    here = _cleared(here, 3 * (row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]))
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    c = nodes[v].clique
+    row = cliques[c]
+    here = _cleared(here, 3 * (row.n_frontal + row.n_separator))
     first = 0
-    while pool_i[row[tb.NODES] + first] != v:
+    while pool_i[row.members + first] != v:
         first += 1
     turn = clique_frames.present_turn(head, c)
     cos, sin = math.cos(turn), math.sin(turn)
@@ -187,17 +189,16 @@ def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped
 @kernel(allocates=True)
 def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-def]
     """Solve for the cliques from c up to, and without, one above; return its right-hand sides."""
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    pool_f = tb.pool_f(head)
+    nodes, pool_i, pool_f = tb.nodes(head), tb.pool_i(head), tb.pool_f(head)
     while c != top:
-        row = clique_i[c]
-        n_frontal, n_separator = row[tb.N_FRONTAL], row[tb.N_SEPARATOR]
-        nodes = pool_i[row[tb.NODES]:row[tb.NODES] + n_frontal + n_separator]
-        values = pool_f[row[tb.VALUES]:]
+        row = tb.cliques(head)[c]
+        n_frontal, n_separator = row.n_frontal, row.n_separator
+        members = pool_i[row.members:row.members + n_frontal + n_separator]
+        values = pool_f[row.values:]
         for f in range(first, n_frontal):
-            if node_i[nodes[f], tb.FIXED] == 0:
+            if nodes[members[f]].fixed == 0:
                 _solve_block(values, 3 * f, 3 * (n_frontal + n_separator), here, out)
-        first, below, c = 0, c, row[tb.PARENT]
+        first, below, c = 0, c, row.parent
         if c < 0:
             break
         spare = _passed_up(head, below, here, spare)
@@ -208,18 +209,18 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
 @kernel(allocates=True)
 def _passed_up(head, c, here, above):  # type: ignore[no-untyped-def]
     """Return the right-hand sides of a clique's separator as those of its parent, in its frame."""
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    row = clique_i[c]
-    parent = clique_i[row[tb.PARENT]]
-    n_above = parent[tb.N_FRONTAL] + parent[tb.N_SEPARATOR]
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    row = cliques[c]
+    parent = cliques[row.parent]
+    n_above = parent.n_frontal + parent.n_separator
     above = _cleared(above, 3 * n_above)
     for m in range(n_above):
-        node_i[pool_i[parent[tb.NODES] + m], tb.INDEX] = 3 * m
+        nodes[pool_i[parent.members + m]].index = 3 * m
     turn = (clique_frames.present_turn(head, c)
-            - clique_frames.present_turn(head, row[tb.PARENT]))
+            - clique_frames.present_turn(head, row.parent))
     cos, sin = math.cos(turn), math.sin(turn)
-    for s in range(row[tb.N_FRONTAL], row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]):
-        at = node_i[pool_i[row[tb.NODES] + s], tb.INDEX]
+    for s in range(row.n_frontal, row.n_frontal + row.n_separator):
+        at = nodes[pool_i[row.members + s]].index
         for r in range(len(here)):
             p, q = here[r, 3 * s], here[r, 3 * s + 1]
             above[r, at], above[r, at + 1] = cos * p - sin * q, sin * p + cos * q

@@ -78,9 +78,9 @@ class IncrementalSmoother:
         """The pose graph; only this object edits it."""
         self._memory = self.graph.memory
         scalars = self._memory['scalars']
-        scalars[tb.SETTING_ALPHA] = self._config.alpha
-        scalars[tb.SETTING_BUDGET] = self._config.budget
-        scalars[tb.SETTING_SHARE] = self._config.budget_share
+        scalars['alpha'] = self._config.alpha
+        scalars['budget'] = self._config.budget
+        scalars['share'] = self._config.budget_share
 
     @property
     def poses(self) -> Poses:
@@ -138,7 +138,7 @@ class IncrementalSmoother:
             return Refinement(finished=True, moved=0.0)
         code = self._refinement_step()
         if code in (tree_update.DONE, tree_update.UNFINISHED):
-            moved = float(self._memory['scalars'][tb.LARGEST_MOVE])
+            moved = float(self._memory['scalars']['largest_move'][0])
             return Refinement(finished=code == tree_update.DONE, moved=moved)
         self._memory.head[tb.INTERRUPT] = 0
         return Refinement(finished=code != tree_update.INTERRUPTED, moved=0.0)

@@ -21,8 +21,8 @@ from pose_graph_ros.core.smoother.back_substitution import back_substitute
 @kernel(forceinline=True)
 def set_waits(head, e, waits):  # type: ignore[no-untyped-def]
     """Note whether a factor is listed as waiting, 1 or 0; return what was noted before."""
-    row = tb.factor_i(head)[e]
-    before, row[tb.FACTOR_WAITS] = row[tb.FACTOR_WAITS], waits
+    row = tb.factors(head)[e]
+    before, row.waits = row.waits, waits
     return before
 
 
@@ -33,13 +33,13 @@ def _check_factor(head, e, frame):  # type: ignore[no-untyped-def]
 
     Frame is the turn of its clique, as for `factors.check`.
     """
-    scalars, f = tb.scalars(head), tb.factor_f(head)[e]
+    scalars, f = tb.scalars(head)[0], tb.factors(head)[e]
     transaction_log.log_energy(head, e)
-    scalars[tb.CHI2] -= f[tb.ENERGY]
+    scalars.chi2 -= f.energy
     factors.check(head, e, frame)
-    scalars[tb.CHI2] += f[tb.ENERGY]
-    scalars[tb.ERROR2_SUM] += f[tb.ERROR2]
-    large = f[tb.ERROR2] > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]
+    scalars.chi2 += f.energy
+    scalars.error2_sum += f.error2
+    large = f.error2 > factors.LEAST_FRACTION * scalars.share
     if large and set_waits(head, e, 1) == 0:
         tb.waiting(head)[head[tb.N_WAITING]] = e
         head[tb.N_WAITING] += 1
@@ -48,42 +48,41 @@ def _check_factor(head, e, frame):  # type: ignore[no-untyped-def]
 @kernel
 def _check(head):  # type: ignore[no-untyped-def]
     """Check the factors of all listed nodes, each factor once."""
-    scalars, factor_i, work_i = tb.scalars(head), tb.factor_i(head), tb.work_i(head)
+    scalars, work_i = tb.scalars(head)[0], tb.work_i(head)
     iteration = head[tb.ITERATION]
     checks = work_i[head[tb.NODE_ROOM]:]
-    scalars[tb.ERROR2_SUM] = 0.0
+    scalars.error2_sum = 0.0
     owner, frame = -1, factors.NO_TURN  # those that follow each other often have the same owner
     for n in range(head[tb.N_CHECKS]):
-        at = tb.node_i(head)[checks[n], tb.FACTOR_LIST]
+        at = tb.nodes(head)[checks[n]].factor_list
         while at >= 0:
             e = at >> 2
-            if factor_i[e, tb.FACTOR_CHECKED] != iteration:
-                factor_i[e, tb.FACTOR_CHECKED] = iteration
-                if factor_i[e, tb.OWNER] != owner:
-                    owner = factor_i[e, tb.OWNER]
+            if tb.factors(head)[e].checked != iteration:
+                tb.factors(head)[e].checked = iteration
+                if tb.factors(head)[e].owner != owner:
+                    owner = tb.factors(head)[e].owner
                     phi = clique_frames.present_turn(head, owner)
                     frame = (phi, math.cos(phi), math.sin(phi))
                 _check_factor(head, e, frame)
-            at = factor_i[e, tb.NEXT_I + (at & 3)]
+            at = tb.factors(head)[e].next[at & 3]
 
 
 @kernel
 def _check_turned(head):  # type: ignore[no-untyped-def]
     """Add the errors of the listed turned frames to the sum, and keep the large ones listed."""
-    scalars, clique_f, work_i = tb.scalars(head), tb.clique_f(head), tb.work_i(head)
-    clique_i = tb.clique_i(head)
+    scalars, cliques, work_i = tb.scalars(head)[0], tb.cliques(head), tb.work_i(head)
     turned = work_i[2 * head[tb.NODE_ROOM]:]
     kept = 0
     for k in range(head[tb.N_TURNED]):
         c = turned[k]
-        if clique_i[c, tb.N_FRONTAL] == 0:
+        if cliques[c].n_frontal == 0:
             error2 = clique_frames.prior_error2(head, c, tb.work_f(head))
         else:
             slip = clique_frames.frame_slip(head, c)
             error2 = clique_frames.interface_error2(head, c, slip, tb.work_f(head))
-        scalars[tb.ERROR2_SUM] += error2
-        if error2 > factors.LEAST_FRACTION * scalars[tb.SETTING_SHARE]:
-            clique_f[c, tb.SLIP_ERROR2] = error2
+        scalars.error2_sum += error2
+        if error2 > factors.LEAST_FRACTION * scalars.share:
+            cliques[c].slip_error2 = error2
             turned[kept] = c
             kept += 1
     head[tb.N_TURNED] = kept
@@ -105,20 +104,19 @@ def relinearize(head):  # type: ignore[no-untyped-def]
     The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
     """
     allowed = 0.4 * _budget(head)
-    work_f, waiting = tb.work_f(head), tb.waiting(head)
-    clique_f, clique_i, pool_i = tb.clique_f(head), tb.clique_i(head), tb.pool_i(head)
-    work_i = tb.work_i(head)
+    work_f, waiting, cliques = tb.work_f(head), tb.waiting(head), tb.cliques(head)
+    pool_i, work_i = tb.pool_i(head), tb.work_i(head)
     # sums of the errors by powers of two of their ratio to `allowed`, largest first
     bins = work_f[:64]
     bins[:] = 0.0
     left, cut = 0.0, 0
     for n in range(head[tb.N_WAITING]):
-        error2 = tb.factor_f(head)[waiting[n], tb.ERROR2]
+        error2 = tb.factors(head)[waiting[n]].error2
         bins[_bin(error2 / allowed)] += error2
         left += error2
     turned = work_i[2 * head[tb.NODE_ROOM]:]
     for n in range(head[tb.N_TURNED]):
-        error2 = clique_f[turned[n], tb.SLIP_ERROR2]
+        error2 = cliques[turned[n]].slip_error2
         bins[_bin(error2 / allowed)] += error2
         left += error2
     while cut < 64 and left > allowed:
@@ -128,18 +126,18 @@ def relinearize(head):  # type: ignore[no-untyped-def]
         e = waiting[n]
         transaction_log.log_factor(head, e)
         set_waits(head, e, 0)
-        if _bin(tb.factor_f(head)[e, tb.ERROR2] / allowed) < cut:
+        if _bin(tb.factors(head)[e].error2 / allowed) < cut:
             head[tb.N_RELINEARIZED] += 1
             factors.linearize(head, e)
-            for v in tb.factor_i(head)[e, tb.END_I:tb.END_K + 1]:
+            for v in tb.factors(head)[e].ends:
                 if v >= 0:
                     _touch(head, v)
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
-        if _bin(clique_f[c, tb.SLIP_ERROR2] / allowed) < cut:
+        if _bin(cliques[c].slip_error2 / allowed) < cut:
             # the parent adds the update matrix again, at the present angle of the frame
             head[tb.N_RELINEARIZED] += 1
-            _touch(head, pool_i[clique_i[clique_i[c, tb.PARENT], tb.NODES]])
+            _touch(head, pool_i[cliques[cliques[c].parent].members])
     head[tb.N_WAITING] = head[tb.N_TURNED] = 0
 
 
@@ -160,8 +158,8 @@ def _bin(ratio):  # type: ignore[no-untyped-def]
 @kernel
 def _budget(head):  # type: ignore[no-untyped-def]
     """Return the squared linearization error that a step may leave [sigma^2]."""
-    scalars = tb.scalars(head)
-    return min(scalars[tb.SETTING_BUDGET], scalars[tb.SETTING_SHARE] * scalars[tb.N_MOVED])
+    scalars = tb.scalars(head)[0]
+    return min(scalars.budget, scalars.share * scalars.n_moved)
 
 
 @kernel
@@ -175,7 +173,7 @@ def solve_and_check(head):  # type: ignore[no-untyped-def]
     _check(head)
     _check_turned(head)
     head[tb.N_ITERATIONS] += 1
-    return tb.scalars(head)[tb.ERROR2_SUM]
+    return tb.scalars(head)[0].error2_sum
 
 
 @kernel

@@ -32,18 +32,18 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
 
     The sweep keeps a stack of cliques and a stack of their Z_ss.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
+    nodes, pool_i = tb.nodes(head), tb.pool_i(head)
     cliques, blocks = np.empty(64, np.int32), np.empty(1024)
     for root in range(head[tb.N_CLIQUES]):
-        if clique_i[root, tb.N_FRONTAL] <= 0 or clique_i[root, tb.PARENT] >= 0:
+        if tb.cliques(head)[root].n_frontal <= 0 or tb.cliques(head)[root].parent >= 0:
             continue  # a free row, a prior, or no root
         cliques[0] = root
         depth, end = 1, 0
         while depth > 0:
             depth -= 1
             c = cliques[depth]
-            row = clique_i[c]
-            rows, rest = 3 * row[tb.N_FRONTAL], 3 * row[tb.N_SEPARATOR]
+            row = tb.cliques(head)[c]
+            rows, rest = 3 * row.n_frontal, 3 * row.n_separator
             inverse = np.empty((rows + rest, rows + rest))
             end -= rest * rest
             for i in range(rest):
@@ -51,13 +51,13 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                     inverse[rows + i, rows + q] = blocks[end + i * rest + q]
             _invert_clique(head, row, inverse)
             turn = clique_frames.present_turn(head, c)
-            _write_blocks(pool_i[row[tb.NODES]:], rows, inverse, turn, out)
+            _write_blocks(pool_i[row.members:], rows, inverse, turn, out)
             for m in range(len(inverse) // 3):
-                node_i[pool_i[row[tb.NODES] + m], tb.INDEX] = 3 * m
-            child = row[tb.CHILD]
+                nodes[pool_i[row.members + m]].index = 3 * m
+            child = row.child
             while child >= 0:
-                if clique_i[child, tb.N_FRONTAL] > 0:
-                    size = 3 * clique_i[child, tb.N_SEPARATOR]
+                if tb.cliques(head)[child].n_frontal > 0:
+                    size = 3 * tb.cliques(head)[child].n_separator
                     if end + size * size > len(blocks):
                         blocks = grown(blocks, end + size * size)
                     below = blocks[end:end + size * size].reshape(size, size)
@@ -70,7 +70,7 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                         cliques = grown(cliques, 0)
                     cliques[depth] = child
                     depth += 1
-                child = clique_i[child, tb.SIBLING]
+                child = tb.cliques(head)[child].sibling
 
 
 @kernel
@@ -104,13 +104,13 @@ def _rotate(block, angle):  # type: ignore[no-untyped-def]
 @kernel
 def _read_separator(head, child, inverse, block):  # type: ignore[no-untyped-def]
     """Copy Z_ss of a child from the inverse of its parent, whose nodes have their INDEX set."""
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    row = clique_i[child]
-    nodes = pool_i[row[tb.NODES] + row[tb.N_FRONTAL]:]
-    for a in range(row[tb.N_SEPARATOR]):
-        i = node_i[nodes[a], tb.INDEX]
-        for b in range(row[tb.N_SEPARATOR]):
-            j = node_i[nodes[b], tb.INDEX]
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    row = cliques[child]
+    members = pool_i[row.members + row.n_frontal:]
+    for a in range(row.n_separator):
+        i = nodes[members[a]].index
+        for b in range(row.n_separator):
+            j = nodes[members[b]].index
             for m in range(3):
                 for q in range(3):
                     block[3 * a + m, 3 * b + q] = inverse[i + m, j + q]
@@ -119,11 +119,11 @@ def _read_separator(head, child, inverse, block):  # type: ignore[no-untyped-def
 @kernel
 def _invert_clique(head, row, inverse):  # type: ignore[no-untyped-def]
     """Fill the inverse of a clique, which has Z_ss already, from its last node to its first."""
-    pool_f, node_i, pool_i = tb.pool_f(head), tb.node_i(head), tb.pool_i(head)
+    pool_f, nodes, pool_i = tb.pool_f(head), tb.nodes(head), tb.pool_i(head)
     n = len(inverse)
-    values = pool_f[row[tb.VALUES]:]
-    for k in range(3 * row[tb.N_FRONTAL] - 1, -1, -1):
-        if node_i[pool_i[row[tb.NODES] + k // 3], tb.FIXED] == 0:
+    values = pool_f[row.values:]
+    for k in range(3 * row.n_frontal - 1, -1, -1):
+        if nodes[pool_i[row.members + k // 3]].fixed == 0:
             _invert_row(values[row_start(k, n):], k, inverse)
         else:
             inverse[k, k:] = 0.0

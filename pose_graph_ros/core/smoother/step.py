@@ -45,10 +45,10 @@ def _has_diverged(head, out_of_iterations):  # type: ignore[no-untyped-def]
     constraint raises chi2 and all linearization errors with it), and either no iteration remains,
     the last one has not halved the error, or it is so large that another can only increase it.
     """
-    scalars = tb.scalars(head)
-    error2, before = scalars[tb.ERROR2_SUM], scalars[tb.ERROR2_BEFORE]
-    scalars[tb.ERROR2_BEFORE] = error2
-    if error2 <= 1.0 or error2 <= 1e-3 * scalars[tb.CHI2]:
+    scalars = tb.scalars(head)[0]
+    error2, before = scalars.error2_sum, scalars.error2_before
+    scalars.error2_before = error2
+    if error2 <= 1.0 or error2 <= 1e-3 * scalars.chi2:
         return False
     return out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6
 
@@ -57,7 +57,7 @@ def _has_diverged(head, out_of_iterations):  # type: ignore[no-untyped-def]
 def _reset_counters(head):  # type: ignore[no-untyped-def]
     head[tb.N_RELINEARIZED] = head[tb.N_ELIMINATED] = 0
     head[tb.N_VISITED] = head[tb.N_ITERATIONS] = 0
-    tb.scalars(head)[tb.ERROR2_BEFORE] = 0.0
+    tb.scalars(head)[0].error2_before = 0.0
 
 
 @kernel(signature=(tb.HEAD, INTEGER, INTEGER), allocates=True)    # the elimination does
@@ -94,8 +94,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
 
 @kernel
 def _touch_clique(head, c):  # type: ignore[no-untyped-def]
-    pool_i, clique_i = tb.pool_i(head), tb.clique_i(head)
-    v = pool_i[clique_i[c, tb.NODES]]
+    pool_i, cliques = tb.pool_i(head), tb.cliques(head)
+    v = pool_i[cliques[c].members]
     transaction_log.log_node(head, v)
     touch(head, v)
     head[tb.N_RELINEARIZED] += 1
@@ -104,15 +104,15 @@ def _touch_clique(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def _touch_waiting(head):  # type: ignore[no-untyped-def]
     """Touch the cliques of waiting constraints and turned frames; eliminating linearizes them."""
-    factor_i, clique_i, work_i = tb.factor_i(head), tb.clique_i(head), tb.work_i(head)
+    factors, work_i = tb.factors(head), tb.work_i(head)
     turned = work_i[2 * head[tb.NODE_ROOM]:]
     for n in range(head[tb.N_TURNED]):
-        _touch_clique(head, clique_i[turned[n], tb.PARENT])
+        _touch_clique(head, tb.cliques(head)[turned[n]].parent)
     for n in range(head[tb.N_WAITING]):
         e = tb.waiting(head)[n]
         transaction_log.log_factor(head, e)
         relinearization.set_waits(head, e, 0)
-        _touch_clique(head, factor_i[e, tb.OWNER])
+        _touch_clique(head, factors[e].owner)
     head[tb.N_WAITING] = head[tb.N_TURNED] = 0
 
 
@@ -125,10 +125,10 @@ def _solve(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def _solve_from_the_root(head):  # type: ignore[no-untyped-def]
-    node_i, clique_i, work_i = tb.node_i(head), tb.clique_i(head), tb.work_i(head)
-    c = node_i[head[tb.NEWEST], tb.CLIQUE]
-    while clique_i[c, tb.PARENT] >= 0:
-        c = clique_i[c, tb.PARENT]
+    nodes, cliques, work_i = tb.nodes(head), tb.cliques(head), tb.work_i(head)
+    c = nodes[head[tb.NEWEST]].clique
+    while cliques[c].parent >= 0:
+        c = cliques[c].parent
     work_i[0] = c
     head[tb.N_ROOTS] = 1
     head[tb.ITERATION] += 1
@@ -138,8 +138,8 @@ def _solve_from_the_root(head):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _iterate(head):  # type: ignore[no-untyped-def]
     """Linearize what waits again, eliminate it and what is above it, and solve."""
-    scalars = tb.scalars(head)
-    chi2, error2 = scalars[tb.CHI2], scalars[tb.ERROR2_SUM]
+    scalars = tb.scalars(head)[0]
+    chi2, error2 = scalars.chi2, scalars.error2_sum
     _touch_waiting(head)
     if head[tb.N_TOUCHED] == 0:
         return DONE      # many errors, each of them negligible
@@ -152,25 +152,25 @@ def _iterate(head):  # type: ignore[no-untyped-def]
     head[tb.N_ELIMINATED] = len(affected)
     _solve(head)
     # Gauss-Newton goes uphill, by at most 0.1 sigma^2, where it swings a soft mode
-    if not scalars[tb.CHI2] <= scalars[tb.LOWEST] + 0.1 or head[tb.ROUND] >= 20:
+    if not scalars.chi2 <= scalars.lowest + 0.1 or head[tb.ROUND] >= 20:
         return DIVERGED
     head[tb.ROUND] += 1
-    scalars[tb.LOWEST] = min(scalars[tb.LOWEST], scalars[tb.CHI2])
+    scalars.lowest = min(scalars.lowest, scalars.chi2)
     least = 1e-11 * max(chi2, 1.0)  # rounding errors, which cannot be reduced any further
-    stalls = abs(scalars[tb.CHI2] - chi2) <= least and scalars[tb.ERROR2_SUM] > 0.5 * error2
-    return DONE if stalls or scalars[tb.ERROR2_SUM] <= ENOUGH else UNFINISHED
+    stalls = abs(scalars.chi2 - chi2) <= least and scalars.error2_sum > 0.5 * error2
+    return DONE if stalls or scalars.error2_sum <= ENOUGH else UNFINISHED
 
 
 @kernel(allocates=True)
 def _refine(head):  # type: ignore[no-untyped-def]
-    scalars = tb.scalars(head)
+    scalars = tb.scalars(head)[0]
     if head[tb.LISTED] != head[tb.UPDATE] - 1:
         head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
         _solve_from_the_root(head)
-        head[tb.ROUND], scalars[tb.LOWEST] = 0, scalars[tb.CHI2]
+        head[tb.ROUND], scalars.lowest = 0, scalars.chi2
     if head[tb.INTERRUPT] != 0:
         return INTERRUPTED
-    code = _iterate(head) if scalars[tb.ERROR2_SUM] > ENOUGH else DONE
+    code = _iterate(head) if scalars.error2_sum > ENOUGH else DONE
     if head[tb.INTERRUPT] != 0 and code != MORE_MEMORY:
         return INTERRUPTED
     if code == DONE:
@@ -190,13 +190,13 @@ def refine(head):  # type: ignore[no-untyped-def]
     minimum. After all but the first two the caller has to roll back what `transaction_log.begin`
     has begun. The graph must have no touched nodes.
     """
-    scalars = tb.scalars(head)
-    alpha, share = scalars[tb.SETTING_ALPHA], scalars[tb.SETTING_SHARE]
-    scalars[tb.SETTING_ALPHA], scalars[tb.SETTING_SHARE] = ALPHA, SHARE
+    scalars = tb.scalars(head)[0]
+    alpha, share = scalars.alpha, scalars.share
+    scalars.alpha, scalars.share = ALPHA, SHARE
     _reset_counters(head)
     code = _refine(head)
-    scalars[tb.SETTING_ALPHA], scalars[tb.SETTING_SHARE] = alpha, share
+    scalars.alpha, scalars.share = alpha, share
     if code in (DONE, UNFINISHED):
-        scalars[tb.LARGEST_MOVE] = transaction_log.largest_move(head)
+        scalars.largest_move = transaction_log.largest_move(head)
         transaction_log.commit(head)
     return code

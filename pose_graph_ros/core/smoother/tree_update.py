@@ -51,35 +51,35 @@ def mark(head):  # type: ignore[no-untyped-def]
     Return these cliques, in no particular order, and the affected nodes: their frontal nodes and
     the touched nodes without a clique, but for those that leave the graph.
     """
-    node_i, clique_i, pool_i = tb.node_i(head), tb.clique_i(head), tb.pool_i(head)
-    touched = tb.touched(head)
+    cliques = tb.cliques(head)
+    nodes, pool_i, touched = tb.nodes(head), tb.pool_i(head), tb.touched(head)
     stamp = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = stamp
     marked = np.empty(64, np.int32)
     n_marked = 0
     n_affected = 0
     for s in range(head[tb.N_TOUCHED]):
-        c = node_i[touched[s], tb.CLIQUE]
+        c = nodes[touched[s]].clique
         if c < 0:
             n_affected += 1
-        while c >= 0 and clique_i[c, tb.MARKED] != stamp:
-            clique_i[c, tb.MARKED] = stamp
+        while c >= 0 and cliques[c].marked != stamp:
+            cliques[c].marked = stamp
             if n_marked == len(marked):
                 marked = grown(marked, 0)
             marked[n_marked] = c
             n_marked += 1
-            n_affected += clique_i[c, tb.N_FRONTAL]
-            c = clique_i[c, tb.PARENT]
+            n_affected += cliques[c].n_frontal
+            c = cliques[c].parent
     affected = np.empty(n_affected, np.int32)
     n_affected = 0
     for k in range(n_marked):
-        row = clique_i[marked[k]]
-        for m in range(row[tb.NODES], row[tb.NODES] + row[tb.N_FRONTAL]):
+        row = cliques[marked[k]]
+        for m in range(row.members, row.members + row.n_frontal):
             affected[n_affected] = pool_i[m]
-            n_affected += node_i[pool_i[m], tb.FACTOR_LIST] != tb.LEAVES
+            n_affected += nodes[pool_i[m]].factor_list != tb.LEAVES
     for s in range(head[tb.N_TOUCHED]):
         v = touched[s]
-        if node_i[v, tb.CLIQUE] < 0 and node_i[v, tb.FACTOR_LIST] != tb.LEAVES:
+        if nodes[v].clique < 0 and nodes[v].factor_list != tb.LEAVES:
             affected[n_affected] = v
             n_affected += 1
     return marked[:n_marked], affected[:n_affected]
@@ -114,10 +114,10 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
 @kernel
 def _leaving_first(head, affected):  # type: ignore[no-untyped-def]
     """Move the nodes that are about to leave to the front of the list; return their number."""
-    node_i = tb.node_i(head)
+    nodes = tb.nodes(head)
     n = 0
     for k in range(len(affected)):
-        if node_i[affected[k], tb.TOUCHED] == ORDERED_FIRST:
+        if nodes[affected[k]].touched == ORDERED_FIRST:
             affected[n], affected[k] = affected[k], affected[n]
             n += 1
     return n
@@ -126,57 +126,57 @@ def _leaving_first(head, affected):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _loose_priors(head):  # type: ignore[no-untyped-def]
     """Return the priors without a parent."""
-    clique_i = tb.clique_i(head)
+    cliques = tb.cliques(head)
     c, n = head[tb.LOOSE], 0
     while c >= 0:
-        c, n = clique_i[c, tb.SIBLING], n + 1
+        c, n = cliques[c].sibling, n + 1
     loose = np.empty(n, np.int32)
     c = head[tb.LOOSE]
     for k in range(n):
-        loose[k], c = c, clique_i[c, tb.SIBLING]
+        loose[k], c = c, cliques[c].sibling
     return loose
 
 
 @kernel
 def _push_drift_down(head, marked, orphans):  # type: ignore[no-untyped-def]
     """Add to each orphan the drift of all cliques above it, which are about to be dropped."""
-    clique_i, clique_f = tb.clique_i(head), tb.clique_f(head)
+    cliques = tb.cliques(head)
     drifting = False
     for k in range(len(marked)):
-        drifting = drifting or clique_f[marked[k], tb.DRIFT] > 0.0
+        drifting = drifting or cliques[marked[k]].drift > 0.0
     if not drifting:
         return
     for k in range(len(orphans)):
-        drift, c = 0.0, clique_i[orphans[k], tb.PARENT]
+        drift, c = 0.0, cliques[orphans[k]].parent
         while c >= 0:
-            drift += clique_f[c, tb.DRIFT]
-            c = clique_i[c, tb.PARENT]
+            drift += cliques[c].drift
+            c = cliques[c].parent
         if drift > 0.0:
             transaction_log.log_clique(head, orphans[k])
-            clique_f[orphans[k], tb.DRIFT] += drift
+            cliques[orphans[k]].drift += drift
 
 
 @kernel(inline='always')
 def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
     """Eliminate the marked cliques again with the same structure."""
-    clique_i, ready = tb.clique_i(head), tb.work_i(head)
+    ready, cliques = tb.work_i(head), tb.cliques(head)
     need, largest = np.int64(0), np.int64(0)
     for k in range(len(marked)):
-        row = clique_i[marked[k]]
-        row[tb.MARKED] = 0
-        largest = max(largest, work_size(row[tb.N_FRONTAL] + row[tb.N_SEPARATOR]))
-        if row[tb.VALUES_BORN] != head[tb.UPDATE]:
-            need += pools.rounded(pools.n_values(row[tb.N_FRONTAL], row[tb.N_SEPARATOR]))
+        row = cliques[marked[k]]
+        row.marked = 0
+        largest = max(largest, work_size(row.n_frontal + row.n_separator))
+        if row.values_born != head[tb.UPDATE]:
+            need += pools.rounded(pools.n_values(row.n_frontal, row.n_separator))
     if lacks_memory(head, head[tb.POOL_F_END] + need, 0, largest):
         return MORE_MEMORY
     for k in range(len(marked)):
-        parent = clique_i[marked[k], tb.PARENT]
+        parent = cliques[marked[k]].parent
         if parent >= 0:
-            clique_i[parent, tb.MARKED] += 1
+            cliques[parent].marked += 1
     # children first; MARKED counts the marked children that are still to be eliminated
     n_ready = 0
     for k in range(len(marked)):
-        if clique_i[marked[k], tb.MARKED] == 0:
+        if cliques[marked[k]].marked == 0:
             ready[n_ready] = marked[k]
             n_ready += 1
     k = 0
@@ -190,11 +190,11 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             return BAD_PIVOT
-        clique_i[c, tb.BUILT] = head[tb.ITERATION]
-        parent = clique_i[c, tb.PARENT]
+        cliques[c].built = head[tb.ITERATION]
+        parent = cliques[c].parent
         if parent >= 0:
-            clique_i[parent, tb.MARKED] -= 1
-            if clique_i[parent, tb.MARKED] == 0:
+            cliques[parent].marked -= 1
+            if cliques[parent].marked == 0:
                 ready[n_ready] = parent
                 n_ready += 1
     _find_roots(head, marked)
@@ -204,10 +204,10 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
 @kernel
 def _find_roots(head, cliques):  # type: ignore[no-untyped-def]
     """Put those of the cliques that are roots on the stack for the back-substitution."""
-    clique_i, work_i = tb.clique_i(head), tb.work_i(head)
+    work_i = tb.work_i(head)
     n_roots = 0
     for k in range(len(cliques)):
-        if clique_i[cliques[k], tb.PARENT] < 0:
+        if tb.cliques(head)[cliques[k]].parent < 0:
             work_i[n_roots] = cliques[k]
             n_roots += 1
     head[tb.N_ROOTS] = n_roots
@@ -235,7 +235,7 @@ def eliminate(head):  # type: ignore[no-untyped-def]
 @kernel
 def forget_touched(head):  # type: ignore[no-untyped-def]
     """Empty the list of the touched nodes, which have been eliminated."""
-    node_i, touched = tb.node_i(head), tb.touched(head)
+    nodes, touched = tb.nodes(head), tb.touched(head)
     for k in range(head[tb.N_TOUCHED]):
-        node_i[touched[k], tb.TOUCHED] = 0
+        nodes[touched[k]].touched = 0
     head[tb.N_TOUCHED] = 0

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import DIAGONAL, factor_table, FactorTable
@@ -51,23 +50,23 @@ def _named(
 ) -> ConstraintEnergy:
     """Return a constraint by its row."""
     nodes, factors = origins
-    number, integers = int(graph.factor_ids[row]), table.integers[row]
-    ends = integers[[tb.END_I, tb.END_J]]
+    number, factor = int(graph.factor_ids[row]), table.records[row]
+    ends = factor['ends'][:2]
     ends = ends[ends >= 0]
     ids = graph.node_ids[ends]
     places = np.searchsorted(nodes.ids, ids[graph.is_pose[ends]]).tolist()
     origin, of_bias = factors.origin(number), factors.bias_origin(int(ids[0]))
     known = origin or of_bias
-    if len(ends) == 2 and integers[tb.FACTOR_KIND] != FactorKind.BIAS:
-        kind = FactorKind(int(integers[tb.FACTOR_KIND])).name.lower()
+    if len(ends) == 2 and factor['kind'] != FactorKind.BIAS:
+        kind = FactorKind(int(factor['kind'])).name.lower()
         i, j = np.searchsorted(nodes.ids, ids).tolist()
         source = '' if origin is None else origin.source
-        if origin is None and integers[tb.FACTOR_KIND] == FactorKind.ODOMETRY:
+        if origin is None and factor['kind'] == FactorKind.ODOMETRY:
             source = nodes.primary_at(int(nodes.stamps_ns[j]))
         name = f'{source or kind} x{i} - x{j}'
     else:
         if len(places) > 0:
-            position, _, heading = table.numbers[row][DIAGONAL] > 0.0
+            position, _, heading = factor['information'][DIAGONAL] > 0.0
             kind = 'heading' if not position else 'global_pose' if heading else 'position'
             where = f' near x{places[0]}'
         else:

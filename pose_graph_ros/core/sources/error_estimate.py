@@ -22,7 +22,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import (
     FactorKind,
     Factors,
@@ -142,9 +141,10 @@ def _sorted(
     """Return those of some observed nodes that are in the graph, and no headings, by stamp."""
     rows = graph.factor_rows(ids)
     stamps_ns, rows = stamps_ns[rows >= 0], rows[rows >= 0]
-    placed = graph.memory['factor_i'][rows, tb.FACTOR_KIND] != FactorKind.HEADING
+    factors = graph.factor_records
+    placed = factors['kind'][rows] != FactorKind.HEADING
     stamps_ns, rows = stamps_ns[placed], rows[placed]
-    where = graph.memory['factor_f'][rows, tb.MEAN:tb.MEAN + 2]
+    where = factors['mean'][rows]
     order = np.lexsort((where[:, 1], where[:, 0], stamps_ns))
     return stamps_ns[order], graph.factors_at(graph.factor_ids[rows[order]])
 
@@ -180,23 +180,21 @@ def _odometry(
     until = np.maximum.accumulate(at[rows] - first)
     n = int(until[-1]) if len(until) > 0 else 0
     edge_after = np.full(n, -1)
-    table = graph.memory['factor_i'][:graph.n_factors]
-    edges = np.flatnonzero(table[:, tb.FACTOR_KIND] == FactorKind.ODOMETRY)
-    start = at[table[edges, tb.END_I]] - first
-    inside: BoolArray = ((start >= 0) & (start < n)
-                         & (at[table[edges, tb.END_J]] - first == start + 1))
+    factors = graph.factor_records
+    edges = np.flatnonzero(factors['kind'] == FactorKind.ODOMETRY)
+    start, end, _ = at[factors['ends'][edges]].T - first
+    inside: BoolArray = (start >= 0) & (start < n) & (end == start + 1)
     # of several edges the first is that of the primary odometry
     edge_after[start[inside][::-1]] = edges[inside][::-1]
     stamps_ns = odometry.stamps_ns[np.searchsorted(
         odometry.ids, graph.node_ids[graph.is_pose][first:first + n + 1])]
     seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
     known = edge_after >= 0
-    numbers = graph.memory['factor_f'][edge_after[known]]
-    claimed = odometry.errors.inverse_noise.informations(
-        full(numbers[:, tb.INFO:tb.INFO + 6]))
+    found = factors[edge_after[known]]
+    claimed = odometry.errors.inverse_noise.informations(full(found['information']))
     means, informations = np.zeros((n, 3)), np.zeros((n, 6))
     means[known] = odometry.reference.motions(odometry.errors.as_odometry_says(
-        numbers[:, tb.MEAN:tb.MEAN + 3], seconds[known]), seconds[known])
+        found['mean'], seconds[known]), seconds[known])
     informations[known] = upper(claimed)
     return until, _Edges(means, informations, seconds)
 

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import networkx as nx
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.graph.tables import N_CLIQUES
 from pose_graph_ros.offline.drawing.views import hidden, markov_random_field, terms
 
 MOST_BINS = 120
@@ -117,9 +118,9 @@ def hessian(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
 def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
     """Return the pattern of the factor R that the smoother has of a graph."""
     memory, fixed = graph.memory, graph.fixed
-    cliques = memory['clique_i'][:memory.head[tb.N_CLIQUES]]
+    cliques = memory['cliques'][:memory.head[N_CLIQUES]]
     frontal, separator, first = (
-        cliques[:, column].tolist() for column in (tb.N_FRONTAL, tb.N_SEPARATOR, tb.NODES))
+        cliques[field].tolist() for field in ('n_frontal', 'n_separator', 'members'))
     nodes = memory['pool_i']
     place, n = np.full(graph.n_nodes, -1), 0
     order = _children_first(cliques)
@@ -140,12 +141,12 @@ def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
     return _binned(blocks(), n, most_bins)
 
 
-def _children_first(cliques: IntArray) -> list[int]:
+def _children_first(cliques: npt.NDArray[Any]) -> list[int]:
     """Return the rows of all cliques with frontal nodes, each after those below it."""
     parents, siblings, children = (
-        cliques[:, column].tolist() for column in (tb.PARENT, tb.SIBLING, tb.CHILD))
-    frontal = cliques[:, tb.N_FRONTAL]
-    stack = np.flatnonzero((frontal > 0) & (cliques[:, tb.PARENT] < 0)).tolist()
+        cliques[field].tolist() for field in ('parent', 'sibling', 'child'))
+    frontal = cliques['n_frontal']
+    stack = np.flatnonzero((frontal > 0) & (cliques['parent'] < 0)).tolist()
     found: list[int] = []
     while len(stack) > 0:
         c = stack.pop()

@@ -11,7 +11,6 @@ from pose_graph_ros.core.batch import gauss_newton, optimizer
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.elimination.assembly import LINEARIZED
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Relative error of a step, for a condition number of H of some 1e4.
@@ -42,7 +41,7 @@ def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     gauss_newton.linearize(head)
     assert gauss_newton.eliminate(head, damping, LINEARIZED)
     length = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
-    step = graph.memory['node_f'][:graph.n_nodes, tb.DELTA:tb.DELTA + 3]
+    step = graph.node_records['delta']
     assert length == np.max(np.abs(step))
     np.testing.assert_array_equal(step[graph.fixed], 0.0)
     return step[~graph.fixed].ravel()
@@ -54,8 +53,8 @@ def test_a_step_is_that_of_dense_matrices(seed: int, damping: float) -> None:
     graph = weighted_graph(seed)
     H, b = free_part(graph, *dense_system(graph))
     assume(np.linalg.cond(H) < 1e12)
-    rows = graph.memory['node_f'][:graph.n_nodes][~graph.fixed]
-    scale = rows[:, [tb.SCALE_T, tb.SCALE_T, tb.SCALE_R]].ravel()**2
+    rows = graph.node_records[~graph.fixed]
+    scale = np.stack((rows['scale_t'], rows['scale_t'], rows['scale_r']), axis=1).ravel()**2
     expected = -np.linalg.solve(H + damping * np.diag(scale), b)
     optimizer.plant(graph, symbolic.analyse(graph.memory.head))
     for _ in range(2):  # again over the same cliques

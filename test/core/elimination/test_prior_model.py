@@ -13,7 +13,7 @@ from slow_smoother import EXACT
 from pose_graph_ros.core.elimination.clique_frames import prior_error2
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import prior_rows, tables as tb
+from pose_graph_ros.core.graph import prior_rows
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
@@ -49,11 +49,11 @@ def test_the_error_of_a_turned_prior_is_that_of_its_displacement(
     smoother = IncrementalSmoother(EXACT)
     smoother.update(GraphUpdate(hidden=before, priors=[prior], factors=Factors.on(
         range(K), None, before, [1e12 * np.eye(3)] * K, [FactorKind.GLOBAL_POSE] * K)))
-    head, nodes = smoother.graph.memory.head, smoother.graph.memory['node_f'][:K]
+    head, nodes = smoother.graph.memory.head, smoother.graph.node_records
     before = smoother.poses.copy()
     change = se2.wrapped(after - before)
-    nodes[:, tb.POSE:tb.POSE + 3] = after
-    nodes[:, tb.DELTA:tb.DELTA + 3] += change
+    nodes['pose'] = after
+    nodes['delta'] += change
     c, = prior_rows.all_priors(head)
     found = prior_error2(head, int(c), np.zeros(15 * K))
 

@@ -35,12 +35,12 @@ def edited(graph: Graph, steps: list[tuple[str, int, float]], rng: np.random.Gen
 
 def listed(graph: Graph) -> list[list[int]]:
     """Return the ids of the factors in the list of each node, sorted."""
-    memory, found = graph.memory, []
-    for row in memory['node_i'][:graph.n_nodes]:
-        factors, entry = [], int(row[tb.FACTOR_LIST])
+    found = []
+    for first in graph.node_records['factor_list'].tolist():
+        factors, entry = [], first
         while entry >= 0:
             factors.append(int(graph.factor_ids[entry >> 2]))
-            entry = int(memory['factor_i'][entry >> 2, tb.NEXT_I + (entry & 3)])
+            entry = int(graph.factor_records['next'][entry >> 2, entry & 3])
         found.append(sorted(factors))
     return found
 
@@ -53,7 +53,7 @@ def test_after_any_edits_chi2_and_lists_are_those_of_the_rows(
     graph = random_graph(seed)
     edited(graph, steps, np.random.default_rng(seed))
     factors = graph.factors
-    assert graph.memory['scalars'][tb.CHI2] == pytest.approx(
+    assert graph.memory['scalars']['chi2'][0] == pytest.approx(
         graph.energies().chi2, rel=1e-9, abs=1e-6)
     assert listed(graph) == [
         np.flatnonzero(((factors.i == node) | (factors.j == node))
@@ -107,9 +107,9 @@ def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
         assert sorted(graph.node_ids[graph.memory['touched'][:graph.memory.head[
             tb.N_TOUCHED]]].tolist()) == nodes.tolist()
         if len(nodes) > 0:
-            scale = [g.memory['node_f'][:g.n_nodes, tb.SCALE_T:tb.SCALE_R + 1]
-                     for g in (graph, anew)]
-            np.testing.assert_allclose(*scale, rtol=1e-6, atol=1e-5)
+            for field in ('scale_t', 'scale_r'):
+                scales = (each.node_records[field] for each in (graph, anew))
+                np.testing.assert_allclose(*scales, rtol=1e-6, atol=1e-5)
         assert graph.energies().chi2 == pytest.approx(anew.energies().chi2, rel=1e-12)
 
 

@@ -5,6 +5,7 @@
 from hypothesis import given, strategies as st
 import numpy as np
 
+from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import rows, tables as tb
 from pose_graph_ros.core.graph.checks import check
@@ -24,10 +25,15 @@ def is_valid(matrix: np.ndarray) -> bool:
     return True
 
 
+@kernel
+def write(factors, mean, matrix):  # type: ignore[no-untyped-def]
+    return rows.write_measurement(factors[0], mean, matrix)
+
+
 def packed(matrix: np.ndarray) -> tuple[bool, np.ndarray]:
-    row = np.zeros(tb.FACTOR_F)
-    valid = rows.write_measurement(row, np.zeros(3), matrix)
-    return valid, full(row[None, tb.INFO:tb.INFO + 6])[0]
+    factors = np.zeros(1, tb.FACTOR)
+    valid = write(factors, np.zeros(3), matrix)
+    return valid, full(factors['information'])[0]
 
 
 @given(st.lists(numbers, min_size=6, max_size=6), skews)

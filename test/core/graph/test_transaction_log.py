@@ -35,11 +35,11 @@ def free_blocks(graph: Graph, heads: int, pool: np.ndarray) -> list[tuple[int, i
 def used_blocks(graph: Graph) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Return the blocks of the lists of nodes and of the values of all cliques."""
     nodes, values = [], []
-    for row in graph.memory['clique_i'][:graph.memory.head[tb.N_CLIQUES]]:
-        if row[tb.N_FRONTAL] > 0:
-            frontal, separator = int(row[tb.N_FRONTAL]), int(row[tb.N_SEPARATOR])
-            nodes.append((int(row[tb.NODES]), int(pools.rounded(frontal + separator))))
-            values.append((int(row[tb.VALUES]),
+    for row in graph.memory['cliques'][:graph.memory.head[tb.N_CLIQUES]]:
+        if row['n_frontal'] > 0:
+            frontal, separator = int(row['n_frontal']), int(row['n_separator'])
+            nodes.append((int(row['members']), int(pools.rounded(frontal + separator))))
+            values.append((int(row['values']),
                            int(pools.rounded(pools.n_values(frontal, separator)))))
     return nodes, values
 
@@ -54,7 +54,7 @@ def assert_pools_are_whole(graph: Graph) -> None:
         ends = np.cumsum([0, *(size for _, size in blocks)])
         assert [begin for begin, _ in blocks] == ends[:-1].tolist()
         assert ends[-1] == head[end]
-    assert (head[tb.LOG_F_END], head[tb.LOG_I_END], head[tb.N_FREED]) == (0, 0, 0)
+    assert (head[tb.LOG_END], head[tb.N_FREED]) == (0, 0)
 
 
 @given(seeds, st.integers(1, 30))

@@ -151,8 +151,9 @@ def test_a_graph_with_other_edges_is_the_one_made_with_them(
             each.update(GraphUpdate())
             each.refine()
     np.testing.assert_allclose(smoother.chi2(), new.chi2(), rtol=1e-5, atol=1e-6)
-    scales = (each.graph.memory['node_f'][:n + 1, 3:] for each in (smoother, new))
-    assert all(np.all(np.isfinite(one)) for one in scales)
+    for each in (smoother, new):
+        nodes = each.graph.node_records
+        assert np.all(np.isfinite(nodes['scale_t'] + nodes['scale_r']))
 
 
 @given(st.integers(0, 1000), some_errors, some_errors)

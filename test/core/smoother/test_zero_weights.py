@@ -81,11 +81,11 @@ def test_adding_them_solves_nothing() -> None:
     twins = Twins(3)
     twins.drive(15)
     graph = twins.full.graph
-    before, cliques = state(graph), graph.memory['clique_i'].copy()
+    before, cliques = state(graph), graph.memory['cliques'].copy()
     idle = Factors.joined([twins.here.edges([(0, 9), (4, 12)]), twins.here.observed([7, 7])])
     idle.weight[:] = 0.0
     result = twins.full.update(GraphUpdate(factors=idle))
     assert result[2:6] == (0, 0, 0, 0)
-    np.testing.assert_array_equal(graph.memory['clique_i'], cliques)
+    np.testing.assert_array_equal(graph.memory['cliques'], cliques)
     assert set(differences(before, state(graph))) == {
-        'factor_f', 'factor_i', 'factor_id', 'next'}
+        'factors', 'factor_id', 'next'}
