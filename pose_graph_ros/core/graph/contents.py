@@ -189,12 +189,12 @@ class GraphContents:
 
     def _factors_in(self, rows: IntArray | slice) -> Factors:
         """Return the factors in some rows, with rows for ends."""
-        found = self.factor_records[rows]
-        kind, ends = found['kind'], found['ends']
+        mean, information, weight, constants, kind, ends = (
+            np.array(self.factor_records[field][rows])
+            for field in ('mean', 'information', 'weight', 'constants', 'kind', 'ends'))
         return Factors(
-            ends[:, 0], ends[:, 1], found['mean'].copy(), full(found['information']), kind,
-            found['weight'].copy(), np.where(_HAS_CONSTANTS[kind], found['constants'], 0.0),
-            ends[:, 2])
+            ends[:, 0], ends[:, 1], mean, full(information), kind, weight,
+            np.where(_HAS_CONSTANTS[kind], constants, 0.0), ends[:, 2])
 
     def _with_ids(self, table: Factors) -> Factors:
         """Return a table with the ids of the nodes in place of their rows."""

@@ -97,9 +97,10 @@ def view(graph: Graph, drawn: DrawnRows = ALL_BELIEVED) -> GraphView | None:
 
 def _measured(graph: Graph, table: 'FactorTable', rows: IntArray) -> Lines:
     """Return measured positions, given the rows of their factors."""
-    found = table.records[rows]
-    predicted = se2.transform(graph.poses[found['ends'][:, 0]], found['constants'][:, :2])
-    return Lines(np.stack((predicted, found['mean'][:, :2]), axis=1), table.sigmas[rows])
+    nodes, offsets, measured = (
+        table.records[field][rows] for field in ('ends', 'constants', 'mean'))
+    predicted = se2.transform(graph.poses[nodes[:, 0]], offsets[:, :2])
+    return Lines(np.stack((predicted, measured[:, :2]), axis=1), table.sigmas[rows])
 
 
 class FactorTable(NamedTuple):

@@ -111,7 +111,7 @@ def _moved_up(
     n, gone = len(stays), memory[f'{name}_id'][:len(stays)][~stays].astype(np.int64)
     if len(gone) > 0:
         first, left = int(np.argmin(stays)), n - len(gone)
-        for table in (memory[f'{name}s'], memory[f'{name}_id']):
+        for table in map(tb.as_bytes, (memory[f'{name}s'], memory[f'{name}_id'])):
             table[first:left] = table[first:n][stays[first:]]
         memory.head[counter] = left
     # one more, so that -1 stays -1

@@ -232,8 +232,8 @@ def residuals(graph: Graph, some: Closures) -> FloatArray:
 
 def are_above(graph: Graph, edges: IntArray, limit: float) -> BoolArray:
     """Tell which squared residuals of edges, by their own covariances, are above a limit."""
-    found = graph.factor_records[graph.factor_rows(edges)]
-    return np.asarray(found['energy'] > limit * found['weight'])
+    rows, factors = graph.factor_rows(edges), graph.factor_records
+    return np.asarray(factors['energy'][rows] > limit * factors['weight'][rows])
 
 
 class Support(NamedTuple):

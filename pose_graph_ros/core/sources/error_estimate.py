@@ -190,11 +190,11 @@ def _odometry(
         odometry.ids, graph.node_ids[graph.is_pose][first:first + n + 1])]
     seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
     known = edge_after >= 0
-    found = factors[edge_after[known]]
-    claimed = odometry.errors.inverse_noise.informations(full(found['information']))
+    found = edge_after[known]
+    claimed = odometry.errors.inverse_noise.informations(full(factors['information'][found]))
     means, informations = np.zeros((n, 3)), np.zeros((n, 6))
     means[known] = odometry.reference.motions(odometry.errors.as_odometry_says(
-        found['mean'], seconds[known]), seconds[known])
+        factors['mean'][found], seconds[known]), seconds[known])
     informations[known] = upper(claimed)
     return until, _Edges(means, informations, seconds)
 
