@@ -81,7 +81,7 @@ def believe(
             SELECTIONS[method](problem))
         if problem is not None and choice is not None and (
                 best is None or choice.cost < best.cost):
-            best, rows = choice, problem.rows
+            best, rows = choice, problem.ids
     plain = _minimum_of_all(graph, edges, closures)
     starts = [poses for poses in (plain, graph.poses.copy() if given else None)
               if poses is not None]

@@ -44,7 +44,13 @@ from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_constraints import Queue, QueuedEdge
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.core.sources.validation import validate
-from pose_graph_ros.core.transaction import Transaction, update_isolated, update_with_all
+from pose_graph_ros.core.transaction import (
+    checked,
+    succeeds,
+    Transaction,
+    update_isolated,
+    update_with_all,
+)
 
 
 class PoseGraphBackend:
@@ -93,7 +99,6 @@ class PoseGraphBackend:
         self.parts = Parts(  # what it is made of, for tools
             self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
             self._pipeline, self._quarantine, self._judge, self._smoother)
-        self._transaction = partial(Transaction, self.parts)
         self._forgetting = Forgetting(self._tuner, self.parts)
         self._settled, self._chi2 = True, 0.0
         self._waits = False  # whether the queue waits until the graph is solved
@@ -266,11 +271,7 @@ class PoseGraphBackend:
 
     def _settle(self) -> bool:
         """Tell whether an update without new constraints succeeds."""
-        with self._transaction() as transaction:
-            change = self._factors.build(Queue(), self.graph)
-            transaction.solved(self._smoother.update(change))
-            self._factors.commit()
-        return transaction.failure == ''
+        return succeeds(self._smoother, GraphUpdate())
 
     def _add_queue(self, *, at_once: bool) -> tuple[UpdateReport, Queue]:
         """Add the constraints in the queue and solve; return those that it could not add."""
@@ -279,35 +280,41 @@ class PoseGraphBackend:
         if self._waits and self._judge.solves_later and not at_once:
             self._judge.work()
             return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), Queue()
-        with self._transaction() as transaction:
-            T_map_graph = self._alignment.find(
-                self.graph, self._pipeline.queue.observed, self._nodes)
-            queue = transaction.queue = self._pipeline.take_ready(
-                aligned=self._alignment.is_aligned)
+        queue, T_map_graph, graph = Queue(), None, self.graph
+        with Transaction() as transaction:
+            transaction.keep(self._alignment, 'state', 'sigma')
+            T_map_graph = self._alignment.find(graph, self._pipeline.queue.observed, self._nodes)
+            queue = self._pipeline.take_ready(aligned=self._alignment.is_aligned)
             if len(queue) == 0 and self._settled:
                 return UpdateReport(Status.CONVERGED, chi2=self._chi2), Queue()
+            freed: list[int] = []
             if T_map_graph is not None:
-                transaction.move_graph(T_map_graph)
-            # once aligned, measurements fix the gauge, and the first node is no longer fixed
-            freed = () if T_map_graph is None else self.graph.node_ids[self.graph.fixed].tolist()
-            change = self._factors.build(queue, self.graph)._replace(free=freed)
+                transaction.callback(graph.set_poses, graph.poses.copy())
+                graph.set_poses(se2.compose(T_map_graph, graph.poses))
+                # measurements fix the gauge from now on, and the first node is no longer fixed
+                freed = graph.node_ids[graph.fixed].tolist()
+            transaction.callback(self._factors.rollback)
+            change = self._factors.build(queue, graph)._replace(free=freed)
+            transaction.callback(self._judge.rollback)
             change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
             # but what has waited for a whole pause does not wait for another one
             at_once = at_once or self._waits or T_map_graph is not None
-            transaction.solved(self._judge.solve(change, at_once=at_once))
+            result = checked(self._judge.solve(change, at_once=at_once))
         self._waits = transaction.failure == DIVERGED and not at_once
         if self._waits:
             self._refiner.restart()
-            return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), transaction.queue
+            return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), queue
         if transaction.failure != '':
-            self._settled = self._settled and not transaction.moved_back
-            return (UpdateReport(Status.FAILED, transaction.failure, chi2=self._chi2),
-                    transaction.queue)
+            # a graph that was moved and moved back must be eliminated again
+            self._settled = self._settled and T_map_graph is None
+            return UpdateReport(Status.FAILED, transaction.failure, chi2=self._chi2), queue
+        if T_map_graph is not None:
+            self._nodes.move_frozen(T_map_graph)
         self._factors.commit()
         self._judge.commit()
         self._alignment.add(queue.observed)
         self._refiner.restart()
-        result, self._settled = self._refiner.reweight(transaction.result, self._transaction)
+        result, self._settled = self._refiner.reweight(result)
         # in a larger graph an update does not change all weights of odometry
         self._tuner.step(1000)
         self._recheck_alignment()
@@ -340,18 +347,19 @@ class PoseGraphBackend:
         poses = self._alignment.recheck(self.graph, self._nodes)
         if poses is None:
             return
-        graph, before = self.graph, self.graph.poses.copy()
+        graph = self.graph
         oldest = int(graph.node_ids[np.argmax(graph.is_pose)])  # that thinning has left
         left = graph.poses_of(oldest)
-        graph.set_poses(poses)
-        if self._optimize_whole().status is not Status.FAILED:
-            self.counts['alignment', 'done_over'] += 1
-            # the frozen part of the path stays in front of the rest
-            self._nodes.move_frozen(se2.compose(graph.poses_of(oldest), se2.inverse(left)))
+        with Transaction() as transaction:
+            transaction.callback(graph.set_poses, graph.poses.copy())
+            graph.set_poses(poses)
+            checked(self._optimize_whole())
+        if transaction.failure != '':
+            self._settle()  # eliminates everything again
             return
-        self.graph.set_poses(before)
-        with self._transaction():
-            self._smoother.update(GraphUpdate())    # eliminates everything again
+        self.counts['alignment', 'done_over'] += 1
+        # the frozen part of the path stays in front of the rest
+        self._nodes.move_frozen(se2.compose(graph.poses_of(oldest), se2.inverse(left)))
 
     def finish(self) -> None:
         """Process all samples in the reorder windows, without waiting for older ones."""
@@ -368,12 +376,13 @@ class PoseGraphBackend:
         self._forgetting.step(self._config)
         self._tuner.decide()
         self._settle()
-        undo = self._judge.finish()
-        self._settle()  # what is believed again
-        optimized = self._optimize_whole()
-        if optimized.status is Status.FAILED:
-            undo()
-        return report.after(optimized)
+        optimized = UpdateReport(Status.FAILED, chi2=self._chi2)
+        with Transaction() as transaction:
+            self._judge.finish(transaction)
+            self._settle()  # what is believed again
+            optimized = self._optimize_whole()
+            checked(optimized)
+        return report.after(replace(optimized, reason=transaction.failure))
 
     def _optimize_whole(self) -> UpdateReport:
         """Optimise the whole graph; a failure leaves all poses and weights unchanged."""

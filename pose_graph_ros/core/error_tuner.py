@@ -11,12 +11,13 @@ in one step, outside the timer if the graph is large. All else is done in bounde
 At the end of a stream the statistics are those that all measurements show, whatever was in use.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import Status, to_the_end
+from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
@@ -39,6 +40,7 @@ from pose_graph_ros.core.sources.gauss_markov import (
     GaussMarkovBias,
 )
 from pose_graph_ros.core.sources.source_constraints import SourceConstraints
+from pose_graph_ros.core.transaction import succeeds
 
 # Number of measurements that a step moves, online and at the end of a stream.
 PART, WHOLE = 100, 5000
@@ -80,8 +82,6 @@ class ErrorTuner:
         self._change: _Change | None = None
         self.n_failures = 0  # number of changes that were undone because the solver failed
         self._failed: OdometryErrors | None = None  # of odometry, with which the solver failed
-        # of each source, its positions that will have left the graph
-        self._past: dict[str, PastPath] = {}
 
     def step(self, most_edges: float = math.inf) -> float:
         """
@@ -155,31 +155,29 @@ class ErrorTuner:
                 self.finish_change()
         self.finish_change()
 
-    def leave(self, factors: IntArray, first: int) -> list[int]:
+    def leaving(
+        self, factors: IntArray, first: int,
+    ) -> tuple[list[int], Mapping[str, PastPath]]:
         """
         Return the ids of the biases that are to leave the graph with constraints.
 
-        What the measurements among these show of the errors of their sources is kept, once
-        `forget` says that they have left. At least the newest bias of a source stays.
+        With it comes what the measurements among these show of the errors of their sources, for
+        `forget`; `first` is the pose that is the oldest one then. At least the newest bias of a
+        source stays.
         """
-        graph = self._smoother.graph
-        self._past = {}
+        graph, past = self._smoother.graph, dict[str, PastPath]()
         for source in self._factors.finding():
             constraints = self._factors.constraints(source)
             gone = np.flatnonzero(constraints.leaving(factors))
             used = gone[constraints.are_used(graph)[gone]]
             stamps_ns, ids = constraints.rows.values[used].T
-            self._past[source] = error_estimate.left_behind(
+            past[source] = error_estimate.left_behind(
                 graph, self._odometry(AS_CLAIMED), stamps_ns, ids, past=constraints.past,
                 node=first)
         change = self._change
         model = None if change is None else change.model or change.failed
         others = {} if change is None or model is None else {change.source: model}
-        return self._factors.leaving_biases(factors, others)
-
-    def stay(self) -> None:
-        """Forget about the last `leave`, as nothing has left the graph."""
-        self._past = {}
+        return self._factors.leaving_biases(factors, others), past
 
     @property
     def needed(self) -> list[int]:
@@ -187,12 +185,13 @@ class ErrorTuner:
         every = (self._factors.constraints(source).past for source in self._factors.finding())
         return [past.node for past in every if past is not None]
 
-    def forget(self, nodes: IntArray, factors: IntArray) -> None:
-        """Forget what has left the graph after `leave`, by ids."""
+    def forget(
+        self, nodes: IntArray, factors: IntArray, past: Mapping[str, PastPath],
+    ) -> None:
+        """Forget what has left the graph, by ids; keep what `leaving` has returned of it."""
         kept, change = self._factors.forget(nodes, factors), self._change
-        for source, past in self._past.items():
-            self._factors.constraints(source).past = past
-        self.stay()
+        for source, path in past.items():
+            self._factors.constraints(source).past = path
         if change is None:
             return
         for model in (change.model, change.failed):
@@ -256,7 +255,7 @@ class ErrorTuner:
         measured = Measured(ids, *changed(
             edges.mean, edges.information,
             np.asarray((end_ns - begin_ns) * 1e-9, dtype=np.float64), before, wanted))
-        if not self._succeeds(GraphUpdate(measure=[measured])):
+        if not succeeds(self._smoother, GraphUpdate(measure=[measured])):
             self.n_failures += 1
             self._failed = wanted
             return
@@ -355,7 +354,7 @@ class ErrorTuner:
             wanted |= dict(zip(np.where(new >= 0, new, added[:, 1]).tolist(), weights.tolist(),
                                 strict=True))
         update = additions.update()._replace(weigh=wanted)
-        if not self._succeeds(update):
+        if not succeeds(self._smoother, update):
             if model is not None:
                 model.rollback()
             return False
@@ -365,13 +364,6 @@ class ErrorTuner:
         for one, to in zip(held.tolist(), after.tolist(), strict=True):
             self._reweighting.move(one, to)
         return True
-
-    def _succeeds(self, update: GraphUpdate) -> bool:
-        """Tell whether the graph was updated."""
-        try:
-            return self._smoother.update(update).status is not Status.FAILED
-        except Exception:
-            return False    # whatever it is, the smoother has rolled its part back
 
 
 def _next_estimate(constraints: SourceConstraints) -> int:

@@ -11,8 +11,9 @@ is freed: a prior of poses relative to it says nothing about where they are in t
 By thinning, nodes leave where a place is driven often, as `window.thinning` decides.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,13 +22,15 @@ from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
+from pose_graph_ros.core.graph.graph_update import Gone, GraphUpdate
 from pose_graph_ros.core.judgement.judge import Leaving
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
+from pose_graph_ros.core.sources.error_likelihood import PastPath
+from pose_graph_ros.core.transaction import succeeds
 from pose_graph_ros.core.window.sparse_removal import (
-    cut_chains,
+    crowded_edges,
     LIMITS,
     NONE,
     old_closures,
@@ -37,15 +40,11 @@ from pose_graph_ros.core.window.sparse_removal import (
 from pose_graph_ros.core.window.thinning import (
     carriers,
     certain,
-    Crowd,
     first_of,
     groups,
     next_segment,
+    NOWHERE,
     Places,
-    relative_noise,
-    removed,
-    Segment,
-    simplify,
     Thinning,
 )
 
@@ -86,16 +85,80 @@ def _beyond(config: WindowConfig, table: NodeTable, factor: float) -> int:
     return most
 
 
-class Thinner:
-    """Keeps the graph at the size of the area."""
+class _Asked(NamedTuple):
+    """What is to leave the graph, and what is known of it only until then."""
+
+    nodes: IntArray  # with the biases that nothing needs without them; ids, ascending
+    judged: Leaving
+    past: Mapping[str, PastPath]
+
+
+class Forgetting:
+    """
+    Keeps the graph within its window, and at the size of the area.
+
+    Whatever leaves, its owners are asked before (`_ask`), the solver takes the update that was
+    computed from that, and if it succeeds, all owners are told the same (`_tell`).
+    """
 
     def __init__(self, tuner: ErrorTuner, parts: Parts) -> None:
         self._tuner, self._parts = tuner, parts
-        self._thinning = Thinning()
+        # pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
+        # was frozen before the graph was aligned with the map; else None
+        self._joint: FloatArray | None = None
+        self._rest = 0  # number of hidden nodes from which on more of them may leave
+        self._thinning, self._n_made = Thinning(), 0
         self._work: Iterator[None] = iter(())
-        self._n_made = 0
 
-    def step(self, config: ThinningConfig) -> None:
+    def step(self, config: BackendConfig) -> None:
+        """Let the nodes leave that are due, by the window and by thinning."""
+        if len(self._parts.nodes) == 0 or self._parts.graph.has_touched:
+            return
+        if config.window.is_limited:
+            self._step_of_window(config.window)
+        self._step_of_thinning(config.thinning)
+
+    def restored(self) -> None:
+        """Tell that the parts have got a saved state."""
+        nodes, parts = self._parts.nodes, self._parts
+        if nodes.n_frozen > 0 and not parts.alignment.is_aligned:
+            last, first = nodes.poses(parts.graph)[nodes.n_frozen - 1:nodes.n_frozen + 1]
+            self._joint = se2.between(last, first)
+
+    def _ask(self, nodes: IntArray, factors: IntArray, after: int | None) -> _Asked:
+        """
+        Ask the owners of hidden nodes, and of further factors, what they must keep of them.
+
+        `after` is the pose from which on measurements stay; None if none of them leaves.
+        """
+        graph, tuner = self._parts.graph, self._tuner
+        factors = np.union1d(graph.factors_on(nodes), factors)
+        # the judge may change weights
+        judged = self._parts.judge.decide_leaving(factors)
+        biases, past = ([], {}) if after is None else tuner.leaving(factors, after)
+        return _Asked(np.union1d(nodes, biases).astype(np.int64), judged, past)
+
+    def _tell(self, asked: _Asked, gone: Gone, places: Places) -> None:
+        """Let all owners forget what has left the graph."""
+        self._parts.judge.forget(gone.nodes, gone.factors, asked.judged)
+        self._parts.reweighting.forget(gone.factors)
+        self._tuner.forget(gone.nodes, gone.factors, asked.past)
+        self._parts.nodes.thin(*places)
+
+    def _solve(self, update: GraphUpdate | None) -> Gone | None:
+        """
+        Return what has left with an update; None if there is none, or the solver fails.
+
+        Rounding may have made an approximation invalid.
+        """
+        if update is None:
+            return None
+        nodes = np.array(update.remove_nodes, dtype=np.int64)
+        with_nodes = self._parts.graph.factors_on(nodes)
+        gone = Gone(nodes, np.union1d(with_nodes, update.drop).astype(np.int64))
+        return gone if succeeds(self._parts.smoother, update) else None
+
+    def _step_of_thinning(self, config: ThinningConfig) -> None:
         """Let groups of nodes leave, or of old measurements in the map, if some are due."""
         if config.cell == 0.0:
             self._work = iter(())
@@ -105,142 +168,85 @@ class Thinner:
         new, self._n_made = max(n_made - self._n_made, 1), n_made
         for _ in range(min(new, LIMITS.pieces)):
             if next(self._work, self) is self:
-                self._work = self._steps(config)
+                self._work = self._thinned(config)
                 if next(self._work, self) is self:
                     return
 
-    def _steps(self, config: ThinningConfig) -> Iterator[None]:
+    def _thinned(self, config: ThinningConfig) -> Iterator[None]:
         """Yield after each change of the graph; others may have changed it before the next."""
-        parts, smoother = self._parts, self._parts.smoother
+        parts, graph = self._parts, self._parts.graph
         # a fixed node that is frozen stays in the graph, but stands for no others
         first = int(parts.nodes.ids[parts.nodes.n_frozen])
         places = self._thinning.places(
-            smoother, config, len(parts.nodes), self._held(), first)
+            parts.smoother, config, len(parts.nodes), self._held(), first)
         if places is None:
             return
-        older = parts.graph.node_ids[parts.graph.is_pose][:-config.newest]
-        while self._thinning.measurements_are_due(parts.graph):
-            older = older[parts.graph.node_rows(older) >= 0]
-            segment = next_segment(parts.graph, older, places.nodes)
+        older = graph.node_ids[graph.is_pose][:-config.newest]
+        while self._thinning.measurements_are_due(graph):
+            older = older[graph.node_rows(older) >= 0]
+            segment = next_segment(graph, older, places.nodes)
             if segment is None:
                 break
             inside = np.isin(places.nodes, segment.poses)
             group = self._present(places.rows(inside), config)
-            if not self._measurements_leave(segment, group):
+            if not self._leave(group, segment.factors, segment.after):
                 break
             places, older = places.rows(~inside), older[older >= segment.after]
             yield
         # others leave with their measurements
-        before = places.nodes < first_of(carriers(parts.graph))
-        places = self._present(places.rows(before), config)
-        for chosen in groups(parts.graph, places):
+        before = places.nodes < first_of(carriers(graph))
+        for chosen in groups(graph, self._present(places.rows(before), config)):
             group = self._present(chosen, config)
-            if len(group.nodes) == 0:
-                continue
-            decided = parts.judge.decide_leaving(parts.graph.factors_on(group.nodes))
-            self._leave(group, sparse_removal(parts.graph, group.nodes), decided)
-            yield
-        nobody = places.rows(np.zeros(len(places.nodes), dtype=bool))
-        while len(closures := old_closures(parts.graph, config.newest, LIMITS.old_closures)) > 0:
-            decided = parts.judge.decide_leaving(closures)
-            if not self._leave(
-                    nobody, sparse_removal(parts.graph, NONE, closures), decided):
+            if len(group.nodes) > 0:
+                self._leave(group)
+                yield
+        while len(closures := old_closures(graph, config.newest)) > 0:
+            if not self._leave(NOWHERE, closures):
                 break
             yield
-        for gone in simplify(smoother):
-            forget(gone, parts, self._tuner, None)
+        for _ in range(LIMITS.replaced):
+            if not any(self._leave(NOWHERE, edges) for edges in crowded_edges(graph)):
+                break
             yield
         parts.nodes.drop_samples(config.newest)
         parts.pipeline.seen.forget(parts.nodes.newest_ns - LIMITS.repeated_ns)
 
     def _present(self, places: Places, config: ThinningConfig) -> Places:
         """Return the places, as they are now, of those nodes that may still leave."""
-        graph = self._parts.graph
-        there = (graph.node_rows(places.nodes) >= 0) & (graph.node_rows(places.anchors) >= 0)
-        free = there & ~np.isin(places.nodes, list(self._held()))
-        crowd = Crowd(places.nodes[free], places.anchors[free])
-        return certain(self._parts.smoother, crowd, config)
+        there = self._parts.graph.node_rows(np.stack((places.nodes, places.anchors))) >= 0
+        free = np.all(there, axis=0) & ~np.isin(places.nodes, self._held())
+        return certain(
+            self._parts.smoother, places.nodes[free], places.anchors[free], config)
 
-    def _measurements_leave(self, segment: Segment, group: Places) -> bool:
-        """
-        Let the measurements of a stretch leave, and a group of its nodes; tell whether they did.
-        """
-        graph = self._parts.graph
-        factors = np.union1d(graph.factors_on(group.nodes), segment.factors)
-        # what is decided may have another weight
-        decided = self._parts.judge.decide_leaving(factors)
-        biases = np.array(self._tuner.leave(factors, segment.after), dtype=np.int64)
-        cuts = cut_chains(graph, biases)
-        update = None if cuts is None else sparse_removal(
-            graph, np.sort(np.concatenate((group.nodes, biases))), segment.factors, cuts)
-        return self._leave(group, update, decided)
+    def _leave(
+        self, places: Places, factors: IntArray = NONE, after: int | None = None,
+    ) -> bool:
+        """Let nodes and further factors leave, few others in their place; tell if they did."""
+        asked = self._ask(places.nodes, factors, after)
+        gone = self._solve(sparse_removal(self._parts.graph, asked.nodes, factors))
+        if gone is not None:
+            self._tell(asked, gone, places)
+        return gone is not None
 
-    def _leave(self, group: Places, update: GraphUpdate | None, decided: Leaving) -> bool:
-        """Let nodes leave with an update; tell whether they did."""
-        gone = removed(self._parts.smoother, update)
-        if gone is None:
-            self._tuner.stay()
-            return False
-        forget(gone, self._parts, self._tuner, decided)
-        self._parts.nodes.thin(*group)
-        return True
-
-    def _held(self) -> set[int]:
+    def _held(self) -> IntArray:
         """Return the ids of nodes that do not leave, as something is to be added to them."""
-        parts, found = self._parts, set(self._tuner.needed)
+        parts, found = self._parts, [*self._tuner.needed]
         for queue in (parts.pipeline.queue, parts.quarantine):
-            found.update(end for each in queue.edges for end in each.ends)
-            found.update(each.attachment.node for each in queue.observed)
-        return found
-
-
-def forget(
-    gone: Left, parts: Parts, tuner: ErrorTuner, decided: Leaving | None,
-) -> None:
-    """Let judge, reweighting, tuner and factors forget what has left the graph."""
-    parts.judge.forget(gone.nodes, gone.factors, decided)
-    parts.reweighting.forget(gone.factors)
-    tuner.forget(gone.nodes, gone.factors)
-
-
-class Forgetting:
-    """Keeps the graph within its window."""
-
-    def __init__(self, tuner: ErrorTuner, parts: Parts) -> None:
-        self._tuner, self._parts = tuner, parts
-        self._thinner = Thinner(tuner, parts)
-        # pose of the oldest node in the graph, seen from the last frozen one, shape (3,), if that
-        # was frozen before the graph was aligned with the map; else None
-        self._joint: FloatArray | None = None
-        self._rest = 0  # number of hidden nodes from which on more of them may leave
-
-    def step(self, config: BackendConfig) -> None:
-        """Let the nodes leave that are due, by the window and by thinning."""
-        if len(self._parts.nodes) == 0 or self._parts.graph.has_touched:
-            return
-        if config.window.is_limited:
-            self._step_of_window(config.window)
-        self._thinner.step(config.thinning)
-
-    def restored(self) -> None:
-        """Tell that the parts have got a saved state."""
-        nodes, parts = self._parts.nodes, self._parts
-        if nodes.n_frozen > 0 and not parts.alignment.is_aligned:
-            last, first = nodes.poses(parts.graph)[nodes.n_frozen - 1:nodes.n_frozen + 1]
-            self._joint = se2.between(last, first)
+            found += [end for each in queue.edges for end in each.ends]
+            found += [each.attachment.node for each in queue.observed]
+        return np.array(found, dtype=np.int64)
 
     def _step_of_window(self, window: WindowConfig) -> None:
         """Let the nodes beyond the window leave, if a group is due."""
-        nodes = self._parts.nodes
+        nodes, parts = self._parts.nodes, self._parts
         n = n_leaving(window, nodes)
         if n > 0:
-            parts = self._parts
             n = n_leaving(window, nodes, parts.pipeline.needed_ns(
                 aligned=parts.alignment.is_aligned))
         if n > 0 and len(nodes) >= self._rest:
-            self._forget(n, window.prior)
+            self._freeze(n, window.prior)
 
-    def _forget(self, n: int, prior: WindowPrior) -> None:
+    def _freeze(self, n: int, prior: WindowPrior) -> None:
         """Let the n oldest nodes leave, with a dense or a sparse prior instead."""
         parts, graph, nodes = self._parts, self._parts.graph, self._parts.nodes
         first = nodes.n_frozen + n
@@ -251,58 +257,36 @@ class Forgetting:
         leaving = graph.node_ids[:row][~graph.is_bias[:row] & ~graph.fixed[:row]]
         self._follow_alignment()
         stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
-        biases = np.array(self._tuner.leave(
-            graph.factors_on(leaving), int(graph.node_ids[np.argmax(stays)])),
-            dtype=np.int64)
-        leaving = np.sort(np.concatenate((leaving, biases)))
-        decided = parts.judge.decide_leaving(graph.factors_on(leaving))
-        self._parts.smoother.linearize(leaving)
-        poses = nodes.recent_poses(graph)
-        anchors = self._other_anchors(first)
-        gone = self._gone(leaving, prior)
+        asked = self._ask(leaving, NONE, int(graph.node_ids[np.argmax(stays)]))
+        parts.smoother.linearize(asked.nodes)
+        poses, places = nodes.recent_poses(graph), self._other_anchors(first)
+        gone = None if prior is WindowPrior.DENSE else self._solve(
+            sparse_marginalization(graph, asked.nodes))
         if gone is None:
-            self._tuner.stay()
-            return
-        forget(gone, parts, self._tuner, decided)
-        if anchors is not None:
-            nodes.thin(*anchors)
+            try:
+                gone = parts.smoother.forget(asked.nodes)
+            except GraphUpdateError:
+                parts.pipeline.counts['solver', 'failed'] += 1
+                self._rest = len(nodes) + LIMITS.rest
+                return
+        self._tell(asked, gone, places)
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[n - 1], poses[n])
         parts.alignment.forget(int(nodes.ids[first]))
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
-        self._refuse(leaving)
+        self._refuse(asked.nodes)
 
-    def _gone(self, leaving: IntArray, prior: WindowPrior) -> Left | None:
-        """Return what has left with nodes; None, and they all stay, if the solver has failed."""
-        gone = None if prior is WindowPrior.DENSE else removed(
-            self._parts.smoother, sparse_marginalization(self._parts.graph, leaving))
-        if gone is not None:
-            return gone
-        try:
-            return self._parts.smoother.forget(leaving)
-        except GraphUpdateError:
-            self._parts.pipeline.counts['solver', 'failed'] += 1
-            self._rest = len(self._parts.nodes) + LIMITS.rest
-            return None
-
-    def _other_anchors(self, first: int) -> Places | None:
-        """
-        Return the places of anchors of thinned nodes that leave, those before a number, in others.
-
-        None if there are none.
-        """
+    def _other_anchors(self, first: int) -> Places:
+        """Return the places in others of anchors of thinned nodes that leave, before a number."""
         table, graph = self._parts.nodes, self._parts.graph
         thinned = table.thinned.places()
         leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
-        if len(leave) == 0:
-            return None
         kept = np.setdiff1d(np.arange(first, len(table)), thinned.numbers)
         ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
-        nearest = np.array([np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T)) for end in ends])
-        ids, anchors = table.ids[leave], table.ids[kept[nearest]]
-        return Places(ids, anchors, se2.between(starts[nearest], ends),
-                      relative_noise(self._parts.smoother, anchors, ids))
+        nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
+        return Places.now(
+            self._parts.smoother, table.ids[leave], table.ids[kept[nearest]])
 
     def _follow_alignment(self) -> None:
         """

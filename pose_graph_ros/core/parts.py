@@ -63,18 +63,10 @@ def capture(
     parts: Parts, newest_covariance: FloatArray, chi2: float, datum: MapOrigin | None,
 ) -> SavedGraph:
     """
-    Return the state of an engine as a value.
+    Return the state of an engine as a value; NothingToSaveError if there is no hidden node.
 
     Measurements that wait are left out and do not count as seen. Edges in the queue for the next
-    update are saved. Raises NothingToSaveError if there is no hidden node.
-
-    Parameters
-    ----------
-    parts : Parts, they are not changed
-    newest_covariance : ndarray, shape (3, 3), of the newest hidden node, in map axes
-    chi2 : float
-    datum : MapOrigin or None
-
+    update are saved. The covariance is that of the newest hidden node, in map axes.
     """
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')

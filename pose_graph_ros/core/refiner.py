@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The weights of robust losses, and the refinement of the estimate between two updates."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from pose_graph_ros.core.smoother.incremental import (
     Refinement,
     UpdateResult,
 )
-from pose_graph_ros.core.transaction import Transaction
+from pose_graph_ros.core.transaction import checked, Transaction
 
 # Constraints with a loss that are looked at in turn without a change after an update.
 LOOKED_AT = 2 * TUNING.part
@@ -41,9 +41,7 @@ class Refiner:
         self.finished, self._tests = False, True
         self._unchanged = self._reweightings = 0
 
-    def reweight(
-        self, result: UpdateResult, begin: Callable[[], Transaction],
-    ) -> tuple[UpdateResult, bool]:
+    def reweight(self, result: UpdateResult) -> tuple[UpdateResult, bool]:
         """
         Return the last result after judging again and some reweightings, and if none was needed.
         """
@@ -57,11 +55,10 @@ class Refiner:
             if len(weights) == 0:
                 break
             settled = False
-            with begin() as transaction:
-                transaction.solved(self._weigh(weights))
+            with Transaction() as transaction:
+                result = checked(self._weigh(weights))
             if transaction.failure != '':
                 break
-            result = transaction.result
         return result, settled
 
     @property

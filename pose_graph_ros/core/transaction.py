@@ -9,79 +9,66 @@ takes about log2 n attempts, and all halves that pass are added on the way.
 """
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from types import TracebackType
-from typing import Self
+from typing import TypeVar
 
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.parts import Parts
-from pose_graph_ros.core.smoother.incremental import UpdateResult
+from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_constraints import Queue
 
+Solved = TypeVar('Solved', UpdateResult, UpdateReport)
 
-class Transaction:
+
+def checked(result: Solved) -> Solved:
+    """Return the result of the solver; raise LinearSolveError if it has failed."""
+    if result.status is Status.FAILED:
+        raise LinearSolveError(result.reason)
+    return result
+
+
+class Transaction(ExitStack[bool]):
     """
-    Context manager in which an update is built and solved.
+    Context manager that undoes what is done in it, the last first, if an exception ends it.
 
-    If the solver fails or the context raises an `Exception`, it restores the poses of the graph,
-    the state of the alignment, and the records of factor builder and judge. It suppresses the
-    exception and stores its message in `failure`. The smoother rolls back its own changes, bit for
-    bit.
+    Who changes anything in it says how that is undone, with `callback` or `keep`; what can wait
+    until it has succeeded is done after it. It suppresses an `Exception`, and stores its message
+    in `failure`. The smoother rolls back its own changes, bit for bit.
     """
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
-        self._before = parts.alignment.state, parts.alignment.sigma
-        self._poses: tuple[FloatArray, FloatArray] | None = None
-        self.queue = Queue()  # the new constraints
-        self.result = UpdateResult(Status.CONVERGED, '', 0, 0, 0, 0)  # result of the solver
-        self.failure = ''  # why the update was rolled back; empty if it succeeded
+    def __init__(self) -> None:
+        super().__init__()
+        self.failure = ''  # why all was undone; empty if it was not
 
-    def move_graph(self, T_map_graph: FloatArray) -> None:
-        """Move all nodes, frozen ones too, by a rigid motion, shape (3,) [m, m, rad]."""
-        graph, nodes = self._parts.graph, self._parts.nodes
-        poses = graph.poses.copy()
-        self._poses = poses, nodes.frozen.copy()
-        graph.set_poses(se2.compose(T_map_graph, poses))
-        nodes.move_frozen(T_map_graph)
-
-    @property
-    def moved_back(self) -> bool:
-        """Whether the nodes were moved and restored, so that all must be eliminated again."""
-        return self.failure != '' and self._poses is not None
-
-    def solved(self, result: UpdateResult) -> None:
-        """Store the result of the solver; raise LinearSolveError if it failed."""
-        if result.status is Status.FAILED:
-            raise LinearSolveError(result.reason)
-        self.result = result
-
-    def __enter__(self) -> Self:
-        return self
+    def keep(self, owner: object, *names: str) -> None:
+        """Have attributes of an owner be again what they are now, if it fails."""
+        for name in names:
+            self.callback(setattr, owner, name, getattr(owner, name))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None,
         traceback: TracebackType | None,
     ) -> bool:
         if error is None:
+            self.pop_all()
             return False
-        parts = self._parts
-        parts.factors.rollback()
-        parts.judge.rollback()
-        if self._poses is not None:
-            poses, frozen = self._poses
-            parts.graph.set_poses(poses)
-            parts.nodes.set_frozen(frozen)
-        parts.alignment.state, parts.alignment.sigma = self._before
         self.failure = str(error)
         if not isinstance(error, LinearSolveError):
             self.failure = f'{type(error).__name__}: {error}'
+        super().__exit__(kind, error, traceback)
         return isinstance(error, Exception)
+
+
+def succeeds(smoother: IncrementalSmoother, update: GraphUpdate) -> bool:
+    """Tell whether an update of the graph, which is taken whole or not at all, succeeds."""
+    with Transaction() as transaction:
+        checked(smoother.update(update))
+    return transaction.failure == ''
 
 
 # Maximum number of attempts in one search, which bounds the time of an update.

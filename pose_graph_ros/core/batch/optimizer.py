@@ -8,7 +8,7 @@ these cliques (`levenberg_marquardt`). Afterwards the tables hold the cliques of
 poses, with which the incremental smoother can continue.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +41,6 @@ __all__ = [
     'Start',
     'Status',
     'chi2_of',
-    'from_linear_start',
     'in_parts',
     'optimize',
     'optimize_from_linear_start',
@@ -54,55 +53,55 @@ Solve = Callable[[Graph, SolverConfig], BatchResult]
 """Function that optimises a graph in place, such as `optimize`."""
 
 
-def optimize(graph: Graph, config: SolverConfig) -> BatchResult:
+def optimize(
+    graph: Graph, config: SolverConfig, starts: Sequence[Start] = (Start.PRESENT,),
+) -> BatchResult:
     """
-    Return the result of moving the hidden nodes from their poses to a local minimum of chi2.
+    Return the result of moving the hidden nodes to a local minimum of chi2.
 
+    It begins at their poses, or at several starts, which are tried in their order until one
+    converges in a few iterations, to a chi2 not above that of the present poses, which should be
+    the last of them. The lowest minimum is kept, and the result says from which start it is.
     If the optimisation fails numerically, the result says so, the poses are as before the call,
     and the smoother eliminates everything anew at its next step. All cliques are replaced, so this
     must not be called between `Graph.begin` and `Graph.rollback`.
     """
-    return to_the_end(in_parts(graph, config))
+    return to_the_end(in_parts(graph, config, starts))
 
 
-def in_parts(graph: Graph, config: SolverConfig) -> Optimization:
-    """
-    Return the result of `optimize`, after a pause at each iteration.
-    """
-    chi2, answer = _prepare(graph)
-    if answer is not None:
-        return answer
-    poses = graph.poses.copy()
-    return _finished(graph, poses, chi2, (yield from _minimize(graph, config, chi2)))
+def optimize_from_linear_start(graph: Graph, config: SolverConfig) -> BatchResult:
+    """Return the result of `optimize` from all starts, of which the present poses are the last."""
+    return optimize(graph, config, tuple(Start))
 
 
-def optimize_from_linear_start(
-    graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
-) -> BatchResult:
-    """
-    Return the result of `from_linear_start` without pauses.
-    """
-    return to_the_end(from_linear_start(graph, config, starts))
-
-
-def from_linear_start(
-    graph: Graph, config: SolverConfig, starts: Collection[Start] = tuple(Start),
+def in_parts(
+    graph: Graph, config: SolverConfig, starts: Sequence[Start] = (Start.PRESENT,),
 ) -> Optimization:
-    """
-    Return the result of moving the hidden nodes to a minimum from a start without initial poses.
-
-    Starts are tried in their order until one converges in a few iterations, to a chi2 not
-    above that of the present poses, which should be the last of them. The lowest minimum is kept,
-    and the result says from which start it is. Failures are treated as in `optimize`.
-    """
-    chi2, answer = _prepare(graph)
+    """Return the result of `optimize`, after a pause at each iteration."""
+    chi2 = chi2_of(graph)
+    answer = _prepare(graph, chi2)
     if answer is not None:
         return answer
     poses = graph.poses.copy()
+    if starts == (Start.PRESENT,):
+        result = yield from _minimize(graph, config, chi2)
+    else:
+        result = yield from _from_starts(graph, config, starts, chi2)
+    if result.status is Status.FAILED:
+        gauss_newton.put_poses(graph.memory, poses)
+        editing.restart(graph.memory.head)
+        return _failed(result.reason, chi2)
+    return result
+
+
+def _from_starts(
+    graph: Graph, config: SolverConfig, starts: Sequence[Start], chi2: float,
+) -> Optimization:
+    """Optimise from several starts, given chi2 of the present poses."""
     few = replace(config, max_iterations=min(config.max_iterations, TRUSTED_ITERATIONS))
+    poses = best_poses = graph.poses.copy()
+    best = result = _failed('', chi2)
     yield
-    best, best_poses = _failed('', chi2), poses
-    result = best
     for start in starts:
         gauss_newton.put_poses(graph.memory, poses)
         try:
@@ -112,23 +111,18 @@ def from_linear_start(
         yield
         result = replace(
             (yield from _minimize(graph, few, chi2_of(graph))), start=start)
-        better = result.status is not Status.FAILED and (
-            best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM))
-        trusted = is_trusted(result, chi2)
-        if better and trusted:
-            return result
-        if better:
+        if result.status is not Status.FAILED and (
+                best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
             best, best_poses = result, graph.poses.copy()
-        if trusted:
+        if is_trusted(result, chi2):
             break
-    if best is not result or best.status is Status.MAX_ITERATIONS:
-        if best.status is Status.FAILED:
-            return _finished(graph, poses, chi2, result)
-        gauss_newton.put_poses(graph.memory, best_poses)
-        rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
-        result = yield from _minimize(graph, rest, best.chi2)
-        result = replace(result, start=best.start, iterations=best.iterations + result.iterations)
-    return _finished(graph, poses, chi2, result)
+    if best.status is Status.FAILED or (
+            best is result and best.status is not Status.MAX_ITERATIONS):
+        return result
+    gauss_newton.put_poses(graph.memory, best_poses)
+    rest = replace(config, max_iterations=max(config.max_iterations - best.iterations, 1))
+    result = yield from _minimize(graph, rest, best.chi2)
+    return replace(result, start=best.start, iterations=best.iterations + result.iterations)
 
 
 def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -> BatchResult:
@@ -173,25 +167,24 @@ def _start(graph: Graph, start: Start) -> FloatArray:
     return linear_starts.joint(graph, unit=start is Start.UNIT)
 
 
-def _prepare(graph: Graph) -> tuple[float, BatchResult | None]:
+def _prepare(graph: Graph, chi2: float) -> BatchResult | None:
     """
-    Return chi2 after storing the cliques of the whole graph.
+    Store the cliques of the whole graph.
 
-    Instead there is a result if there is nothing to optimise or poses are not determined.
+    Return a result if there is nothing to optimise or poses are not determined.
     """
-    chi2 = chi2_of(graph)
     if not np.isfinite(chi2):
-        return chi2, _failed('chi2 is not finite', chi2)
+        return _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
-        return chi2, BatchResult(Status.CONVERGED, '', 0, chi2)
+        return BatchResult(Status.CONVERGED, '', 0, chi2)
     analysis = symbolic.analyse(graph.memory.head)
     loose = loose_nodes(graph, analysis.cliques)
     if len(loose) > 0:
-        return chi2, _failed(
+        return _failed(
             f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
             f'and no observed node: their poses are not determined', chi2)
     plant(graph, analysis)
-    return chi2, None
+    return None
 
 
 def plant(graph: Graph, analysis: symbolic.Analysis) -> None:
@@ -229,15 +222,6 @@ def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
     if result.status is Status.FAILED:
         node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
-    return result
-
-
-def _finished(graph: Graph, poses: FloatArray, chi2: float, result: BatchResult) -> BatchResult:
-    """Return the result of the whole call; restore the poses if it has failed."""
-    if result.status is Status.FAILED:
-        gauss_newton.put_poses(graph.memory, poses)
-        editing.restart(graph.memory.head)
-        return _failed(result.reason, chi2)
     return result
 
 

@@ -35,17 +35,19 @@ from twice the largest s to 1 for that of Geman-McClure.
 from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
+import math
 from typing import Final, TypeAlias
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import chi2_of, in_parts, Status, to_the_end
-from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.config import Loss, SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.checks import scaled
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.reweighting import costs_and_weights
 
 # Value that 99 % of the energies of right constraints are below, by the rank of the information.
 LIMITS: Final = np.array([0.0, 6.635, 9.210, 11.345])
@@ -69,7 +71,7 @@ class Surrogate(Enum):
     def weights(self, share: FloatArray, mu: float) -> FloatArray:
         """Return the weights of constraints."""
         if self is Surrogate.GEMAN_MCCLURE:
-            return (mu / (mu + share)) ** 2
+            return costs_and_weights(Loss.GEMAN_MCCLURE, share, math.sqrt(mu))[1]
         root = np.sqrt(mu * (mu + 1.0) / np.maximum(share, 1e-12))
         return np.clip(root - mu, 0.0, 1.0)
 
@@ -98,16 +100,16 @@ class TruncatedProblem:
     """
     A graph with M edges that may be wrong. Their weights and its poses are for trying.
 
-    The graph is changed; the information of the edges of `rows`, without repetition, is that to
+    The graph is changed; the information of the edges, with `ids` without repetition, is that to
     decide by. Each solution starts at `start`, by default at the minimum of chi2 of all that is
     right, from the poses of the graph.
     """
 
     def __init__(
-        self, graph: Graph, rows: IntArray, start: FloatArray | None = None,
+        self, graph: Graph, ids: IntArray, start: FloatArray | None = None,
     ) -> None:
-        self.graph, self.rows = graph, rows
-        self.edges = graph.factors_at(rows)
+        self.graph, self.ids = graph, ids
+        self.edges = graph.factors_at(ids)
         """What may be wrong; their weights have no meaning."""
         self.limits = LIMITS[_ranks(self.edges.information)]
         """c^2 of each, shape (M,)."""
@@ -231,7 +233,7 @@ class TruncatedProblem:
     def _weigh(self, weights: FloatArray) -> None:
         changed = np.flatnonzero(weights != self._weights)
         self.graph.apply(GraphUpdate(weigh=dict(zip(
-            self.rows[changed].tolist(), weights[changed].tolist(), strict=True))))
+            self.ids[changed].tolist(), weights[changed].tolist(), strict=True))))
         self._weights = weights.copy()
 
 

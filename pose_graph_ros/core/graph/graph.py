@@ -17,9 +17,9 @@ from pose_graph_ros.core.graph.contents import COUNTERS, GraphContents
 from pose_graph_ros.core.graph.graph_update import (
     Energies,
     FIRST_EDIT,
+    Gone,
     GraphRows,
     GraphUpdate,
-    Left,
     NextIds,
     NO_FACTORS,
 )
@@ -206,7 +206,7 @@ class Graph(GraphContents):
             self.memory.restart_stamps()
             transaction_log.begin(self.memory.head)
 
-    def commit(self) -> Left:
+    def commit(self) -> Gone:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
         if self.memory.head[tb.LOG_END] > 0:  # else a step has done so
             transaction_log.commit(self.memory.head)

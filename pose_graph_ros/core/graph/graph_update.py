@@ -55,14 +55,14 @@ class GraphUpdate(NamedTuple):
     measure: Sequence[Measured] = ()    # new mean and information; factors keep their weights
 
 
-class Left(NamedTuple):
+class Gone(NamedTuple):
     """Ids of what has left a graph, ascending."""
 
     nodes: IntArray
     factors: IntArray   # with those that were on these nodes, whatever their weight
 
 
-NOTHING_LEFT: Final = Left(*(np.empty(0, dtype=np.int64) for _ in range(2)))
+NOTHING_GONE: Final = Gone(*(np.empty(0, dtype=np.int64) for _ in range(2)))
 
 # Index of the first part of an update that edits what there is.
 FIRST_EDIT: Final = GraphUpdate._fields.index('fix')

@@ -19,7 +19,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import prior_rows, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.editing import weigh
-from pose_graph_ros.core.graph.graph_update import Left, NOTHING_LEFT
+from pose_graph_ros.core.graph.graph_update import Gone, NOTHING_GONE
 from pose_graph_ros.core.graph.rows import touch
 
 _POSE = int(NodeKind.POSE)
@@ -81,11 +81,11 @@ def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
     _forget_newest(head)
 
 
-def compact(memory: tb.Memory) -> Left:
+def compact(memory: tb.Memory) -> Gone:
     """Take out all rows that leave, and return their ids; the update must have been committed."""
     head = memory.head
     if head[tb.N_LEAVING] == 0:
-        return NOTHING_LEFT
+        return NOTHING_GONE
     nodes, factors = _rows_in_use(memory)
     stays = nodes['factor_list'] != tb.LEAVES
     with_ends = np.append(stays, True)  # -1: no such end
@@ -96,7 +96,7 @@ def compact(memory: tb.Memory) -> Left:
     _rewrite_rows(memory, moved, factors_moved)
     _rewrite_lists(memory, moved, factors_moved)
     head[tb.N_LEAVING] = 0
-    return Left(nodes_gone, factors_gone)
+    return Gone(nodes_gone, factors_gone)
 
 
 def _rows_in_use(memory: tb.Memory) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:

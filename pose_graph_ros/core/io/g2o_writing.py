@@ -152,7 +152,7 @@ def standing_for(rows: GraphRows) -> Factors:
         if not np.any(is_pose):
             continue
         U, u = schur_complement(
-            linear.information, -linear.gradient, np.repeat(~is_pose, 3))
+            linear.information, -linear.gradient, np.flatnonzero(~is_pose))
         sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
                           anchored=prior.anchored)
         factors.append(sparse.factors)

@@ -9,7 +9,6 @@ While the robot drives, `decide` looks for a set that is better than the present
 """
 
 from collections.abc import Generator
-from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate, NextIds
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closures import floored, forward, GATE
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
@@ -87,6 +86,7 @@ class _Gates:
 
     def __init__(self, problem: TruncatedProblem) -> None:
         self._problem = problem
+        self._edges = problem.edges.renumbered(problem.graph.node_rows)
         self._information = problem.edges.information
         measured = np.einsum('mii->mi', self._information) > 0.0
         filled = self._information + np.einsum('mi,ij->mij', ~measured, np.eye(3))
@@ -103,9 +103,8 @@ class _Gates:
         """Set gates by odometry, the largest: it is quicker than the tree without closures."""
         problem, chain = self._problem, OdometryChain(weighted=True)
         chain.extend(problem.graph)
-        chained = np.zeros(problem.graph.n_nodes, dtype=bool)
-        chained[chain.nodes] = True
-        numbers = np.flatnonzero(chained[problem.edges.i] & chained[problem.edges.j])
+        numbers = np.flatnonzero(np.isin(problem.edges.i, chain.nodes)
+                                 & np.isin(problem.edges.j, chain.nodes))
         some = problem.edges.rows(numbers)
         pose, covariance = chain.between(some.i, some.j)
         # from the axes of the predicted pose to those of the measured one
@@ -126,7 +125,7 @@ class _Gates:
         for begin in range(0, len(waiting), size):
             part = waiting[begin:begin + size]
             errors, covariances = innovations(
-                self._problem.graph.memory.head, self._problem.edges.rows(part))
+                self._problem.graph.memory.head, self._edges.rows(part))
             self._set(part, covariances)
             self.squared[part] = self._squared(part, errors)
             inside[begin:begin + len(part)] = self.squared[part] <= self._problem.limits[part]
@@ -195,27 +194,28 @@ def decide(
     the surest set, or None if `inside`, the present one, costs as little. With more than
     `most_at_end` nodes and closures it is `inside`, improved.
     """
-    rows, forced = graph.factor_rows(ids), graph.factor_rows(forced)
-    copy, present = _copy(graph, np.union1d(rows, forced)), graph.poses.copy()
-    others = None if losses is None else _losses_in_rows(graph, losses)
+    copy, present = _copy(graph, np.union1d(ids, forced)), graph.poses.copy()
+    others = Reweighting()
+    if losses is not None:
+        others.restore(losses.saved())
     yield
-    if graph.n_nodes + len(rows) > BELIEF.most_at_end:
-        problem = TruncatedProblem(copy, rows, start=present)
+    if graph.n_nodes + len(ids) > BELIEF.most_at_end:
+        problem = TruncatedProblem(copy, ids, start=present)
         choice = yield from problem.choice(inside)
         if choice is not None:
             choice = yield from problem.improved(choice, BELIEF.retests_at_end)
     else:
-        weights = dict.fromkeys(rows.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
+        weights = dict.fromkeys(ids.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
         copy.apply(GraphUpdate(weigh=weights))
         starts = (Start.CHORDAL, Start.JOINT, Start.PRESENT)
-        result = yield from optimizer.from_linear_start(copy, CONFIG, starts)
-        if result.status is not Status.FAILED and others is not None and len(others) > 0:
-            for row, weight in weights.items():
-                others.set_base_weight(row, weight)
+        result = yield from optimizer.in_parts(copy, CONFIG, starts)
+        if result.status is not Status.FAILED and len(others) > 0:
+            for number, weight in weights.items():
+                others.set_base_weight(number, weight)
             result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
         if result.status is Status.FAILED:
             return None
-        problem = TruncatedProblem(copy, rows, start=copy.poses.copy())
+        problem = TruncatedProblem(copy, ids, start=copy.poses.copy())
         choice = yield from (surest if losses is None else best)(problem)
     if choice is None or losses is not None:
         return choice
@@ -224,32 +224,15 @@ def decide(
     return choice if choice.cost < cost - LEAST_GAIN else None
 
 
-def _copied_rows(graph: Graph) -> GraphRows:
-    """Return copies of all rows of a graph, with rows in place of ids."""
-    rows = graph.rows()
-    n_nodes, n_factors = len(rows.poses), len(rows.factors)
-    return rows._replace(
-        factors=rows.factors.renumbered(graph.node_rows), node_ids=np.arange(n_nodes),
-        factor_ids=np.arange(n_factors), next_ids=NextIds(n_nodes, n_factors),
-        priors=[replace(prior, nodes=graph.node_rows(prior.nodes)) for prior in rows.priors])
-
-
-def _losses_in_rows(graph: Graph, reweighting: Reweighting) -> Reweighting:
-    """Return a copy of the losses of a graph, by row instead of by id."""
-    saved, copy = reweighting.saved(), Reweighting()
-    copy.restore(replace(saved, rows=graph.factor_rows(saved.rows)))
-    return copy
-
-
 def _copy(graph: Graph, closures: IntArray) -> Graph:
-    """Return a copy of a graph in which closures have the information to decide by; by row."""
-    rows, copy = _copied_rows(graph), Graph()
+    """Return a copy of a graph in which closures, by id, have the information to decide by."""
+    rows, copy, at = graph.rows(), Graph(), graph.factor_rows(closures)
     factors = rows.factors
     columns = factors.i.copy(), factors.j.copy(), factors.mean.copy(), factors.information.copy()
-    own = floored(forward(factors.rows(closures)))
+    own = floored(forward(factors.rows(at)))
     for column, values in zip(
             columns, (own.i, own.j, own.mean, own.information), strict=True):
-        column[closures] = values
+        column[at] = values
     copy.fill(rows._replace(factors=Factors(
         *columns, factors.kind, factors.weight, factors.constants, factors.k)))
     return copy

@@ -10,7 +10,8 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -238,13 +239,12 @@ class Judge:
                         for each in unused], last)
 
     def forget(
-        self, nodes: IntArray, factors: IntArray, leaving: Leaving | None,
+        self, nodes: IntArray, factors: IntArray, leaving: Leaving,
     ) -> None:
         self._closures.forget(nodes, factors)
-        self._fixes.forget(nodes, factors, leaving and leaving.last)
+        self._fixes.forget(nodes, factors, leaving.last)
         self._odometry.forget(self._smoother.graph, factors, self._fixes.loosened)
-        if leaving is not None:
-            self._left.extend(leaving.unused)
+        self._left.extend(leaving.unused)
 
     def saved(self) -> SavedJudgement:
         loosened = self._fixes.loosened
@@ -277,30 +277,25 @@ class Judge:
         """Return the weights of factors, by row, that the end would give."""
         return self._fixes.final_weights()
 
-    def finish(self) -> Callable[[], None]:
+    def finish(self, undo: ExitStack[bool]) -> None:
         """
         Test the closures that wait, then decide on all by the graph alone.
 
-        What is returned undoes all that, if what follows fails: verdicts, weights and poses. The
-        next update of the smoother then eliminates the graph again.
+        If what follows fails, all that is undone: verdicts, weights and poses. The next update of
+        the smoother then eliminates the graph again.
         """
         graph = self._smoother.graph
-        poses, weights, base = graph.poses.copy(), graph.weights, self._reweighting.base_weights()
-        bring_back = self._closures.state(), self._fixes.state(), self._odometry.state()
-
-        def undo() -> None:
-            for each in bring_back:
-                each()
-            self._reweighting.set_base_weights(base)
-            graph.set_weights(weights)
-            graph.set_poses(poses)
+        undo.callback(graph.set_poses, graph.poses.copy())
+        undo.callback(graph.set_weights, graph.weights)
+        undo.callback(self._reweighting.set_base_weights, self._reweighting.base_weights())
+        for judge in (self._closures, self._fixes, self._odometry):
+            undo.callback(judge.state())
         # each part believes one more, or leaves fewer to be tested
         while self._closures.test():
             pass
         self._fixes.finish()
         self._keep_gaps()
         self._closures.decide_finally()
-        return undo
 
 
 def _weighed(change: GraphUpdate, numbers: IntArray, weights: FloatArray) -> GraphUpdate:

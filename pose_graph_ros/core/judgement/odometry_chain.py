@@ -51,8 +51,8 @@ class OdometryChain:
     odometry.
     """
 
-    def __init__(self, *, weighted: bool = False, by_row: bool = False) -> None:
-        self._weighted, self._by_row = weighted, by_row
+    def __init__(self, *, weighted: bool = False) -> None:
+        self._weighted = weighted
         self._nodes = GrowingArray((), np.int64)
         self._poses = GrowingArray((3,), np.float64)
         self._sums = GrowingArray((6,), np.float64)
@@ -85,7 +85,7 @@ class OdometryChain:
             first = _first(graph)
             if len(first) == 0:
                 return
-            self._nodes.append(first if self._by_row else graph.node_ids[first])
+            self._nodes.append(graph.node_ids[first])
             self._poses.append(np.zeros((1, 3)))
             self._sums.append(np.zeros((1, 6)))
             self._travel.append(np.zeros(1))
@@ -93,9 +93,7 @@ class OdometryChain:
         self._next_edge = graph.next_ids.factor
         factors = graph.factor_records[begin:]
         last = len(self) - 1
-        end = int(self._nodes.values[last])
-        if not self._by_row:
-            end = int(graph.node_rows(end))
+        end = int(graph.node_rows(self._nodes.values[last]))
         later = factors['ends'][:, 1]
         new = np.flatnonzero((factors['kind'] == FactorKind.ODOMETRY) & (later > end))
         if len(new) == 0:
@@ -110,7 +108,7 @@ class OdometryChain:
                         self._weighted, over_gaps, rows, poses, sums, travel)
             if (n > 0 and rows[n - 1] == newest) or not _has_left(graph):
                 break
-        self._nodes.append(rows[:n] if self._by_row else graph.node_ids[rows[:n]])
+        self._nodes.append(graph.node_ids[rows[:n]])
         self._poses.append(poses[:n])
         self._sums.append(sums[:n])
         self._travel.append(self._travel.values[last] + travel[:n])

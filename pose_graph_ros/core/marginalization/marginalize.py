@@ -44,13 +44,6 @@ class Cut(NamedTuple):
     vector: FloatArray  # (3,)
 
 
-class Marginal(NamedTuple):
-    """What constraints that leave a graph say about the nodes that remain."""
-
-    prior: Prior | None     # on all nodes that remain, at their present poses
-    factors: IntArray   # ids of those in it
-
-
 def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
     """
     Return the update with which nodes leave a graph; their information remains.
@@ -64,7 +57,7 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
     factors, priors = [], []
     leaving = _checked(graph, nodes)
     for members in _parts(graph, leaving):
-        prior = marginal(graph, members).prior
+        prior = marginal(graph, members)
         if prior is None:
             continue
         is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
@@ -84,11 +77,12 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
 def marginal(
     graph: Graph, nodes: Collection[int], factors: Collection[int] = (),
     cuts: Sequence[Cut] = (),
-) -> Marginal:
+) -> Prior | None:
     """
     Return what all constraints of leaving nodes, and further ones, say about the other nodes.
 
-    The nodes of the further ones remain unless they leave. Raises as `marginalize` does.
+    It is a prior at their present poses; None if they say nothing. The nodes of the further ones
+    remain unless they leave. Raises as `marginalize` does.
     """
     leaving = _checked(graph, nodes)
     part = _part(graph, leaving, list(factors), [cut.edge for cut in cuts])
@@ -111,24 +105,22 @@ def marginal(
     U[tiny], U[:, tiny], u[tiny] = 0.0, 0.0, 0.0
     # the nodes about which it says anything
     kept = kept[np.any(np.any(U != 0.0, axis=1).reshape(-1, 3), axis=1)]
-    prior = None
-    if len(kept) > 0:
-        says = np.flatnonzero(np.isin(columns // 3, kept))
-        prior = Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
-                      _symmetric(U[np.ix_(says, says)]), u[says], energy,
-                      bool(np.any(inside & fixed)) or _is_anchored(part, part.node_ids[kept]))
-    return Marginal(prior, part.factor_ids.astype(np.int64))
+    if len(kept) == 0:
+        return None
+    says = np.flatnonzero(np.isin(columns // 3, kept))
+    return Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
+                 _symmetric(U[np.ix_(says, says)]), u[says], energy,
+                 bool(np.any(inside & fixed)) or _is_anchored(part, part.node_ids[kept]))
 
 
 def schur_complement(
-    H: FloatArray, b: FloatArray, leaves: BoolArray,
+    H: FloatArray, b: FloatArray, rows: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a semidefinite system without some coordinates, which take their best values."""
-    if not np.any(leaves):
-        return H, b
-    gain = H[np.ix_(~leaves, leaves)] @ _pseudo_inverse(H[np.ix_(leaves, leaves)])
-    reduced = H[np.ix_(~leaves, ~leaves)] - gain @ H[np.ix_(leaves, ~leaves)]
-    return _symmetric(reduced), b[~leaves] - gain @ b[leaves]
+    """Return a semidefinite system without some nodes, which take their best values."""
+    H, b = H.copy(), b.copy()
+    eliminate(H, b, rows, np.diagonal(H).copy())
+    columns = columns_of(np.delete(np.arange(len(b) // 3), rows))
+    return _symmetric(H[np.ix_(columns, columns)]), b[columns]
 
 
 def as_edge(prior: Prior) -> Factors:
@@ -196,9 +188,8 @@ def _part(
 ) -> Graph:
     """Return the part of a graph with the factors of leaving nodes and further ones."""
     factors = graph.factors
-    chosen = (np.any(np.isin(_ends(factors), leaving), axis=0)
-              | np.isin(graph.factor_ids, more)) & (factors.weight > 0.0)
-    chosen &= ~np.isin(graph.factor_ids, without)
+    ids = np.union1d(graph.factors_on(leaving), np.array(more, dtype=np.int64))
+    chosen = np.isin(graph.factor_ids, np.setdiff1d(ids, without)) & (factors.weight > 0.0)
     priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
     ends = _ends(factors)[:, chosen].ravel()
     ids = np.unique(np.concatenate((

@@ -23,7 +23,7 @@ from pose_graph_ros.core.geometry.se2 import (
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.graph_update import Left
+from pose_graph_ros.core.graph.graph_update import Gone
 from pose_graph_ros.core.smoother import (
     chain,
     covariances,
@@ -220,7 +220,7 @@ class IncrementalSmoother:
             factors=Factors([last], [node], mean[None], information[None], [FactorKind.ODOMETRY],
                             [weight])))
 
-    def forget(self, nodes: Collection[int]) -> Left:
+    def forget(self, nodes: Collection[int]) -> Gone:
         """
         Take nodes out of the graph; what their constraints say about the others becomes priors.
 

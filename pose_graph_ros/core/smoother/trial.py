@@ -49,7 +49,7 @@ def optimize_copy(graph: Graph, copy: Graph) -> bool:
     transaction_log.poses_before(graph.memory.head, poses)
     copy.fill(graph.rows()._replace(poses=poses))
     copy.apply(graph.leaving())
-    result = optimizer.optimize_from_linear_start(copy, _OF_STEP, _STARTS_OF_STEP)
+    result = optimizer.optimize(copy, _OF_STEP, _STARTS_OF_STEP)
     if result.status is Status.FAILED:
         return False
     copy.set_poses(copy.poses)
@@ -92,8 +92,8 @@ class Trial:
         copy.fill(rows if start is None else rows._replace(poses=start))
         copy.apply(self._update)
         yield
-        result = yield from (optimizer.from_linear_start(copy, _CONFIG, _STARTS)
-                             if start is None else optimizer.in_parts(copy, _CONFIG))
+        result = yield from optimizer.in_parts(
+            copy, _CONFIG, _STARTS if start is None else (Start.PRESENT,))
         yield
         copy.set_poses(copy.poses)
         # from poses of a solution it needs few iterations, if any number of them is enough

@@ -23,23 +23,21 @@ is nowhere more than what both know together. w is the share that the leaving pa
 is common to both: small where the part is short against the time constant of the bias.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import breadth_first_order
 
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.graph_update import Left
 from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.marginalization.marginalize import (
     as_observed,
     columns_of,
     Cut,
-    eliminate,
     equations,
     marginal,
     marginalize,
@@ -106,143 +104,107 @@ class Limits:
 
 
 LIMITS = Limits()
+NONE: IntArray = np.empty(0, dtype=np.int64)
 
 
-class Cuts(NamedTuple):
-    """Edges of chains of biases that are cut, and what stays on the other side."""
+def cut_chains(graph: Graph, biases: IntArray) -> tuple[list[Cut], list[Factors]] | None:
+    """
+    Return where the chains of some biases, ascending, are cut; None if one has several such ends.
 
-    cuts: Sequence[Cut]
-    observed: Factors  # on the first states that stay, of the kind NODE_PRIOR
-
-
-NO_CUTS = Cuts((), Factors())
-
-
-def cut_chains(graph: Graph, biases: IntArray) -> Cuts | None:
-    """Return where the chains of some biases are cut; None if one has several ends that stay."""
-    edges = graph.factors
-    rows = np.flatnonzero((edges.weight > 0.0) & (edges.j >= 0) & (edges.k < 0)
-                          & (np.isin(edges.i, biases) | np.isin(edges.j, biases)))
-    ends = np.column_stack((edges.i[rows], edges.j[rows]))
+    With each cut comes what it leaves on the first state that stays, of the kind NODE_PRIOR.
+    """
+    factors = graph.factors
+    rows = np.flatnonzero((factors.weight > 0.0) & (factors.j >= 0) & (factors.k < 0)
+                          & (np.isin(factors.i, biases) | np.isin(factors.j, biases)))
+    ends = np.column_stack((factors.i[rows], factors.j[rows]))
     rows, ends = (each[np.all(graph.is_bias[graph.node_rows(ends)], axis=1)]
                   for each in (rows, ends))
     leaves = np.isin(ends, biases)
     inside = np.all(leaves, axis=1)
-    found, observed, seen = list[Cut](), list[Factors](), set[int]()
+    between = np.searchsorted(biases, ends[inside]).T
+    near = np.zeros((len(biases), len(biases)), dtype=bool)
+    near[tuple(between)] = True
+    cuts, observed, seen = list[Cut](), list[Factors](), set[int]()
     for row, pair, first in zip(rows[~inside].tolist(), ends[~inside].tolist(),
                                 leaves[~inside, 0].tolist(), strict=True):
         x, y = pair if first else pair[::-1]
-        chain = _chain(x, ends[inside])
-        if not seen.isdisjoint(chain):
+        # from the cut back
+        chain = biases[breadth_first_order(
+            near, int(np.searchsorted(biases, x)), directed=False, return_predecessors=False)]
+        if not seen.isdisjoint(chain.tolist()):
             return None
-        seen.update(chain)
-        cut, rest = _cut(graph, np.array((*chain, y)), rows[inside], row)
-        found.append(cut)
+        seen.update(chain.tolist())
+        cut, rest = _cut(graph, np.append(chain, y), rows[inside], row)
+        cuts.append(cut)
         observed.append(rest)
-    return Cuts(found, Factors.joined(observed))
-
-
-def _chain(first: int, ends: IntArray) -> list[int]:
-    """Return the nodes that edges connect with a first one, in the order of the way to them."""
-    near: dict[int, list[int]] = {}
-    for i, j in ends.tolist():
-        near.setdefault(i, []).append(j)
-        near.setdefault(j, []).append(i)
-    chain = [first]
-    for node in chain:
-        chain += [other for other in near.get(node, ()) if other not in chain]
-    return chain
+    return cuts, observed
 
 
 def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cut, Factors]:
-    """Return a cut, and what it leaves on the state that stays."""
+    """Return a cut, and what it leaves on the state that stays: the last one of the nodes."""
     factors = graph.factors
     chain = inside[np.isin(factors.i[inside], nodes)]
     seen = np.flatnonzero(
         (factors.j < 0) & np.isin(factors.i, nodes[:-1]) & (factors.weight > 0.0))
-    part = part_of(graph, np.sort(nodes), np.sort(np.concatenate((chain, seen, (edge,)))))
-    order = np.argsort(np.argsort(nodes))
-    (x, y), last = columns_of(order[[0, -1]]).reshape(2, 3), order[-2]
-    whole, own_b = equations(part)
-    part.apply(GraphUpdate(weigh={int(graph.factor_ids[edge]): 0.0}))
+    part = part_of(graph, np.sort(nodes), np.sort(np.concatenate((chain, seen, (edge,)))),
+                   _of_chain(graph, nodes[:-1]))
+    x, first, y = part.node_rows(nodes[[0, -2, -1]])
     H, b = equations(part)
-    between = (whole - H)[np.ix_((*x, *y), (*x, *y))], (own_b - b)[[*x, *y]]
-    # of the state that is cut off, and the same if the first one were known
-    _add_priors(graph, nodes, order, H, b)
-    own, fixed = (_of_first(H.copy(), b.copy(), order, known) for known in (-1, last))
-    after, later = (_through(each, between) for each in (own, fixed))
-    if len(nodes) == 2:     # the only one is the first one
-        later = between[0][3:, 3:], between[1][3:]
-    # so much of the variance of the next state is new since the first one
+    part.apply(GraphUpdate(weigh={int(graph.factor_ids[edge]): 0.0}))
+    without, without_b = equations(part)
+    own = _of_one(without, without_b, x)
+    after, of_edge = _of_one(H, b, y), (H - without)[3 * y, 3 * y]
+    # the same if the first state were known: so much of the variance of y is new since then
+    at = columns_of(np.array([first]))
+    H[at], H[:, at], b[at] = 0.0, 0.0, 0.0
+    later = _of_one(H, b, y)
     new = min(float(after[0][0, 0] / max(later[0][0, 0], 1e-300)), 1.0 - 1e-9)
     given = 1.0 / (1.0 - 0.5 * math.log(1.0 - new))
-    if after[0][0, 0] < 1e-9 * between[0][3, 3]:
+    if after[0][0, 0] < 1e-9 * of_edge:
         # a chain of which nothing is known but its steps, and the rest is rounding
         return Cut(int(graph.factor_ids[edge]), int(nodes[0]), 0.0 * own[0], 0.0 * own[1]), (
             Factors())
-    reference = graph.poses_of(nodes[-1:])
-    rest = as_observed(
-        Prior(nodes[-1:], reference, given * after[0], given * after[1], 0.0, True))
+    rest = as_observed(Prior(
+        nodes[-1:], graph.poses_of(nodes[-1:]), given * after[0], given * after[1], 0.0, True))
     return Cut(int(graph.factor_ids[edge]), int(nodes[0]), given * own[0], given * own[1]), rest
 
 
-def _add_priors(
-    graph: Graph, nodes: IntArray, order: IntArray, H: FloatArray, b: FloatArray,
-) -> None:
-    """Add to the equations of a chain what dense priors tell of it alone."""
+def _of_chain(graph: Graph, chain: IntArray) -> list[Prior]:
+    """Return what dense priors tell of a chain alone."""
+    found = []
     for prior in graph.priors:
-        known, at, of = np.intersect1d(nodes[:-1], prior.nodes, return_indices=True)
-        if len(known) == 0:
-            continue
-        rows = graph.node_rows(prior.nodes)
-        linear = model(prior, graph.poses[rows], graph.is_pose[rows])
-        others = np.ones(len(prior.vector), dtype=bool)
-        others[columns_of(of)] = False
-        U, u = schur_complement(linear.information, -linear.gradient, others)
-        # what is left is in the order of the prior's nodes
-        columns = columns_of(order[at[np.argsort(of)]])
-        H[np.ix_(columns, columns)] += U
-        b[columns] += u
+        known = np.isin(prior.nodes, chain)
+        if np.any(known):
+            rows = graph.node_rows(prior.nodes)
+            linear = model(prior, graph.poses[rows], graph.is_pose[rows])
+            U, u = schur_complement(
+                linear.information, -linear.gradient, np.flatnonzero(~known))
+            found.append(Prior(prior.nodes[known], graph.poses[rows[known]], U, u, 0.0, True))
+    return found
 
 
-def _of_first(
-    H: FloatArray, b: FloatArray, order: IntArray, known: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Return what a chain tells of its first node; its equations are changed."""
-    if known >= 0:
-        at = columns_of(np.array([known]))
-        H[at], H[:, at], b[at] = 0.0, 0.0, 0.0
-    others = order[1:-1]
-    eliminate(H, b, others, np.diagonal(H).copy())
-    at = columns_of(order[:1])
-    return H[np.ix_(at, at)], b[at]
-
-
-def _through(
-    own: tuple[FloatArray, FloatArray], edge: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, FloatArray]:
-    """Return what is known of one end of an edge from what is known of the other one."""
-    H, b = edge[0].copy(), edge[1].copy()
-    H[:3, :3] += own[0]
-    b[:3] += own[1]
-    return schur_complement(H, b, np.arange(6) < 3)
-
-
-NONE: IntArray = np.empty(0, dtype=np.int64)
+def _of_one(H: FloatArray, b: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
+    """Return what the equations of a chain tell of one of its nodes."""
+    return schur_complement(H, b, np.delete(np.arange(len(b) // 3), row))
 
 
 def sparse_removal(
-    graph: Graph, nodes: IntArray, factors: IntArray = NONE, cuts: Cuts = NO_CUTS,
+    graph: Graph, nodes: IntArray, factors: IntArray = NONE,
 ) -> GraphUpdate | None:
     """
-    Return the update by which nodes leave, and edges and observed nodes take their place.
+    Return the update by which nodes, ascending, and factors leave, and few take their place.
 
-    No covariance becomes smaller by it. None if something else than poses is connected with them,
-    or what they tell is too stiff for double precision.
+    These are edges and observed nodes. No covariance becomes smaller by it. None if something else
+    than poses is connected with what leaves, but for chains of biases that can be cut, or if what
+    it tells is too stiff for double precision.
     """
+    cut = cut_chains(graph, nodes[graph.is_bias[graph.node_rows(nodes)]])
+    if cut is None:
+        return None
+    cuts, observed = cut
     table, ids, with_nodes = graph.factors, graph.factor_ids, graph.factors_on(nodes)
     leaves = (np.isin(ids, np.union1d(with_nodes, factors)) & (table.weight > 0.0)
-              & ~np.isin(ids, [cut.edge for cut in cuts.cuts]))
+              & ~np.isin(ids, [cut.edge for cut in cuts]))
     of_priors = [prior.nodes for prior in graph.priors if np.any(np.isin(prior.nodes, nodes))]
     around = np.setdiff1d(np.concatenate((
         table.i[leaves], table.j[leaves], table.k[leaves], *of_priors)), (*nodes, -1))
@@ -251,11 +213,11 @@ def sparse_removal(
     earlier = (np.isin(table.kind, (FactorKind.PRIOR, FactorKind.NODE_PRIOR))
                & np.isin(table.i, around) & np.isin(table.j, (*around, -1)))
     more = np.union1d(factors, ids[earlier])
-    sparse = _approximation(marginal(graph, nodes, more.tolist(), cuts.cuts).prior)
+    sparse = _approximation(marginal(graph, nodes, more.tolist(), cuts))
     if sparse is None:
         return None
     return GraphUpdate(
-        factors=Factors.joined([sparse.factors, cuts.observed]), remove_nodes=nodes.tolist(),
+        factors=Factors.joined([sparse.factors, *observed]), remove_nodes=nodes.tolist(),
         # the others leave with the nodes
         drop=np.setdiff1d(more, with_nodes).tolist())
 
@@ -320,32 +282,26 @@ def _approximation(
         return None
 
 
-def with_fewer_edges(graph: Graph, most: float) -> GraphUpdate | None:
+def crowded_edges(graph: Graph) -> Iterator[IntArray]:
     """
-    Return an update that replaces edges of the kind PRIOR by fewer ones, or None if there are few.
+    Yield ids of edges of the kind PRIOR that fewer ones could replace, if there are many in all.
 
-    They are those within a group of nodes that have many of them to each other.
+    They are those within a group of nodes that have many of them to each other, the most first.
     """
     edges = graph.factors
     prior = np.flatnonzero(edges.kind == FactorKind.PRIOR)
-    if len(prior) <= most * np.count_nonzero(graph.is_pose):
-        return None
-    near: dict[int, set[int]] = {}
-    for i, j in zip(edges.i[prior].tolist(), edges.j[prior].tolist(), strict=True):
-        near.setdefault(i, set()).add(j)
-        near.setdefault(j, set()).add(i)
+    if len(prior) <= LIMITS.prior_edges * np.count_nonzero(graph.is_pose):
+        return
+    ends = np.column_stack((edges.i[prior], edges.j[prior]))
+    near = neighbours(np.unique(ends), ends)
     for first in sorted(near, key=lambda node: -len(near[node])):
-        group = _dense_group(near, first)
-        inside = prior[np.isin(edges.i[prior], group) & np.isin(edges.j[prior], group)]
+        group = grown(near, first, LIMITS.group_nodes, math.inf)
+        inside = prior[np.all(np.isin(ends, group), axis=1)]
         if len(inside) > len(group) - 1 + round(LIMITS.extra * len(group)):
-            ids = graph.factor_ids[inside].tolist()
-            sparse = _approximation(marginal(graph, (), ids).prior)
-            if sparse is not None:
-                return GraphUpdate(factors=sparse.factors, drop=ids)
-    return None
+            yield graph.factor_ids[inside]
 
 
-def old_closures(graph: Graph, newest: int, most: float) -> IntArray:
+def old_closures(graph: Graph, newest: int) -> IntArray:
     """
     Return ids of loop closures that nothing else lets go, some of the oldest, if there are many.
 
@@ -356,25 +312,36 @@ def old_closures(graph: Graph, newest: int, most: float) -> IntArray:
     newer = np.flatnonzero(~old & (edges.kind == FactorKind.ODOMETRY))
     first = int(np.min(newer, initial=len(old)))
     closures = np.flatnonzero(old[:first] & (edges.kind[:first] == FactorKind.LOOP_CLOSURE))
-    many = len(closures) > most * np.count_nonzero(graph.is_pose)
+    many = len(closures) > LIMITS.old_closures * np.count_nonzero(graph.is_pose)
     return graph.factor_ids[closures[:LIMITS.closures_at_once]] if many else NONE
 
 
-def _dense_group(near: dict[int, set[int]], first: int, size: int = 10) -> IntArray:
-    """Return nodes around a first one, each time the one with the most edges to the others."""
-    group = [first]
-    links = dict.fromkeys(near[first], 1)
+def neighbours(nodes: IntArray, ends: IntArray) -> dict[int, set[int]]:
+    """Return what edges, given by their ends, shape (M, 2), connect each of some nodes with."""
+    near: dict[int, set[int]] = {node: set() for node in nodes.tolist()}
+    for i, j in ends[np.isin(ends, nodes).any(axis=1)].tolist():
+        for one, other in ((i, j), (j, i)):
+            if one in near:
+                near[one].add(other)
+    return near
+
+
+def grown(near: Mapping[int, Set[int]], first: int, size: int, most_around: float) -> IntArray:
+    """
+    Return a node with others, each time the one that is next to most of those before it.
+
+    There are at most so many nodes in it, and as many as keep the number of those around below a
+    limit. A node may be near to some that are not to be chosen.
+    """
+    group, links = [first], dict.fromkeys(near[first] & near.keys(), 1)
+    around = set(near[first])
     while links and len(group) < size:
-        node = max(links, key=lambda node: (links[node], len(near[node]), -node))
+        node = max(links, key=lambda node: (links[node], -node))
+        around |= near[node]
+        if len(around.difference(group, (node,))) > most_around:
+            break
         del links[node]
         group.append(node)
-        for other in near[node].difference(group):
+        for other in (near[node] & near.keys()).difference(group):
             links[other] = links.get(other, 0) + 1
     return np.array(sorted(group), dtype=np.int64)
-
-
-def leaving(graph: Graph, update: GraphUpdate) -> Left:
-    """Return what leaves a graph with an update, factors with weight 0 included."""
-    nodes = np.array(update.remove_nodes, dtype=np.int64)
-    return Left(np.sort(nodes), np.union1d(
-        graph.factors_on(nodes), list(update.drop)).astype(np.int64))

@@ -15,22 +15,19 @@ before and after it. So the measurements leave stretch by stretch, in the order 
 biases that only they need, whether their nodes leave or stay.
 """
 
-from collections.abc import Collection, Iterator
-from typing import NamedTuple, Self
+from collections.abc import Iterator
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import ThinningConfig
-from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import FactorKind
+from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, IntArray, Poses
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.graph_update import GraphUpdate, Left
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.window.sparse_removal import leaving, LIMITS, with_fewer_edges
+from pose_graph_ros.core.window.sparse_removal import grown, LIMITS, neighbours, NONE
 
 
 class Segment(NamedTuple):
@@ -67,7 +64,7 @@ def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | 
     """
     holder = carriers(graph)
     ahead = older[np.searchsorted(older, first_of(holder)):]
-    size = _size(graph, ahead[:LIMITS.stretch], np.isin(ahead, leaving))
+    size = _size(graph, ahead[:LIMITS.stretch], leaving)
     # where no bias is needed on both sides
     ends = _ends(graph, ahead[:LIMITS.longest_stretch + 1], holder)
     ends = ends[ends < len(ahead)]
@@ -99,35 +96,33 @@ def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
     return np.flatnonzero(free)[1:]
 
 
-def _size(graph: Graph, poses: IntArray, leaves: BoolArray) -> int:
+def _size(graph: Graph, poses: IntArray, leaving: IntArray) -> int:
     """Return how many of some poses make a stretch, as far as not too many others are around."""
-    edges, is_pose = graph.factors.edges, graph.is_pose
-    used = (edges.weight > 0.0) & is_pose[graph.node_rows(edges.i)] & is_pose[
-        graph.node_rows(edges.j)]
-    ends = np.column_stack((edges.i[used], edges.j[used]))
+    near = _near(graph, np.intersect1d(poses, leaving))
     around, inside = set[int](), set[int]()
-    for size, (pose, leave) in enumerate(zip(poses.tolist(), leaves.tolist(), strict=False)):
-        if leave:
+    for size, pose in enumerate(poses.tolist()):
+        if pose in near:
             inside.add(pose)
-            around.update(ends[np.any(ends == pose, axis=1)].ravel().tolist())
-        else:
-            around.add(pose)
+        around |= near.get(pose, {pose})
         if size > 0 and len(around - inside) > LIMITS.stretch_around:
             return size
     return len(poses)
 
 
-class Crowd(NamedTuple):
-    """Nodes that leave, in ascending order, and the kept nodes that stand for them."""
-
-    leaving: IntArray  # shape (L,)
-    anchors: IntArray  # shape (L,)
+def _near(graph: Graph, poses: IntArray) -> dict[int, set[int]]:
+    """Return what other poses are connected with each of some."""
+    edges, is_pose = graph.factors.edges, graph.is_pose
+    ends = np.column_stack((edges.i, edges.j))
+    used = (edges.weight > 0.0) & np.all(is_pose[graph.node_rows(ends)], axis=1)
+    return neighbours(poses, ends[used])
 
 
 def crowded(
     poses: Poses, preferred: BoolArray, config: ThinningConfig, part: int = LIMITS.compared,
-) -> Crowd:
-    """Return rows of poses that leave."""
+) -> IntArray:
+    """
+    Return rows of poses that leave, ascending, each with that of its anchor, shape (L, 2).
+    """
     order = np.argsort(~preferred, kind='stable')
     place, heading = poses[order, :2], poses[order, 2]
     anchor = np.full(len(poses), -1, dtype=np.int64)
@@ -150,24 +145,8 @@ def crowded(
                 distance = np.hypot(*(place[near] - place[row]).T)
                 anchor[row] = near[np.argmin(distance)]
     leaving = np.flatnonzero(anchor >= 0)
-    leaving, anchors = order[leaving], order[anchor[leaving]]
-    ascending = np.argsort(leaving)
-    return Crowd(leaving[ascending], anchors[ascending])
-
-
-def crowd(graph: Graph, config: ThinningConfig, first: int = 0) -> Crowd:
-    """
-    Return ids of the hidden nodes of a graph that leave it, and of their anchors.
-
-    Fixed nodes and the newest ones never leave.
-    """
-    rows = np.flatnonzero(graph.is_pose & (graph.node_ids >= first))[:-config.newest]
-    fixed = graph.fixed
-    found = crowded(graph.poses[rows], fixed[rows], config)
-    leaving, anchors = rows[found.leaving], rows[found.anchors]
-    free = ~fixed[leaving]
-    ids = graph.node_ids
-    return Crowd(ids[leaving[free]], ids[anchors[free]])
+    pairs = order[np.column_stack((leaving, anchor[leaving]))]
+    return pairs[np.argsort(pairs[:, 0])]
 
 
 class Places(NamedTuple):
@@ -175,13 +154,25 @@ class Places(NamedTuple):
 
     nodes: IntArray  # ids, shape (L,)
     anchors: IntArray  # ids, shape (L,)
-    relative: FloatArray  # poses in the anchors, shape (L, 3) [m, m, rad]
-    noise: FloatArray  # covariances of these, in the frames of the nodes, shape (L, 3, 3)
+    relative: Poses  # in the anchors
+    noise: Covariances  # of these, in the frames of the nodes
+
+    @classmethod
+    def now(cls, smoother: IncrementalSmoother, nodes: IntArray, anchors: IntArray) -> Self:
+        """Return the present places of nodes."""
+        graph = smoother.graph
+        relative = se2.between(graph.poses_of(anchors), graph.poses_of(nodes))
+        edges = Factors(anchors, nodes, relative, np.tile(np.eye(3), (len(nodes), 1, 1)),
+                        np.full(len(nodes), FactorKind.PRIOR))
+        return cls(nodes, anchors, relative, smoother.innovations(edges).covariances)
 
     def rows(self, index: BoolArray) -> Self:
         """Return the places of some of the nodes."""
         return type(self)(self.nodes[index], self.anchors[index], self.relative[index],
                           self.noise[index])
+
+
+NOWHERE: Final = Places(NONE, NONE, np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
 class Thinning:
@@ -199,122 +190,55 @@ class Thinning:
         return n_measured + LIMITS.every > LIMITS.measurements * self._n_stay
 
     def places(
-        self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int,
-        keep: Collection[int] = (), first: int = 0,
+        self, smoother: IncrementalSmoother, config: ThinningConfig, n_made: int, keep: IntArray,
+        first: int,
     ) -> Places | None:
-        """Return the nodes that leave now, maybe none; None most times."""
-        if config.cell == 0.0 or n_made < self._n_made + LIMITS.every:
+        """
+        Return the nodes from a first one on that leave now, maybe none; None most times.
+
+        Fixed nodes, those to keep and the newest ones never leave.
+        """
+        if n_made < self._n_made + LIMITS.every:
             return None
         self._n_made = n_made
         graph = smoother.graph
-        found = crowd(graph, config, first)
-        n_stay = int(np.count_nonzero(graph.is_pose)) - len(found.leaving)
+        ids, fixed = graph.node_ids, graph.fixed
+        rows = np.flatnonzero(graph.is_pose & (ids >= first))[:-config.newest]
+        crowd = rows[crowded(graph.poses[rows], fixed[rows], config)]
+        crowd = ids[crowd[~fixed[crowd[:, 0]]]]
+        n_stay = int(np.count_nonzero(graph.is_pose)) - len(crowd)
         self._n_stay = max(n_stay, LIMITS.least_area * config.newest)
         if not self.measurements_are_due(graph):
-            before = found.leaving < first_of(carriers(graph))
-            found = Crowd(*(ids[before] for ids in found))
-        found = Crowd(*(ids[~np.isin(found.leaving, list(keep))] for ids in found))
+            crowd = crowd[crowd[:, 0] < first_of(carriers(graph))]
+        crowd = crowd[~np.isin(crowd[:, 0], keep)]
         # those that are not sure enough to leave must not keep others from being looked at
-        order = np.argsort(found.leaving < self._next, kind='stable')[:LIMITS.looked_at]
+        order = np.argsort(crowd[:, 0] < self._next, kind='stable')[:LIMITS.looked_at]
         if len(order) > 0:
-            self._next = int(found.leaving[order[-1]]) + 1
-        chosen = Crowd(*(ids[np.sort(order)] for ids in found))
-        return certain(smoother, chosen, config)
+            self._next = int(crowd[order[-1], 0]) + 1
+        chosen = crowd[np.sort(order)]
+        return certain(smoother, chosen[:, 0], chosen[:, 1], config)
 
 
 def groups(graph: Graph, places: Places) -> Iterator[Places]:
     """Yield connected groups of nodes; each must leave the graph before the next is asked for."""
     while len(places.nodes) > 0:
-        edges = graph.factors.edges
-        used = edges.weight > 0.0
-        members = group(places.nodes, np.column_stack((edges.i[used], edges.j[used])))
-        inside = np.isin(places.nodes, members)
+        inside = np.isin(places.nodes, grown(
+            _near(graph, places.nodes), int(places.nodes[0]), LIMITS.group_nodes,
+            LIMITS.group_neighbours))
         yield places.rows(inside)
         places = places.rows(~inside)
 
 
-def removed(smoother: IncrementalSmoother, update: GraphUpdate | None) -> Left | None:
+def certain(
+    smoother: IncrementalSmoother, nodes: IntArray, anchors: IntArray, config: ThinningConfig,
+) -> Places:
     """
-    Return what has left the graph with an update, or None if there is none or the solver fails.
-    """
-    if update is None:
-        return None
-    gone = leaving(smoother.graph, update)
-    try:
-        result = smoother.update(update)
-    except GraphUpdateError:    # an approximation that rounding has made invalid
-        return None
-    return None if result.status is Status.FAILED else gone
-
-
-def simplify(smoother: IncrementalSmoother) -> Iterator[Left]:
-    """Replace some edges between poses by fewer ones where there are many; yield what leaves."""
-    for _ in range(LIMITS.replaced):
-        update = with_fewer_edges(smoother.graph, LIMITS.prior_edges)
-        if update is None:
-            return
-        gone = removed(smoother, update)
-        if gone is None:
-            return
-        yield gone
-
-
-def certain(smoother: IncrementalSmoother, found: Crowd, config: ThinningConfig) -> Places:
-    """
-    Return those nodes that leave which are beside their anchors for sure.
+    Return the places of those nodes which are beside their anchors for sure.
 
     The standard deviation of the position relative to the anchor is at most half of `cell`, that
     of the heading half of `angle`. So what odometry alone brings together is not thinned.
     """
-    graph = smoother.graph
-    start, end = graph.poses_of(found.anchors), graph.poses_of(found.leaving)
-    noise = relative_noise(smoother, found.anchors, found.leaving)
-    sure = (np.linalg.eigvalsh(noise[:, :2, :2])[:, -1] <= (0.5 * config.cell)**2) & (
-        noise[:, 2, 2] <= (0.5 * config.angle)**2)
-    return Places(found.leaving[sure], found.anchors[sure],
-                  se2.between(start[sure], end[sure]), noise[sure])
-
-
-def relative_noise(
-    smoother: IncrementalSmoother, anchors: IntArray, nodes: IntArray,
-) -> FloatArray:
-    """
-    Return the covariances of the poses of nodes in others, shape (L, 3, 3).
-
-    They are in the frames of the nodes.
-    """
-    start, end = smoother.graph.poses_of(anchors), smoother.graph.poses_of(nodes)
-    noise = np.empty((len(start), 3, 3))
-    for k, (anchor, node) in enumerate(zip(anchors.tolist(), nodes.tolist(), strict=True)):
-        # from both poses in map axes to the frame of the node
-        jacobian = np.hstack((-np.eye(3), np.eye(3)))
-        jacobian[:2, 2] = end[k, 1] - start[k, 1], start[k, 0] - end[k, 0]
-        axes = np.eye(3)
-        axes[:2, :2] = se2.rotation(end[k, 2]).T
-        jacobian = axes @ jacobian
-        noise[k] = jacobian @ smoother.joint_covariance(anchor, node) @ jacobian.T
-    return noise
-
-
-def group(leaving: IntArray, ends: IntArray) -> IntArray:
-    """
-    Return the first group of connected nodes among those that leave, given the ends of edges.
-    """
-    neighbours: dict[int, set[int]] = {node: set() for node in leaving.tolist()}
-    concerned = ends[np.isin(ends, leaving).any(axis=1)]
-    for i, j in concerned.tolist():
-        for one, other in ((i, j), (j, i)):
-            if one in neighbours:
-                neighbours[one].add(other)
-    first = int(leaving[0])
-    members, around = {first}, set(neighbours[first])
-    while len(members) < LIMITS.group_nodes:
-        node = min(around & neighbours.keys(), default=None)
-        if node is None:
-            break
-        grown = (around | neighbours[node]) - members - {node}
-        if len(grown) > LIMITS.group_neighbours:
-            break
-        members.add(node)
-        around = grown
-    return np.array(sorted(members), dtype=np.int64)
+    places = Places.now(smoother, nodes, anchors)
+    largest = np.linalg.eigvalsh(places.noise[:, :2, :2])[:, -1]
+    return places.rows((largest <= (0.5 * config.cell)**2)
+                       & (places.noise[:, 2, 2] <= (0.5 * config.angle)**2))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is decided on fixes survives failures, another order of arrival and another error model."""
 
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -122,7 +123,7 @@ def test_a_decision_of_a_person_is_kept_at_the_end() -> None:
                     for which in (True, False))
     backend.decide(wrong, Decision.IN)
     backend.decide(right, Decision.OUT)
-    backend._judge.finish()
+    backend._judge.finish(ExitStack())
     states = {each.id: each.state.in_graph for each in backend.verdicts()}
     assert states[wrong]
     assert not states[right]

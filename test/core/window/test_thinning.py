@@ -9,7 +9,9 @@ import numpy as np
 from random_graphs import random_poses
 
 from pose_graph_ros.core.config import ThinningConfig
-from pose_graph_ros.core.window import thinning
+from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.window.sparse_removal import grown, LIMITS, neighbours
+from pose_graph_ros.core.window.thinning import crowded
 
 
 def slowly_crowded(
@@ -41,15 +43,19 @@ def test_those_leave_that_have_enough_others_around_them(
     config = ThinningConfig(cell=cell, angle=angle, poses=kept)
     expected = slowly_crowded(poses.tolist(), preferred.tolist(), config)
     for part in (3, 1000):
-        found = thinning.crowded(poses, preferred, config, part)
-        assert dict(zip(*(rows.tolist() for rows in found), strict=True)) == expected
-        assert found.leaving.tolist() == sorted(expected)
+        found = crowded(poses, preferred, config, part)
+        assert dict(found.tolist()) == expected
+        assert found[:, 0].tolist() == sorted(expected)
 
 
 def test_a_group_is_connected_and_has_few_neighbours() -> None:
+    def group(leaving: list[int], ends: IntArray) -> list[int]:
+        near = neighbours(np.array(leaving), ends)
+        return grown(near, leaving[0], LIMITS.group_nodes, LIMITS.group_neighbours).tolist()
+
     chain = np.column_stack((np.arange(29), np.arange(1, 30)))
-    assert thinning.group(np.array([3, 4, 5, 9]), chain).tolist() == [3, 4, 5]
-    assert len(thinning.group(np.arange(1, 29), chain)) == thinning.LIMITS.group_nodes
+    assert group([3, 4, 5, 9], chain) == [3, 4, 5]
+    assert len(group(list(range(1, 29)), chain)) == LIMITS.group_nodes
     # a hub with many neighbours leaves alone
     star = np.column_stack((np.zeros(20, dtype=int), np.arange(1, 21)))
-    assert thinning.group(np.array([0, 1, 2]), star).tolist() == [0]
+    assert group([0, 1, 2], star) == [0]
