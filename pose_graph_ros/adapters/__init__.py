@@ -5,5 +5,5 @@ Convert between ROS formats and the values of the engine, without rclpy.
 
 Bags, ROS messages and parameter values come in; measurements, settings of the engine and
 serialised messages go out. The node and the offline tools share these modules. Read first
-`sources`, which defines the kinds of sources, then `message_reader`.
+`sources`, whose table has the kinds of sources, then `message_reader`.
 """

@@ -6,7 +6,7 @@ Choose the topics of a bag that feed the sources, and read them, for player and 
 Planar poses can be read of any topic of odometry, poses, or poses with covariance.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 import logging
@@ -16,7 +16,14 @@ from typing import Any, NamedTuple
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, ODOMETRY_KINDS, Source
+from pose_graph_ros.adapters.sources import (
+    CLOSURES,
+    GLOBAL_POSE,
+    Kind,
+    KNOWN_SOURCES,
+    ODOMETRY,
+    Source,
+)
 from pose_graph_ros.core.geometry.se2 import FloatArray
 
 logger = logging.getLogger(__name__)
@@ -40,9 +47,19 @@ class Inputs:
         if self.hold_out < 0 or self.hold_out == 1:
             raise BagError(f'hold out: expected 0 or at least 2, got {self.hold_out}')
 
-    def of(self, *kinds: Kind) -> list[str]:
-        """Return the names of the sources of the given kinds."""
-        return [source for source in self.topics if self.kinds[source] in kinds]
+    def of(self, is_wanted: Callable[[Kind], bool]) -> list[str]:
+        """Return the names of the sources of some kinds."""
+        return [source for source in self.topics if is_wanted(self.kinds[source])]
+
+    @property
+    def odometry(self) -> list[str]:
+        """Names of the sources of odometry, in the order of preference."""
+        return self.of(lambda kind: kind.is_odometry)
+
+    @property
+    def fixes(self) -> list[str]:
+        """Names of the sources of fixes."""
+        return self.of(lambda kind: kind.on_earth)
 
 
 class InputMessage(NamedTuple):
@@ -90,9 +107,9 @@ def choose_inputs(
             topics[name] = guess
     ordered = {name: topics[name] for name in kinds if name in topics}
     inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out, span)
-    if len(inputs.of(*ODOMETRY_KINDS)) == 0:
+    if len(inputs.odometry) == 0:
         other = '' if truth is None else f' but that of the truth, {truth}'
-        raise BagError(f'{reader.path}: no topic of type {Kind.ODOMETRY.message_type} for the '
+        raise BagError(f'{reader.path}: no topic of type {ODOMETRY.message_type} for the '
                        f'odometry{other}; the bag has {reader.describe()}')
     return inputs
 
@@ -122,14 +139,15 @@ def _guess(
     kind, option = kinds[name], f'--{_option(name)}'
     free = [topic for topic, info in reader.topics.items()
             if info.type == kind.message_type and topic != truth and not TRUTH.search(topic)
-            and (kind is Kind.GYRO or topic not in topics.values())]
-    if kind is Kind.LOOP_CLOSURE:
+            and not any(used == topic and (kind.part == '' or kinds[source].part == kind.part)
+                        for source, used in topics.items())]
+    if kind.is_rare:
         usual = '/' + KNOWN_SOURCES[CLOSURES][1]
         return usual if usual in free else None
-    if kind is Kind.GLOBAL_POSE:
-        fixes = any(kinds[source] is Kind.FIX for source in topics)
+    if kind.in_map and not kind.on_earth:
+        fixes = any(kinds[source].on_earth for source in topics)
         return free[0] if len(free) == 1 and not fixes else None
-    if len(free) == 0 or (kind is Kind.FIX and asked):
+    if len(free) == 0 or (kind.on_earth and asked):
         return None
     if len(free) > 1:
         choices = ' or '.join(f'{option} {topic}' for topic in free)
@@ -143,7 +161,7 @@ def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[InputMessage]:
     sources: dict[str, list[str]] = {}
     for source, topic in inputs.topics.items():
         sources.setdefault(topic, []).append(source)
-    held = inputs.of(Kind.FIX) or inputs.of(Kind.GLOBAL_POSE)
+    held = inputs.fixes or inputs.of(lambda kind: kind.in_map)
     count = 0
     for message in reader.messages(list(sources), inputs.span):
         for source in sources[message.topic]:
@@ -175,9 +193,8 @@ def reader_of(bag: Bag, values: Mapping[str, Any]) -> MessageReader:
     return reader
 
 
-ODOMETRY, POSE, POSE_WITH_COVARIANCE = POSE_TYPES = (
-    'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped',
-    'geometry_msgs/msg/PoseWithCovarianceStamped')
+POSE = 'geometry_msgs/msg/PoseStamped'
+POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)
 
 
 class BagPose(NamedTuple):

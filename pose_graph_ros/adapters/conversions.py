@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose, wrap_one
 from pose_graph_ros.core.measurements import (
@@ -27,7 +26,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     rejected,
 )
-from pose_graph_ros.core.quantities import Radians
+from pose_graph_ros.core.quantities import NANOSECONDS, Radians
 
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # rows and columns of x, y and yaw in a 6x6 covariance
 
@@ -170,53 +169,3 @@ def _bad_pose(pose: Message) -> Answer:
     p, q = pose.position, pose.orientation
     return rejected('not_finite', f'position ({p.x}, {p.y}), quaternion ({q.x}, {q.y}, {q.z}, '
                                   f'{q.w})')
-
-
-class StaticFrames:
-    """Static transforms; for each child frame the newest one is used."""
-
-    def __init__(self) -> None:
-        # parent, rotation and translation by child frame
-        self._frames: dict[str, tuple[str, FloatArray, FloatArray]] = {}
-
-    def receive(self, message: Message) -> None:
-        """Add the transforms of a tf2_msgs/TFMessage; invalid ones are ignored."""
-        for item in message.transforms:
-            parent, child = frame(item.header.frame_id), frame(item.child_frame_id)
-            t, q = item.transform.translation, item.transform.rotation
-            norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
-            translation = np.array([t.x, t.y, t.z])
-            if (parent in ('', child) or child == '' or not 1e-6 < norm < math.inf
-                    or not np.all(np.abs(translation) < 1e3)):
-                continue
-            rotation = _rotation(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
-            self._frames[child] = parent, rotation, translation
-
-    def transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
-        """Return rotation and translation of a frame in another one; None if unknown."""
-        of_name, of_base = self._chain(name), self._chain(base)
-        for ancestor, (turn, point) in of_name.items():
-            if ancestor in of_base:
-                rotation, translation = of_base[ancestor]
-                return rotation.T @ turn, rotation.T @ (point - translation)
-        return None
-
-    def _chain(self, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return rotation and translation of a frame in itself and in each of its ancestors."""
-        rotation, translation = np.eye(3), np.zeros(3)
-        chain = {name: (rotation, translation)}
-        while name in self._frames and len(chain) < 100:  # there may be a cycle
-            name, turn, shift = self._frames[name]
-            rotation, translation = turn @ rotation, turn @ translation + shift
-            if name in chain:
-                break
-            chain[name] = rotation, translation
-        return chain
-
-
-def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
-    """Return the matrix of a unit quaternion; SciPy's would make each start 0.3 s longer."""
-    return np.array([
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])

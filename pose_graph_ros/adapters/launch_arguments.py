@@ -7,8 +7,9 @@ from difflib import get_close_matches
 from pathlib import Path
 import re
 
+from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
 from pose_graph_ros.adapters.parameters import LIKENESS
-from pose_graph_ros.adapters.sources import Kind, KNOWN_SOURCES, OUTPUTS
+from pose_graph_ros.adapters.sources import CLOSURES, KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 
 AS_IN_FILE = 'as in params_file'  # default of what sets a parameter only if it is given
@@ -20,7 +21,7 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
     config = share / 'config'
     inputs = {
         source: (AS_IN_FILE, f'topic of the input, {kind.message_type}; sets {source}.topic' + (
-            f', if sources lists {source}' if kind in (Kind.IMU, Kind.GYRO) else ''))
+            '' if source in {*DEFAULT_SOURCES, CLOSURES} else f', if sources lists {source}'))
         for source, (kind, _) in KNOWN_SOURCES.items()}
     return {
         'params_file': (str(config / 'pose_graph.yaml'), 'yaml file of parameters'),

@@ -16,12 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import NANOSECONDS
 from pose_graph_ros.core.estimate import Prediction
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
-from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.core.quantities import NANOSECONDS, StampNs
 
 # Variances of height, roll and pitch, which are not estimated, in messages for filters, and in
 # poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].

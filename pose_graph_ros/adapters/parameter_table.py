@@ -1,20 +1,31 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The ROS parameters in two tables: those of the node, and those of each source.
+The ROS parameters: those of the node, and groups of those of sources.
 
-The node declares its parameters from the tables, and the parameter file and docs/parameters.md are
-generated from them. Defaults come from `core.config`. This module imports no ROS.
+Which groups a source has, its kind says (`sources`). The node declares its parameters from here,
+and the parameter file and docs/parameters.md are generated. Defaults come from `core.config`. This
+module imports no ROS.
 """
 
 from dataclasses import dataclass
 from enum import Enum
 
-from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, ODOMETRY_KINDS, OUTPUTS
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, RateNoise
 
 Value = bool | float | str | list[float] | list[str]
+
+DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
+OUTPUTS = {
+    'path': ('path', 'nav_msgs/msg/Path', 'corrected path'),
+    'pose': ('pose', 'geometry_msgs/msg/PoseWithCovarianceStamped', 'newest pose'),
+    'filtered_odometry': ('odometry/filtered', 'nav_msgs/msg/Odometry', 'newest pose and twist'),
+    'filtered_fix': ('gps/filtered', 'sensor_msgs/msg/NavSatFix', 'newest pose on the Earth'),
+    'graph': ('graph', 'visualization_msgs/msg/MarkerArray', 'markers of the graph'),
+    'verdicts': ('~/verdicts', 'diagnostic_msgs/msg/DiagnosticArray', 'verdicts'),
+    'diagnostics': ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'diagnostics')}
+"""Default topic, type and content of the outputs."""
 
 
 class Change(Enum):
@@ -27,7 +38,7 @@ class Change(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of the node, or of its sources if `kinds` is not empty."""
+    """One parameter of the node or of a source."""
 
     name: str  # for a parameter of a source, without the name of the source
     default: Value  # an empty list of numbers means that the parameter is unset
@@ -37,7 +48,6 @@ class Parameter:
     largest: float | None = None
     choices: tuple[str, ...] = ()  # allowed texts; empty if all are allowed
     sizes: tuple[int, ...] = ()  # allowed sizes of a list; empty if all are allowed
-    kinds: tuple[Kind, ...] = ()  # kinds of sources with this parameter
     change: Change = Change.ALWAYS
 
 
@@ -46,7 +56,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 
 
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
-_MEASUREMENT, _COVARIANCE = config.MeasurementSource(), config.CovariancePolicy()
+_COVARIANCE = config.CovariancePolicy()
 _RATES = GyroSource()
 _NODES, _NOISE = _BACKEND.nodes, _ODOMETRY.noise
 _WINDOW, _THINNING = _BACKEND.window, _BACKEND.thinning
@@ -116,101 +126,98 @@ PARAMETERS: tuple[Parameter, ...] = (
                 change=Change.UNCONFIGURED) for name, (topic, _, content) in OUTPUTS.items()),
 )
 
-_ALL = tuple(Kind)
-_WHEELS, _GYRO = ODOMETRY_KINDS, (Kind.GYRO,)
-_OTHERS = tuple(kind for kind in Kind if kind is not Kind.GYRO and not kind.is_odometry)
-_POSITIONS = (Kind.GLOBAL_POSE, Kind.FIX)
-_JUDGED = (*_POSITIONS, Kind.LOOP_CLOSURE)
-_NOT_CLOSURES = tuple(kind for kind in _OTHERS if kind is not Kind.LOOP_CLOSURE)
+# --- groups of parameters of sources
 
-SOURCE_PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('type', '', '', 'Type of the source.', choices=_values(Kind), kinds=_ALL,
-              change=Change.START),
+OF_ALL = (
     Parameter('topic', '', '', 'Topic of the messages. By default the name of the source, unless '
-              'the source is predefined.', kinds=_ALL, change=Change.UNCONFIGURED),
+              'the source is predefined.', change=Change.UNCONFIGURED),
     Parameter('time_offset', 0.0, 's', 'Time added to the stamps of the messages.', -3600.0,
-              3600.0, kinds=_ALL),
+              3600.0),
+    Parameter('covariance_scale', 1.0, '', 'Factor applied to all covariances.', 1e-6, 1e6))
+
+OF_WHEELS = (
     Parameter('noise', _ODOMETRY.noise_from.value, '', 'Origin of the odometry noise: `model` '
               'uses distance and rotation, `twist` the twist covariance times the time step.',
-              choices=_values(config.NoiseFrom), kinds=_WHEELS, change=Change.UNCONFIGURED),
-    Parameter('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` in '
-              'the messages, or their `twist`, integrated between messages.',
-              choices=_values(Integrate), kinds=(Kind.ODOMETRY,),
-              change=Change.UNCONFIGURED),
+              choices=_values(config.NoiseFrom), change=Change.UNCONFIGURED),
     Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)', 'Odometry noise along the '
-              'path, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
+              'path, per square root of the distance.', 0.0, 10.0),
     Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)', 'Odometry noise across the '
-              'path, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
+              'path, per square root of the distance.', 0.0, 10.0),
     Parameter('sigma_heading_distance', _NOISE.sigma_heading_distance, 'rad/sqrt(m)', 'Odometry '
-              'noise of the heading, per square root of the distance.', 0.0, 10.0, kinds=_WHEELS),
+              'noise of the heading, per square root of the distance.', 0.0, 10.0),
     Parameter('sigma_heading_turn', _NOISE.sigma_heading_turn, 'rad/sqrt(rad)', 'Odometry noise '
-              'of the heading, per square root of the rotation.', 0.0, 10.0, kinds=_WHEELS),
+              'of the heading, per square root of the rotation.', 0.0, 10.0),
     Parameter('maximum_speed', _ODOMETRY.maximum_speed, 'm/s', 'Faster motion is treated as a '
-              'jump of the odometry.', 0.01, 1e4, kinds=_WHEELS),
-    Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
-              'With `tf` the rotation from its frame to the robot base frame is taken from '
-              '/tf_static; messages are refused until it is there.',
-              choices=('tf', 'up', 'down'), kinds=_GYRO),
-    Parameter('noise', _RATES.noise_from.value, '', 'Origin of the noise of the rate: `message` '
-              'uses the variance in the messages, if it is positive, `model` uses `sigma_rate`.',
-              choices=_values(RateNoise), kinds=_GYRO),
-    Parameter('sigma_rate', _RATES.sigma_rate, 'rad/sqrt(s)', 'Noise density of the rate (angle '
-              'random walk).', 1e-9, 10.0, kinds=_GYRO),
-    Parameter('sigma_turn', _RATES.sigma_turn, 'rad/sqrt(rad)', 'Noise of the rotation, per '
-              'square root of the rotation; stands for the error of the scale.', 0.0, 10.0,
-              kinds=_GYRO),
-    Parameter('sigma_bias', _RATES.sigma_bias, 'rad/s', 'Standard deviation of the bias when the '
-              'sensor is switched on. At rest by the wheels, a mean rate of up to five of these '
-              'is a measurement of the bias.', 1e-9, 10.0, kinds=_GYRO,
-              change=Change.UNCONFIGURED),
-    Parameter('sigma_bias_walk', _RATES.sigma_bias_walk, 'rad/s/sqrt(s)', 'Random walk of the '
-              'bias.', 1e-12, 1.0, kinds=_GYRO, change=Change.UNCONFIGURED),
-    Parameter('bias_period', _RATES.bias_period, 's', 'Time between two states of the bias.', 0.1,
-              3600.0, kinds=_GYRO, change=Change.UNCONFIGURED),
-    Parameter('maximum_gap', _RATES.maximum_gap, 's', 'Longest time between two messages over '
-              'which the rate is integrated. A longer one leaves the rotation between two hidden '
-              'nodes out.', 1e-3, 10.0, kinds=_GYRO),
-    Parameter('covariance_override', [], 'm, rad', 'Standard deviation of the position and, '
-              'optionally, of the heading, used instead of the covariance in the messages.', 1e-6,
-              1e6, sizes=(0, 1, 2), kinds=_OTHERS),
-    Parameter('covariance_scale', 1.0, '', 'Factor applied to all covariances.', 1e-6, 1e6,
-              kinds=_ALL),
-    Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
-              'Minimum standard deviation of position and heading.', 1e-6, 100.0, sizes=(2,),
-              kinds=_NOT_CLOSURES),
-    Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
-              'With `auto` it is used if its variance is positive and less than that of a uniform '
-              'distribution on the circle.', choices=_values(config.Heading),
-              kinds=(Kind.GLOBAL_POSE,)),
-    Parameter('lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
-              'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,),
-              kinds=(Kind.FIX,)),
-    Parameter('yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3,
-              6.3, kinds=(Kind.IMU,)),
-    *(Parameter('robust', robust.value, '', text, choices=choices, kinds=kinds)
-      for kinds, robust, choices, text in (
-        (_JUDGED, config.POSITIONS.robust, _values(config.Robust), 'Protection from wrong '
-         'measurements: `judged` uses only those that the others do not contradict, with the '
-         '`robust_loss`; `loss` uses all, with the `robust_loss`; `none` uses all, without it.'),
-        ((Kind.IMU,), config.HEADINGS.robust, _values(config.Robust)[1:], 'Whether the '
-         '`robust_loss` is used.'))),
+              'jump of the odometry.', 0.01, 1e4),
     Parameter('sigma_scale', _ODOMETRY.sigma_scale, '', 'Factor on the standard deviations of the '
               'primary odometry. If 0, it is 1, but more or less where global poses or fixes '
               'with a `correlation_time` of -1 show that odometry drifts more or less than it '
-              'claims.',
-              0.0, 1e3, kinds=_WHEELS),
-    *(Parameter('robust_loss', loss.value, '', 'Robust loss applied to the errors. The last four '
-                'are bounded: very wrong measurements have no influence, and the start matters. '
-                'The weight of a measurement falls above an error of 3 standard deviations, for '
-                '`tukey` of 5.', choices=_values(config.Loss), kinds=kinds) for kinds, loss in (
-        (_POSITIONS, config.POSITIONS.loss),
-        ((Kind.IMU, Kind.LOOP_CLOSURE), _MEASUREMENT.loss))),
-    *(Parameter('correlation_time', time, 's', 'Time constant of time-correlated errors. If 0, '
-                'errors are white noise. If -1, the errors themselves show whether they are '
-                'correlated and for how long.', config.FOUND, 1e5, kinds=kinds,
-                change=Change.UNCONFIGURED) for kinds, time in (
-        (_POSITIONS, config.POSITIONS.correlation_time),
-        ((Kind.IMU,), _MEASUREMENT.correlation_time))),
-)
+              'claims.', 0.0, 1e3))
 
-OF_SOURCES = frozenset(parameter.name for parameter in SOURCE_PARAMETERS)
+INTEGRATE = Parameter(
+    'integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` in the '
+    'messages, or their `twist`, integrated between messages.', choices=_values(Integrate),
+    change=Change.UNCONFIGURED)
+
+OF_GYROS = (
+    Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
+              'With `tf` the rotation from its frame to the robot base frame is taken from '
+              '/tf_static; messages are refused until it is there.',
+              choices=('tf', 'up', 'down')),
+    Parameter('noise', _RATES.noise_from.value, '', 'Origin of the noise of the rate: `message` '
+              'uses the variance in the messages, if it is positive, `model` uses `sigma_rate`.',
+              choices=_values(RateNoise)),
+    Parameter('sigma_rate', _RATES.sigma_rate, 'rad/sqrt(s)', 'Noise density of the rate (angle '
+              'random walk).', 1e-9, 10.0),
+    Parameter('sigma_turn', _RATES.sigma_turn, 'rad/sqrt(rad)', 'Noise of the rotation, per '
+              'square root of the rotation; stands for the error of the scale.', 0.0, 10.0),
+    Parameter('sigma_bias', _RATES.sigma_bias, 'rad/s', 'Standard deviation of the bias when the '
+              'sensor is switched on. At rest by the wheels, a mean rate of up to five of these '
+              'is a measurement of the bias.', 1e-9, 10.0, change=Change.UNCONFIGURED),
+    Parameter('sigma_bias_walk', _RATES.sigma_bias_walk, 'rad/s/sqrt(s)', 'Random walk of the '
+              'bias.', 1e-12, 1.0, change=Change.UNCONFIGURED),
+    Parameter('bias_period', _RATES.bias_period, 's', 'Time between two states of the bias.', 0.1,
+              3600.0, change=Change.UNCONFIGURED),
+    Parameter('maximum_gap', _RATES.maximum_gap, 's', 'Longest time between two messages over '
+              'which the rate is integrated. A longer one leaves the rotation between two hidden '
+              'nodes out.', 1e-3, 10.0))
+
+HEADING = Parameter(
+    'heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
+    'With `auto` it is used if its variance is positive and less than that of a uniform '
+    'distribution on the circle.', choices=_values(config.Heading))
+LEVER_ARM = Parameter(
+    'lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
+    'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,))
+YAW_OFFSET = Parameter(
+    'yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3, 6.3)
+
+
+def of_measurements(defaults: config.MeasurementSource) -> tuple[Parameter, ...]:
+    """Return the parameters of sources whose measurements have a covariance."""
+    judged = defaults.robust is config.Robust.JUDGED
+    return (
+        Parameter('covariance_override', [], 'm, rad', 'Standard deviation of the position and, '
+                  'optionally, of the heading, used instead of the covariance in the messages.',
+                  1e-6, 1e6, sizes=(0, 1, 2)),
+        Parameter('robust', defaults.robust.value, '', (
+            'Protection from wrong measurements: `judged` uses only those that the others do not '
+            'contradict, with the `robust_loss`; `loss` uses all, with the `robust_loss`; `none` '
+            'uses all, without it.' if judged else 'Whether the `robust_loss` is used.'),
+            choices=_values(config.Robust)[not judged:]),
+        Parameter('robust_loss', defaults.loss.value, '', 'Robust loss applied to the errors. The '
+                  'last four are bounded: very wrong measurements have no influence, and the '
+                  'start matters. The weight of a measurement falls above an error of 3 standard '
+                  'deviations, for `tukey` of 5.', choices=_values(config.Loss)))
+
+
+def in_the_map(defaults: config.MeasurementSource) -> tuple[Parameter, ...]:
+    """Return the parameters of sources of measurements relative to the map."""
+    return (
+        *of_measurements(defaults),
+        Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
+                  'Minimum standard deviation of position and heading.', 1e-6, 100.0, sizes=(2,)),
+        Parameter('correlation_time', defaults.correlation_time, 's', 'Time constant of '
+                  'time-correlated errors. If 0, errors are white noise. If -1, the errors '
+                  'themselves show whether they are correlated and for how long.', config.FOUND,
+                  1e5, change=Change.UNCONFIGURED))

@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format the tables of parameters for docs/parameters.md and as a parameter file; no ROS."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 
 from pose_graph_ros.adapters.parameter_table import (
     Change,
+    OF_ALL,
     Parameter,
     PARAMETERS,
-    SOURCE_PARAMETERS,
     Value,
 )
 from pose_graph_ros.adapters.parameters import listed_sources, source_parameters, type_parameter
-from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.adapters.sources import KINDS, TYPE
 
 # Examples for lists that are not set by default.
 _EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]'}
@@ -66,8 +66,11 @@ def sources_as_markdown() -> str:
     """Return the table in docs/parameters.md of the parameters of a source."""
     lines = ['| parameter | types | default | unit | range | changes | description |',
              '|---|---|---|---|---|---|---|']
-    lines += (f'| `<source>.{parameter.name}` | {_kinds(parameter.kinds)} | {_facts(parameter)}'
-              for parameter in SOURCE_PARAMETERS)
+    every = [TYPE, *OF_ALL]
+    for kind in KINDS.values():
+        every += [each for each in kind.parameters if each not in every]
+    lines += (f'| `<source>.{parameter.name}` | {_kinds(parameter)} | {_facts(parameter)}'
+              for parameter in every)
     return '\n'.join(lines) + '\n'
 
 
@@ -79,13 +82,10 @@ def _facts(parameter: Parameter) -> str:
             f'{parameter.description} |')
 
 
-def _kinds(kinds: Collection[Kind]) -> str:
-    missing = [kind.value for kind in Kind if kind not in kinds]
-    if len(missing) == 0:
-        return 'all'
-    if len(missing) == 1:
-        return f'all but {missing[0]}'
-    return ', '.join(kind.value for kind in Kind if kind in kinds)
+def _kinds(parameter: Parameter) -> str:
+    """Return the names of the kinds of sources that have a parameter."""
+    names = [kind.name for kind in KINDS.values() if parameter in kind.parameters]
+    return ', '.join(names) or 'all'
 
 
 def _range(parameter: Parameter) -> str:

@@ -19,22 +19,22 @@ from typing import Any, cast
 import yaml
 
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.fixes import datum_of
 from pose_graph_ros.adapters.parameter_table import (
     Change,
-    OF_SOURCES,
+    DEFAULT_SOURCES,
+    OF_ALL,
     Parameter,
     PARAMETERS,
-    SOURCE_PARAMETERS,
     Value,
 )
 from pose_graph_ros.adapters.sources import (
     backend_config,
-    DEFAULT_SOURCES,
-    Kind,
+    KINDS,
     KNOWN_SOURCES,
     source_names,
+    TYPE,
 )
+from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.exceptions import ConfigError
 
 LIKENESS = 0.7  # from which on one name may be meant by another, as difflib measures it
@@ -45,6 +45,8 @@ NOTHING = (None, 'null', 'None')
 # Names of sources are prefixes of parameters and of counts in the diagnostics.
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 _TOPIC = re.compile(r'(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+_OF_SOURCES = {TYPE.name, *(each.name for kind in KINDS.values()
+                            for each in (*OF_ALL, *kind.parameters))}
 _TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'outputs',
           'qos_overrides', 'use_sim_time', 'start_type_description_service'} | {
               parameter.name for parameter in PARAMETERS}
@@ -52,19 +54,19 @@ _TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'ou
 
 def type_parameter(source: str) -> Parameter:
     """Return the parameter with the kind of a source, on which its other parameters depend."""
-    return _of_source(SOURCE_PARAMETERS[0], source)
+    return _of_source(TYPE, source)
 
 
 def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
     """Return all parameters of a source with their full names, if it has a kind."""
     checked_value(type_parameter(source), kind)
-    return tuple(_of_source(parameter, source) for parameter in SOURCE_PARAMETERS
-                 if Kind(kind) in parameter.kinds)
+    return tuple(_of_source(parameter, source)
+                 for parameter in (TYPE, *OF_ALL, *KINDS[kind].parameters))
 
 
 def _of_source(parameter: Parameter, source: str) -> Parameter:
     kind, topic = KNOWN_SOURCES.get(source, (None, source))
-    own = {'type': '' if kind is None else kind.value, 'topic': topic}
+    own = {'type': '' if kind is None else kind.name, 'topic': topic}
     return replace(parameter, name=f'{source}.{parameter.name}',
                    default=own.get(parameter.name, parameter.default))
 
@@ -110,7 +112,7 @@ def unknown(name: str, known: Collection[str]) -> ConfigError:
 def explanation(name: str, known: Collection[str]) -> str:
     """Return what may be wrong with a name that is not known; empty if no other is like it."""
     source, _, own = name.rpartition('.')
-    if source == '' or own not in OF_SOURCES:
+    if source == '' or own not in _OF_SOURCES:
         nearest, said = get_close_matches(name, known, 1, LIKENESS), []
     elif f'{source}.type' in known:
         return f'a source of the type of {source} has none'

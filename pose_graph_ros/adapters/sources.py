@@ -1,72 +1,114 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The sources of measurements by the ROS parameters, and the settings of the engine for them."""
+"""
+The kinds of sources, each of them one row of a table, and the sources by the ROS parameters.
 
-from collections.abc import Collection, Mapping
+A row says what messages a kind has and what they become, which settings the engine has for it, and
+by which parameters. What the engine does with the measurements, `core.sources.kinds` says.
+"""
+
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, replace
-from enum import Enum
 import math
 from typing import Any
 
+from pose_graph_ros.adapters import parameter_table as table
+from pose_graph_ros.adapters.conversions import (
+    global_pose,
+    heading,
+    loop_closure,
+    Message,
+    odometry_sample,
+)
+from pose_graph_ros.adapters.parameter_table import Change, Parameter
+from pose_graph_ros.adapters.surroundings import fix, Surroundings, twist_odometry, yaw_rate
 from pose_graph_ros.core import config
-from pose_graph_ros.core.config import GyroSource, Integrate, RateNoise
+from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample
+from pose_graph_ros.core.quantities import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 # The graph is reset if the clock or the stamps of odometry jump back by more than this [ns].
 CLOCK_JUMP_NS = NANOSECONDS
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+_IMU = 'sensor_msgs/msg/Imu'
+
+Settings = OdometrySource | MeasurementSource | GyroSource
+Measured = OdometrySample | Measurement
 
 
-class Kind(Enum):
-    """Kind of a source; the value of its parameter `type`, and the type of its messages."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Kind:
+    """A kind of sources."""
 
-    ODOMETRY = 'odometry', 'nav_msgs/msg/Odometry'
-    GLOBAL_POSE = 'global_pose', _POSE
-    FIX = 'fix', 'sensor_msgs/msg/NavSatFix'
-    IMU = 'imu', 'sensor_msgs/msg/Imu'
-    LOOP_CLOSURE = 'loop_closure', _POSE
-    TWIST = 'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped'
-    GYRO = 'gyro', 'sensor_msgs/msg/Imu'
-
+    name: str  # value of the parameter `type`
     message_type: str
-
-    def __new__(cls, name: str, message_type: str = '') -> 'Kind':
-        """Make a member whose value is its name alone."""
-        kind = object.__new__(cls)
-        kind._value_, kind.message_type = name, message_type
-        return kind
+    convert: Callable[[Message, 'Source', Surroundings], Measured | Answer]
+    settings: Settings  # of a source, but for those that have parameters
+    parameters: tuple[Parameter, ...]  # beside `OF_ALL`
+    in_map: bool = False  # whether it tells where the robot is in the map
+    on_earth: bool = False  # whether it tells where the map is on the Earth
+    is_rare: bool = False  # whether its silence means nothing, and no message must get lost
+    in_frames: bool = False  # whether its messages are in frames that /tf_static places
+    names_frames: bool = False  # whether its frames are odom_frame and base_link_frame
+    without_frame: str = ''  # what a message without a frame_id means
+    part: str = ''  # the part of its messages that is used, if other kinds use other ones
 
     @property
     def is_odometry(self) -> bool:
         """Whether the source is one of odometry."""
-        return self in ODOMETRY_KINDS
+        return isinstance(self.settings, OdometrySource)
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether its messages tell motions, and come without a gap."""
+        return not isinstance(self.settings, MeasurementSource)
 
 
-IN_MAP = (Kind.FIX, Kind.GLOBAL_POSE)
-"""Kinds of sources of positions in the map."""
-ODOMETRY_KINDS = (Kind.ODOMETRY, Kind.TWIST)
+ODOMETRY = Kind(
+    'odometry', 'nav_msgs/msg/Odometry',
+    lambda message, source, _: odometry_sample(
+        message, source.time_offset_ns, with_twist=source.integrate == Integrate.TWIST.value),
+    OdometrySource(), (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
+GLOBAL_POSE = Kind(
+    'global_pose', _POSE,
+    lambda message, source, by: global_pose(message, (by.map_frame,), source.time_offset_ns),
+    config.POSITIONS, (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
+    without_frame='it is taken for {map}, the map_frame')
+FIX = Kind(
+    'fix', 'sensor_msgs/msg/NavSatFix', fix, config.POSITIONS,
+    (*table.in_the_map(config.POSITIONS), table.LEVER_ARM), in_map=True, on_earth=True,
+    in_frames=True,
+    without_frame='its antenna is taken to be in {base}: set {name}.lever_arm')
+IMU = Kind(
+    'imu', _IMU,
+    lambda message, source, by: heading(
+        message, by.datum.yaw, source.yaw_offset, source.time_offset_ns),
+    config.HEADINGS, (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
+LOOP_CLOSURE = Kind(
+    'loop_closure', _POSE,
+    lambda message, source, _: loop_closure(message, source.time_offset_ns),
+    config.LOOP_CLOSURES, table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
+TWIST = Kind(
+    'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', twist_odometry,
+    OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
+    without_frame='it is taken for {base}, the base_link_frame')
+GYRO = Kind(
+    'gyro', _IMU, yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
+    without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
+KINDS = {kind.name: kind
+         for kind in (ODOMETRY, GLOBAL_POSE, FIX, IMU, LOOP_CLOSURE, TWIST, GYRO)}
+"""Kinds of sources by name."""
+
+TYPE = Parameter('type', '', '', 'Type of the source.', choices=tuple(KINDS), change=Change.START)
 
 SET_POSE, JUDGE = 'set_pose', 'judge'  # names under which what a person asks for is counted
 CLOSURES = 'loop_closure'  # name of the source of loop closures that always exists
 KNOWN_SOURCES = {
-    'odom': (Kind.ODOMETRY, 'odom'), 'global_pose': (Kind.GLOBAL_POSE, 'global_pose'),
-    'fix': (Kind.FIX, 'gps/fix'), 'imu': (Kind.IMU, 'imu/data'),
-    CLOSURES: (Kind.LOOP_CLOSURE, 'loop_closure'), 'gyro': (Kind.GYRO, 'imu/data')}
+    'odom': (ODOMETRY, 'odom'), 'global_pose': (GLOBAL_POSE, 'global_pose'),
+    'fix': (FIX, 'gps/fix'), 'imu': (IMU, 'imu/data'),
+    CLOSURES: (LOOP_CLOSURE, 'loop_closure'), 'gyro': (GYRO, 'imu/data')}
 """Default kind and topic of the predefined sources."""
-DEFAULT_SOURCES = ('odom', 'global_pose', 'fix')
-
-
-OUTPUTS = {
-    'path': ('path', 'nav_msgs/msg/Path', 'corrected path'),
-    'pose': ('pose', _POSE, 'newest pose'),
-    'filtered_odometry': ('odometry/filtered', Kind.ODOMETRY.message_type,
-                          'newest pose and twist'),
-    'filtered_fix': ('gps/filtered', Kind.FIX.message_type, 'newest pose on the Earth'),
-    'graph': ('graph', 'visualization_msgs/msg/MarkerArray', 'markers of the graph'),
-    'verdicts': ('~/verdicts', 'diagnostic_msgs/msg/DiagnosticArray', 'verdicts'),
-    'diagnostics': ('/diagnostics', 'diagnostic_msgs/msg/DiagnosticArray', 'diagnostics')}
-"""Default topic, type and content of the outputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +122,12 @@ class Source:
     lever_arm: tuple[float, ...] = (0.0, 0.0)  # antenna of fixes on the robot [m]; 0: not given
     yaw_offset: float = 0.0  # added to the yaw of an IMU [rad]
     mounting: str = 'tf'  # of a gyroscope: by /tf_static, or its z axis points `up` or `down`
-    integrates_twist: bool = False  # whether the motion of odometry is that of its twists
+    integrate: str = Integrate.POSE.value  # what the motion of odometry is taken from
+
+    @property
+    def needs_frame(self) -> bool:
+        """Whether the frame_id of its messages matters, and no parameter stands for it."""
+        return self.mounting == 'tf' and not any(self.lever_arm)
 
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
@@ -95,13 +142,11 @@ def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _source(name: str, own: Mapping[str, Any]) -> Source:
-    kind, given = Kind(own['type']), _same(own, Source)
+    given = _same(own, Source)
     if 'lever_arm' in given:
         given['lever_arm'] = tuple(given['lever_arm'])
-    return Source(
-        name, kind, time_offset_ns=round(own['time_offset'] * NANOSECONDS),
-        integrates_twist=(kind is Kind.TWIST or own.get('integrate') == Integrate.TWIST.value),
-        **given)
+    return Source(name, KINDS[own['type']],
+                  time_offset_ns=round(own['time_offset'] * NANOSECONDS), **given)
 
 
 def source_names(listed: list[str]) -> list[str]:
@@ -111,10 +156,6 @@ def source_names(listed: list[str]) -> list[str]:
 
 # Parameters of a source by the setting that the error messages of the engine name.
 _SETTINGS = {'CovariancePolicy.heading_floor': 'sigma_floor'}
-DEFAULTS = {
-    Kind.GLOBAL_POSE: config.POSITIONS, Kind.FIX: config.POSITIONS, Kind.IMU: config.HEADINGS,
-    Kind.LOOP_CLOSURE: config.LOOP_CLOSURES}
-"""Settings of the sources of measurements, but for those that have parameters."""
 
 
 def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
@@ -123,17 +164,19 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
 
     Raises `ConfigError` if these contradict each other, or have no source of odometry.
     """
-    odometry: dict[str, config.OdometrySource] = {}
-    measurements, gyros = {SET_POSE: config.SET_POSES}, dict[str, GyroSource]()
+    odometry, gyros = dict[str, OdometrySource](), dict[str, GyroSource]()
+    measurements = {SET_POSE: config.SET_POSES}
     for source in source_list(values):
         own = _own(values, source.name)
         try:
-            if source.kind.is_odometry:
-                odometry[source.name] = _odometry_source(own, source)
-            elif source.kind is Kind.GYRO:
-                gyros[source.name] = _gyro_source(own)
-            else:
-                measurements[source.name] = _measurement_source(own, DEFAULTS[source.kind])
+            match source.kind.settings:
+                case OdometrySource() as settings:
+                    odometry[source.name] = _odometry_source(own, settings)
+                case GyroSource():
+                    gyros[source.name] = GyroSource(
+                        config.RateNoise(own['noise']), **_same(own, GyroSource))
+                case MeasurementSource() as settings:
+                    measurements[source.name] = _measurement_source(own, settings)
         except ConfigError as error:
             setting, _, rest = str(error).partition(': ')
             raise ConfigError(
@@ -151,16 +194,12 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
-def _odometry_source(own: Mapping[str, Any], source: Source) -> config.OdometrySource:
-    return config.OdometrySource(
+def _odometry_source(own: Mapping[str, Any], default: OdometrySource) -> OdometrySource:
+    return OdometrySource(
         noise=config.OdometryNoise(**_same(own, config.OdometryNoise)),
         noise_from=config.NoiseFrom(own['noise']),
-        integrate=Integrate.TWIST if source.integrates_twist else Integrate.POSE,
-        **_same(own, config.OdometrySource, but=('noise', 'integrate')))
-
-
-def _gyro_source(own: Mapping[str, Any]) -> GyroSource:
-    return GyroSource(RateNoise(own['noise']), **_same(own, GyroSource))
+        integrate=Integrate(own.get('integrate', default.integrate)),
+        **_same(own, OdometrySource, but=('noise', 'integrate')))
 
 
 def _same(
@@ -171,9 +210,7 @@ def _same(
             if field.name in own and field.name not in but}
 
 
-def _measurement_source(
-    own: Mapping[str, Any], default: config.MeasurementSource,
-) -> config.MeasurementSource:
+def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:
     policy, loss = default.covariance, config.Loss(own['robust_loss'])
     floors = own.get('sigma_floor', (policy.position_floor, policy.heading_floor))
     return replace(

@@ -155,7 +155,7 @@ def _run(
               str((options.out / RECORDED).resolve()), '--rate', str(options.rate),
               '--hold-out', str(inputs.hold_out)]
     for name, topic in inputs.topics.items():
-        player += ['--input', name, inputs.kinds[name].value, values[f'{name}.topic'], topic]
+        player += ['--input', name, inputs.kinds[name].name, values[f'{name}.topic'], topic]
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \
             isolated_environment(Path(log)) as env:
         processes = [node := subprocess.Popen(node_command, env=env)]

@@ -22,7 +22,6 @@ from scipy.special import gammaincinv
 from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import Kind, ODOMETRY_KINDS
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
@@ -299,10 +298,10 @@ def drive_in(
     reader = reader_of(bag, values)
     if origin is not None:
         reader.datum.keep(origin)
-    is_on_earth = len(inputs.of(Kind.FIX)) > 0 and not any(values['datum'][2:])
+    is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
     drive = collect_drive(
         measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-        inputs.of(*ODOMETRY_KINDS)[0], refused)
+        inputs.odometry[0], refused)
     return place_truth(replace(
         drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))

@@ -18,7 +18,6 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagMessage, MessageError, Span
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.output_cdr import (
     odometry_cdr,
@@ -26,7 +25,8 @@ from pose_graph_ros.adapters.output_cdr import (
     transform_cdr,
     UNKNOWN_VARIANCE,
 )
-from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.adapters.sources import KINDS
+from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.run.recorder import Run
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -154,7 +154,7 @@ class _Corrector:
     def __init__(self, bag: Bag, inputs: Inputs, run: Run) -> None:
         path, values, self._source = run.estimate.path, run.values, run.estimate.primary
         self.topic = inputs.topics[self._source]
-        self._has_poses = inputs.kinds[self._source] is Kind.ODOMETRY
+        self._has_poses = inputs.kinds[self._source] is KINDS['odometry']
         self.map_frame, self.odom_frame, self._base_frame = (
             frame(values[key]) for key in ('map_frame', 'odom_frame', 'base_link_frame'))
         odometry = interpolated(path, self._samples(

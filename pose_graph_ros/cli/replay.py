@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import Bag, BagError, open_bags
-from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import (
     backend_config,
     CLOSURES,
     Kind,
-    ODOMETRY_KINDS,
+    LOOP_CLOSURE,
+    ODOMETRY,
     source_list,
 )
+from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
 from pose_graph_ros.cli.exports import (
@@ -119,7 +120,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
         bag = stack.enter_context(open_bags(options.bags))
         inputs = shared.inputs_of(bag, options, values, options.hold_out)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
-            inputs.of(Kind.FIX)) > 0)
+            inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
             BagWriter(options.new_bag, latched=LATCHED))
         if not options.json:
@@ -129,7 +130,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
         result = run(shared.watched_bag(bag, 'optimising'), inputs, values, live)
         seconds = time.monotonic() - start
         if len(result.backend.node_stamps_ns) == 0:
-            names = inputs.of(*ODOMETRY_KINDS)
+            names = inputs.odometry
             topics = ' or '.join(inputs.topics[name] for name in names)
             why = ', '.join(f'{answer} {count}' for (source, answer), count
                             in sorted(result.counts.items()) if source in names)
@@ -164,7 +165,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         ((*each, False) for each in measurements), backend, odometry, result.refused)
     return _report(options, _run_of(
         options, result, drive, values=values,
-        kinds={odometry: Kind.ODOMETRY, CLOSURES: Kind.LOOP_CLOSURE}, seconds=seconds),
+        kinds={odometry: ODOMETRY, CLOSURES: LOOP_CLOSURE}, seconds=seconds),
         {'seconds': seconds})
 
 

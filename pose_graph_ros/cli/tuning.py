@@ -22,7 +22,7 @@ import numpy as np
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import backend_config, Kind, ODOMETRY_KINDS
+from pose_graph_ros.adapters.sources import backend_config, IMU
 from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.cli.tuned_parameters import (
     changed,
@@ -47,7 +47,8 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
 )
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
-from pose_graph_ros.core.sources.validation import validate, Validated
+from pose_graph_ros.core.sources.kinds import validate
+from pose_graph_ros.core.sources.validation import Validated
 from pose_graph_ros.offline.residuals.scale import RowFit, ScaleFit
 from pose_graph_ros.offline.residuals.variance_components import analyse
 from pose_graph_ros.offline.tuning import held_out, noise
@@ -113,9 +114,9 @@ class Tuning:
         self.is_cut = next(stream, None) is not None  # whether the bag has more
         counts = Counter(name for name, each in self._measurements
                          if isinstance(each, OdometrySample))
-        self._odometries = [name for name in inputs.of(*ODOMETRY_KINDS) if counts[name] > 1]
+        self._odometries = [name for name in inputs.odometry if counts[name] > 1]
         if len(self._odometries) == 0:
-            topics = ' or '.join(inputs.topics[name] for name in inputs.of(*ODOMETRY_KINDS))
+            topics = ' or '.join(inputs.topics[name] for name in inputs.odometry)
             raise BagError(f'{self._path}: no usable odometry on {topics}')
         stamps = [each.stamp_ns for name, each in self._measurements
                   if name == self._odometries[0]]
@@ -169,7 +170,7 @@ class Tuning:
     def _valid(self, values: Mapping[str, Any]) -> dict[str, list[Absolute]]:
         """Return the valid measurements in the map of each source by stamp, by some parameters."""
         config, found = backend_config(values), {}
-        for name in self._inputs.of(Kind.FIX, Kind.GLOBAL_POSE, Kind.IMU):
+        for name in self._inputs.of(lambda kind: kind.in_map or kind is IMU):
             valid = []
             for of, each in self._measurements:
                 if of == name and isinstance(each, Absolute):

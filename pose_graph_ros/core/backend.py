@@ -39,11 +39,10 @@ from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources import constraint_names as cn
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.measurement_constraints import attach
+from pose_graph_ros.core.sources.kinds import attach, validate
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.source_constraints import Queue, QueuedEdge
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.core.sources.validation import validate
 from pose_graph_ros.core.transaction import (
     checked,
     succeeds,
@@ -173,11 +172,10 @@ class PoseGraphBackend:
         """Collect secondary edges and counts of odometry; attach measurements that are due."""
         self._pipeline.queue.edges += [
             QueuedEdge(*edge) for edge in self._nodes.take_secondary_edges()]
+        self._pipeline.count_sorted(self._nodes.streams)
         for source, stream in self._nodes.streams.items():
-            for reason, count in (('jump', stream.n_jumps), ('sorted', stream.n_sorted),
-                                  ('stamp_ahead', stream.n_dropped)):
-                if count > 0:
-                    self.counts[source, reason] = count
+            if stream.n_jumps > 0:
+                self.counts[source, 'jump'] = stream.n_jumps
         self._pipeline.attach_due()
 
     def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:

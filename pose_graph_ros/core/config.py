@@ -11,12 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any, ClassVar, Protocol
 
 from pose_graph_ros.core.exceptions import ConfigError
-
-if TYPE_CHECKING:  # it loads NumPy, and the tools say how they are used without it
-    from pose_graph_ros.core.measurements import Measurement
 
 # Sigma of a heading that is uniform on the circle [rad].
 FLAT_GUESS = math.pi / math.sqrt(3.0)
@@ -267,6 +264,12 @@ LOOP_CLOSURES = MeasurementSource(
     covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
 
 
+class HasDefaults(Protocol):
+    """A kind of measurements."""
+
+    defaults: ClassVar[MeasurementSource]  # settings of a source that is not configured
+
+
 @dataclass(frozen=True, slots=True)
 class NodePolicy:
     """Conditions for a new hidden node: enough motion, or a maximum time."""
@@ -409,10 +412,9 @@ class BackendConfig:
         """Factor on the sigmas of odometry of the preferred source; 0 for one that is found."""
         return next((source.sigma_scale for source in self.odometry.values()), 0.0)
 
-    def measurement_source(self, name: str, kind: 'type[Measurement]') -> MeasurementSource:
+    def measurement_source(self, name: str, kind: type[HasDefaults]) -> MeasurementSource:
         """Return the settings of a source, by default those of its kind of measurement."""
-        defaults = {'LoopClosure': LOOP_CLOSURES, 'HeadingOnly': HEADINGS}
-        return self.measurements.get(name, defaults.get(kind.__name__, POSITIONS))
+        return self.measurements.get(name, kind.defaults)
 
     def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
         """

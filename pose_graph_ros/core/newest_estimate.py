@@ -23,7 +23,7 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.measurements import Absolute, Fix, LoopClosure, Position, value_defect
+from pose_graph_ros.core.measurements import Absolute
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -32,7 +32,7 @@ from pose_graph_ros.core.sources.gauss_markov import (
     CorrelatedErrors,
     GaussMarkovBias,
 )
-from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint, motion_noise
+from pose_graph_ros.core.sources.kinds import KINDS, observed
 
 
 def estimate(
@@ -151,13 +151,12 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
     for source, given in parts.pipeline.waiting.until(parts.nodes.newest_ns):
         attachment = parts.nodes.attach_ahead(given.stamp_ns)
         # the first one of a source may set the origin of the map, but not before it is attached
-        if (isinstance(given, LoopClosure) or attachment is None
-                or not parts.factors.has(source)):
+        if attachment is None or not parts.factors.has(source):
+            continue
+        measurement = KINDS[type(given)].in_map(given)
+        if measurement is None:
             continue
         model = parts.factors.error_model(source)
-        measurement = given.placed() if isinstance(given, Fix) else given
-        if isinstance(measurement, Position) and value_defect(measurement.position) is not None:
-            continue
         settings = parts.factors.config.measurement_source(source, type(measurement))
         found.append((
             _edge(measurement, attachment, model),
@@ -169,11 +168,10 @@ def _edge(
     measurement: Absolute, attachment: Attachment, model: GaussMarkovBias | None,
 ) -> Factors:
     """Return a measurement as an edge to the last state of the bias before it, or to none, -1."""
-    observed = absolute_constraint(measurement, attachment)
-    noise = motion_noise(measurement, attachment)
-    edge = None if model is None else model.preview(measurement.stamp_ns, observed, noise)
+    factors, noise = observed(measurement, attachment)
+    edge = None if model is None else model.preview(measurement.stamp_ns, factors, noise)
     return edge if edge is not None else biased_constraint(
-        observed, noise, -1, 1.0, CorrelatedErrors(0.0, 0.0, 1.0))
+        factors, noise, -1, 1.0, CorrelatedErrors(0.0, 0.0, 1.0))
 
 
 def _joint(smoother: IncrementalSmoother, ids: Sequence[int]) -> FloatArray:

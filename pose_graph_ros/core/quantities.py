@@ -5,6 +5,7 @@
 import numpy as np
 import numpy.typing as npt
 
+NANOSECONDS = 1_000_000_000  # in a second
 Metres = float
 Radians = float
 Seconds = float

@@ -16,11 +16,12 @@ from typing import NamedTuple, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.sources import DEFAULT_SOURCES, Kind, KNOWN_SOURCES, OUTPUTS, Source
+from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
+from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.judgement.texts import short
-from pose_graph_ros.core.odometry.turns import CONTRADICTORY, MOST_BIAS
+from pose_graph_ros.core.odometry.gyro import CONTRADICTORY, MOST_BIAS
 from pose_graph_ros.ros.arrivals import EXPECTED
 from pose_graph_ros.ros.topics import moved
 from pose_graph_ros.ros.transforms import other_publishers
@@ -129,7 +130,7 @@ def _disagreements(session: 'Session') -> Iterator[Concern]:
     if found is not None:
         yield Concern(WARN, found.text, logged=True)
     for name, source in session.input.reader.sources.items():
-        if source.kind is not Kind.GYRO or estimate is None:
+        if source.kind is not GYRO or estimate is None:
             continue
         counts, bias = status.counts, status.biases.get(name, 0.0)
         difference = status.differences.get(name)
@@ -164,9 +165,9 @@ def doubts(session: 'Session') -> Iterator[str]:
 
 
 def _shared(topic: str, users: list[Source]) -> Iterator[str]:
-    """Yield a doubt, but for a heading and a rate, which are both in an Imu."""
-    kinds = [source.kind for source in users]
-    if len(users) > 1 and sorted(kinds, key=str) != [Kind.GYRO, Kind.IMU]:
+    """Yield a doubt, but for sources that use other parts of the same messages."""
+    parts = {source.kind.part for source in users}
+    if len(users) > 1 and (len(parts) < len(users) or '' in parts):
         names = ' and '.join(source.name for source in users)
         yield (f'{names} listen to the same topic, {topic}, so that its messages count '
                f'{len(users)} times: set {users[-1].name}.topic')
@@ -177,7 +178,7 @@ def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str
     node, name, wanted = session.node, source.name, source.kind.message_type
     usual = node.resolve_topic_name(KNOWN_SOURCES[name][1]) if name in KNOWN_SOURCES else ''
     expected = source.kind.is_odometry or topic != usual or (
-        name not in DEFAULT_SOURCES and source.kind is not Kind.LOOP_CLOSURE)
+        name not in DEFAULT_SOURCES and not source.kind.is_rare)
     if session.input.arrivals[name].count > 0 or not expected:
         return
     types = {info.topic_type for info in node.get_publishers_info_by_topic(source.topic)}
@@ -198,7 +199,7 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
     if frames is None:
         return
     parent, child = map(frame, frames)
-    if source.kind is Kind.ODOMETRY:
+    if source.kind.names_frames:
         is_primary = estimate is not None and estimate.primary == name
         for what, found, parameter, expected, consequence in (
                 ('frame_id', parent if is_primary else out.odom_frame, 'odom_frame',
@@ -210,17 +211,9 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
             elif found != expected:
                 yield (f'{name} has the {what} {found!r}, but the parameter {parameter} is '
                        f'{expected!r}: set it, else {consequence}')
-    elif parent == '':
-        taken = {
-            Kind.TWIST: f'it is taken for {out.base_frame}, the base_link_frame',
-            Kind.GLOBAL_POSE: f'it is taken for {out.map_frame}, the map_frame',
-            Kind.GYRO: '' if source.mounting != 'tf' else (
-                f'it is taken for {out.base_frame}: set {name}.mounting'),
-            Kind.FIX: '' if any(source.lever_arm) else (
-                f'its antenna is taken to be in {out.base_frame}: set {name}.lever_arm'),
-        }.get(source.kind, '')
-        if taken != '':
-            yield f'{name} has no frame_id: {taken}'
+    elif parent == '' and source.needs_frame and source.kind.without_frame != '':
+        yield f'{name} has no frame_id: ' + source.kind.without_frame.format(
+            base=out.base_frame, map=out.map_frame, name=name)
 
 
 def _published_by_others(session: 'Session', name: str, default: str) -> Iterator[str]:

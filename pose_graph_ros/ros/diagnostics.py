@@ -118,11 +118,10 @@ def _inputs(session: 'Session') -> dict[str, object]:
             found[f'{name}.rate_hz'] = f'{arrivals.rate:.1f}'
         if arrivals.delay is not None:
             found[f'{name}.delay_s'] = f'{arrivals.delay:.3f}'
-    for name, fixes in reader.fixes.items():
-        if fixes.antenna is not None:
-            x, y = fixes.antenna.lever_arm
-            found[f'{name}.lever_arm'] = f'[{x:.3f}, {y:.3f}] from {fixes.antenna.origin}'
-            found[f'{name}.without_lever_arm'] = fixes.without_lever_arm
+    for name, antenna in [*reader.surroundings.antennas.items()]:
+        x, y = antenna.lever_arm
+        found[f'{name}.lever_arm'] = f'[{x:.3f}, {y:.3f}] from {antenna.origin}'
+        found[f'{name}.without_lever_arm'] = reader.surroundings.without_lever_arm[name]
     plane = reader.datum.plane
     found['datum'] = 'none' if plane is None else (
         f'[{plane.latitude:.9f}, {plane.longitude:.9f}, {plane.yaw:.6f}]')

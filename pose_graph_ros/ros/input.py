@@ -17,16 +17,13 @@ from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.se2 import between_one
 from pose_graph_ros.core.measurements import (
     Answer,
-    LoopClosure,
     Measurement,
     OdometrySample,
     rejected,
-    YawRate,
 )
 from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
@@ -143,7 +140,7 @@ class Input:
 
     def _clear(self) -> None:
         self.arrivals = {
-            name: Arrivals(name, is_rare=source.kind is Kind.LOOP_CLOSURE)
+            name: Arrivals(name, is_rare=source.kind.is_rare)
             for name, source in self.reader.sources.items()}
         self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
         self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
@@ -171,10 +168,9 @@ class Input:
         decision = self.time_jumps.receive(ReceivedMessage(source, message, measurement))
         if decision.is_old:
             self.reject(source, BEFORE_JUMP)
-        elif decision.jump_ns == 0 and not isinstance(measurement, LoopClosure):
-            arrivals.compare(
-                measurement.stamp_ns, self.reader.keeper.clock,
-                may_be_late=not isinstance(measurement, OdometrySample | YawRate))
+        elif decision.jump_ns == 0 and not arrivals.is_rare:
+            arrivals.compare(measurement.stamp_ns, self.reader.keeper.clock,
+                             may_be_late=not self.reader.sources[source].kind.is_motion)
         return decision
 
     def release_overdue(self) -> list[ReceivedMessage]:

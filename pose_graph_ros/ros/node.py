@@ -176,7 +176,7 @@ class PoseGraphNode(LifecycleNode):
         """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
         # pose_graph.yaml has defaults of sources that `sources` may leave out
         usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
-                 for parameter in source_parameters(source, kind.value)}
+                 for parameter in source_parameters(source, kind.name)}
         for name, value in sorted(self._overrides.items()):
             # those of rclpy are declared, or will be with the publishers and subscriptions
             if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (

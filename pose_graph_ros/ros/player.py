@@ -36,7 +36,9 @@ from pose_graph_ros.adapters.bag_inputs import (
 )
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
-from pose_graph_ros.adapters.sources import Kind, NANOSECONDS, OUTPUTS
+from pose_graph_ros.adapters.parameter_table import OUTPUTS
+from pose_graph_ros.adapters.sources import KINDS
+from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros.transforms import message_class, TF_TYPE, TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
@@ -233,7 +235,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('--rate', type=float, default=20.0)
     options = parser.parse_args(args)
     inputs = Inputs({source: topic for source, _, _, topic in options.input},
-                    {source: Kind(kind) for source, kind, _, _ in options.input},
+                    {source: KINDS[kind] for source, kind, _, _ in options.input},
                     options.hold_out)
     rclpy.init()
     try:

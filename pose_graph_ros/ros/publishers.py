@@ -28,7 +28,6 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.fixes import Datum
 from pose_graph_ros.adapters.output_cdr import (
     markers_cdr,
     odometry_cdr,
@@ -36,13 +35,9 @@ from pose_graph_ros.adapters.output_cdr import (
     stamped_pose_cdr,
     UNKNOWN_VARIANCE,
 )
-from pose_graph_ros.adapters.sources import (
-    IN_MAP,
-    JUDGE,
-    NANOSECONDS,
-    OUTPUTS,
-    source_list,
-)
+from pose_graph_ros.adapters.parameter_table import OUTPUTS
+from pose_graph_ros.adapters.sources import JUDGE, source_list
+from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction
@@ -53,7 +48,7 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
+from pose_graph_ros.core.quantities import Metres, NANOSECONDS, Seconds, StampNs
 from pose_graph_ros.ros.transforms import (
     message_class,
     Slew,
@@ -123,7 +118,7 @@ class Publishers:
         # None if `publish_tf` is false or tf2_msgs is not installed
         self.transforms: TransformPublisher | None = None
         self._map_topics = [node.resolve_topic_name(source.topic)
-                            for source in source_list(values) if source.kind in IN_MAP]
+                            for source in source_list(values) if source.kind.in_map]
         self._awaits_map = False    # whether there ever was a publisher on one of these
         self._newest_ns = 0
         self.graph = 0  # number of the present graph: how many were started after the first

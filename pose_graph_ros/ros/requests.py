@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros.adapters.conversions import frame, global_pose, Message
-from pose_graph_ros.adapters.fixes import datum_of
 from pose_graph_ros.adapters.sources import JUDGE, SET_POSE
+from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate

@@ -151,7 +151,8 @@ class Services:
                 worker.call(lambda _: None).result()
         self._require_present(worker)
         status, datum = worker.status, session.input.reader.datum
-        used = sum(status.counts[name, 'accepted'] for name in session.input.reader.fixes)
+        used = sum(status.counts[name, 'accepted'] for name, source
+                   in session.input.reader.sources.items() if source.kind.on_earth)
         if datum.is_of_graph:
             return False, 'refused: the graph that was loaded refers to the present datum'
         if datum.plane is not None and used > 0:

@@ -28,8 +28,6 @@ from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import (
     backend_config,
     CLOCK_JUMP_NS,
-    Kind,
-    NANOSECONDS,
     SET_POSE,
     Source,
 )
@@ -37,6 +35,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros import diagnostics
 from pose_graph_ros.ros.concerns import concerns
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
@@ -51,7 +50,6 @@ from pose_graph_ros.ros.worker import Worker
 logger = logging.getLogger(__name__)
 
 STOP_TIMEOUT = 0.5  # longest wait at the end for what the worker does [s]
-IN_FRAMES = (Kind.FIX, Kind.GYRO, Kind.TWIST)  # sources that need /tf_static
 
 
 class Session:
@@ -127,14 +125,14 @@ class Session:
             'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
             JUDGE_TOPIC: lambda message: decide(message, self.worker),
             STATIC_TOPIC: self.input.reader.frames.receive}
-        in_frames = any(source.kind in IN_FRAMES for source in sources)
+        in_frames = any(source.kind.in_frames for source in sources)
         for topic, given in INPUTS.items():
             if topic != STATIC_TOPIC or in_frames:
                 self._subscribe(topic, *given, callbacks[topic])
         for source in sources:
             self._subscribe(
                 source.topic, source.kind.message_type,
-                CLOSURE_QOS if source.kind is Kind.LOOP_CLOSURE else SENSOR_QOS,
+                CLOSURE_QOS if source.kind.is_rare else SENSOR_QOS,
                 partial(self._on_message, source))
         self._watch_time()
         for arrivals in self.input.arrivals.values():

@@ -13,7 +13,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
-from pose_graph_ros.adapters.sources import Kind, OUTPUTS, source_list
+from pose_graph_ros.adapters.parameter_table import OUTPUTS
+from pose_graph_ros.adapters.sources import GLOBAL_POSE, source_list
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.transforms import STATIC_TOPIC, TF_TYPE, TFMessage, TOPIC
 
@@ -24,8 +25,8 @@ SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT
 CLOSURE_QOS = QoSProfile(depth=100)     # a loop closure is rare and must not get lost
 JUDGE_TOPIC = '~/judge'
 INPUTS = {
-    'initialpose': (Kind.GLOBAL_POSE.message_type, QoSProfile(depth=1)),
-    'set_pose': (Kind.GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+    'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+    'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
     JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
 """Messages and quality of service by topic, but for the sources."""
 if TFMessage is not None:   # late subscribers receive the newest message of every broadcaster

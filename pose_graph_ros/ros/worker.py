@@ -23,7 +23,7 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
 from pose_graph_ros.core.measurements import Measurement, OdometrySample
-from pose_graph_ros.core.odometry.turns import Difference
+from pose_graph_ros.core.odometry.gyro import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.log import verdict_lines
 

@@ -11,7 +11,7 @@ import pytest
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, read_inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag, TopicInfo
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import Kind, KNOWN_SOURCES, source_list
+from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, KNOWN_SOURCES, source_list
 from pose_graph_ros.cli.bag_messages import (
     fix_messages,
     loop_closure_messages,
@@ -20,7 +20,7 @@ from pose_graph_ros.cli.bag_messages import (
 )
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 
-POSE = Kind.GLOBAL_POSE.message_type
+POSE = GLOBAL_POSE.message_type
 SOURCES = source_list(checked({}))
 
 
@@ -66,7 +66,7 @@ def test_the_choice_of_topics(
     (bag(o='odom', f='fix', g='fix'), {}, '--fix /f or --fix /g'),
     (bag(o='odom', f='fix'), {'fix': '/x'}, r'no topic /x \(--fix\); the bag has /o, /f'),
     (bag(o='odom', f='fix'), {'global_pose': '/f'},
-     f'--global-pose /f is of type {Kind.FIX.message_type}, expected {POSE}')])
+     f'--global-pose /f is of type {FIX.message_type}, expected {POSE}')])
 def test_a_choice_that_is_not_clear_names_the_candidates(
     reader: SimpleNamespace, wanted: dict[str, str], said: str,
 ) -> None:
@@ -98,7 +98,7 @@ def test_sources_of_other_names_are_looked_up_by_their_topics() -> None:
     inputs = choose_inputs(reader, sources, {})
     assert inputs.topics == {'odom': '/o', 'visual': '/vo', 'fix': '/f', 'rear': '/rear/fix'}
     assert list(inputs.topics) == ['odom', 'visual', 'fix', 'rear']
-    assert inputs.of(Kind.FIX) == ['fix', 'rear']
+    assert inputs.fixes == ['fix', 'rear']
     # what the bag does not have is left out
     assert choose_inputs(bag(o='odom', f='fix'), sources, {}).topics == {'odom': '/o', 'fix': '/f'}
     with pytest.raises(BagError, match=r'rear\.topic /rear/fix is of type'):

@@ -10,32 +10,30 @@ import pyproj
 import pytest
 from sensor_msgs.msg import NavSatFix
 
-from pose_graph_ros.adapters.conversions import StaticFrames
-from pose_graph_ros.adapters.fixes import Datum, FixReader
 from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import Kind, Source
+from pose_graph_ros.adapters.surroundings import Datum, StaticFrames
 from pose_graph_ros.core.measurements import Answer, Fix, Position
 
 
-def fixes(**values: object) -> FixReader:
+def fixes(**values: object) -> MessageReader:
     return MessageReader(checked({
-        name.replace('__', '.'): value for name, value in values.items()})).fixes['fix']
+        name.replace('__', '.'): value for name, value in values.items()}))
 
 
-def placed(reader: FixReader, message: NavSatFix) -> Position:
+def placed(reader: MessageReader, message: NavSatFix) -> Position:
     """Return the position of a fix that the engine uses."""
-    return reader.read(message).placed()
+    return reader.read('fix', message).placed()
 
 
 def test_the_first_good_fix_is_the_datum() -> None:
     reader = fixes()
     bad = fix(1.0, 48.0, 11.0)
     bad.status.status = -1
-    assert isinstance(reader.read(bad), Answer)
-    assert reader.read(fix(0.0, 48.0, 11.0)).reason == 'zero_stamp'
+    assert isinstance(reader.read('fix', bad), Answer)
+    assert reader.read('fix', fix(0.0, 48.0, 11.0)).reason == 'zero_stamp'
     # one that the engine does not use is none
-    assert isinstance(reader.read(fix(1.5, 48.0, 11.0)), Fix)
+    assert isinstance(reader.read('fix', fix(1.5, 48.0, 11.0)), Fix)
     first = placed(reader, fix(2.0, 48.1, 11.6))
     assert isinstance(first, Position)
     assert first.position == pytest.approx([0.0, 0.0], abs=1e-9)
@@ -72,15 +70,15 @@ def test_the_plane_is_at_the_first_altitude_that_is_known(given: list[float]) ->
 
 def test_an_unknown_covariance_is_zeros() -> None:
     reader, message = fixes(), fix(1.0, 48.1, 11.6, sigma=2.0)
-    assert reader.read(message).covariance == pytest.approx(4.0 * np.eye(2))
+    assert reader.read('fix', message).covariance == pytest.approx(4.0 * np.eye(2))
     message.position_covariance_type = 0
-    assert not np.any(reader.read(message).covariance)
+    assert not np.any(reader.read('fix', message).covariance)
 
 
 def test_fixes_wait_for_a_datum_if_they_are_told_to() -> None:
-    datum = Datum(wait=True)
-    reader = FixReader(Source('fix', Kind.FIX, 'fix'), datum, StaticFrames(), 'base_link')
-    assert reader.read(fix(1.0, 48.0, 11.0)).reason == 'no_datum'
+    reader = fixes(wait_for_datum=True)
+    datum = reader.datum
+    assert reader.read('fix', fix(1.0, 48.0, 11.0)).reason == 'no_datum'
     datum.renew()
     assert isinstance(placed(reader, fix(2.0, 48.1, 11.6)), Position)
     assert (datum.plane.latitude, datum.plane.longitude) == (48.1, 11.6)
@@ -150,21 +148,22 @@ def test_the_antenna_is_where_the_parameter_says_else_where_tf_static_does() -> 
     reader = MessageReader(checked({
         'sources': ['odom', 'fix', 'rear'], 'rear.type': 'fix', 'rear.lever_arm': [-1.0, 0.5]}))
     assert reader.read('fix', fix(1.0, 48.1, 11.6)).lever_arm.tolist() == [0.0, 0.0]
-    assert reader.fixes['fix'].antenna.origin == 'none'
-    assert reader.fixes['fix'].without_lever_arm == 1
+    by = reader.surroundings
+    assert by.antennas['fix'].origin == 'none'
+    assert by.without_lever_arm['fix'] == 1
     reader.frames.receive(Transforms(transform('base_link', 'gps', (0.75, -0.25, 1.0))))
     assert reader.read('fix', fix(2.0, 48.1, 11.6)).lever_arm.tolist() == [0.75, -0.25]
-    assert reader.fixes['fix'].antenna.origin == 'tf_static'
-    assert reader.fixes['fix'].without_lever_arm == 1
+    assert by.antennas['fix'].origin == 'tf_static'
+    assert by.without_lever_arm['fix'] == 1
     assert reader.read('rear', fix(2.0, 48.1, 11.6)).lever_arm.tolist() == [-1.0, 0.5]
-    assert reader.fixes['rear'].antenna.origin == 'parameter'
+    assert by.antennas['rear'].origin == 'parameter'
 
 
 def test_another_lever_arm_is_taken_for_fixes_from_then_on_and_all_else_stays() -> None:
     values = checked({'fix.lever_arm': [0.5, 0.0]})
     reader = MessageReader(values)
     first = reader.read('fix', fix(1.0, 48.1, 11.6)).placed()
-    plane, one = reader.datum.plane, reader.fixes['fix']
+    plane = reader.datum.plane
     reader.frames.receive(Transforms(transform('base_link', 'gps', (0.75, -0.25, 1.0))))
     reader.configure({**values, 'fix.lever_arm': [1.5, 0.25], 'fix.time_offset': -0.5})
     second = reader.read('fix', fix(2.0, 48.1, 11.6)).placed()
@@ -172,7 +171,6 @@ def test_another_lever_arm_is_taken_for_fixes_from_then_on_and_all_else_stays() 
     assert second.stamp_ns == 1_500_000_000
     assert second.position == pytest.approx(first.position, abs=1e-9)
     assert reader.datum.plane is plane
-    assert reader.fixes['fix'] is one
     # zero: from the transforms that came before
     reader.configure({**values, 'fix.lever_arm': [0.0, 0.0]})
     assert reader.read('fix', fix(3.0, 48.1, 11.6)).lever_arm.tolist() == [0.75, -0.25]

@@ -15,8 +15,9 @@ from pose_graph_ros.adapters.launch_arguments import (
     switch,
     unknown,
 )
+from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.adapters.parameters import all_parameters
-from pose_graph_ros.adapters.sources import KNOWN_SOURCES, OUTPUTS
+from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 
 TREE = Path(__file__).resolve().parents[2]

@@ -30,7 +30,11 @@ from pose_graph_ros.adapters.parameters import (
 )
 from pose_graph_ros.adapters.sources import (
     backend_config,
-    Kind,
+    FIX,
+    GLOBAL_POSE,
+    IMU,
+    LOOP_CLOSURE,
+    ODOMETRY,
     SET_POSE,
     Source,
     source_list,
@@ -106,10 +110,10 @@ def test_defaults_make_the_default_engine_with_a_loss_for_what_is_in_the_map() -
         measurements={SET_POSE: SET_POSES, 'global_pose': robust, 'fix': robust,
                       'loop_closure': LOOP_CLOSURES})
     assert source_list(checked({})) == (
-        Source('odom', Kind.ODOMETRY, 'odom'),
-        Source('global_pose', Kind.GLOBAL_POSE, 'global_pose'),
-        Source('fix', Kind.FIX, 'gps/fix'),
-        Source('loop_closure', Kind.LOOP_CLOSURE, 'loop_closure'))
+        Source('odom', ODOMETRY, 'odom'),
+        Source('global_pose', GLOBAL_POSE, 'global_pose'),
+        Source('fix', FIX, 'gps/fix'),
+        Source('loop_closure', LOOP_CLOSURE, 'loop_closure'))
 
 
 NUMBERS = [p for p in (*all_parameters({}), *all_parameters({'sources': ['imu']}))
@@ -193,12 +197,12 @@ def test_every_setting_of_a_source_reaches_the_engine() -> None:
             policy.heading_floor, policy.heading) == (True, (1.2,), 1.3, 1.0, 1.5, Heading.AUTO)
     assert config.measurements['closer'] == LOOP_CLOSURES
     assert sources == (
-        Source('visual', Kind.ODOMETRY, '/vo', -125_000_000),
-        Source('odom', Kind.ODOMETRY, 'odom'),
-        Source('rear', Kind.FIX, 'rear', lever_arm=(0.22, 0.23)),
-        Source('compass', Kind.IMU, 'compass', yaw_offset=0.24),
-        Source('closer', Kind.LOOP_CLOSURE, 'closer'),
-        Source('loop_closure', Kind.LOOP_CLOSURE, 'loop_closure'))
+        Source('visual', ODOMETRY, '/vo', -125_000_000),
+        Source('odom', ODOMETRY, 'odom'),
+        Source('rear', FIX, 'rear', lever_arm=(0.22, 0.23)),
+        Source('compass', IMU, 'compass', yaw_offset=0.24),
+        Source('closer', LOOP_CLOSURE, 'closer'),
+        Source('loop_closure', LOOP_CLOSURE, 'loop_closure'))
 
 
 # --- Names that are not known

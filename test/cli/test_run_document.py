@@ -13,7 +13,7 @@ import pytest
 from run_schema import problems
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, GYRO, LOOP_CLOSURE, ODOMETRY
 from pose_graph_ros.cli.drive import collect_drive, place_truth
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.run import places
@@ -34,8 +34,8 @@ def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
     compared = place_truth(replace(collect_drive(
         ((*each, False) for each in drive.measurements()), backend, 'odom', ()),
         truth=drive.truth))
-    kinds = {'odom': Kind.ODOMETRY, 'global_pose': Kind.GLOBAL_POSE,
-             'loop_closure': Kind.LOOP_CLOSURE}
+    kinds = {'odom': ODOMETRY, 'global_pose': GLOBAL_POSE,
+             'loop_closure': LOOP_CLOSURE}
     # as it is read from the file
     return dict(json.loads(json.dumps(document(Run(
         'a drive', 'made up', compared, backend, recorder, values, kinds, backend.counts, report,
@@ -205,7 +205,7 @@ def test_a_silence_of_one_of_two_odometries_does_not_hide_the_motion() -> None:
     tenths = (np.arange(1, 101) * SECOND // 10).tolist()
     interrupted = [*tenths[:41], *tenths[80:]]
     arrived = {'wheels': tenths, 'visual': interrupted, 'gyro': interrupted}
-    kinds = {'wheels': Kind.ODOMETRY, 'visual': Kind.ODOMETRY, 'gyro': Kind.GYRO}
+    kinds = {'wheels': ODOMETRY, 'visual': ODOMETRY, 'gyro': GYRO}
     told = {text.partition(':')[0]: text.rpartition('; ')[2]
             for _, text, _ in silences(arrived, kinds, 0)}
     assert told == {
@@ -222,6 +222,6 @@ def test_a_silence_is_a_warning_from_20_s_on_as_the_docs_say(source) -> None:
         stamps = [tenth * SECOND // 10 for tenth in (
             *range(10, 110), *range(109 + 10 * length, 210 + 10 * length))]
         (found, text, _), = silences(
-            {source: stamps}, {'odom': Kind.ODOMETRY, 'fix': Kind.FIX}, SECOND)
+            {source: stamps}, {'odom': ODOMETRY, 'fix': FIX}, SECOND)
         assert found == level
         assert f'({length} s at most)' in text

@@ -18,7 +18,7 @@ import yaml
 pytest.importorskip('rclpy', reason='ROS 2 is not there: no rclpy')
 
 from pose_graph_ros.adapters.output_cdr import NAMESPACES
-from pose_graph_ros.adapters.sources import OUTPUTS
+from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.ros import diagnostics, publishers
 from pose_graph_ros.ros.topics import INPUTS
 

@@ -23,7 +23,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import number_of, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
-from pose_graph_ros.core.odometry.turns import CONTRADICTORY
+from pose_graph_ros.core.odometry.gyro import CONTRADICTORY
 from pose_graph_ros.core.quantities import Seconds, StampNs
 
 LEVELS = ('warning', 'notice', 'good')
@@ -258,9 +258,9 @@ def silences(
     """Yield silences of odometry, and of fixes and global poses."""
     for source, stamps_ns in arrived_ns.items():
         kind = kinds.get(source)
-        moves = kind in (Kind.ODOMETRY, Kind.TWIST, Kind.GYRO)
-        if not moves and kind not in (Kind.FIX, Kind.GLOBAL_POSE):
+        if kind is None or not (kind.is_motion or kind.in_map):
             continue
+        moves = kind.is_motion
         gaps = silent(stamps_ns, 0.5 if moves else 4.0) - start_ns * 1e-9
         if len(gaps) == 0:
             continue
@@ -271,7 +271,7 @@ def silences(
         others = any(each.is_odometry and name != source and name in arrived_ns
                      for name, each in kinds.items())
         what = ('the path follows odometry there, and its covariance grows' if not moves else
-                'the heading there is that of other sources' if kind is Kind.GYRO else
+                'the heading there is that of other sources' if not kind.is_odometry else
                 'the motion there is that of other odometry, as far as it goes on' if others else
                 'the motion there is not known')
         longest = float(np.max(lengths))

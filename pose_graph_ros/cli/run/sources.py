@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.adapters.sources import GLOBAL_POSE, GYRO, Kind, LOOP_CLOSURE, ODOMETRY
 from pose_graph_ros.cli.run.places import Frame, number, rounded
 from pose_graph_ros.cli.run.recorder import Run
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -51,8 +51,8 @@ class SourceAnalysis(NamedTuple):
 
 def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
     """Return the analysis of each source."""
-    guesses = {'odometry': Kind.ODOMETRY, 'loop_closure': Kind.LOOP_CLOSURE, 'turn': Kind.GYRO,
-               'map': Kind.GLOBAL_POSE}
+    guesses = {'odometry': ODOMETRY, 'loop_closure': LOOP_CLOSURE, 'turn': GYRO,
+               'map': GLOBAL_POSE}
     reports, found = run.backend.reports(), {}
     for source, each in analysis.residuals.items():
         fit, report = analysis.fits[source], reports.get(source)
@@ -84,7 +84,7 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
     values = normalised[np.isfinite(normalised)]
     return {
-        'name': residuals.source, 'kind': analysis.kind.value,
+        'name': residuals.source, 'kind': analysis.kind.name,
         'count': len(residuals.ids), 'used': len(used.ids),
         'rows': [_row(row, names) for row in found.rows],
         'energy': {'expected': number(found.energy_expected),

@@ -16,7 +16,6 @@ from pose_graph_ros.core.config import BackendConfig, OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import (
-    FactorKind,
     FactorKinds,
     Factors,
     full,
@@ -184,7 +183,7 @@ class AlignmentMonitor:
 
 def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
     """Return the measurements that contain a position: all but headings."""
-    return [each for each in attached if each.observed.kind[0] != FactorKind.HEADING]
+    return [each for each in attached if each.is_placed]
 
 
 def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> Factors:

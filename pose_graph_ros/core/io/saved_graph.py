@@ -18,8 +18,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, wrap
 from pose_graph_ros.core.graph.graph import GraphRows
 from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.judge import SavedJudgement
+from pose_graph_ros.core.odometry.gyro import SavedGyro
 from pose_graph_ros.core.odometry.node_table import SavedNodes
-from pose_graph_ros.core.odometry.turns import SavedGyro
 from pose_graph_ros.core.saved_columns import Matrix
 from pose_graph_ros.core.sources.gyro_bias import SavedGyroBias
 from pose_graph_ros.core.sources.source_constraints import SavedEdges, SavedSource

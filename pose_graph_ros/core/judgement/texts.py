@@ -16,8 +16,8 @@ from pose_graph_ros.core.judgement.verdicts import (
     Verdict,
 )
 from pose_graph_ros.core.measurements import Answer, rejected
+from pose_graph_ros.core.quantities import NANOSECONDS
 
-NANOSECONDS = 1_000_000_000
 PLAUSIBLE = 3.37  # distance up to which a pose may be right: 99 % of right ones are nearer [sigma]
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
 PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',

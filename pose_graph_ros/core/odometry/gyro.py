@@ -1,23 +1,39 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Yaw rates of a gyroscope by stamp, and their integral between two instants.
+From yaw rates of gyroscopes to rotations between consecutive hidden nodes.
 
-Between two samples the rate is taken to change uniformly, so the integral is that of a polygon. A
-rate is w + b + n: w the true one, b the bias, which is estimated in the graph, n white noise.
+Between two samples the rate is taken to change uniformly, so its integral is that of a polygon. A
+rate is w + b + n: w the true one, b the bias, which is estimated in the graph, n white noise. At
+rest the mean rate measures the bias.
+
+How well rotations agree with those of odometry is told to people, and has no part in the estimate.
+A rotation by the gyroscope minus that by odometry is, over the time t between two hidden nodes,
+
+    d = b t + tau (w_1 - w_0) + k a
+
+with b the bias, tau how much its stamps are early, w the rates at both nodes, a the rotation by
+odometry and 1 + k how much the gyroscope turns for each turn of odometry: 0 if it is dead, -1 if
+it is upside down. These three are fitted to the newest rotations by least squares, with the noise
+that both claim.
 """
 
 import bisect
-from collections.abc import Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.config import GyroSource, RateNoise
+from pose_graph_ros.core.config import BackendConfig, GyroSource, RateNoise
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
+from pose_graph_ros.core.odometry.timeline import STANDING_NS
 from pose_graph_ros.core.quantities import StampNs
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
@@ -37,93 +53,6 @@ class Rotation(NamedTuple):
     def without(self, part: 'Rotation') -> 'Rotation':
         """Return the rotation during the rest of the time."""
         return Rotation(*(whole - less for whole, less in zip(self, part, strict=True)))
-
-
-class GyroStream(ReorderBuffer[YawRate]):
-    """The samples of a gyroscope, sorted by stamp."""
-
-    def __init__(self, source: GyroSource) -> None:
-        super().__init__('a rate')
-        self._settled: list[YawRate] = []
-        self.configure(source)
-
-    def configure(self, source: GyroSource) -> None:
-        """Set the settings for samples that are not integrated yet."""
-        self._source = source
-        self._window_ns = round(source.reorder_window * 1e9)
-        self._gap_ns = round(source.maximum_gap * 1e9)
-
-    @property
-    def first_ns(self) -> int:
-        """Stamp of the oldest settled sample that is still here [ns]; -1 without."""
-        return self._settled[0].stamp_ns if self._settled else -1
-
-    @property
-    def settled_ns(self) -> int:
-        """Stamp of the newest settled sample [ns]; -1 before the first."""
-        return self._settled[-1].stamp_ns if self._settled else -1
-
-    def _was_settled(self, stamp_ns: int) -> bool:
-        at = bisect.bisect_left(self._settled, stamp_ns, key=stamp_of)
-        return at < len(self._settled) and self._settled[at].stamp_ns == stamp_ns
-
-    def add(self, sample: YawRate) -> Answer:
-        """Add a sample; return whether it is accepted, or the reason for its rejection."""
-        if not abs(sample.rate) <= LARGEST_RATE:
-            return rejected('too_large' if abs(sample.rate) > LARGEST_RATE else 'not_finite',
-                            f'yaw rate {sample.rate} rad/s')
-        if not 0.0 < sample.variance < LARGEST_RATE**2:
-            sample = replace(sample, variance=0.0)
-        at = self._insert(sample)
-        if isinstance(at, Answer):
-            return at
-        self.settle(self._waiting[-1].stamp_ns - self._window_ns)
-        return ACCEPTED
-
-    def settle(self, until_ns: int | None = None) -> None:
-        """Settle the samples up to a stamp [ns], by default all."""
-        n = len(self._waiting) if until_ns is None else bisect.bisect_right(
-            self._waiting, until_ns, key=stamp_of)
-        self._settled += self._waiting[:n]
-        # without odometry the oldest are dropped
-        del self._waiting[:n], self._settled[:-100_000]
-
-    def forget_before(self, stamp_ns: int) -> None:
-        """Forget the samples that rates from a stamp [ns] on do not need."""
-        n = bisect.bisect_right(self._settled, stamp_ns, key=stamp_of) - 1
-        del self._settled[:max(n, 0)]
-
-    def integral(
-        self, start_ns: StampNs, end_ns: StampNs, *, to_come: bool = False,
-    ) -> 'RateIntegral | None':
-        """
-        Return the integral of the rate; None if samples do not cover the time without a gap.
-
-        Where samples are still to come, the newest rate is taken to last until the end.
-        """
-        every = self._settled + self._waiting
-        begin = bisect.bisect_right(every, start_ns, key=stamp_of) - 1
-        if begin < 0:
-            return None
-        samples = every[begin:bisect.bisect_left(every, end_ns, key=stamp_of) + 1]
-        if to_come and samples[-1].stamp_ns < end_ns:
-            samples.append(replace(samples[-1], stamp_ns=end_ns))
-        stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
-        if (len(stamps_ns) < 2 or stamps_ns[-1] < end_ns
-                or np.max(np.diff(stamps_ns)) > self._gap_ns):
-            return None
-        rates = np.array([(each.rate, each.variance) for each in samples])
-        return RateIntegral(stamps_ns, rates, self._source)
-
-    def saved(self) -> tuple[YawRate, ...]:
-        """Return the samples that are still here."""
-        return (*self._settled, *self._waiting)
-
-    def restore(self, saved: Sequence[YawRate]) -> None:
-        """Fill this empty stream with saved samples."""
-        self._waiting = [*saved]
-        if len(saved) > 0:
-            self.settle(self._waiting[-1].stamp_ns - self._window_ns)
 
 
 class RateIntegral:
@@ -163,3 +92,344 @@ class RateIntegral:
         step = time - self._times[k]
         angle = self._angles[k] + (self.rates[k] + 0.5 * self._slopes[k] * step) * step
         return float(angle), float(self._variances[k] + self._densities[k] * step)
+
+
+# Rotations of independent sensors that differ by more contradict each other [sigma].
+CONTRADICTORY = 1.5
+LEAST = 30  # rotations for a verdict
+# A robot whose gyroscope shows more than this many sigmas of its bias at rest is turned by others.
+MOST_BIAS = 5.0
+
+
+class Difference(NamedTuple):
+    """How much rotations differ from those of odometry."""
+
+    sigmas: float  # root mean square of what the bias does not explain, in units of its sigma
+    # what is probably wrong, as a sentence without capital and full stop; '' for nothing
+    reason: str
+
+
+class Agreement:
+    """The sums over the newest rotations of one gyroscope."""
+
+    def __init__(self) -> None:
+        self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
+        self._squares = self._n = self._turned = 0.0
+
+    def add(
+        self, difference: float, seconds: float, change: float, angle: float, variance: float,
+    ) -> None:
+        """
+        Add a rotation, `angle` by the gyroscope and that less a difference by odometry.
+
+        `variance` is that of the difference, `change` how much the rate changes meanwhile [rad/s].
+        """
+        by_odometry, fade = angle - difference, 1.0 - 1.0 / 1000.0  # the fit forgets
+        row = np.array((seconds, change, by_odometry))
+        left = difference
+        if self._n >= LEAST:
+            left -= float(row @ self._fit()[0])
+        # differences beyond 5 sigma do not count, as those of wheels that slip
+        weight = min(25.0 / (left * left + 1e-300), 1.0 / variance)
+        self._normal = fade * self._normal + weight * np.outer(row, row)
+        self._right = fade * self._right + weight * difference * row
+        self._squares = fade * self._squares + weight * difference * difference
+        self._n = fade * self._n + 1.0
+        self._turned = fade * self._turned + max(abs(angle), abs(by_odometry))
+
+    def _fit(self) -> tuple[FloatArray, FloatArray]:
+        """Return bias, time and scale, and their covariance."""
+        # weak priors: 0.1 rad/s, 10 s, 10
+        covariance = np.linalg.inv(self._normal + np.diag((1e2, 1e-2, 1e-2)))
+        return np.asarray(covariance @ self._right), np.asarray(covariance, dtype=np.float64)
+
+    def difference(self) -> Difference | None:
+        """Return the difference by now; None as long as too little is known."""
+        if self._n < LEAST or self._turned < 2.0 * math.pi:
+            return None
+        explained = self._right[0]**2 / self._normal[0, 0]
+        sigmas = math.sqrt(max(self._squares - explained, 0.0) / self._n)
+        found, covariance = self._fit()
+        rest = max((self._squares - float(found @ self._right)) / self._n, 1.0)
+        shown = np.abs(found) > 5.0 * np.sqrt(rest * np.diagonal(covariance))
+        early, turns, reason = float(found[1]), 1.0 + float(found[2]), ''
+        if sigmas < 0.1:
+            reason = 'odometry seems to contain it already, so that it counts twice'
+        elif sigmas < CONTRADICTORY:
+            pass
+        elif turns < -0.3:
+            reason = 'it turns the other way: check its mounting'
+        elif turns < 0.3:
+            reason = ('it does not turn with odometry: its z axis is not up (see mounting and '
+                      '/tf_static), or it is dead')
+        elif shown[1] and abs(early) > 0.05:
+            reason = (f'its stamps seem to be {abs(early):.2f} s '
+                      f'{"early" if early > 0.0 else "late"}: see time_offset')
+        elif shown[2] and abs(1.0 / turns - 1.0) > 0.05:
+            reason = f'odometry turns {1.0 / turns:.2f} times as much'
+        return Difference(sigmas, reason)
+
+
+# Parts of a standstill by the wheels in which the robot may still, or already, turn [ns].
+STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
+
+
+class Turn(NamedTuple):
+    """The rotation from one hidden node to the next."""
+
+    source: str
+    i: int  # id of the node that it begins at
+    j: int  # id of the node that it leads to
+    stamp_ns: int  # middle of the time in between [ns]
+    angle: float  # rotation, with the bias during `seconds`, not wrapped [rad]
+    variance: float  # [rad^2]
+    seconds: float  # time for which the robot was not at rest, during which the bias acted [s]
+    rest_rate: float = 0.0  # mean rate at rest, which is the bias [rad/s]
+    rest_variance: float = 0.0  # of that rate [rad^2/s^2]; 0 if the robot was not at rest
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Ids of the nodes that it is on."""
+        return self.i, self.j
+
+
+@dataclass(frozen=True, slots=True)
+class SavedGyro:
+    """Saved state of a gyroscope."""
+
+    rates: tuple[YawRate, ...]  # from the last node on that was reached
+    next_node: int  # number of the hidden node that the next rotation leads to
+    waiting: tuple[Turn, ...]  # rotations that are not in the graph yet
+
+
+class GyroStream(ReorderBuffer[YawRate]):
+    """The samples of a gyroscope, sorted by stamp, and what was made of them."""
+
+    def __init__(self, source: GyroSource) -> None:
+        super().__init__('a rate')
+        self._settled: list[YawRate] = []
+        self.next_node = 1  # number of the hidden node that the next rotation leads to
+        self.agreement = Agreement()
+        self.configure(source)
+
+    def configure(self, source: GyroSource) -> None:
+        """Set the settings for samples that are not integrated yet."""
+        self._source = source
+        self._set_window(source.reorder_window)
+
+    @property
+    def samples(self) -> tuple[YawRate, ...]:
+        """The samples that are still here."""
+        return (*self._settled, *self._waiting)
+
+    @property
+    def first_ns(self) -> int:
+        """Stamp of the oldest settled sample that is still here [ns]; -1 without."""
+        return self._settled[0].stamp_ns if self._settled else -1
+
+    def _was_settled(self, stamp_ns: int) -> bool:
+        at = bisect.bisect_left(self._settled, stamp_ns, key=stamp_of)
+        return at < len(self._settled) and self._settled[at].stamp_ns == stamp_ns
+
+    def add(self, sample: YawRate) -> Answer:
+        """Add a sample; return whether it is accepted, or the reason for its rejection."""
+        if not abs(sample.rate) <= LARGEST_RATE:
+            return rejected('too_large' if abs(sample.rate) > LARGEST_RATE else 'not_finite',
+                            f'yaw rate {sample.rate} rad/s')
+        if not 0.0 < sample.variance < LARGEST_RATE**2:
+            sample = replace(sample, variance=0.0)
+        answer = self._insert(sample)
+        if isinstance(answer, Answer):
+            return answer
+        self.settle()
+        return ACCEPTED
+
+    def settle(self, until_ns: int | None = None) -> None:
+        """Settle samples, by default those that no older ones can come before any more."""
+        self._settled += self._settle(until_ns)
+        del self._settled[:-100_000]    # without odometry the oldest are dropped
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Forget the samples that rates from a stamp [ns] on do not need."""
+        n = bisect.bisect_right(self._settled, stamp_ns, key=stamp_of) - 1
+        del self._settled[:max(n, 0)]
+
+    def integral(
+        self, start_ns: StampNs, end_ns: StampNs, *, to_come: bool = False,
+    ) -> RateIntegral | None:
+        """
+        Return the integral of the rate; None if samples do not cover the time without a gap.
+
+        Where samples are still to come, the newest rate is taken to last until the end.
+        """
+        every = self._settled + self._waiting
+        begin = bisect.bisect_right(every, start_ns, key=stamp_of) - 1
+        if begin < 0:
+            return None
+        samples = every[begin:bisect.bisect_left(every, end_ns, key=stamp_of) + 1]
+        if to_come and samples[-1].stamp_ns < end_ns:
+            samples.append(replace(samples[-1], stamp_ns=end_ns))
+        stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
+        if (len(stamps_ns) < 2 or stamps_ns[-1] < end_ns
+                or np.max(np.diff(stamps_ns)) > round(self._source.maximum_gap * 1e9)):
+            return None
+        rates = np.array([(each.rate, each.variance) for each in samples])
+        return RateIntegral(stamps_ns, rates, self._source)
+
+    def restore(self, saved: SavedGyro) -> None:
+        """Fill this empty stream with what was saved."""
+        self._waiting, self.next_node = [*saved.rates], saved.next_node
+        self.settle()
+
+
+class Gyros:
+    """
+    Makes a rotation per gyroscope between each two consecutive hidden nodes that it covers.
+
+    Rates are integrated over gaps no longer than a limit; a longer one leaves the rotation out.
+    While the wheels stand, the robot does not turn but for what the wheels say: the rotation has
+    no part of that, and the mean rate measures the bias instead.
+    """
+
+    def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
+        self._nodes, self._config = nodes, config
+        self.streams: dict[str, GyroStream] = {}  # by the name of the source
+        # Number of rotations by source: 'rotations' that were made, those that a 'gap' in the
+        # rates has left out, and those 'before_window', whose nodes have left the graph. Whoever
+        # takes them clears it.
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.new: list[Turn] = []  # rotations not yet taken; whoever takes them clears the list
+
+    def configure(self, config: BackendConfig) -> None:
+        """Set the settings for rotations that are made from now on."""
+        self._config = config
+        for name, stream in self.streams.items():
+            stream.configure(config.gyro(name))
+
+    def add(self, sample: YawRate, source: str) -> Answer:
+        """Return the answer to a sample, after adding it."""
+        return self._stream(source).add(sample)
+
+    def finish(self) -> None:
+        """Settle all samples."""
+        for stream in self.streams.values():
+            stream.settle(stream.newest_ns)
+
+    def extend(self) -> None:
+        """Make the rotations up to the newest node that settled rates have reached."""
+        for source, stream in self.streams.items():
+            stamps_ns = self._nodes.stamps_ns
+            end = int(np.searchsorted(stamps_ns, stream.settled_ns, side='right'))
+            if stream.next_node >= end:
+                continue
+            # before the first sample there is nothing to integrate
+            begin = max(stream.next_node, int(np.searchsorted(stamps_ns, stream.first_ns)))
+            for node in range(begin, end):
+                self._extend(source, stream, node)
+            stream.next_node = max(begin, end)
+            stream.forget_before(int(stamps_ns[stream.next_node - 1]))
+
+    def _extend(self, source: str, stream: GyroStream, node: int) -> None:
+        """Make the rotation to a node, given by its number."""
+        nodes = self._nodes
+        start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
+        # closer nodes have no rotation between them: a robot was put elsewhere
+        if end_ns - start_ns < 1_000_000 or node in nodes.relocated:
+            return
+        integral = stream.integral(start_ns, end_ns)
+        if integral is None:
+            if stream.first_ns <= start_ns:
+                self.counts[source, 'gap'] += 1
+            return
+        if nodes.has_left(node - 1) or nodes.has_left(node):
+            self.counts[source, 'before_window'] += 1
+            return
+        rotation = integral.between(start_ns, end_ns)
+        at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
+        self.counts[source, 'rotations'] += 1
+        self._compare(source, integral, start_ns, end_ns)
+        i, j = nodes.ids[node - 1:node + 1].tolist()
+        middle_ns = (start_ns + end_ns) // 2
+        if at_rest.seconds == 0.0:
+            self.new.append(Turn(source, i, j, middle_ns, *rotation))
+            return
+        angle, variance, seconds = rotation.without(at_rest)
+        self.new.append(Turn(
+            source, i, j, middle_ns, angle + creep, variance + creep_variance, seconds,
+            (at_rest.angle - creep) / at_rest.seconds,
+            (at_rest.variance + creep_variance) / at_rest.seconds**2))
+
+    def _compare(
+        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
+    ) -> None:
+        """Compare the rotation between two stamps [ns] with that by odometry."""
+        stream = self._nodes.streams[self._nodes.primary_at(end_ns)]
+        if not (stream.timeline.covers(start_ns) and stream.timeline.covers(end_ns)):
+            return
+        motion, rotation = stream.timeline.motion(start_ns, end_ns), integral.between(
+            start_ns, end_ns)
+        self.streams[source].agreement.add(
+            float(se2.wrap(rotation.angle - motion.increment[2])), rotation.seconds,
+            integral.rate(end_ns) - integral.rate(start_ns), rotation.angle,
+            rotation.variance + float(stream.covariance(motion)[2, 2]))
+
+    def _at_rest(
+        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
+    ) -> tuple[Rotation, float, float]:
+        """Return the rotation by rates at rest, that by the wheels [rad] and its variance."""
+        total, creep, variance = Rotation(0.0, 0.0, 0.0), 0.0, 0.0
+        if end_ns - start_ns < STOPPING_NS + STARTING_NS + STANDING_NS:
+            return total, creep, variance
+        primary = self._nodes.primary_at(end_ns)
+        timeline = self._nodes.streams[primary].timeline
+        most = MOST_BIAS * self._config.gyro(source).sigma_bias
+        for first_ns, last_ns in timeline.rests(start_ns, end_ns):
+            begin_ns, until_ns = first_ns + STOPPING_NS, last_ns - STARTING_NS
+            if until_ns - begin_ns < STANDING_NS:
+                continue
+            rest = integral.between(begin_ns, until_ns)
+            if abs(rest.angle) > most * rest.seconds:
+                continue
+            total = Rotation(*(one + more for one, more in zip(total, rest, strict=True)))
+            creep += float(timeline.motion(begin_ns, until_ns).increment[2])
+            variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
+        return total, creep, variance
+
+    def _stream(self, source: str) -> GyroStream:
+        stream = self.streams.get(source)
+        if stream is None:
+            stream = self.streams[source] = GyroStream(self._config.gyro(source))
+        return stream
+
+    def differences(self) -> dict[str, Difference]:
+        """Return how much each gyroscope differs from odometry, where enough is known."""
+        found = {source: each.agreement.difference() for source, each in self.streams.items()}
+        return {source: each for source, each in found.items() if each is not None}
+
+    def newest(
+        self, start_ns: int, end_ns: int, biases: Mapping[str, float],
+    ) -> tuple[float, float] | None:
+        """
+        Return the rotation of the robot between two recent stamps, and its variance.
+
+        It is that of the first source that has one, among those with a bias [rad/s].
+        """
+        for source, bias in biases.items() if start_ns < end_ns else ():
+            stream = self.streams.get(source)
+            integral = None if stream is None else stream.integral(
+                start_ns, end_ns, to_come=True)
+            if integral is not None:
+                angle, variance, seconds = integral.between(start_ns, end_ns)
+                return angle - bias * seconds, variance
+        return None
+
+    def saved(self, waiting: Sequence[Turn]) -> dict[str, SavedGyro]:
+        """Return the state of each gyroscope, with the rotations that wait for an update."""
+        return {source: SavedGyro(
+            stream.samples, stream.next_node,
+            tuple(turn for turn in waiting if turn.source == source))
+            for source, stream in self.streams.items()}
+
+    def restore(self, source: str, saved: SavedGyro) -> None:
+        """Restore the saved state of a gyroscope."""
+        self._stream(source).restore(saved)

@@ -20,7 +20,6 @@ from pose_graph_ros.core.odometry.several_sources import (
     choose_first,
     find_silence,
     first_with_sample,
-    SecondaryEdges,
     Silence,
 )
 from pose_graph_ros.core.odometry.stream import OdometryStream
@@ -59,7 +58,7 @@ class HiddenNodes(NodeTable):
         # motion from the newest node to `_base_ns`, shape (3,), and covariance, shape (3, 3),
         # where the primary source has no sample as old as that node; else None
         self._span: tuple[FloatArray, FloatArray] | None = None
-        self._secondary = SecondaryEdges()
+        self._secondary: list[tuple[str, Factors]] = []  # edges not yet taken, with their sources
         # stamp before which samples may have been dropped as nodes were thinned out [ns]
         self._samples_since_ns = -1
         self.errors = AS_CLAIMED  # of the primary odometry, which the edges to new nodes know of
@@ -122,13 +121,11 @@ class HiddenNodes(NodeTable):
 
     def take_secondary_edges(self) -> list[tuple[str, Factors]]:
         """Return the new edges of the other sources with their sources' names; forget them."""
-        edges, self._secondary.new = self._secondary.new, []
+        edges, self._secondary = self._secondary, []
         return edges
 
     def _make_stream(self, source: str) -> OdometryStream:
-        stream = OdometryStream(self._config.odometry_source(source))
-        self.streams[source] = stream
-        self._secondary.skip_to(source, 0, reached=False)
+        stream = self.streams[source] = OdometryStream(self._config.odometry_source(source))
         return stream
 
     def _process(self, source: str, settled: Iterable[tuple[int, Pose]]) -> None:
@@ -215,9 +212,9 @@ class HiddenNodes(NodeTable):
             stamp_ns, node, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
         self._base_ns = self.covered_ns
         # no secondary edge spans the step to the new pose
-        for source in self.streams:
+        for source, stream in self.streams.items():
             if source != self.primary:
-                self._secondary.skip_to(source, len(self) - 1, reached=False)
+                stream.tie_from(len(self) - 1, reached=False)
         return node
 
     def _catch_up(self) -> None:
@@ -237,7 +234,7 @@ class HiddenNodes(NodeTable):
     def _append(self, stamp_ns: int, node: int, base: Pose, odometry: FloatArray) -> None:
         self.append(stamp_ns, node, odometry)
         self._base_ns, self._base, self._span = stamp_ns, base, None
-        self._secondary.skip_to(self.primary, len(self) - 1, reached=True)
+        self.streams[self.primary].tie_from(len(self) - 1, reached=True)
 
     def _extend(self, stamp_ns: int, pose: Pose) -> None:
         """Make a node at a settled sample of the primary source, if one is due."""
@@ -278,10 +275,10 @@ class HiddenNodes(NodeTable):
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:
             return
-        stamps_ns, ids, primary = self.stamps_ns, self.ids, self.primary
         for source, stream in self.streams.items():
-            if source != primary:
-                self._secondary.extend(source, stream, stamps_ns, ids)
+            if source != self.primary:
+                self._secondary += [
+                    (source, edge) for edge in stream.secondary_edges(self.stamps_ns, self.ids)]
 
     def primary_at(self, stamp_ns: int) -> str:
         """Return the source that was the primary one at a stamp [ns]."""
@@ -340,22 +337,20 @@ class HiddenNodes(NodeTable):
         if len(self.thinned) == 0 or len(self) - newest <= self.n_frozen:
             return
         since_ns = int(self.stamps_ns[-newest])
-        for source, stream in self.streams.items():
-            begin = self._secondary.progress[source][0]
+        for stream in self.streams.values():
             # the next edge of the source begins there
-            at_ns = since_ns if begin < 0 else min(since_ns, int(self.stamps_ns[begin]))
-            stream.forget(at_ns)
+            stream.forget(since_ns if stream.tied < 0
+                          else min(since_ns, int(self.stamps_ns[stream.tied])))
         self._samples_since_ns = since_ns
 
     def forget(self, poses: FloatArray) -> None:
         """Freeze the oldest nodes at poses, shape (M, 3), as they have left; drop their past."""
         self.freeze(poses)
         first, last_ns = self.n_frozen, self.last_frozen_ns
-        for source, stream in self.streams.items():
+        for stream in self.streams.values():
             stream.forget(last_ns)
-            begin, node = self._secondary.progress[source]
-            if begin < first:   # no edge begins at a node that has left
-                self._secondary.skip_to(source, max(node, first), reached=False)
+            if stream.tied < first:   # no edge begins at a node that has left
+                stream.tie_from(max(stream.next_to_tie, first), reached=False)
         n_old = sum(after_ns < last_ns for after_ns, _ in self._primaries) - 1
         del self._primaries[:max(n_old, 0)]
 
@@ -380,8 +375,7 @@ class HiddenNodes(NodeTable):
         return SavedNodes(
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
-            {name: stream.saved(needed_ns, self._secondary.progress[name])
-             for name, stream in self.streams.items()},
+            {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
             self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
             np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
@@ -395,7 +389,6 @@ class HiddenNodes(NodeTable):
             self._span = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)
         for name, stream in saved.streams.items():
             self._make_stream(name).restore(stream)
-            self._secondary.progress[name] = stream.tied, stream.next_to_tie
         self.relocated = {*saved.relocated.tolist()}
         if len(saved.errors) > 0:
             self.errors = OdometryErrors(*saved.errors.tolist())

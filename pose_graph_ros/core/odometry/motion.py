@@ -18,7 +18,7 @@ import numpy as np
 
 from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry.se2 import exp_one, FloatArray, Pose
 
 Variances = tuple[float, float, float]  # of (x, y, theta) [m^2, m^2, rad^2], or of a twist
 NO_VARIANCE: FloatArray = np.zeros(3)
@@ -48,6 +48,12 @@ class Attachment:
     # `T_at`, pose at the instant in the frame of the node, shape (3,) [m, m, rad]
     motion: FloatArray
     noise: FloatArray  # covariance of the motion in the frame at the instant, shape (3, 3)
+
+
+def integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
+    """Return the motion during a time [s] by the mean of the twists at its begin and end."""
+    x, y, theta = (0.5 * (one + other) * elapsed for one, other in zip(first, last, strict=True))
+    return exp_one((x, y, theta))
 
 
 def step_variance(

@@ -3,10 +3,11 @@
 """Samples of one source that wait, in the order of stamps, until no older one can come."""
 
 import bisect
+from collections.abc import Iterator
 from typing import Generic, Protocol, TypeVar
 
 from pose_graph_ros.core.measurements import Answer, LARGEST_STAMP, rejected
-from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.core.quantities import Seconds, StampNs
 
 # A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
 # stamps of this number of consecutive samples that came after it.
@@ -36,18 +37,35 @@ class ReorderBuffer(Generic[Sample]):
     def __init__(self, what: str) -> None:
         self.n_sorted = 0  # samples that were received after newer ones and sorted in before them
         self.n_dropped = 0  # accepted samples that were dropped later, as they were far ahead
+        self.settled_ns = -1  # stamp of the newest settled sample; -1 before the first [ns]
         self._waiting: list[Sample] = []
         self._what, self._window_ns = what, 0
         self._n_behind = 0  # consecutive received samples that are far behind the newest one
 
     @property
-    def settled_ns(self) -> StampNs:
-        """Stamp of the newest settled sample; -1 before the first."""
-        raise NotImplementedError
+    def newest_ns(self) -> StampNs:
+        """Stamp of the newest sample, settled or not; -1 before the first."""
+        return self._waiting[-1].stamp_ns if self._waiting else self.settled_ns
 
     def _was_settled(self, stamp_ns: StampNs) -> bool:
         """Tell whether there was a settled sample with a stamp."""
         raise NotImplementedError
+
+    def _set_window(self, window: Seconds) -> None:
+        self._window_ns = round(window * 1e9)
+
+    def _settle(self, until_ns: StampNs | None = None) -> Iterator[Sample]:
+        """
+        Settle samples one by one, and yield each.
+
+        The newest stamp to settle is by default that of the newest sample minus the window.
+        """
+        if until_ns is None:
+            until_ns = self.newest_ns - self._window_ns
+        while self._waiting and self._waiting[0].stamp_ns <= until_ns:
+            sample = self._waiting.pop(0)
+            self.settled_ns = sample.stamp_ns
+            yield sample
 
     def _insert(self, sample: Sample) -> Answer | int:
         """Return the index of a sample that was added, or why it was not."""

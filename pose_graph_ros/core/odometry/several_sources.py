@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What several sources of odometry make: the nodes of the primary one, and edges of the others.
+Which of several sources of odometry makes the nodes: the primary one; the others add edges.
 
 The preferred source becomes the primary one unless it begins later than another by more than the
 patience. A primary source that is silent for longer than the patience is replaced by the most
@@ -13,9 +13,6 @@ the earlier samples of all sources are known.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from pose_graph_ros.core.geometry import covariance
-from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.odometry.stream import OdometryStream
 from pose_graph_ros.core.quantities import StampNs
 
@@ -76,45 +73,3 @@ def find_silence(
         if next_ns is None or next_ns >= settled_ns:
             return None
         last_ns = next_ns
-
-
-class SecondaryEdges:
-    """
-    Makes one edge per source between each two consecutive hidden nodes that its samples cover.
-
-    The poses of a source are interpolated at the stamps of the nodes. A node without samples of
-    the source close to its stamp is left out: the edge spans from the node before to the next.
-    """
-
-    def __init__(self) -> None:
-        # by source: newest node that its samples cover (-1 for none), next node to check
-        self.progress: dict[str, tuple[int, int]] = {}
-        # edges not yet taken, each with its source; whoever takes them clears the list
-        self.new: list[tuple[str, Factors]] = []
-
-    def skip_to(self, source: str, node: int, *, reached: bool) -> None:
-        """
-        Set where the edges of a source continue, by the number of a node.
-
-        They begin there if it is reached, or else at the first one from it on that the samples
-        cover.
-        """
-        self.progress[source] = (node, node + 1) if reached else (-1, node)
-
-    def extend(
-        self, source: str, stream: OdometryStream, stamps_ns: IntArray, ids: IntArray,
-    ) -> None:
-        """Add the edges of a source up to its newest settled sample to `new`."""
-        last, node = self.progress[source]
-        while node < len(stamps_ns) and stamps_ns[node] <= stream.settled_ns:
-            if stream.timeline.covers(int(stamps_ns[node]), closely=True):
-                # no edge spans a restart
-                if last >= 0 and not stamps_ns[last] < stream.restarted_ns <= stamps_ns[node]:
-                    motion = stream.timeline.motion(int(stamps_ns[last]), int(stamps_ns[node]))
-                    self.new.append((source, Factors(
-                        [ids[last]], [ids[node]], [motion.increment],
-                        [covariance.information(stream.covariance(motion))],
-                        [FactorKind.ODOMETRY])))
-                last = node
-            node += 1
-        self.progress[source] = last, node

@@ -11,15 +11,16 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, OdometrySource
-from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import (
     between_one,
     compose_one,
-    exp_one,
     FloatArray,
+    IntArray,
     Pose,
     wrap_one,
 )
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
     Answer,
@@ -39,6 +40,7 @@ from pose_graph_ros.core.odometry.jumps import (
     UNKNOWN,
 )
 from pose_graph_ros.core.odometry.motion import (
+    integrated,
     Motion,
     odometry_covariance,
     step_variance,
@@ -112,6 +114,9 @@ class OdometryStream(ReorderBuffer[Received]):
         self.saved_ns = -1
         # stamp at which odometry restarted after a graph was loaded; -1 if it did not [ns]
         self.restarted_ns = -1
+        # newest node that the samples cover, where the next secondary edge begins, or -1 for none;
+        # and the next node to check
+        self.tied, self.next_to_tie = -1, 0
         self.configure(source)
 
     def configure(self, source: OdometrySource) -> None:
@@ -126,19 +131,9 @@ class OdometryStream(ReorderBuffer[Received]):
             # the variances of the timeline contain all of the noise
             self._noise = replace(source.noise, sigma_distance=0.0, sigma_lateral=0.0,
                                   sigma_heading_distance=0.0, sigma_heading_turn=0.0)
-        self._window_ns = round(source.reorder_window * 1e9)
+        self._set_window(source.reorder_window)
         # samples not settled yet get the new settings, even if their states were computed before
         self._ahead.clear()
-
-    @property
-    def newest_ns(self) -> int:
-        """Stamp of the newest sample [ns], settled or not; -1 before the first."""
-        return self._waiting[-1].stamp_ns if self._waiting else self.settled_ns
-
-    @property
-    def settled_ns(self) -> int:
-        """Stamp of the newest settled sample [ns]; -1 before the first."""
-        return -1 if self._last is None else self._last.row.stamp_ns
 
     @property
     def n_jumps_seen(self) -> int:
@@ -177,13 +172,9 @@ class OdometryStream(ReorderBuffer[Received]):
         What is yielded are its stamp [ns] and its pose in a frame without jumps. The newest stamp
         to settle [ns] is by default that of the newest sample minus the reorder window.
         """
-        if until_ns is None:
-            until_ns = self.newest_ns - self._window_ns
-        while self._waiting and self._waiting[0].stamp_ns <= until_ns:
-            if not self._ahead:
-                self._ahead.append(self._next_instant(self._last, self._waiting[0]))
-            del self._waiting[0]
-            before, self._last = self._last, self._ahead.pop(0)
+        for sample in self._settle(until_ns):
+            ahead = self._ahead.pop(0) if self._ahead else None
+            before, self._last = self._last, ahead or self._next_instant(self._last, sample)
             if self._last.jumped and before is not None:
                 self.jump = _described(before, self._last)
             self.n_jumps += self._last.jumped
@@ -215,23 +206,54 @@ class OdometryStream(ReorderBuffer[Received]):
         at = bisect.bisect_right(self._waiting, stamp_ns, key=stamp_of)
         return self._waiting[at].stamp_ns if at < len(self._waiting) else None
 
-    def saved(self, nodes_ns: StampsNs, tied: tuple[int, int]) -> SavedStream:
+    def tie_from(self, node: int, *, reached: bool) -> None:
+        """
+        Let secondary edges continue at a node, by its number.
+
+        They begin there if it is reached, or else at the first one from it on that the samples
+        cover.
+        """
+        self.tied, self.next_to_tie = (node, node + 1) if reached else (-1, node)
+
+    def secondary_edges(self, stamps_ns: StampsNs, ids: IntArray) -> Iterator[Factors]:
+        """
+        Make the edges between consecutive nodes up to the newest settled sample.
+
+        The poses are interpolated at the stamps of the nodes. A node without samples close to its
+        stamp is left out: the edge spans from the node before to the next.
+        """
+        end = int(np.searchsorted(stamps_ns, self.settled_ns, side='right'))
+        for node in range(self.next_to_tie, end):
+            node_ns = int(stamps_ns[node])
+            if self.timeline.covers(node_ns, closely=True):
+                # no edge spans a restart
+                last_ns = int(stamps_ns[self.tied])
+                if self.tied >= 0 and not last_ns < self.restarted_ns <= node_ns:
+                    motion = self.timeline.motion(last_ns, node_ns)
+                    yield Factors(
+                        [ids[self.tied]], [ids[node]], [motion.increment],
+                        [covariance.information(self.covariance(motion))], [FactorKind.ODOMETRY])
+                self.tied = node
+        self.next_to_tie = max(self.next_to_tie, end)
+
+    def saved(self, nodes_ns: StampsNs) -> SavedStream:
         """Return the state, with the samples next to the hidden nodes and the newest ones."""
         stamps, rows, dense = self.timeline.thinned(
             # and those of the last minute, for measurements that come late
             nodes_ns, min(int(nodes_ns[-1]), self.settled_ns - 60_000_000_000))
         return SavedStream(stamps, rows, dense, self.timeline.resting, self._last,
-                           tuple(self._waiting), self.restarted_ns, *tied)
+                           tuple(self._waiting), self.restarted_ns, self.tied, self.next_to_tie)
 
     def restore(self, saved: SavedStream) -> None:
         """Set the state of this empty stream to a saved one."""
         if saved.last is not None:
-            self._last = saved.last
+            self._last, self.settled_ns = saved.last, saved.last.row.stamp_ns
             self.timeline.restore(
                 saved.stamps_ns, saved.samples, saved.dense, saved.last.row,
                 resting=saved.resting)
         self._waiting += saved.waiting
         self.restarted_ns = saved.restarted_ns
+        self.tied, self.next_to_tie = saved.tied, saved.next_to_tie
         self.saved_ns = self.newest_ns
 
     def usual_noise(self) -> OdometryNoise:
@@ -296,7 +318,7 @@ class OdometryStream(ReorderBuffer[Received]):
                             SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
         integrates = self._source.integrate is Integrate.TWIST
-        motion = (_integrated(before.twist, twist, elapsed) if integrates
+        motion = (integrated(before.twist, twist, elapsed) if integrates
                   else between_one(before.raw, raw))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
         # twists are not integrated over a longer gap [s]
@@ -315,12 +337,6 @@ class OdometryStream(ReorderBuffer[Received]):
         row = next_row(before.row, stamp_ns, pose, variance)
         return Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
                         jumped=False, twist=twist)
-
-
-def _integrated(first: Pose, last: Pose, elapsed: float) -> Pose:
-    """Return the motion during a time [s] by the mean of the twists at its begin and end."""
-    x, y, theta = (0.5 * (one + other) * elapsed for one, other in zip(first, last, strict=True))
-    return exp_one((x, y, theta))
 
 
 def _after_jump(before: Instant, sample: Received, elapsed: float) -> Instant:

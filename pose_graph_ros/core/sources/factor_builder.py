@@ -21,7 +21,6 @@ from pose_graph_ros.core.sources.gauss_markov import (
     GaussMarkovBias,
 )
 from pose_graph_ros.core.sources.gyro_bias import GyroBias
-from pose_graph_ros.core.sources.measurement_constraints import motion_noise
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_constraints import (
     AttachedMeasurement,
@@ -84,12 +83,11 @@ class FactorBuilder:
 
     def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
         """Add a measurement to an update, as the errors of its source ask for."""
-        source, observed, measurement, attachment = attached
+        source, observed, measurement, *_ = attached
         kind, stamp_ns = type(measurement), measurement.stamp_ns
         settings = self.config.measurement_source(source, kind)
-        model, noise = self._error_model(source, settings), NO_NOISE
-        if settings.correlation_time != 0.0:
-            noise = motion_noise(measurement, attachment)
+        model = self._error_model(source, settings)
+        noise = NO_NOISE if settings.correlation_time == 0.0 else attached.noise
         if model is None:
             return NewConstraint(
                 additions.add(observed), source, stamp_ns, kind, noise=noise)

@@ -24,7 +24,7 @@ from pose_graph_ros.core.config import GyroSource
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.odometry.turns import Turn
+from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.saved_columns import Integers, Pairs
 from pose_graph_ros.core.sources.gauss_markov import Additions, BiasChain, NO_TRANSITION
 from pose_graph_ros.core.sources.settings import SOURCES

@@ -5,9 +5,9 @@
 from array import array
 import bisect
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,30 +15,21 @@ from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.measurements import (
     Absolute,
-    ACCEPTED,
     Answer,
     AnswerStatus,
-    Fix,
-    HeadingOnly,
     LoopClosure,
     Measurement,
     PoseMeasurement,
     rejected,
-    value_defect,
     YawRate,
 )
+from pose_graph_ros.core.odometry.gyro import Gyros
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.odometry.turns import Gyros
-from pose_graph_ros.core.sources.measurement_constraints import (
-    absolute_constraint,
-    attach,
-    attach_reference,
-    loop_closure_constraint,
-)
+from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer
+from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, validate
 from pose_graph_ros.core.sources.settings import SOURCES
-from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
-from pose_graph_ros.core.sources.validation import validate
+from pose_graph_ros.core.sources.source_constraints import Queue
 
 
 class WaitingMeasurement(NamedTuple):
@@ -109,7 +100,7 @@ class SeenStamps:
         stamps = self._stamps.setdefault(source, array('q'))
         at = bisect.bisect_right(stamps, measurement.stamp_ns)
         stamps.insert(at, measurement.stamp_ns)
-        self._references.setdefault(source, array('q')).insert(at, _reference(measurement))
+        self._references.setdefault(source, array('q')).insert(at, key(measurement))
 
     def remove(self, source: str, measurement: PoseMeasurement) -> None:
         at = self._find(source, measurement)
@@ -146,28 +137,8 @@ class SeenStamps:
             return -1
         begin = bisect.bisect_left(stamps, measurement.stamp_ns)
         end = bisect.bisect_right(stamps, measurement.stamp_ns)
-        reference, references = _reference(measurement), self._references[source]
-        return next((at for at in range(begin, end) if references[at] == reference), -1)
-
-
-def due_ns(measurement: PoseMeasurement) -> int:
-    """Return the stamp that odometry must have reached to attach a measurement [ns]."""
-    if isinstance(measurement, LoopClosure) and measurement.reference_ns is not None:
-        return max(measurement.stamp_ns, measurement.reference_ns)
-    return measurement.stamp_ns
-
-
-def _reference(measurement: PoseMeasurement) -> int:
-    """
-    Return the stamp of a reference, -2 - k for node k, or 0: it tells those of one stamp apart.
-    """
-    if not isinstance(measurement, LoopClosure):
-        return 0
-    if measurement.reference_ns is not None:
-        return measurement.reference_ns
-    return -1 if measurement.reference_node is None else -2 - measurement.reference_node
-
-
+        own, references = key(measurement), self._references[source]
+        return next((at for at in range(begin, end) if references[at] == own), -1)
 
 
 class MeasurementPipeline:
@@ -213,11 +184,7 @@ class MeasurementPipeline:
         gyros.new.clear()
         self.counts.update(gyros.counts)
         gyros.counts.clear()
-        for source, stream in gyros.streams.items():
-            for reason, count in (('sorted', stream.n_sorted),
-                                  ('stamp_ahead', stream.n_dropped)):
-                if count > 0:
-                    self.counts[source, reason] = count
+        self.count_sorted(gyros.streams)
 
     def _add(self, measurement: PoseMeasurement, source: str) -> Answer:
         settings = self._config.measurement_source(source, type(measurement))
@@ -269,35 +236,14 @@ class MeasurementPipeline:
         attachment = attach(self._nodes, measurement.stamp_ns)
         if isinstance(attachment, Answer):
             return attachment
-        if isinstance(measurement, Fix):
-            # the last step: only a fix that nothing else is wrong with may become the datum
-            measurement = measurement.placed()
-            if (defect := value_defect(measurement.position)) is not None:
-                return rejected(defect, f'Fix: {measurement.position.tolist()} m from the datum')
-        if not isinstance(measurement, LoopClosure):
-            self._enqueue(measurement, source, attachment)
-            return ACCEPTED
-        reference = attach_reference(self._nodes, measurement)
-        if isinstance(reference, Answer):
-            return reference
-        if reference.node == attachment.node:
-            return rejected(
-                'same_node', f'both ends are attached to hidden node {attachment.node}')
-        reference_ns = measurement.reference_ns
-        if reference_ns is None:
-            reference_ns = int(self._nodes.stamps_ns[measurement.reference_node])
-        self.queue.edges.append(QueuedEdge(
-            source, loop_closure_constraint(measurement, reference, attachment),
-            measurement.stamp_ns, reference_ns))
-        return ACCEPTED
+        return KINDS[type(measurement)].attach(
+            measurement, source, attachment, self._nodes, self.queue)
 
     def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
         """Attach a measurement to a hidden node, with no motion in between."""
-        self._enqueue(measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))))
-
-    def _enqueue(self, measurement: Absolute, source: str, attachment: Attachment) -> None:
-        self.queue.observed.append(AttachedMeasurement(
-            source, absolute_constraint(measurement, attachment), measurement, attachment))
+        KINDS[type(measurement)].attach(
+            measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))), self._nodes,
+            self.queue)
 
     def take_ready(self, *, aligned: bool) -> Queue:
         """
@@ -325,19 +271,26 @@ class MeasurementPipeline:
             needed += [stamp_ns for stamp_ns in edge[2:] if stamp_ns >= 0]
         if not aligned:
             needed += [each.measurement.stamp_ns for each in self.queue.observed
-                       if not isinstance(each.measurement, HeadingOnly)]
+                       if each.is_placed]
         begin_ns = self._nodes.last_frozen_ns
         return min((stamp_ns for stamp_ns in needed if stamp_ns >= begin_ns), default=None)
 
-    def _stamps_of(self, measurement: Measurement) -> Iterator[int]:
+    def _stamps_of(self, measurement: PoseMeasurement) -> Iterator[int]:
         """Yield the stamps that a measurement is attached at, as far as they are known [ns]."""
         yield measurement.stamp_ns
-        if isinstance(measurement, LoopClosure):
-            node = measurement.reference_node
-            if measurement.reference_ns is not None:
-                yield measurement.reference_ns
-            elif node is not None and 0 <= node < len(self._nodes):
-                yield int(self._nodes.stamps_ns[node])
+        other = key(measurement)
+        if 0 <= -2 - other < len(self._nodes):
+            yield int(self._nodes.stamps_ns[-2 - other])
+        elif other > 0:
+            yield other
+
+    def count_sorted(self, streams: Mapping[str, ReorderBuffer[Any]]) -> None:
+        """Count what was sorted in late or dropped of some streams, by source."""
+        for source, stream in streams.items():
+            for reason, count in (('sorted', stream.n_sorted),
+                                  ('stamp_ahead', stream.n_dropped)):
+                if count > 0:
+                    self.counts[source, reason] = count
 
     def count(self, source: str, answer: Answer) -> Answer:
         if answer.status is AnswerStatus.ACCEPTED:

@@ -11,11 +11,11 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import FactorKinds, Factors
+from pose_graph_ros.core.graph.constraints import FactorKind, FactorKinds, Factors
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.measurements import Absolute, Measurement
+from pose_graph_ros.core.measurements import Absolute, PoseMeasurement
+from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, OdometryErrors
-from pose_graph_ros.core.odometry.turns import Turn
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Pairs, Rows2, Rows3, Rows6
 from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
@@ -53,6 +53,13 @@ class AttachedMeasurement(NamedTuple):
     observed: Factors  # its constraint if its error is treated as white
     measurement: Absolute
     attachment: Attachment
+    # what the motion since the node adds to the variances of position and heading
+    noise: FloatArray = NO_NOISE
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether it contains a position: not if it is a heading."""
+        return bool(self.observed.kind[0] != FactorKind.HEADING)
 
     @property
     def ends(self) -> tuple[int, ...]:
@@ -116,9 +123,9 @@ class NewConstraint(NamedTuple):
     number: int  # its id
     source: str
     stamp_ns: int  # of the measurement [ns]; -1 for an edge of odometry
-    kind: type[Measurement]  # `LoopClosure` for all edges between poses
+    kind: type[PoseMeasurement]  # `LoopClosure` for all edges between poses
     reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
-    # what the motion since the node adds to its variances; see `motion_noise`
+    # what the motion since the node adds to its variances, as `AttachedMeasurement.noise`
     noise: FloatArray = NO_NOISE
     held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
 
@@ -141,7 +148,7 @@ class SavedSource:
     bins: SavedBins | None  # states of its bias, if it has one
     # estimated statistics of its errors that are in use; None for white or given ones
     errors: CorrelatedErrors | None = None
-    # what the motion since the node adds to the variances, or empty; see `motion_noise`
+    # what the motion since the node adds to the variances, or empty
     noise: Rows2 = field(default_factory=lambda: np.empty((0, 2)))
     # with estimated statistics, ids of the edges that hold the measurements, or empty
     edges: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -165,7 +172,7 @@ class SourceConstraints:
     def __init__(self) -> None:
         # stamp [ns] of each measurement, and the id of what it was first added as
         self.rows = GrowingArray((2,), np.int64)
-        # what the motion since the node adds to its variances; see `motion_noise`
+        # what the motion since the node adds to its variances, as `AttachedMeasurement.noise`
         self.noise = GrowingArray((2,), np.float64)
         self.edges = GrowingArray((), np.int64)  # id of the edge that holds it instead, or -1
         self.report: SourceReport | None = None  # the newest report

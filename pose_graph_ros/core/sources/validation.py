@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Validation of measurements: reject what cannot be used, repair covariances where possible.
+Covariances of measurements: reject what cannot be used, repair them where possible.
 
 Only x, y and yaw of a covariance are used, in the axes in which the sender gave them. A variance
 that is zero, negative or not a number is unknown. One that is infinite, or larger than the square
@@ -21,12 +21,10 @@ from pose_graph_ros.core.measurements import (
     Fix,
     GlobalPose,
     HeadingOnly,
-    LARGEST_STAMP,
     LoopClosure,
     PoseMeasurement,
     Position,
     rejected,
-    value_defect,
 )
 
 # Lower bound of the eigenvalues of a repaired correlation matrix.
@@ -38,37 +36,77 @@ class Validated(NamedTuple):
     repairs: tuple[str, ...]  # keys for counting, such as `default_covariance`
 
 
-def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validated | Answer:
-    """Return a measurement without what it has no information on, or why it is rejected."""
-    kind = type(measurement).__name__
-    numbers = _numbers(measurement)
-    defect = value_defect(numbers)
-    if defect is not None:
-        return rejected(defect, f'{kind}: {numbers.tolist()}')
-    stamps = _stamps(measurement)
-    if stamps[0] <= 0 or any(abs(stamp) > LARGEST_STAMP for stamp in stamps):
-        return rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
-                        f'{kind}: expected stamps above 0, got {stamps} ns')
-    if isinstance(measurement, HeadingOnly):
-        return _validate_heading(measurement, policy)
-    cov, repairs = np.array(measurement.covariance, dtype=np.float64), []
-    if len(cov) == 3 and np.all(_is_uninformative(cov)[:2]):
-        return _without_position(measurement, cov, policy)
-    if len(policy.override) > 0:
-        cov = _overridden(cov, policy)
-    elif not np.any(cov) and policy.repair:
-        cov = np.diag(_defaults(policy)[:len(cov)])
+def check_position(
+    measurement: Position | Fix, policy: CovariancePolicy,
+) -> Validated | Answer:
+    """Return a position with a valid covariance, or why it is rejected."""
+    return _finished(measurement, *_given(measurement.covariance, policy), policy)
+
+
+def check_pose(measurement: GlobalPose, policy: CovariancePolicy) -> Validated | Answer:
+    """Return a pose, or its position or heading if it has no information on the other."""
+    never = policy.heading is Heading.NEVER
+    if _lacks_position(measurement.covariance):
+        variance = None if never else _heading_variance(measurement.covariance, policy)
+        return _no_information(measurement) if variance is None else Validated(
+            HeadingOnly(measurement.stamp_ns, float(measurement.pose[2]), variance), ())
+    cov, repairs = _given(measurement.covariance, policy)
+    if len(repairs) > 0 and policy.heading is not Heading.ALWAYS:
+        cov[2, 2] = np.inf  # a sender that does not know its covariance knows no heading
+    is_known = _is_known_heading(cov[2, 2])
+    if never or (policy.heading is Heading.AUTO and not is_known):
+        return _finished(Position(measurement.stamp_ns, measurement.pose[:2], cov[:2, :2],
+                                  np.zeros(2)), cov[:2, :2], repairs, policy)
+    if not is_known:
+        cov[2, :] = cov[:, 2] = 0.0
+        cov[2, 2] = policy.default_heading**2
+    return _finished(measurement, cov, repairs, policy)
+
+
+def check_closure(measurement: LoopClosure, policy: CovariancePolicy) -> Validated | Answer:
+    """Return a loop closure; without information on the position, that is infinite."""
+    if not _lacks_position(measurement.covariance):
+        return _finished(measurement, *_given(measurement.covariance, policy), policy)
+    variance = _heading_variance(measurement.covariance, policy)
+    return _no_information(measurement) if variance is None else Validated(
+        replace(measurement, covariance=np.diag((np.inf, np.inf, variance))), ())
+
+
+def check_heading(measurement: HeadingOnly, policy: CovariancePolicy) -> Validated | Answer:
+    """Return a heading with a valid variance, or why it is rejected."""
+    variance, repairs = measurement.variance, list[str]()
+    if not variance > 0.0 and len(policy.override) < 2:
+        if not policy.repair:
+            return rejected('covariance_not_positive', f'variance of a heading: {variance}')
+        variance = policy.default_heading**2
         repairs.append('default_covariance')
-        if isinstance(measurement, GlobalPose) and policy.heading is not Heading.ALWAYS:
-            cov[2, 2] = np.inf  # a sender that does not know its covariance knows no heading
-    if isinstance(measurement, GlobalPose):
-        measurement, cov = _with_heading_policy(measurement, cov, policy)
+    valid = _heading_variance(np.diag((0.0, 0.0, variance)), policy)
+    if valid is None:
+        return rejected('no_information', f'variance of a heading: {variance}')
+    return Validated(replace(measurement, variance=valid), tuple(repairs))
+
+
+def _given(given: FloatArray, policy: CovariancePolicy) -> tuple[FloatArray, list[str]]:
+    """Return a covariance as a policy overrides it, or its default, and what was repaired."""
+    cov = np.array(given, dtype=np.float64)
+    if len(policy.override) > 0:
+        return _overridden(cov, policy), []
+    if not np.any(cov) and policy.repair:
+        return np.diag(_defaults(policy)[:len(cov)]), ['default_covariance']
+    return cov, []
+
+
+def _finished(
+    measurement: GlobalPose | Position | LoopClosure | Fix, cov: FloatArray, repairs: list[str],
+    policy: CovariancePolicy,
+) -> Validated | Answer:
+    """Return a measurement with a covariance that is repaired, scaled and within the bounds."""
     defect = covariance.defect(cov)
     if defect is not None:
         if not policy.repair:
             return rejected(
-                f'covariance_{defect}', f'{kind}: expected a positive definite matrix, got '
-                f'{cov.tolist()}; covariance_override replaces it')
+                f'covariance_{defect}', f'{type(measurement).__name__}: expected a positive '
+                f'definite matrix, got {cov.tolist()}; covariance_override replaces it')
         cov = repaired(cov, policy)
         repairs.append(f'repaired_covariance_{defect}')
     floors = np.array([policy.position_floor, policy.position_floor, policy.heading_floor])
@@ -104,16 +142,6 @@ def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     return 0.5 * (result + result.T)
 
 
-def _numbers(measurement: PoseMeasurement) -> FloatArray:
-    if isinstance(measurement, Position):
-        return np.concatenate((measurement.position, measurement.lever_arm))
-    if isinstance(measurement, HeadingOnly):
-        return np.array([measurement.heading])
-    if isinstance(measurement, Fix):
-        return measurement.lever_arm    # its position is checked when it is placed
-    return measurement.pose
-
-
 def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     variances = np.diagonal(cov).copy()
     variances[:2] = policy.override[0]**2
@@ -122,63 +150,22 @@ def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     return np.diag(variances)
 
 
-def _stamps(measurement: PoseMeasurement) -> tuple[int, ...]:
-    if isinstance(measurement, LoopClosure):
-        return (measurement.stamp_ns, measurement.reference_ns or 0,
-                measurement.reference_node or 0)
-    return (measurement.stamp_ns,)
+def _lacks_position(cov: FloatArray) -> bool:
+    return bool(np.all(_is_uninformative(np.asarray(cov))[:2]))
 
 
-def _validate_heading(measurement: HeadingOnly, policy: CovariancePolicy) -> Validated | Answer:
-    variance, repairs = measurement.variance, []
-    if len(policy.override) == 2:
-        variance = policy.override[1]**2
-    elif not variance > 0.0:
-        if not policy.repair:
-            return rejected('covariance_not_positive', f'variance of a heading: {variance}')
-        variance = policy.default_heading**2
-        repairs.append('default_covariance')
-    if not _is_known_heading(variance):
-        return rejected('no_information', f'variance of a heading: {variance}')
-    return Validated(
-        replace(measurement, variance=_heading_variance(variance, policy)), tuple(repairs))
+def _no_information(measurement: GlobalPose | LoopClosure) -> Answer:
+    return rejected('no_information', (
+        f'{type(measurement).__name__}: {np.asarray(measurement.covariance).tolist()}'))
 
 
-def _without_position(
-    measurement: GlobalPose | LoopClosure | Position | Fix, cov: FloatArray,
-    policy: CovariancePolicy,
-) -> Validated | Answer:
-    """Return what is left of a pose without information on the position: its known heading."""
+def _heading_variance(cov: FloatArray, policy: CovariancePolicy) -> float | None:
+    """Return the variance of a heading within the bounds [rad^2]; None if it is not known."""
     variance = float(cov[2, 2]) if len(policy.override) < 2 else policy.override[1]**2
-    never = isinstance(measurement, GlobalPose) and policy.heading is Heading.NEVER
-    if isinstance(measurement, Position | Fix) or never or not _is_known_heading(variance):
-        return rejected('no_information', f'{type(measurement).__name__}: {cov.tolist()}')
-    variance = _heading_variance(variance, policy)
-    if isinstance(measurement, LoopClosure):
-        return Validated(replace(measurement, covariance=np.diag((np.inf, np.inf, variance))), ())
-    return Validated(
-        HeadingOnly(measurement.stamp_ns, float(measurement.pose[2]), variance), ())
-
-
-def _heading_variance(variance: float, policy: CovariancePolicy) -> float:
-    """Return the variance of a heading with factor, floor and ceiling applied [rad^2]."""
+    if not _is_known_heading(variance):
+        return None
     return min(max(policy.scale * variance, policy.heading_floor**2),
                covariance.UNKNOWN_HEADING_VARIANCE)
-
-
-def _with_heading_policy(
-    measurement: GlobalPose, cov: FloatArray, policy: CovariancePolicy,
-) -> tuple[GlobalPose | Position, FloatArray]:
-    """Return a global pose, or its position if the policy does not use the heading."""
-    known = _is_known_heading(cov[2, 2])
-    if policy.heading is Heading.NEVER or (policy.heading is Heading.AUTO and not known):
-        return Position(measurement.stamp_ns, measurement.pose[:2], cov[:2, :2],
-                        np.zeros(2)), cov[:2, :2]
-    if not known:
-        cov = cov.copy()
-        cov[2, :] = cov[:, 2] = 0.0
-        cov[2, 2] = policy.default_heading**2
-    return measurement, cov
 
 
 def _is_known_heading(variance: float) -> bool:

@@ -21,7 +21,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
+from pose_graph_ros.core.sources.kinds import observed
 from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement
 
 SECOND = 1_000_000_000
@@ -66,7 +66,7 @@ def attached(
 ) -> AttachedMeasurement:
     attachment = Attachment(node, np.zeros(3), np.zeros((3, 3)))
     return AttachedMeasurement(
-        source, absolute_constraint(measurement, attachment), measurement, attachment)
+        source, observed(measurement, attachment)[0], measurement, attachment)
 
 
 def fixes(

@@ -15,7 +15,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.node_table import ThinnedNodes
-from pose_graph_ros.core.sources.measurement_constraints import attach
+from pose_graph_ros.core.sources.kinds import attach
 
 SECOND = 1_000_000_000
 WINDOW = 6

@@ -341,7 +341,7 @@ def test_a_saved_stream_of_twists_continues_bit_for_bit() -> None:
     for _ in first.settle():
         pass
     second = OdometryStream(OdometrySource(integrate=Integrate.TWIST))
-    second.restore(first.saved(np.array([EPOCH]), (0, 1)))
+    second.restore(first.saved(np.array([EPOCH])))
     for sample in samples[100:]:
         second.add(sample)
     for _ in second.settle(second.newest_ns):

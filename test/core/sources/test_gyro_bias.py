@@ -28,7 +28,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     YawRate,
 )
-from pose_graph_ros.core.odometry.turns import Turn
+from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.source_constraints import Queue
 

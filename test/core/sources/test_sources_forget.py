@@ -14,7 +14,7 @@ from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
 from pose_graph_ros.core.sources.error_likelihood import no_past
 from pose_graph_ros.core.sources.gauss_markov import Additions, CorrelatedErrors, GaussMarkovBias
-from pose_graph_ros.core.sources.measurement_constraints import absolute_constraint
+from pose_graph_ros.core.sources.kinds import observed
 from pose_graph_ros.core.sources.settings import SOURCES
 
 NOWHERE = Attachment(0, np.zeros(3), np.zeros((3, 3)))
@@ -35,8 +35,8 @@ class Chain:
     def add(self, second: int) -> None:
         additions = Additions(self.next)
         self.bias.begin()
-        edge = self.bias.add(second * SECOND, absolute_constraint(
-            position(second), NOWHERE), np.zeros(2), additions)
+        edge = self.bias.add(second * SECOND, observed(
+            position(second), NOWHERE)[0], np.zeros(2), additions)
         for number, one in enumerate(additions.factors, self.next.factor):
             if one.j[0] < 0:
                 self.priors[number] = int(one.i[0])

@@ -21,7 +21,8 @@ from pose_graph_ros.core.measurements import (
     Measurement,
     Position,
 )
-from pose_graph_ros.core.sources.validation import validate, Validated
+from pose_graph_ros.core.sources.kinds import validate
+from pose_graph_ros.core.sources.validation import Validated
 
 SECOND = 1_000_000_000
 NAN, INF, LARGEST = np.nan, np.inf, np.finfo(float).max     # 1.8e308 itself reads as inf

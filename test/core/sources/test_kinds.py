@@ -20,7 +20,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.sources import measurement_constraints
+from pose_graph_ros.core.sources import kinds
 
 SECOND = 1_000_000_000
 # Compositions of poses of some 50 m.
@@ -102,7 +102,7 @@ def test_a_true_measurement_in_the_map_has_no_error_at_the_true_nodes(
             (GlobalPose(stamp, pose, np.eye(3)), FactorKind.GLOBAL_POSE, [0, 1, 2]),
             (Position(stamp, position, np.eye(2), lever_arm), FactorKind.POSITION, [0, 1]),
             (HeadingOnly(stamp, float(pose[2]), 1.0), FactorKind.HEADING, [2])):
-        constraint = measurement_constraints.absolute_constraint(measurement, anchored(stamp))
+        constraint, _ = kinds.observed(measurement, anchored(stamp))
         assert constraint.kind[0] == kind
         error = error_functions.errors(NODES, constraint)
         np.testing.assert_allclose(error[:, rows], 0.0, atol=ROUNDING)
@@ -114,7 +114,7 @@ def test_a_true_measurement_in_the_map_has_no_error_at_the_true_nodes(
 @given(covered, covered)
 def test_a_true_loop_closure_has_no_error_at_the_true_nodes(stamp: int, other: int) -> None:
     z = se2.between(truth(other), truth(stamp))
-    constraint = measurement_constraints.loop_closure_constraint(
+    constraint = kinds.loop_closure_constraint(
         LoopClosure(stamp, z, np.eye(3), reference_ns=other), anchored(other), anchored(stamp))
     assert constraint.kind[0] == FactorKind.LOOP_CLOSURE
     np.testing.assert_allclose(error_functions.errors(NODES, constraint), 0.0, atol=ROUNDING)
@@ -152,7 +152,7 @@ def test_the_noise_of_a_global_pose_is_that_of_samples() -> None:
     measured = pose + draws(MAP_COVARIANCE, rng)
     moved = se2.compose(tiled(NODES[attachment.node]), noisy_motions(attachment, rng))
     errors = se2.between(measured, moved)     # (3.52) through the offset
-    constraint = measurement_constraints.absolute_constraint(
+    constraint, _ = kinds.observed(
         GlobalPose(STAMP, pose, MAP_COVARIANCE), attachment)
     assert_agree(np.cov(errors.T), covariance_of(constraint))
 
@@ -165,7 +165,7 @@ def test_the_noise_of_a_position_is_at_least_that_of_samples() -> None:
     measured = where + draws(covariance, rng)
     moved = se2.compose(tiled(NODES[attachment.node]), noisy_motions(attachment, rng))
     errors = se2.transform(moved, lever_arm) - measured     # in map axes
-    constraint = measurement_constraints.absolute_constraint(
+    constraint, _ = kinds.observed(
         Position(STAMP, where, covariance, lever_arm), attachment)
     claimed = np.linalg.inv(constraint.information[0, :2, :2])
     sampled = np.cov(errors.T)
@@ -184,7 +184,7 @@ def test_the_noise_of_a_loop_closure_is_that_of_samples(stamp: int, other: int) 
                        se2.inverse(noisy_motions(attachment, rng)))
     between = se2.between(NODES[reference.node], NODES[attachment.node])
     errors = se2.between(mean, tiled(between))     # (3.48)
-    constraint = measurement_constraints.loop_closure_constraint(
+    constraint = kinds.loop_closure_constraint(
         LoopClosure(stamp, z, MAP_COVARIANCE, reference_ns=other), reference, attachment)
     assert (constraint.i[0], constraint.j[0]) == (reference.node, attachment.node)
     assert_agree(np.cov(errors.T), covariance_of(constraint))
@@ -195,7 +195,7 @@ def test_the_noise_of_a_heading_is_that_of_samples() -> None:
     attachment, heading = anchored(STAMP, NOISY), float(truth(STAMP)[2])
     moved = se2.compose(tiled(NODES[attachment.node]), noisy_motions(attachment, rng))
     errors = se2.wrap(moved[:, 2] - heading - 0.01 * rng.standard_normal(N_SAMPLES))
-    constraint = measurement_constraints.absolute_constraint(
+    constraint, _ = kinds.observed(
         HeadingOnly(STAMP, heading, 1e-4), attachment)
     assert constraint.kind[0] == FactorKind.HEADING
     assert np.var(errors) == pytest.approx(1.0 / constraint.information[0, 2, 2], rel=SAMPLING)
@@ -211,7 +211,7 @@ def test_a_relative_heading_does_not_constrain_the_position(stamp: int, other: i
     # the positions do not matter
     closure = LoopClosure(stamp, np.array([7.0, -9.0, turn]), np.diag([np.inf, np.inf, 1e-4]),
                           reference_ns=other)
-    constraint = measurement_constraints.loop_closure_constraint(closure, reference, attachment)
+    constraint = kinds.loop_closure_constraint(closure, reference, attachment)
     error = error_functions.errors(NODES, constraint)
     assert error[0, 2] == pytest.approx(0.0, abs=ROUNDING)
     information = constraint.information[0].copy()

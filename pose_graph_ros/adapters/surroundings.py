@@ -1,0 +1,308 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What some messages cannot be read without: the frames of the robot, and the datum of the map.
+
+The conversions here need them: those of fixes, of yaw rates, and of twists.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+import math
+import threading
+from typing import Any, NamedTuple, TYPE_CHECKING
+
+import numpy as np
+
+from pose_graph_ros.adapters.conversions import (
+    frame,
+    Message,
+    planar_twist,
+    stamp_ns,
+    twist_variance,
+)
+from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core.geometry import covariance
+from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
+from pose_graph_ros.core.geometry.se2 import compose_one, FloatArray, Pose
+from pose_graph_ros.core.measurements import Answer, Fix, OdometrySample, rejected, YawRate
+from pose_graph_ros.core.odometry.motion import integrated
+
+if TYPE_CHECKING:
+    from pose_graph_ros.adapters.sources import Source
+
+
+class Datum:
+    """
+    The origin of the map on the Earth: a given one, or the position of the first fix in the graph.
+
+    It is given as latitude and longitude [degrees] and, if there are three numbers, the angle of
+    the map's x axis from east [rad]. Else a fix is used at once, or after a call of `renew`.
+    """
+
+    def __init__(self, given: Sequence[float] = (), *, wait: bool = False) -> None:
+        self.yaw = float(given[2]) if len(given) == 3 else 0.0
+        self.is_given = len(given) > 0  # whether the datum comes from the parameter
+        self.is_of_graph = False  # whether the datum comes from a loaded graph
+        self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
+        self.altitude = math.nan  # of the newest fix in the graph that has one [m]
+        self._waits = wait
+        # a plane lies on the ellipsoid until an altitude is known; east and north do not change
+        self._to_lift = self.is_given
+        # fixes are placed by the thread of the engine
+        self._lock = threading.Lock()
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether fixes are refused until a call of `renew`."""
+        return self._waits and self.plane is None
+
+    def keep(self, origin: MapOrigin) -> None:
+        """Use the datum of a loaded graph from now on."""
+        with self._lock:
+            self.plane, self.yaw, self.altitude = (
+                TangentPlane(*origin), origin.yaw, origin.altitude)
+            self._waits = self._to_lift = False
+            self.is_of_graph = True
+
+    def renew(self) -> None:
+        """Make the next fix that is used the datum."""
+        with self._lock:
+            self.plane, self._waits, self._to_lift = None, False, False
+
+    def plane_for(self, latitude: float, longitude: float, altitude: float) -> TangentPlane:
+        """Return the plane for a fix that is used, which becomes the datum if there is none."""
+        with self._lock:
+            if math.isfinite(altitude):
+                self.altitude = altitude
+            known = math.isfinite(self.altitude)
+            if self.plane is None:
+                self.plane = TangentPlane(
+                    latitude, longitude, self.altitude if known else 0.0, self.yaw)
+                self._to_lift = not known
+            elif self._to_lift and known:
+                self.plane = TangentPlane(
+                    self.plane.latitude, self.plane.longitude, self.altitude, self.yaw)
+                self._to_lift = False
+            return self.plane
+
+    def place(self, latitude: float, longitude: float, altitude: float) -> FloatArray:
+        """Return the position in the map of a fix that is used, shape (2,) [m]."""
+        plane = self.plane_for(latitude, longitude, altitude)
+        return plane.to_map(
+            latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
+
+    def geodetic(self, position: FloatArray) -> FloatArray:
+        """
+        Return latitude, longitude [degrees] and altitude [m] of points of the map, shape (..., 3).
+
+        They lie at the altitude of the newest fix; this is the inverse of `place`. Raises
+        ValueError without a datum.
+        """
+        if self.plane is None:
+            raise ValueError('the map has no datum')
+        return self.plane.to_geodetic(
+            position, self.altitude if math.isfinite(self.altitude) else self.plane.altitude)
+
+
+def datum_of(values: Mapping[str, Any]) -> Datum:
+    """Return the datum by the checked parameters; raises `ConfigError` if it is not on Earth."""
+    try:
+        return Datum(values['datum'], wait=values['wait_for_datum'])
+    except ValueError as error:
+        raise ConfigError(f'parameter {error}') from error
+
+
+class Antenna(NamedTuple):
+    """Position of the antenna of a receiver on the robot."""
+
+    lever_arm: FloatArray  # antenna in the frame of the robot, shape (2,) [m]
+    origin: str  # `parameter`, `tf_static`, or `none` if unknown (the lever arm is then zero)
+
+
+class StaticFrames:
+    """Static transforms; for each child frame the newest one is used."""
+
+    def __init__(self) -> None:
+        # parent, rotation and translation by child frame
+        self._frames: dict[str, tuple[str, FloatArray, FloatArray]] = {}
+
+    def receive(self, message: Message) -> None:
+        """Add the transforms of a tf2_msgs/TFMessage; invalid ones are ignored."""
+        for item in message.transforms:
+            parent, child = frame(item.header.frame_id), frame(item.child_frame_id)
+            t, q = item.transform.translation, item.transform.rotation
+            norm = math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w)
+            translation = np.array([t.x, t.y, t.z])
+            if (parent in ('', child) or child == '' or not 1e-6 < norm < math.inf
+                    or not np.all(np.abs(translation) < 1e3)):
+                continue
+            rotation = _rotation(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
+            self._frames[child] = parent, rotation, translation
+
+    def transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return rotation and translation of a frame in another one; None if unknown."""
+        of_name, of_base = self._chain(name), self._chain(base)
+        for ancestor, (turn, point) in of_name.items():
+            if ancestor in of_base:
+                rotation, translation = of_base[ancestor]
+                return rotation.T @ turn, rotation.T @ (point - translation)
+        return None
+
+    def _chain(self, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return rotation and translation of a frame in itself and in each of its ancestors."""
+        rotation, translation = np.eye(3), np.zeros(3)
+        chain = {name: (rotation, translation)}
+        while name in self._frames and len(chain) < 100:  # there may be a cycle
+            name, turn, shift = self._frames[name]
+            rotation, translation = turn @ rotation, turn @ translation + shift
+            if name in chain:
+                break
+            chain[name] = rotation, translation
+        return chain
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
+    """Return the matrix of a unit quaternion; SciPy's would make each start 0.3 s longer."""
+    return np.array([
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])
+
+
+class IntegratedTwist(NamedTuple):
+    """
+    A twist, and the pose that all up to it make, integrated in the order of arrival.
+
+    That pose is for outputs between two estimates; the engine integrates the twists anew in the
+    order of their stamps.
+    """
+
+    stamp_ns: int = 0
+    pose: Pose = (0.0, 0.0, 0.0)
+    twist: Pose = (0.0, 0.0, 0.0)
+
+    def then(self, stamp_ns: int, twist: Pose) -> 'IntegratedTwist':
+        """Return the same after another one; one that is older changes nothing."""
+        if stamp_ns <= self.stamp_ns:
+            return self
+        time = (stamp_ns - self.stamp_ns) * 1e-9 if self.stamp_ns > 0 else 0.0
+        return IntegratedTwist(
+            stamp_ns, compose_one(self.pose, integrated(self.twist, twist, time)), twist)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What messages are read by beside their source, and what is noted of sources meanwhile."""
+
+    map_frame: str
+    base_frame: str
+    datum: Datum
+    frames: StaticFrames
+    antennas: dict[str, Antenna] = field(default_factory=dict)  # of the newest fix, by source
+    # number of fixes that were read while the antenna was unknown, by source
+    without_lever_arm: Counter[str] = field(default_factory=Counter)
+    twists: dict[str, IntegratedTwist] = field(default_factory=dict)  # by source
+
+    def in_base(self, message: Message) -> tuple[FloatArray, FloatArray] | None:
+        """Return rotation and translation of the frame of a message in the robot's, if known."""
+        return self.frames.transform(frame(message.header.frame_id), self.base_frame)
+
+    def is_of_base(self, message: Message) -> bool:
+        """Tell whether a message is in the robot's frame, or names none."""
+        return frame(message.header.frame_id) in ('', self.base_frame)
+
+    def antenna(self, message: Message, source: 'Source') -> Antenna:
+        """Return where the antenna of a message is."""
+        given = np.array(source.lever_arm, dtype=np.float64)
+        if np.any(given):
+            return Antenna(given, 'parameter')
+        found = self.in_base(message)
+        return Antenna(given, 'none') if found is None else Antenna(found[1][:2], 'tf_static')
+
+
+def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
+    """
+    Return the fix in a sensor_msgs/NavSatFix, or the reason for rejecting it.
+
+    An unknown covariance is returned as zeros.
+    """
+    if message.status.status == -1:
+        return rejected('no_fix', 'the receiver reports no fix')
+    latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return rejected('not_finite', f'latitude {latitude}, longitude {longitude}')
+    # an altitude of NaN means that it is unknown, and passes
+    if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > 1e5:
+        return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
+                                        f'altitude {altitude}')
+    stamp = stamp_ns(message, source.time_offset_ns)
+    if stamp <= 0:
+        return rejected('zero_stamp', 'a fix without a stamp')
+    if by.datum.is_awaited:
+        return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
+    cov = np.zeros((2, 2))
+    if message.position_covariance_type != 0:
+        cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
+    if np.all(np.isfinite(cov)):
+        with np.errstate(over='ignore', invalid='ignore'):
+            cov = covariance.turned(cov, by.datum.yaw)
+    antenna = by.antennas[source.name] = by.antenna(message, source)
+    by.without_lever_arm[source.name] += antenna.origin == 'none'
+    return Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
+               antenna.lever_arm)
+
+
+def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> YawRate | Answer:
+    """Return the yaw rate in a sensor_msgs/Imu, or the reason for rejecting it."""
+    values = message.angular_velocity_covariance
+    if values[0] == -1.0:   # by the definition of the message
+        return rejected('no_angular_velocity', 'the sensor reports no angular velocity')
+    velocity = message.angular_velocity
+    if source.mounting != 'tf' or by.is_of_base(message):
+        rate, variance = -velocity.z if source.mounting == 'down' else velocity.z, values[8]
+    else:
+        found = by.in_base(message)
+        if found is None:
+            return rejected('unknown_frame', (
+                f'no transform from {frame(message.header.frame_id)!r} to {by.base_frame!r} on '
+                f'/tf_static: publish it, or set {source.name}.mounting'))
+        up = found[0][2]
+        rate = float(up @ (velocity.x, velocity.y, velocity.z))
+        variance = up @ np.asarray(values, dtype=float).reshape(3, 3) @ up
+    if not math.isfinite(rate):
+        return rejected('not_finite', (
+            f'angular velocity ({velocity.x}, {velocity.y}, {velocity.z})'))
+    return YawRate(stamp_ns(message, source.time_offset_ns), float(rate),
+                   float(variance) if variance > 0.0 else 0.0)
+
+
+def twist_odometry(
+    message: Message, source: 'Source', by: Surroundings,
+) -> OdometrySample | Answer:
+    """Return the odometry by a TwistWithCovarianceStamped, or the reason for rejecting it."""
+    twist = planar_twist(message.twist.twist)
+    if isinstance(twist, Answer):
+        return twist
+    if not by.is_of_base(message):
+        found = by.in_base(message)
+        if found is None:
+            return rejected('wrong_frame', (
+                f'expected frame {by.base_frame!r} or one with a transform to it on '
+                f'/tf_static, got {frame(message.header.frame_id)!r}'))
+        twist = _at_base(twist, *found)
+    stamp = stamp_ns(message, source.time_offset_ns)
+    whole = by.twists.get(source.name, IntegratedTwist()).then(stamp, twist)
+    by.twists[source.name] = whole
+    return OdometrySample(stamp, np.array(whole.pose), math.hypot(twist[0], twist[1]),
+                          twist_variance(message.twist.covariance), twist)
+
+
+def _at_base(twist: Pose, rotation: FloatArray, place: FloatArray) -> Pose:
+    """Return the twist of the robot from that of a sensor at a place in its frame."""
+    x, y, rate = twist
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    return (c * x - s * y + rate * float(place[1]), s * x + c * y - rate * float(place[0]), rate)

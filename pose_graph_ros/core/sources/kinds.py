@@ -1,0 +1,267 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The kinds of measurements, one row of a table each: how they are checked, attached, and constrain.
+
+A measurement at stamp t constrains the last hidden node a before t through T_at, the motion by
+odometry from a to t. The noise of that motion is added to that of the measurement. Measurements
+make no hidden nodes, and a constraint depends neither on the order of arrival nor on the estimate.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.core.config import CovariancePolicy
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.measurements import (
+    Absolute,
+    ACCEPTED,
+    Answer,
+    Fix,
+    GlobalPose,
+    HeadingOnly,
+    LARGEST_STAMP,
+    LoopClosure,
+    PoseMeasurement,
+    Position,
+    rejected,
+    value_defect,
+)
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
+from pose_graph_ros.core.sources.validation import (
+    check_closure,
+    check_heading,
+    check_pose,
+    check_position,
+    Validated,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasurementKind:
+    """What the engine asks of a kind of measurements; the functions take one of them first."""
+
+    numbers: Callable[[Any], FloatArray]  # that must be valid coordinates
+    # what is left of it with a valid covariance, or why it is rejected
+    check: Callable[[Any, CovariancePolicy], Validated | Answer]
+    # puts its constraint into a queue, given its source and how its stamp is attached
+    attach: Callable[[Any, str, Attachment, HiddenNodes, Queue], Answer]
+    # what it says of the robot in the map; None if that is nothing, or not valid
+    in_map: Callable[[Any], Absolute | None] = lambda measurement: measurement
+    # of those in the map, the observed node, and the variances of position and heading that the
+    # motion since that node adds
+    observed: Callable[[Any, Attachment], tuple[Factors, FloatArray]] | None = None
+    # tells those of one stamp apart: 0, the stamp of another pose [ns], or -2 - k for node k
+    key: Callable[[Any], int] = lambda _: 0
+
+
+def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validated | Answer:
+    """Return a measurement without what it has no information on, or why it is rejected."""
+    kind, name = KINDS[type(measurement)], type(measurement).__name__
+    numbers = kind.numbers(measurement)
+    defect = value_defect(numbers)
+    if defect is not None:
+        return rejected(defect, f'{name}: {numbers.tolist()}')
+    stamps = measurement.stamp_ns, kind.key(measurement)
+    if stamps[0] <= 0 or any(abs(stamp) > LARGEST_STAMP for stamp in stamps):
+        return rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
+                        f'{name}: expected stamps above 0, got {stamps} ns')
+    return kind.check(measurement, policy)
+
+
+def key(measurement: PoseMeasurement) -> int:
+    """Return what tells measurements of one stamp apart; see `MeasurementKind.key`."""
+    return KINDS[type(measurement)].key(measurement)
+
+
+def due_ns(measurement: PoseMeasurement) -> int:
+    """Return the stamp that odometry must have reached to attach a measurement [ns]."""
+    return max(measurement.stamp_ns, key(measurement))
+
+
+# --- how they are attached
+
+def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
+    """Return the motion from the last hidden node before a stamp, or why there is none."""
+    first_ns = int(nodes.stamps_ns[0])
+    if stamp_ns < first_ns:
+        return rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
+                                           f'{1e-9 * first_ns:.3f} s')
+    if stamp_ns < nodes.last_frozen_ns:
+        return _before_window(stamp_ns, nodes)
+    attachment = nodes.attach(stamp_ns)
+    if attachment is None:
+        return rejected(
+            'no_odometry', f'no odometry covers the motion up to {1e-9 * stamp_ns:.3f} s')
+    return attachment
+
+
+def _before_window(stamp_ns: int, nodes: HiddenNodes) -> Answer:
+    return rejected('before_window', f'stamp {1e-9 * stamp_ns:.3f} s, the graph begins at '
+                                     f'{1e-9 * nodes.last_frozen_ns:.3f} s')
+
+
+def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | Answer:
+    """Return the attachment of the reference pose of a loop closure, or why it has none."""
+    if closure.reference_ns is not None:
+        return attach(nodes, closure.reference_ns)
+    node = closure.reference_node
+    if node is None or not 0 <= node < len(nodes):
+        return rejected('unknown_node', f'there is no hidden node {node}')
+    if node < nodes.n_frozen:
+        return _before_window(int(nodes.stamps_ns[node]), nodes)
+    return nodes.attachment(node, np.zeros(3), np.zeros((3, 3)))
+
+
+def _observe(
+    measurement: Absolute, source: str, attachment: Attachment, _: HiddenNodes, queue: Queue,
+) -> Answer:
+    factors, noise = observed(measurement, attachment)
+    queue.observed.append(AttachedMeasurement(source, factors, measurement, attachment, noise))
+    return ACCEPTED
+
+
+def _observe_fix(
+    measurement: Fix, source: str, attachment: Attachment, nodes: HiddenNodes, queue: Queue,
+) -> Answer:
+    # the last step: only a fix that nothing else is wrong with may become the datum
+    position = measurement.placed()
+    if (defect := value_defect(position.position)) is not None:
+        return rejected(defect, f'Fix: {position.position.tolist()} m from the datum')
+    return _observe(position, source, attachment, nodes, queue)
+
+
+def _join(
+    closure: LoopClosure, source: str, attachment: Attachment, nodes: HiddenNodes, queue: Queue,
+) -> Answer:
+    reference = attach_reference(nodes, closure)
+    if isinstance(reference, Answer):
+        return reference
+    if reference.node == attachment.node:
+        return rejected('same_node', f'both ends are attached to hidden node {attachment.node}')
+    reference_ns = closure.reference_ns
+    if reference_ns is None:
+        reference_ns = int(nodes.stamps_ns[closure.reference_node])
+    queue.edges.append(QueuedEdge(
+        source, loop_closure_constraint(closure, reference, attachment), closure.stamp_ns,
+        reference_ns))
+    return ACCEPTED
+
+
+# --- their constraints
+
+def observed(measurement: Absolute, attachment: Attachment) -> tuple[Factors, FloatArray]:
+    """
+    Return the observed node of a measurement in the map.
+
+    With it come the variances of position and heading that the motion since the node adds.
+    """
+    of_kind = KINDS[type(measurement)].observed
+    assert of_kind is not None, 'it is in the map'
+    return of_kind(measurement, attachment)
+
+
+def _observed_position(
+    measurement: Position, attachment: Attachment,
+) -> tuple[Factors, FloatArray]:
+    # it has no information on the heading, and lies in map axes
+    variance, information = swept_variance(measurement, attachment), np.zeros((3, 3))
+    information[:2, :2] = covariance.information(measurement.covariance + variance * np.eye(2))
+    offset = se2.compose(attachment.motion, np.append(measurement.lever_arm, 0.0))
+    return Factors.on(
+        [attachment.node], [offset], [np.append(measurement.position, 0.0)], [information],
+        [FactorKind.POSITION]), np.array((variance, 0.0))
+
+
+def _observed_heading(
+    measurement: HeadingOnly, attachment: Attachment,
+) -> tuple[Factors, FloatArray]:
+    variance, information = float(attachment.noise[2, 2]), np.zeros((3, 3))
+    information[2, 2] = 1.0 / (measurement.variance + variance)
+    return Factors.on(
+        [attachment.node], [attachment.motion], [(0.0, 0.0, measurement.heading)], [information],
+        [FactorKind.HEADING]), np.array((0.0, variance))
+
+
+def _observed_pose(
+    measurement: GlobalPose, attachment: Attachment,
+) -> tuple[Factors, FloatArray]:
+    noise, pose = attachment.noise, measurement.pose
+    information = covariance.information(    # (3.51)-(3.53)
+        covariance.turned(measurement.covariance, float(pose[2])) + noise)
+    return Factors.on(
+        [attachment.node], [attachment.motion], [pose], [information], [FactorKind.GLOBAL_POSE],
+        ), np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
+
+
+def swept_variance(measurement: Position, attachment: Attachment) -> float:
+    """
+    Return the variance that the motion since the node adds to a position [m^2].
+
+    The noise of the motion, including the effect of its heading on the end of the lever arm, is
+    given in the frame of the robot, whose heading in the map is unknown. The largest eigenvalue of
+    its covariance is therefore used in all directions.
+    """
+    jacobian = np.eye(2, 3)
+    jacobian[:, 2] = -measurement.lever_arm[1], measurement.lever_arm[0]
+    return float(np.linalg.eigvalsh(jacobian @ attachment.noise @ jacobian.T)[-1])
+
+
+def loop_closure_constraint(
+    measurement: LoopClosure, reference: Attachment, attachment: Attachment,
+) -> Factors:
+    """
+    Return the edge of a loop closure between the hidden nodes before its two stamps.
+
+    With T_i and T_j the motions from the nodes to the stamps, the edge measures
+    `z' = T_i z T_j^-1`. A small error at the end of z is mapped to the end of z' by the adjoint of
+    T_j, an error at its start by that of T_j z^-1. If the variances of x and y are infinite, the
+    edge constrains the headings alone.
+    """
+    z = measurement.pose
+    mean = se2.compose(se2.compose(reference.motion, z), se2.inverse(attachment.motion))
+    if not np.isfinite(measurement.covariance[0, 0]):
+        information = np.zeros((3, 3))
+        information[2, 2] = 1.0 / float(
+            measurement.covariance[2, 2] + attachment.noise[2, 2] + reference.noise[2, 2])
+    else:
+        information = covariance.information(closure_covariance(
+            covariance.turned(measurement.covariance, float(z[2])), z, reference, attachment))
+    return Factors([reference.node], [attachment.node], [mean], [information],
+                   [FactorKind.LOOP_CLOSURE])
+
+
+def closure_covariance(
+    own: FloatArray, pose: FloatArray, reference: Attachment, attachment: Attachment,
+) -> FloatArray:
+    """Return the covariance of a closure with that of the motions since its nodes."""
+    back, out = se2.adjoint(se2.inverse(pose)), se2.adjoint(attachment.motion)
+    return np.asarray(
+        out @ (own + attachment.noise + back @ reference.noise @ back.T) @ out.T)
+
+
+KINDS: dict[type[PoseMeasurement], MeasurementKind] = {
+    GlobalPose: MeasurementKind(
+        lambda each: each.pose, check_pose, _observe, observed=_observed_pose),
+    Position: MeasurementKind(
+        lambda each: np.concatenate((each.position, each.lever_arm)), check_position, _observe,
+        lambda each: each if value_defect(each.position) is None else None, _observed_position),
+    Fix: MeasurementKind(   # its position is checked when it is placed
+        lambda each: each.lever_arm, check_position, _observe_fix,
+        lambda each: KINDS[Position].in_map(each.placed())),
+    HeadingOnly: MeasurementKind(
+        lambda each: np.array([each.heading]), check_heading, _observe,
+        observed=_observed_heading),
+    LoopClosure: MeasurementKind(
+        lambda each: each.pose, check_closure, _join, lambda _: None,
+        key=lambda each: each.reference_ns if each.reference_ns is not None else (
+            -1 if each.reference_node is None else -2 - each.reference_node)),
+}
+"""What the engine asks of each kind of measurements, by its class."""
