@@ -33,7 +33,6 @@ from pose_graph_ros.core.window.sparse_removal import (
     crowded_edges,
     LIMITS,
     NONE,
-    old_closures,
     sparse_marginalization,
     sparse_removal,
 )
@@ -200,13 +199,7 @@ class Forgetting:
             if len(group.nodes) > 0:
                 self._leave(group)
                 yield
-        while len(closures := old_closures(graph, config.newest)) > 0:
-            if not self._leave(NOWHERE, closures):
-                break
-            yield
-        for _ in range(LIMITS.replaced):
-            if not any(self._leave(NOWHERE, edges) for edges in crowded_edges(graph)):
-                break
+        while any(self._leave(NOWHERE, edges) for edges in crowded_edges(graph, config.newest)):
             yield
         parts.nodes.drop_samples(config.newest)
         parts.pipeline.seen.forget(parts.nodes.newest_ns - LIMITS.repeated_ns)

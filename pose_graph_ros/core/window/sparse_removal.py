@@ -80,10 +80,9 @@ class Limits:
     # edges beyond the tree for each node; a tree alone costs 8 % in rms where a hall is driven 30
     # times, this 1 %
     extra: float = 0.5
-    # edges of the kind PRIOR for each pose, above which some are replaced by fewer ones, and how
-    # often in one step
-    prior_edges: float = 2.5
-    replaced: int = 3
+    # edges of the kind PRIOR and old loop closures for each pose, above which some are replaced by
+    # fewer ones: late closures between nodes that stay would pile up
+    edges: float = 2.5
 
     # fixes, poses and rotations for each pose that stays, up to which they stay as well, with
     # their nodes: what they tell of the errors they have in common is exact only as long as they
@@ -95,10 +94,6 @@ class Limits:
     stretch: int = 10
     stretch_around: int = 12
     longest_stretch: int = 100
-    # loop closures between nodes that stay, for each pose, above which the oldest become priors,
-    # and how many at once
-    old_closures: float = 0.5
-    closures_at_once: int = 5
     # a measurement that comes twice is refused the second time, if it is not older than that [ns]
     repeated_ns: int = 3600 * 1_000_000_000
 
@@ -282,38 +277,30 @@ def _approximation(
         return None
 
 
-def crowded_edges(graph: Graph) -> Iterator[IntArray]:
+def crowded_edges(graph: Graph, newest: int) -> Iterator[IntArray]:
     """
-    Yield ids of edges of the kind PRIOR that fewer ones could replace, if there are many in all.
+    Yield ids of edges that fewer ones could replace, if there are many in all.
 
-    They are those within a group of nodes that have many of them to each other, the most first.
+    They are those within a group of nodes that have many of them to each other, the most first:
+    edges of the kind PRIOR, and loop closures that were there before the newest poses.
     """
-    edges = graph.factors
-    prior = np.flatnonzero(edges.kind == FactorKind.PRIOR)
-    if len(prior) <= LIMITS.prior_edges * np.count_nonzero(graph.is_pose):
+    edges, older = graph.factors, graph.node_ids[graph.is_pose][:-newest]
+    ends = np.column_stack((edges.i, edges.j))
+    old = np.all(np.isin(ends, older), axis=1)
+    # what waits on new poses is still to be judged
+    newer = np.flatnonzero(~old & (edges.kind == FactorKind.ODOMETRY))
+    old[int(np.min(newer, initial=len(old))):] = False
+    rows = np.flatnonzero((edges.kind == FactorKind.PRIOR)
+                          | (old & (edges.kind == FactorKind.LOOP_CLOSURE)))
+    if len(rows) <= LIMITS.edges * np.count_nonzero(graph.is_pose):
         return
-    ends = np.column_stack((edges.i[prior], edges.j[prior]))
+    ends = ends[rows]
     near = neighbours(np.unique(ends), ends)
     for first in sorted(near, key=lambda node: -len(near[node])):
         group = grown(near, first, LIMITS.group_nodes, math.inf)
-        inside = prior[np.all(np.isin(ends, group), axis=1)]
+        inside = rows[np.all(np.isin(ends, group), axis=1)]
         if len(inside) > len(group) - 1 + round(LIMITS.extra * len(group)):
             yield graph.factor_ids[inside]
-
-
-def old_closures(graph: Graph, newest: int) -> IntArray:
-    """
-    Return ids of loop closures that nothing else lets go, some of the oldest, if there are many.
-
-    They are between poses that stay, and were there before the newest poses.
-    """
-    edges, older = graph.factors, graph.node_ids[graph.is_pose][:-newest]
-    old = np.isin(edges.i, older) & np.isin(edges.j, older)
-    newer = np.flatnonzero(~old & (edges.kind == FactorKind.ODOMETRY))
-    first = int(np.min(newer, initial=len(old)))
-    closures = np.flatnonzero(old[:first] & (edges.kind[:first] == FactorKind.LOOP_CLOSURE))
-    many = len(closures) > LIMITS.old_closures * np.count_nonzero(graph.is_pose)
-    return graph.factor_ids[closures[:LIMITS.closures_at_once]] if many else NONE
 
 
 def neighbours(nodes: IntArray, ends: IntArray) -> dict[int, set[int]]:

@@ -83,10 +83,10 @@ def test_fewer_edges_take_the_place_of_many() -> None:
         i, j, se2.between(poses[i], poses[j]), np.tile(np.eye(3), (len(i), 1, 1)),
         np.full(len(i), FactorKind.PRIOR))))
     before = covariances(graph)
-    edges = next(crowded_edges(graph))
+    edges = next(crowded_edges(graph, 1))
     np.testing.assert_array_equal(edges, graph.factor_ids)
     IncrementalSmoother(EXACT, graph).update(sparse_removal(graph, NONE, edges))
-    assert list(crowded_edges(graph)) == []
+    assert list(crowded_edges(graph, 1)) == []
     assert len(graph.factors.edges) == 7 + 4
     assert np.min(np.linalg.eigvalsh(covariances(graph) - before)) > -1e-9
 
