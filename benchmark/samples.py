@@ -19,7 +19,7 @@ from benchmark.parts import child
 from benchmark.section import about, Options, say, Section
 from pose_graph_ros.adapters.bag_writer import BAG_VERSION
 from pose_graph_ros.adapters.output_cdr import odometry_cdr
-from pose_graph_ros.cli.bag_messages import fix_messages, loop_closure_messages, odometry_messages
+from pose_graph_ros.cli.simulate import fix_messages, loop_closure_messages, odometry_messages
 from pose_graph_ros.core.estimate import Prediction
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray

@@ -27,8 +27,7 @@ from pose_graph_ros.cli.arguments import METHODS
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 
 TITLE = '`pose-graph solve` beside a GTSAM script'
 FILES = {'ring.g2o': (11.163100832, 'g2o'), 'intel_vertigo.g2o': (546.461111602, 'g2o'),

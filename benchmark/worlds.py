@@ -29,6 +29,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 from scipy.spatial import cKDTree
 
@@ -37,7 +38,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.offline.simulation.graph import composed
-from pose_graph_ros.offline.simulation.streets import street_path
+from pose_graph_ros.offline.simulation.motion import street_corners
 
 SEED = 20260
 CHAIN_SIGMA = (0.05, 0.02, 0.003)
@@ -243,6 +244,35 @@ def laps(n: int = 1500, per_lap: int = 408, seed: int = SEED) -> World:
     ahead = np.arange(n - 1)
     edges = between(truth, (ahead, ahead + 1), FactorKind.ODOMETRY, (0.05, 0.05, 0.02), rng)
     return arranged('laps', truth, Factors.joined((edges, closing)))
+
+
+def street_path(
+    rng: np.random.Generator, n: int, step: float, spacing: FloatArray, *, fresh: float,
+    rounding: int = 0,
+) -> FloatArray:
+    """
+    Return poses, shape (N, 3), at equal steps along a random drive through a grid of streets.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    n : int
+    step : float
+        Distance of the poses [m].
+    spacing, fresh
+        As of `street_corners`.
+    rounding : int
+        Corners are cut over this many steps to each side; with 0 a corner is a turn on the spot.
+
+    """
+    points = street_corners(rng, (n + 1) * step, spacing, fresh=fresh)
+    along = np.concatenate(([0.0], np.cumsum(np.sum(np.abs(np.diff(points, axis=0)), axis=1))))
+    at = step * np.arange(n + 1)
+    path = np.column_stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)])
+    if rounding > 0:
+        path = uniform_filter1d(path, 2 * rounding + 1, axis=0, mode='nearest')
+    moves = np.diff(path, axis=0)
+    return np.column_stack((path[:-1], np.arctan2(moves[:, 1], moves[:, 0])))
 
 
 def grid(n: int = 3500, seed: int = SEED) -> World:

@@ -3,8 +3,9 @@
 """
 Arguments of the tools.
 
-A function has the name of its tool, and its docstring is the description in the help. Nothing is
-imported here that takes time: help and wrong words are answered without the engine.
+A function has the name of its tool, and its docstring is what the help says, the examples behind
+the arguments. Nothing is imported here that takes time: help and wrong words are answered without
+the engine.
 """
 
 import argparse
@@ -47,6 +48,12 @@ def replay(parser: argparse.ArgumentParser) -> None:
     file, edges to the next vertex are odometry, with the noise of the file (odom.noise:=model
     takes that of the parameters); all others are loop closures, which come when their later end is
     reached.
+
+    examples:
+      pose-graph replay my_bag --odom /wheel/odometry --fix /gnss/fix -o tuesday
+      pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
+      pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
+      pose-graph replay my_bag --hold-out 5 --json | jq .errors
     """
     parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
@@ -66,13 +73,6 @@ def replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true',
                         help='print the contents of summary.json instead of a text')
     _add_replayed(parser)
-    parser.epilog = """
-examples:
-  pose-graph replay my_bag --odom /wheel/odometry --fix /gnss/fix -o tuesday
-  pose-graph replay monday.bag tuesday.bag --until 600 --export kitti,csv
-  pose-graph replay my_bag --export gpx,geojson --bag corrected_bag
-  pose-graph replay my_bag --hold-out 5 --json | jq .errors
-"""
 
 
 def report(parser: argparse.ArgumentParser) -> None:
@@ -81,6 +81,12 @@ def report(parser: argparse.ArgumentParser) -> None:
 
     RUN is the folder of a replay or a demo, its run.json, or a bag or g2o file, which is replayed
     first with the options of `replay`. The page needs no network and no other file.
+
+    examples:
+      pose-graph report replay                       # of a replay's folder: replay/report.html
+      pose-graph report demo -o tuesday.html --open
+      pose-graph report my_bag --odom /wheel/odometry --fix /gnss/fix --run tuesday
+      pose-graph report replay --json | jq '.findings[] | select(.level == "warning")'
     """
     parser.add_argument('runs', metavar='RUN', type=Path, nargs='+',
                         help='folder of a replay or a demo, run.json, bags, or a .g2o or '
@@ -94,13 +100,6 @@ def report(parser: argparse.ArgumentParser) -> None:
                         help='print what was found as JSON instead of a text')
     parser.add_argument('--open', action='store_true', help='show the page in a browser')
     _add_replayed(parser)
-    parser.epilog = """
-examples:
-  pose-graph report replay                       # of a replay's folder: replay/report.html
-  pose-graph report demo -o tuesday.html --open
-  pose-graph report my_bag --odom /wheel/odometry --fix /gnss/fix --run tuesday
-  pose-graph report replay --json | jq '.findings[] | select(.level == "warning")'
-"""
 
 
 def demo(parser: argparse.ArgumentParser) -> None:
@@ -132,6 +131,11 @@ def tune(parser: argparse.ArgumentParser) -> None:
     The table shows how well a path predicts fixes (global poses) of whole stretches of the drive
     that were held out, from the tuning too, before and after. If that is not better, no file is
     written. The exit code is 1 then, 2 for wrong input.
+
+    examples:
+      pose-graph tune my_bag --odom /wheel/odometry --fix /gnss/fix -o tuned.yaml
+      pose-graph tune monday.bag tuesday.bag --params-file robot.yaml --json | jq .parameters
+      ros2 run pose_graph_ros pose_graph_node --ros-args --params-file tuned.yaml
     """
     parser.add_argument('bags', metavar='BAG', type=Path, nargs='+',
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag')
@@ -144,12 +148,6 @@ def tune(parser: argparse.ArgumentParser) -> None:
     _add_span(parser)
     _add_inputs(parser, hold_out=False)
     _add_parameters(parser)
-    parser.epilog = """
-examples:
-  pose-graph tune my_bag --odom /wheel/odometry --fix /gnss/fix -o tuned.yaml
-  pose-graph tune monday.bag tuesday.bag --params-file robot.yaml --json | jq .parameters
-  ros2 run pose_graph_ros pose_graph_node --ros-args --params-file tuned.yaml
-"""
 
 
 def parameters(parser: argparse.ArgumentParser) -> None:
@@ -177,6 +175,16 @@ def solve(parser: argparse.ArgumentParser) -> None:
     comments, `# not used EDGE_SE2 ...`, so that other programs read the graph without them. Unless
     `--no-certificate` is given, it is proved whether the minimum is the global one, for an
     objective that is nearly chi2; if it is not, a lower one is searched for.
+
+    examples:
+      pose-graph solve graph.g2o -o optimised.g2o
+      pose-graph solve graph.graph --edge2 toro --start best
+      pose-graph solve graph.g2o --marginals newest
+      pose-graph solve graph.g2o --marginals all -o covariances.csv --json
+      pose-graph solve graph.g2o --robust -o optimised.g2o
+      pose-graph solve graph.g2o --robust gnc --closure-sigma 0 0 --json
+
+    exit code: 0 converged, 1 not converged, 2 wrong input
     """
     parser.add_argument('graph', type=Path, nargs='?',  # in `--robust FILE` it is that of --robust
                         help='g2o, TORO or iSAM file, also compressed by gzip')
@@ -208,17 +216,6 @@ def solve(parser: argparse.ArgumentParser) -> None:
                              .format(*BELIEF.closure_floors[::2]))
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file; by default both are tried')
-    parser.epilog = """
-examples:
-  pose-graph solve graph.g2o -o optimised.g2o
-  pose-graph solve graph.graph --edge2 toro --start best
-  pose-graph solve graph.g2o --marginals newest
-  pose-graph solve graph.g2o --marginals all -o covariances.csv --json
-  pose-graph solve graph.g2o --robust -o optimised.g2o
-  pose-graph solve graph.g2o --robust gnc --closure-sigma 0 0 --json
-
-exit code: 0 converged, 1 not converged, 2 wrong input
-"""
 
 
 def draw(parser: argparse.ArgumentParser) -> None:
@@ -228,6 +225,13 @@ def draw(parser: argparse.ArgumentParser) -> None:
     It is drawn as pose graph, factor graph, Markov random field or dynamic Bayesian network.
     The suffix of the picture's name says what it is: .svg, .png, or .dot for Graphviz. Hidden
     nodes stand where they are in the file, to scale; ids are those of the file.
+
+    examples:
+      pose-graph draw --example -o states.svg             five states of a graph, with H
+      pose-graph draw graph.g2o -o graph.svg --pattern
+      pose-graph draw graph.g2o --as factor-graph -o factors.png
+      pose-graph draw map.json --as dbn --nodes 0:20 -o start.svg
+      pose-graph draw graph.g2o --around 17 --hops 3 -o near.dot
     """
     _add_graph(parser, nargs='?')
     parser.add_argument('-o', '--out', metavar='PICTURE', type=_picture, required=True,
@@ -253,14 +257,6 @@ def draw(parser: argparse.ArgumentParser) -> None:
                              'file')
     parser.add_argument('--json', action='store_true',
                         help='print what is drawn as JSON (docs/tools.md)')
-    parser.epilog = """
-examples:
-  pose-graph draw --example -o states.svg             five states of a graph, with H
-  pose-graph draw graph.g2o -o graph.svg --pattern
-  pose-graph draw graph.g2o --as factor-graph -o factors.png
-  pose-graph draw map.json --as dbn --nodes 0:20 -o start.svg
-  pose-graph draw graph.g2o --around 17 --hops 3 -o near.dot
-"""
 
 
 def marginalize(parser: argparse.ArgumentParser) -> None:
@@ -270,6 +266,10 @@ def marginalize(parser: argparse.ArgumentParser) -> None:
     What remains is linear at the poses in the file, so solve it first. A single neighbour gets an
     observed node, two poses an edge; more than two a dense prior, which g2o does not have. With
     --sparse, edges stand for it which tell no more than it does.
+
+    examples:
+      pose-graph marginalize graph.g2o --nodes landmarks --sparse -o poses.g2o
+      pose-graph marginalize graph.g2o --nodes 3,7,20:25 -o smaller.g2o
     """
     _add_graph(parser)
     parser.add_argument('--nodes', metavar='IDS', required=True,
@@ -280,11 +280,6 @@ def marginalize(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--sparse', action='store_true',
                         help='write conservative edges in place of dense priors')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
-    parser.epilog = """
-examples:
-  pose-graph marginalize graph.g2o --nodes landmarks --sparse -o poses.g2o
-  pose-graph marginalize graph.g2o --nodes 3,7,20:25 -o smaller.g2o
-"""
 
 
 def _add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:

@@ -157,6 +157,13 @@ def distances(
     return stamps_ns[inside], np.hypot(offsets[:, 0], offsets[:, 1])
 
 
+def extent(path: Trajectory) -> tuple[float, float]:
+    """Return the duration [s] and the length [m] of a path."""
+    stamps, steps = path.stamps_ns, np.diff(path.poses[:, :2], axis=0)
+    return (float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) > 0 else 0.0,
+            float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))))
+
+
 def error_rows(name: str, errors: FloatArray, unit: str = 'm') -> list[ErrorRow]:
     """Return a list with the statistics of errors; an empty one without errors."""
     return [] if len(errors) == 0 else [ErrorRow(
@@ -219,11 +226,9 @@ def format_table(rows: Sequence[ErrorRow]) -> str:
 
 def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a drive as plain Python values, ready for JSON."""
-    stamps, positions = drive.corrected.stamps_ns, drive.corrected.poses[:, :2]
-    steps = np.diff(positions, axis=0)
+    duration, distance = extent(drive.corrected)
     return {
-        'duration_s': float(stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0,
-        'distance_m': float(np.sum(np.hypot(steps[:, 0], steps[:, 1]))),
+        'duration_s': duration, 'distance_m': distance,
         'odometry': len(drive.odometry), 'poses': len(drive.corrected),
         **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
            for kind, chosen in drive.fix_kinds.items()},

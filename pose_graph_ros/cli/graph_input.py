@@ -23,7 +23,7 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph_update import GraphRows
-from pose_graph_ros.core.io.g2o import GraphFile, Guess, read_g2o, read_guessed
+from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
@@ -46,14 +46,13 @@ def read(path: Path, edge2_order: str | None) -> NamedRows:
 
         rows = read_graph(path).rows
         return NamedRows(rows, rows.node_ids)
-    file, _ = read_file(path, edge2_order)
+    file = read_file(path, edge2_order)
     return NamedRows(file.rows, file.ids)
 
 
-def read_file(path: Path, edge2_order: str | None) -> tuple[GraphFile, str | None]:
-    """Return a g2o, TORO or iSAM file with the order of its EDGE2; warnings go to stderr."""
-    file, order, reason = (read_guessed(path) if edge2_order is None
-                           else Guess(read_g2o(path, edge2_order), edge2_order, ''))
+def read_file(path: Path, edge2_order: str | None) -> GraphFile:
+    """Return a g2o, TORO or iSAM file; warnings go to stderr."""
+    file = read_g2o(path, edge2_order)
     tags = sorted(file.skipped, key=lambda tag: -file.skipped[tag])
     lines = [f'{file.skipped[tag]} lines {tag!r} are skipped'
              + (': TORO may merge these nodes, which their edges connect anyway'
@@ -61,12 +60,12 @@ def read_file(path: Path, edge2_order: str | None) -> tuple[GraphFile, str | Non
     if len(tags) > 10:
         lines.append(f'lines with {len(tags) - 10} other tags are skipped')
     lines += file.notes
-    if reason:
-        lines.append(f'EDGE2 is read in the order of {order}, as {reason}; say which it is with '
-                     f'--edge2')
+    if file.found_by:
+        lines.append(f'EDGE2 is read in the order of {file.edge2_order}, as {file.found_by}; say '
+                     f'which it is with --edge2')
     for line in lines:
         print(f'warning: {path}: {line}', file=sys.stderr)
-    return file, order
+    return file
 
 
 def _begins_as_saved(path: Path) -> bool:
@@ -105,7 +104,7 @@ def read_measurements(
     of the file of stamps begins with that of a vertex [s]. Raises FileFormatError if a vertex has
     no edge to the next one.
     """
-    file, _ = read_file(path, edge2)
+    file = read_file(path, edge2)
     edges, n = file.graph.factors.edges, file.graph.n_nodes
     stamps_ns = SECOND * np.arange(1, n + 1) if stamps is None else _read_stamps(stamps, n)
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)

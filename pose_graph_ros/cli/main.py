@@ -60,11 +60,13 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _declare(parser: argparse.ArgumentParser, tool: str) -> None:
-    """Add the description and the arguments of a tool to a parser."""
+    """Add the description, the arguments and, behind these, the examples of a tool to a parser."""
     name = 'simulation_options' if tool == 'simulate' else 'arguments'
     declare = getattr(importlib.import_module(f'pose_graph_ros.cli.{name}'),
                       tool.replace('-', '_'))
-    parser.description = textwrap.dedent(declare.__doc__).strip()
+    parser.description, examples, rest = textwrap.dedent(declare.__doc__).strip().partition(
+        'examples:')
+    parser.epilog = examples + rest
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     declare(parser)
 

@@ -14,7 +14,7 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o_writing import standing_for, write_g2o
+from pose_graph_ros.core.io.g2o import standing_for, write_g2o
 from pose_graph_ros.core.marginalization.marginalize import marginalize
 
 

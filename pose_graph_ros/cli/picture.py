@@ -22,6 +22,7 @@ from pose_graph_ros.cli.drive import (
     distances,
     DOUBTED,
     Drive,
+    extent,
     REFUSED,
     WAITING,
     WEAKLY_BELIEVED,
@@ -99,7 +100,6 @@ def _limits(near: Points, stray: Points) -> tuple[Points, Points]:
 def _facts(drive: Drive) -> str:
     """Return the subtitle: duration, length and numbers of measurements."""
     path = max(drive.corrected, drive.odometry, key=len)
-    steps = np.diff(path.poses[:, :2], axis=0)
     numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()
                if kind != 'refused'}
     doubted, waiting = (int(np.sum(np.isin(drive.loop_states, states)))
@@ -110,8 +110,8 @@ def _facts(drive: Drive) -> str:
             f', {number} {what}' for number, what in ((doubted, 'not used'), (waiting, 'waiting'))
             if number > 0)]
     if len(path) > 1:
-        parts[:0] = (f'{(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9:.0f} s',
-                     f'{np.sum(np.hypot(steps[:, 0], steps[:, 1])):.0f} m')
+        duration, distance = extent(path)
+        parts[:0] = f'{duration:.0f} s', f'{distance:.0f} m'
     return '   ·   '.join(parts)
 
 

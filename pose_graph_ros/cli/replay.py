@@ -38,7 +38,7 @@ from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.measurements import Measurement, OdometrySample
 

@@ -65,20 +65,19 @@ def simulate(parser: argparse.ArgumentParser) -> None:
 
     A bag has the true poses on /ground_truth. What was false, moved or left out is in
     OUT_truth.json; of a graph OUT.g2o the truth is in OUT_truth.g2o, with the same ids.
+
+    examples:
+      pose-graph simulate city                                        # as in `pose-graph demo`
+      pose-graph simulate hall --world hall --duration 3600 --closures 0.5 --false-rate 0.1
+      pose-graph simulate gnss --world grid --closures 0 --fix-sigma 0.5 --fix-correlated 1,30
+      pose-graph simulate bad --outage /gps/fix:60:90 --jump /odom:90:3,0 --jump /gps/fix:95:9,5:30
+      pose-graph simulate late --delay /gps/fix:2:3 --duplicate /loop_closure:0.2 --gyro
+      pose-graph simulate city.g2o --world grid --duration 2300 --false-rate 0.3 --false-groups 9:5
+      pose-graph replay hall --odom /odom --truth /ground_truth
+
+    exit code: 0 written, 2 wrong input
     """
     parser.usage = '%(prog)s OUT [options]'
-    parser.epilog = """
-examples:
-  pose-graph simulate city                                        # as in `pose-graph demo`
-  pose-graph simulate hall --world hall --duration 3600 --closures 0.5 --false-rate 0.1
-  pose-graph simulate gnss --world grid --closures 0 --fix-sigma 0.5 --fix-correlated 1,30
-  pose-graph simulate bad --outage /gps/fix:60:120 --jump /odom:200:3,0 --jump /gps/fix:250:20,5:30
-  pose-graph simulate late --delay /gps/fix:2:3 --duplicate /loop_closure:0.2 --gyro
-  pose-graph simulate city.g2o --world grid --duration 2300 --false-rate 0.3 --false-groups 9:5
-  pose-graph replay hall --odom /odom --truth /ground_truth
-
-exit code: 0 written, 2 wrong input
-"""
     parser.add_argument('out', metavar='OUT', type=Path,
                         help='folder of the rosbag2, or a graph if the name ends in .g2o')
     parser.add_argument('--world', choices=DURATIONS_S, default='drive',

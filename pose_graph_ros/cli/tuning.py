@@ -49,7 +49,7 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
 from pose_graph_ros.core.sources.kinds import validate
 from pose_graph_ros.core.sources.validation import Validated
-from pose_graph_ros.offline.residuals.scale import RowFit, ScaleFit
+from pose_graph_ros.offline.residuals.source_residuals import RowFit, ScaleFit
 from pose_graph_ros.offline.residuals.variance_components import analyse
 from pose_graph_ros.offline.tuning import held_out, noise
 from pose_graph_ros.offline.tuning.held_out import Errors, NO_ERRORS, Summary

@@ -18,7 +18,7 @@ Public names; import each from its own module, as importing all of them costs st
 - `graph.graph.Graph`, `graph.graph.GraphUpdate`: a graph without sources, and an edit of it.
 - `smoother.incremental.IncrementalSmoother`: solve such a graph edit by edit.
 - `batch.optimizer.optimize`: optimise such a graph as a whole.
-- `io.g2o.read_g2o`, `io.g2o_writing.write_g2o`, `io.path_files.write_tum`: files for others.
+- `io.g2o.read_g2o`, `io.g2o.write_g2o`, `io.path_files.write_tum`: files for others.
 - `io.graph_files.read_graph`, `io.graph_files.write_graph`: saved graphs.
 - `exceptions.PoseGraphError`: base class of all exceptions of the engine.
 """

@@ -21,13 +21,12 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.io.json_values import MISMATCHES
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.judgement.texts import is_notable, sentence
 from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.saved_columns import as_matrix
+from pose_graph_ros.core.saved_columns import as_matrix, MISMATCHES
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline

@@ -1,16 +1,26 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Types of the columns of saved states.
+Saved states: the types of their columns, and their conversion to JSON values and back.
 
 Each part of the engine defines a plain dataclass `Saved...` of its own state. The arrays in it are
-annotated with the types of this module, which `io` uses to read, check and write them.
+annotated with the types of this module, which decoding follows. Members of enumerations
+(`Choices`) become the names in use and, for each row, the position of its name among these. A
+value that does not have the form of its annotation raises one of `MISMATCHES`.
 """
 
+from collections.abc import Mapping
+from dataclasses import is_dataclass
 from enum import Enum, IntEnum
-from typing import Annotated, NamedTuple
+from types import UnionType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints, NamedTuple, Union
+
+import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Pose
+
+MISMATCHES = (AttributeError, LookupError, OverflowError, TypeError, ValueError)
 
 
 class Column(NamedTuple):
@@ -60,3 +70,54 @@ def as_matrix(numbers: FloatArray) -> Matrix:
     """Return a matrix, shape (3, 3), as plain numbers."""
     first, second, third = numbers
     return as_pose(first), as_pose(second), as_pose(third)
+
+
+def encoded(value: Any, kind: Any = None) -> Any:
+    """Return a value as lists, dictionaries, strings and numbers."""
+    if _has_fields(type(value)):
+        return {name: encoded(getattr(value, name), hint)
+                for name, hint in annotations(type(value)).items()}
+    if isinstance(value, Mapping):
+        return {key: encoded(item) for key, item in value.items()}
+    if get_origin(kind) is Annotated and isinstance(choices := get_args(kind)[1], Choices):
+        names = {number: name for name, number in choices.numbers.items()}
+        used, which = np.unique(value, return_inverse=True)
+        return {'names': [names[number] for number in used.tolist()], 'of': which.tolist()}
+    if isinstance(value, tuple):
+        return [encoded(each) for each in value]
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _has_fields(kind: Any) -> bool:
+    return is_dataclass(kind) or hasattr(kind, '_fields')
+
+
+def annotations(kind: Any) -> Mapping[str, Any]:
+    """Return the annotations of the fields of a class."""
+    return get_type_hints(kind, include_extras=True)
+
+
+def decoded(kind: Any, plain: Any) -> Any:
+    """Return the value that `encoded` was given."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _array(arguments[1], plain)
+    if origin in (UnionType, Union):     # of something and None
+        return None if plain is None else decoded(arguments[0], plain)
+    if origin is tuple:
+        items = [arguments[0]] * len(plain) if arguments[-1] is Ellipsis else arguments
+        return tuple(decoded(item, each) for item, each in zip(items, plain, strict=True))
+    if origin is not None:      # a mapping of names
+        return {name: decoded(arguments[1], each) for name, each in plain.items()}
+    if _has_fields(kind):
+        hints = annotations(kind)
+        # one with a default may be missing: older versions did not write it
+        return kind(**{name: decoded(hints[name], each) for name, each in plain.items()})
+    return kind(plain)
+
+
+def _array(column: Choices | Column, plain: Any) -> npt.NDArray[Any]:
+    if isinstance(column, Column):
+        return np.array(plain, dtype=column.kind).reshape(-1, *column.shape)
+    numbers = [column.numbers[name] for name in plain['names']]
+    return np.array(numbers, dtype=np.int64)[np.array(plain['of'], dtype=np.int64)]

@@ -12,7 +12,7 @@ from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, read_input
 from pose_graph_ros.adapters.bags import BagError, open_bag, TopicInfo
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, KNOWN_SOURCES, source_list
-from pose_graph_ros.cli.bag_messages import (
+from pose_graph_ros.cli.simulate import (
     fix_messages,
     loop_closure_messages,
     odometry_messages,

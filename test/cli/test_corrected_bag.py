@@ -16,8 +16,8 @@ from tum_files import read_tum
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
-from pose_graph_ros.cli.bag_messages import Message, write_bag
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.simulate import Message, write_bag
 from pose_graph_ros.core.geometry import se2
 
 TYPES = message_types()

@@ -15,8 +15,8 @@ import pytest
 from tum_files import read_tum
 
 from pose_graph_ros.cli.arguments import FORMATS, replay
-from pose_graph_ros.cli.bag_messages import write_bag
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.simulate import write_bag
 
 DATUM = 50.7, 7.1, 0.3
 ALTITUDE = 60.0

@@ -20,14 +20,14 @@ from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import replay
-from pose_graph_ros.cli.bag_messages import (
+from pose_graph_ros.cli.drive import drive_in, read_truth, REFUSED
+from pose_graph_ros.cli.main import guarded, main
+from pose_graph_ros.cli.simulate import (
     loop_closure_messages,
     Message,
     odometry_messages,
     write_bag,
 )
-from pose_graph_ros.cli.drive import drive_in, read_truth, REFUSED
-from pose_graph_ros.cli.main import guarded, main
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError

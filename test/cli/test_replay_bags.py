@@ -16,10 +16,10 @@ from pose_graph_ros.adapters.bag_inputs import choose_inputs
 from pose_graph_ros.adapters.bags import open_bags
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
-from pose_graph_ros.cli.bag_messages import Message, write_bag
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.replay import run
 from pose_graph_ros.cli.shared import watched_bag
+from pose_graph_ros.cli.simulate import Message, write_bag
 
 START = int(circle().stamps_ns[0])
 

@@ -13,8 +13,7 @@ import pytest
 
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 
 DATA = Path(__file__).resolve().parents[1] / 'data'
 GOLDEN = json.loads((DATA / 'golden.json').read_text(encoding='utf-8'))

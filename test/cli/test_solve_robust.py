@@ -13,8 +13,7 @@ from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.error_functions import energies
-from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 
 LIMIT = 11.345  # 99 % of chi2 with three degrees of freedom
 ODOMETRY, CLOSURE = np.array([0.05, 0.05, 0.02]), np.array([0.1, 0.1, 0.03])

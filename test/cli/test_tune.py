@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.tuned_parameters import changed, odometry_parameters
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory

@@ -28,9 +28,9 @@ from pose_graph_ros.adapters.bag_inputs import choose_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, open_bags
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, source_list
-from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.replay import measurements_of
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane

@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-from pose_graph_ros.cli.bag_messages import fix_messages, Message, odometry_messages
+from pose_graph_ros.cli.simulate import fix_messages, Message, odometry_messages
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory

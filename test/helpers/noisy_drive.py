@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory

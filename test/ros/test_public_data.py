@@ -15,8 +15,8 @@ from public_data import needs, PUBLIC
 import pytest
 from tum_files import read_tum
 
-from pose_graph_ros.cli.bag_messages import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.cli.main import main
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.cli.drive import STATES
+from pose_graph_ros.cli.drive import extent, STATES
 from pose_graph_ros.cli.run import places
 from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.places import number, rounded
@@ -63,7 +63,7 @@ def document(run: Run) -> dict[str, Any]:
     return {
         'version': VERSION, 'title': run.title, 'subtitle': run.subtitle,
         'start': _utc(run.start_ns), 'start_ns': str(run.start_ns),
-        'duration': round(float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9, 3),
+        'duration': round(extent(path)[0], 3),
         'axes': list(drive.map_axes), 'offset': rounded(frame.offset),
         'facts': _facts(run), 'findings': findings(run, analyses, errors), 'lines': lines,
         'ellipses': places.ellipses(path, run.covariances, frame),
@@ -96,9 +96,7 @@ def _utc(stamp_ns: int) -> str | None:
 def _facts(run: Run) -> list[dict[str, str]]:
     """Return what stands at the head of the page."""
     estimate, drive = run.estimate, run.drive
-    path = drive.corrected
-    duration = float(path.stamps_ns[-1] - path.stamps_ns[0]) * 1e-9
-    travelled = float(np.sum(np.hypot(*np.diff(path.poses[:, :2], axis=0).T)))
+    duration, travelled = extent(drive.corrected)
     longest = max((each.milliseconds for each in run.recorder.updates), default=None)
     freedom = _freedom(run.backend.graph)
     facts = [

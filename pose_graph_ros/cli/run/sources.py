@@ -16,8 +16,14 @@ from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
-from pose_graph_ros.offline.residuals.scale import RowFit, ScaleFit, Whiteness, whiteness
-from pose_graph_ros.offline.residuals.source_residuals import SourceResiduals, spread
+from pose_graph_ros.offline.residuals.source_residuals import (
+    RowFit,
+    ScaleFit,
+    SourceResiduals,
+    spread,
+    Whiteness,
+    whiteness,
+)
 from pose_graph_ros.offline.residuals.variance_components import Analysis
 
 WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.consensus import TimeCorrelation, TUNED
-from pose_graph_ros.core.config import BackendConfig, OdometryNoise
+from pose_graph_ros.core.alignment.estimator import Given, TUNED
+from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import (
@@ -92,8 +92,7 @@ class AlignmentMonitor:
         if self.state is AlignmentState.ALIGNED or len(placed(waiting)) == 0:
             return None
         found = estimator.find_alignment(
-            nodes.recent_poses(graph), _numbered(nodes, _table(waiting)), self._config.alignment,
-            _noise(nodes), self._correlation([_evidence_of(each) for each in waiting]))
+            nodes.recent_poses(graph), self._given(nodes, [*map(_evidence_of, waiting)]))
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
                       else AlignmentState.ALIGNED)
         self.sigma = found.sigma
@@ -125,10 +124,8 @@ class AlignmentMonitor:
             return None
         self._next_recheck = 2 * len(self._evidence)
         rows = graph.node_rows(nodes.ids[nodes.n_frozen:])
-        found = estimator.recheck(
-            nodes.recent_poses(graph), nodes.odometry, _numbered(nodes, _table(self._evidence)),
-            self._config.alignment, _noise(nodes),
-            correlation=self._correlation(self._evidence), sigma=self.sigma)
+        found = estimator.recheck(nodes.recent_poses(graph), nodes.odometry,
+                                  self._given(nodes, self._evidence), self.sigma)
         if self._next_recheck > TUNED.last_recheck:
             self._evidence.clear()
         if found is None or found.T_map_graph is None:
@@ -143,13 +140,20 @@ class AlignmentMonitor:
         poses[rows] = moved
         return poses
 
-    def _correlation(self, evidence: list[Evidence]) -> TimeCorrelation:
+    def _given(self, nodes: HiddenNodes, evidence: list[Evidence]) -> Given:
+        """Return measurements by rows of `HiddenNodes.recent_poses`, and what is assumed."""
+        ids = nodes.ids[nodes.n_frozen:]    # which has no biases
+        observed = _table(evidence).renumbered(lambda some: np.searchsorted(ids, some))
+        # the noise that odometry has at least, constant errors included
+        scale = math.sqrt(max(nodes.errors.way, nodes.errors.turn, 1.0))
+        noise = nodes.streams[nodes.primary].usual_noise().scaled(scale)
         # a time that is not known yet counts as white noise
         times = {name: max(source.correlation_time, 0.0)
                  for name, source in self._config.measurements.items()}
-        return TimeCorrelation(
-            np.array([each.stamp_ns for each in evidence]) * 1e-9,
-            np.array([times.get(each.source, 0.0) for each in evidence]))
+        return Given(
+            observed, np.array([each.stamp_ns for each in evidence]) * 1e-9,
+            np.array([times.get(each.source, 0.0) for each in evidence]),
+            self._config.alignment, noise)
 
     @property
     def is_aligned(self) -> bool:
@@ -189,18 +193,6 @@ def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
 def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> Factors:
     """Return the observed nodes of measurements, with the rows of their hidden nodes."""
     return _table(measurements).renumbered(graph.node_rows)
-
-
-def _numbered(nodes: HiddenNodes, table: Factors) -> Factors:
-    """Return observed nodes by the rows of `HiddenNodes.recent_poses`, which has no biases."""
-    ids = nodes.ids[nodes.n_frozen:]
-    return table.renumbered(lambda some: np.searchsorted(ids, some))
-
-
-def _noise(nodes: HiddenNodes) -> OdometryNoise:
-    """Return the noise that odometry has at least, constant errors included."""
-    scale = math.sqrt(max(nodes.errors.way, nodes.errors.turn, 1.0))
-    return nodes.streams[nodes.primary].usual_noise().scaled(scale)
 
 
 def _evidence_of(attached: AttachedMeasurement) -> Evidence:

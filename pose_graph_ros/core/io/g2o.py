@@ -31,7 +31,7 @@ matrix the upper triangle is written.
 
 The tags `VERTEX2` and `EDGE2` are used by two formats with different numbers: TORO orders the
 information as 11 12 22 33 13 23, iSAM stores its square root as R11 R12 R13 R22 R23 R33.
-`read_guessed` finds out which of them a file has. `VERTEX` and `EDGE` are TORO's old tags,
+Which of them a file has is found out unless it is said. `VERTEX` and `EDGE` are TORO's old tags,
 `ODOMETRY` is another one of iSAM's for `EDGE2`. iSAM's `LANDMARK i l x y R11 R12 R22` is read as
 `EDGE_SE2_XY`, with the square root of the information (M. Kaess, iSAM 1.7, `Loader.cpp`).
 Landmarks have their own numbers there, so they get others if a pose has one of these.
@@ -44,32 +44,36 @@ are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge
 connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-import math
 from pathlib import Path
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Protocol, TYPE_CHECKING
 
 import numpy as np
 
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, compose_one, FloatArray, IntArray, Pose
 from pose_graph_ros.core.graph.checks import check, RowError, scaled
 from pose_graph_ros.core.graph.constraints import (
     FactorKind,
     FACTORS,
     Factors,
+    full,
     NodeKind,
+    upper,
 )
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
+from pose_graph_ros.core.graph.priors import model
 from pose_graph_ros.core.io.g2o_text import (
     AMBIGUOUS,
     GraphText,
     Lines,
-    OWN_TAGS,
+    MEASURED,
     read_lines,
+    TAGS,
 )
 
 if TYPE_CHECKING:
@@ -78,13 +82,14 @@ if TYPE_CHECKING:
 # Formats of EDGE2.
 EDGE2_ORDERS = ('toro', 'isam')
 # Row and column of each of the six numbers of the information in TORO.
-_TORO = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_TORO = (0, 0, 1, 2, 0, 1), (0, 1, 1, 2, 2, 2)
 # Kinds of edges to landmarks, that tell where the other end is.
 _TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKind.LANDMARK,)]
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
-_POINT = OWN_TAGS[FactorKind.POINT]
-_EDGES = ('EDGE_SE2', 'EDGE', *AMBIGUOUS, *OWN_TAGS.values())
-OBSERVED = ('EDGE_PRIOR_SE2', 'EDGE_PRIOR_SE2_XY', 'OBSERVED_SE2_OFFSET')
+NOT_USED = '# not used '
+"""Begin of the line of a constraint with weight 0."""
+STANDING_FOR_PRIORS = '# instead of dense priors, which g2o does not have, '
+"""Begin of the line behind which there is nothing but edges and observed nodes for priors."""
 
 
 @dataclass
@@ -96,6 +101,8 @@ class GraphFile:
     has_start: bool  # whether the file has the poses of all nodes; else missing ones were composed
     skipped: dict[str, int]  # number of lines that were skipped, by their tag
     notes: tuple[str, ...] = ()  # sentences about what was read otherwise than it is in the file
+    edge2_order: str | None = None  # of `EDGE2_ORDERS`, as it was said or found out
+    found_by: str = ''  # why this order, if it was found out
 
     @cached_property
     def graph(self) -> 'Graph':
@@ -115,244 +122,46 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     without `VERTEX_SE2` is composed from edges, breadth-first from the nodes with a pose, else
     from the smallest id. Lines with tags that are not known are skipped. If the file is not such
     a graph, a FileFormatError names the file and the line, what was expected and what was found.
-    `edge2_order` is the format of `EDGE2` in this file, one of `EDGE2_ORDERS`.
+
+    `edge2_order` is the format of `EDGE2` in this file, one of `EDGE2_ORDERS`. By default both are
+    tried. Read in the other's order, a file without correlations has the number for one coordinate
+    in the place of a correlation, so that a matrix is singular or indefinite. If all matrices are
+    positive definite in both orders, the graph is optimised with each. Then the one is kept with
+    which energies differ less, as measured by the mean over the median, whatever the unit of the
+    information is. If neither can be read, the error is that in TORO's order.
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
-    return graph_of(read_lines(path), edge2_order)
-
-
-def graph_of(text: GraphText, edge2_order: str | None = None) -> GraphFile:
-    """Return the graph in the lines of a file, as `read_g2o` does."""
-    ambiguous = [(int(text.rows[tag].lines[0]), tag) for tag in AMBIGUOUS if len(text.rows[tag])]
-    if edge2_order is None and len(ambiguous) > 0:
-        line, tag = min(ambiguous)
-        raise FileFormatError(
-            f'{text.where(line)}: {tag} means two formats with the information in different '
-            f'order; say which this is: {" or ".join(EDGE2_ORDERS)}')
-    rows, loops = _without_loops(text.rows)
-    vertices = Lines.joined(rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX'))
-    points = rows['VERTEX_XY']
-    vertices = Lines.joined((vertices, Lines(points.ids, np.pad(
-        points.numbers, ((0, 0), (0, 1))), points.lines)))
-    rows[_POINT], notes = _with_landmarks(text, rows)
-    notes = (*loops, *notes)
-    # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
-    ids, _ = np.unique(np.concatenate([table.ids.ravel() for tag, table in rows.items()
-                                       if tag != 'LANDMARK']), return_index=True)
-    given, first = np.unique(vertices.ids.ravel(), return_index=True)
-    if len(given) < len(vertices):
-        again = np.setdiff1d(np.arange(len(vertices)), first)[0]
-        raise FileFormatError(f'{text.where(vertices.lines[again])}: vertex '
-                              f'{vertices.ids[again, 0]} is in the file twice')
-    is_landmark = np.isin(ids, np.concatenate((
-        points.ids[:, 0], *(rows[FACTORS[kind].tag].ids[:, 1] for kind in _TO_LANDMARKS))))
-    kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
-    factors = Factors.joined([
-        _with_rows(Factors.joined(tables), ids, ends) for tables, ends in (
-            ([edges_of(tag, rows[tag], edge2_order) for tag in _EDGES], 'ij'),
-            ([observed_of(tag, rows[tag]) for tag in OBSERVED], 'i'))])
-    try:
-        check(factors, kind)
-    except RowError as error:
-        line = np.concatenate([rows[tag].lines for tag in (*_EDGES, *OBSERVED)])[error.row]
-        raise FileFormatError(f'{text.where(line)}: {error}') from error
-    poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
-    poses[known] = vertices.numbers[first]
-    if not np.all(known):
-        compose_missing(poses, known, factors)
-        poses[is_landmark, 2] = 0.0
-    if not np.all(np.isfinite(poses)):
-        raise FileFormatError(f'{text.path}: poses composed from edges are not finite')
-    fixed = _fixed(text, ids)
-    if not np.any(fixed) and np.all(factors.j >= 0):
-        fixed[np.argmin(is_landmark)] = True
-    n = len(ids)
-    graph = GraphRows(
-        se2.wrapped(poses), kind, fixed, factors, np.arange(n), np.arange(len(factors)),
-        NextIds(n, len(factors)))
-    return GraphFile(graph, ids, bool(len(given) == n), text.skipped, notes)
-
-
-def _without_loops(rows: dict[str, Lines]) -> tuple[dict[str, Lines], tuple[str, ...]]:
-    """Return lines without edges from a node to itself, which tell nothing, and a note of them."""
-    kept, n = dict(rows), 0
-    for tag, table in rows.items():
-        if table.ids.shape[1] == 2 and tag != 'LANDMARK':
-            loop = table.ids[:, 0] == table.ids[:, 1]
-            if np.any(loop):
-                n += int(np.sum(loop))
-                kept[tag] = table.rows(np.flatnonzero(~loop))
-    return kept, () if n == 0 else (f'{n} edges from a node to itself are skipped',)
-
-
-def _with_landmarks(
-    text: GraphText, rows: dict[str, Lines],
-) -> tuple[Lines, tuple[str, ...]]:
-    """Return the lines of `EDGE_SE2_XY` with those of `LANDMARK`, and a note of other numbers."""
-    seen = rows['LANDMARK']
-    if len(seen) == 0:
-        return rows[_POINT], ()
-    ids = seen.ids.copy()
-    others = np.unique(np.concatenate(
-        [table.ids.ravel() for tag, table in rows.items() if tag != 'LANDMARK']
-        + [ids[:, 0], text.fixes.ids.ravel()]))
-    notes: tuple[str, ...] = ()
-    if np.any(np.isin(ids[:, 1], others)):
-        first = max(int(np.max(others)), 0) + 1 - min(int(np.min(ids[:, 1])), 0)
-        if first + int(np.max(ids[:, 1])) > np.iinfo(np.int64).max:
-            raise FileFormatError(f'{text.where(seen.lines[0])}: LANDMARK: the ids are too large')
-        ids[:, 1] += first
-        notes = (f'landmark 0 of iSAM is node {first} here, 1 is {first + 1} and so on, as poses '
-                 f'have the same numbers',)
-    a, b, c = seen.numbers[:, 2:].T
-    numbers = np.column_stack((seen.numbers[:, :2], a * a, a * b, b * b + c * c))
-    return Lines.joined((rows[_POINT], Lines(ids, numbers, seen.lines))), notes
-
-
-def edges_of(tag: str, lines: Lines, edge2_order: str | None = None) -> Factors:
-    """Return the edges of a tag; their ends are ids of the file."""
-    i, j = lines.ids.T
-    order = {'EDGE': 'toro'}.get(tag, edge2_order if tag in AMBIGUOUS else None)
-    # the next id; a difference could overflow
-    kind = np.where(j == i + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
-    for own, own_tag in OWN_TAGS.items():
-        if tag == own_tag:
-            kind[:] = own
-    return Factors(i, j, *_measured(lines.numbers, order), kind)
-
-
-def observed_of(tag: str, lines: Lines) -> Factors:
-    """Return the observed nodes of a tag; their nodes are ids of the file."""
-    numbers, offset = lines.numbers, None
-    if tag == 'OBSERVED_SE2_OFFSET':
-        offset, numbers = numbers[:, :3], numbers[:, 3:]
-    mean, information = _measured(numbers)
-    kind = np.where(
-        information[:, 2, 2] == 0.0, FactorKind.POSITION, FactorKind.GLOBAL_POSE)
-    return Factors.on(lines.ids[:, 0], offset, mean, information, kind)
-
-
-def _measured(numbers: FloatArray, order: str | None = None) -> tuple[FloatArray, FloatArray]:
-    """Return means and information matrices from the 2, 5 or 9 numbers for 1 to 3 coordinates."""
-    size = {2: 1, 5: 2, 9: 3}[numbers.shape[1]]
-    mean, matrix = np.zeros((len(numbers), 3)), np.zeros((len(numbers), 3, 3))
-    mean[:, :size] = numbers[:, :size]
-    row, column = np.transpose(_TORO) if order == 'toro' else np.triu_indices(size)
-    matrix[:, row, column] = numbers[:, size:]
-    if order == 'isam':
-        return mean, np.swapaxes(matrix, 1, 2) @ matrix
-    matrix[:, column, row] = numbers[:, size:]
-    return mean, matrix
-
-
-def _with_rows(table: Factors, ids: IntArray, ends: str) -> Factors:
-    """Return factors with rows in place of ids of the file, and headings wrapped."""
-    # these ids may be negative
-    columns = {end: np.searchsorted(ids, getattr(table, end)).astype(np.int64) for end in ends}
-    return replace(table, mean=se2.wrapped(table.mean), **columns)
-
-
-def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> None:
-    """
-    Set the poses of the nodes that are not known by composing edges, breadth-first.
-
-    In a part without any that is known, its first node stays.
-    """
-    neighbours: dict[int, list[tuple[int, list[float]]]] = {}
-    placing = factors.rows(np.isin(factors.kind, _PLACING))
-    for i, j, forward, backward, kind in zip(
-            placing.i.tolist(), placing.j.tolist(), placing.mean.tolist(),
-            se2.inverse(placing.mean).tolist(), placing.kind.tolist(), strict=True):
-        neighbours.setdefault(i, []).append((j, forward))
-        if kind not in _TO_LANDMARKS:
-            neighbours.setdefault(j, []).append((i, backward))
-    # Python's numbers, as NumPy takes several times as long for a single pose
-    found, reached = poses.tolist(), known.tolist()
-    for start in (*np.flatnonzero(known).tolist(), *range(len(known))):
-        reached[start] = True
-        frontier = [start]
-        while len(frontier) > 0:
-            further = []
-            for node in frontier:
-                for neighbour, mean in neighbours.get(node, ()):
-                    if not reached[neighbour]:
-                        found[neighbour] = _composed(found[node], mean)
-                        reached[neighbour] = True
-                        further.append(neighbour)
-            frontier = further
-    poses[:] = found
-
-
-def _composed(pose: list[float], motion: list[float]) -> list[float]:
-    """Return the pose after a motion [m, m, rad], its heading not wrapped."""
-    if not math.isfinite(pose[2]):
-        return [math.nan] * 3
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return [pose[0] + c * motion[0] - s * motion[1], pose[1] + s * motion[0] + c * motion[1],
-            math.remainder(pose[2] + motion[2], math.tau)]
-
-
-def _fixed(text: GraphText, ids: IntArray) -> BoolArray:
-    """Return which nodes are fixed."""
-    fixed, names = np.zeros(len(ids), dtype=bool), text.fixes.ids.ravel()
-    rows = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
-    missing = np.flatnonzero(ids[rows] != names)
-    if len(missing) > 0:
-        raise FileFormatError(f'{text.where(text.fixes.lines[missing[0]])}: FIX '
-                              f'{names[missing[0]]}: there is no such vertex')
-    fixed[rows] = True
-    return fixed
-
-
-class Guess(NamedTuple):
-    """A graph that was read, with what was guessed of its format."""
-
-    file: GraphFile
-    order: str | None  # of `EDGE2_ORDERS`; None if the file has no tag with two meanings
-    reason: str  # why this order; empty without a guess
-
-
-def read_guessed(path: Path) -> Guess:
-    """
-    Return the planar graph in a file as `read_g2o` does, its order found out if need be.
-
-    Read in the other's order, a file without correlations has the number for one coordinate in the
-    place of a correlation, so that a matrix is singular or indefinite. If all matrices are
-    positive definite in both orders, the graph is optimised with each. Then the one is kept with
-    which energies differ less, as measured by the mean over the median, whatever the unit of the
-    information is. Raises FileFormatError, with what is wrong in TORO's order, if neither can be
-    read.
-    """
     text = read_lines(path)
-    if not any(len(text.rows[tag]) for tag in AMBIGUOUS):
-        return Guess(graph_of(text), None, '')
+    if edge2_order is not None or not any(len(text.rows[tag]) for tag in AMBIGUOUS):
+        return _graph_of(text, edge2_order)
     files: dict[str, GraphFile] = {}
-    errors: dict[str, FileFormatError] = {}
+    refused: list[FileFormatError] = []
     for order in EDGE2_ORDERS:
         try:
-            files[order] = graph_of(text, order)
+            files[order] = _graph_of(text, order)
         except FileFormatError as error:
-            errors[order] = error
+            refused.append(error)
     if len(files) == 0:
-        raise errors[EDGE2_ORDERS[0]]
-    if len(text.rows['LANDMARK']) > 0 and 'isam' in files:
-        return Guess(files['isam'], 'isam', 'LANDMARK is a tag of iSAM')
-    worst = {order: _smallest(file.rows) for order, file in files.items()}
-    definite = [order for order, value in worst.items() if value > 1e-9]
+        raise refused[0]
+    order, why = ('isam', 'LANDMARK is a tag of iSAM') if (
+        len(text.rows['LANDMARK']) > 0 and 'isam' in files) else _likelier(files)
+    return replace(files[order], found_by=why)
+
+
+def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
+    """Return in which order the numbers of a file make more sense, and why."""
+    definite = [order for order, file in files.items() if _smallest(file.rows) > 1e-9]
     if len(definite) == 1:
         other = next(order for order in EDGE2_ORDERS if order != definite[0])
-        return Guess(files[definite[0]], definite[0], (
-            f'in the order of {other} not all information matrices are positive definite'))
+        return definite[0], (
+            f'in the order of {other} not all information matrices are positive definite')
     if len(files) == 1:
-        order, = files
-        return Guess(files[order], order, 'the other order is refused')
+        return next(iter(files)), 'the other order is refused'
     spread = {order: _spread(file.rows) for order, file in files.items()}
-    order = min(EDGE2_ORDERS, key=lambda each: spread[each])
-    other = next(each for each in EDGE2_ORDERS if each != order)
-    return Guess(files[order], order, (
-        f'at the optimum the mean energy of an edge is {spread[order]:.3g} times the median, in '
-        f'the order of {other} {spread[other]:.3g} times'))
+    order, other = sorted(EDGE2_ORDERS, key=lambda each: spread[each])
+    return order, (f'at the optimum the mean energy of an edge is {spread[order]:.3g} times the '
+                   f'median, in the order of {other} {spread[other]:.3g} times')
 
 
 def _smallest(rows: GraphRows) -> float:
@@ -372,3 +181,265 @@ def _spread(rows: GraphRows) -> float:
     energies = copy.energies().factors[rows.factors.j >= 0]
     median = float(np.median(energies))
     return float(np.mean(energies)) / median if median > 0.0 else np.inf
+
+
+def _graph_of(text: GraphText, edge2_order: str | None) -> GraphFile:
+    """Return the graph in the lines of a file."""
+    rows, loops = _without_loops(text.rows)
+    rows['LANDMARK'], notes = _numbered(text, rows)
+    points = rows['VERTEX_XY']
+    vertices = Lines.joined((*(rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX')), Lines(
+        points.ids, np.pad(points.numbers, ((0, 0), (0, 1))), points.lines)))
+    # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
+    ids, _ = np.unique(np.concatenate([
+        table.ids.ravel() for tag, table in rows.items() if tag != 'FIX']), return_index=True)
+    given, first = np.unique(vertices.ids.ravel(), return_index=True)
+    if len(given) < len(vertices):
+        again = np.setdiff1d(np.arange(len(vertices)), first)[0]
+        raise FileFormatError(f'{text.where(vertices.lines[again])}: vertex '
+                              f'{vertices.ids[again, 0]} is in the file twice')
+    factors = Factors.joined([
+        factors_of(tag, rows[tag], edge2_order if tag in AMBIGUOUS else None, ids)
+        for tag in MEASURED])
+    is_landmark = np.isin(ids, points.ids)
+    is_landmark[factors.j[np.isin(factors.kind, _TO_LANDMARKS)]] = True
+    kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
+    try:
+        check(factors, kind)
+    except RowError as error:
+        line = np.concatenate([rows[tag].lines for tag in MEASURED])[error.row]
+        raise FileFormatError(f'{text.where(line)}: {error}') from error
+    poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
+    poses[known] = vertices.numbers[first]
+    if not np.all(known):
+        compose_missing(poses, known, factors)
+        poses[is_landmark, 2] = 0.0
+    if not np.all(np.isfinite(poses)):
+        raise FileFormatError(f'{text.path}: poses composed from edges are not finite')
+    fixed = _fixed(text, ids)
+    if not np.any(fixed) and np.all(factors.j >= 0):
+        fixed[np.argmin(is_landmark)] = True
+    n = len(ids)
+    graph = GraphRows(
+        se2.wrapped(poses), kind, fixed, factors, np.arange(n), np.arange(len(factors)),
+        NextIds(n, len(factors)))
+    return GraphFile(
+        graph, ids, bool(len(given) == n), text.skipped, (*loops, *notes), edge2_order)
+
+
+def _without_loops(rows: dict[str, Lines]) -> tuple[dict[str, Lines], tuple[str, ...]]:
+    """Return lines without edges from a node to itself, which tell nothing, and a note of them."""
+    kept, n = dict(rows), 0
+    for tag, table in rows.items():
+        if TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
+            kept[tag] = table.rows(np.flatnonzero(table.ids[:, 0] != table.ids[:, 1]))
+            n += len(table) - len(kept[tag])
+    return kept, () if n == 0 else (f'{n} edges from a node to itself are skipped',)
+
+
+def _numbered(text: GraphText, rows: dict[str, Lines]) -> tuple[Lines, tuple[str, ...]]:
+    """Return the lines of `LANDMARK`, landmarks with other numbers than poses, and a note."""
+    seen = rows['LANDMARK']
+    poses = [seen.ids[:, 0], *(table.ids.ravel() for tag, table in rows.items()
+                               if tag != 'LANDMARK')]
+    others, names = np.unique(np.concatenate(poses)), seen.ids[:, 1]
+    if not np.any(np.isin(names, others)):
+        return seen, ()
+    first = max(int(np.max(others)), 0) + 1 - min(int(np.min(names)), 0)
+    if first + int(np.max(names)) > np.iinfo(np.int64).max:
+        raise FileFormatError(f'{text.where(seen.lines[0])}: LANDMARK: the ids are too large')
+    moved = np.column_stack((seen.ids[:, 0], names + first))
+    return Lines(moved, seen.numbers, seen.lines), (
+        f'landmark 0 of iSAM is node {first} here, 1 is {first + 1} and so on, as poses have the '
+        f'same numbers',)
+
+
+def factors_of(
+    tag: str, lines: Lines, order: str | None = None, nodes: IntArray | None = None,
+) -> Factors:
+    """
+    Return the factors in the lines of a tag.
+
+    Their ends are ids of the file, or the places of these among the sorted ids of all nodes.
+    """
+    layout, n, size = TAGS[tag], len(lines), TAGS[tag].rows
+    order, begin = order or layout.order, 3 * layout.has_offset
+    mean, information, constants = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 4))
+    constants[:, :begin] = lines.numbers[:, :begin]
+    mean[:, :size] = lines.numbers[:, begin:begin + size]
+    row, column = _TORO if order == 'toro' else np.triu_indices(size)
+    information[:, row, column] = lines.numbers[:, begin + size:]
+    if order == 'isam':
+        information = np.swapaxes(information, 1, 2) @ information
+    else:
+        information[:, column, row] = information[:, row, column]
+    ends = lines.ids if nodes is None else np.searchsorted(nodes, lines.ids).astype(np.int64)
+    if layout.n_ids == 1:
+        i, j, kind = ends[:, 0], np.full(n, -1), np.where(
+            information[:, 2, 2] == 0.0, FactorKind.POSITION, FactorKind.GLOBAL_POSE)
+    else:
+        # the next id; a difference could overflow
+        i, j, kind = *ends.T, np.where(
+            lines.ids[:, 1] == lines.ids[:, 0] + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
+    if layout.kind is not None:
+        kind[:] = layout.kind
+    return Factors(i, j, mean if nodes is None else se2.wrapped(mean), information, kind, None,
+                   constants)
+
+
+def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> None:
+    """
+    Set the poses of the nodes that are not known by composing edges, breadth-first.
+
+    In a part without any that is known, its first node stays.
+    """
+    neighbours: dict[int, list[tuple[int, Pose]]] = {}
+    placing = factors.rows(np.isin(factors.kind, _PLACING))
+    for i, j, forward, backward, kind in zip(
+            placing.i.tolist(), placing.j.tolist(), placing.mean.tolist(),
+            se2.inverse(placing.mean).tolist(), placing.kind.tolist(), strict=True):
+        neighbours.setdefault(i, []).append((j, forward))
+        if kind not in _TO_LANDMARKS:
+            neighbours.setdefault(j, []).append((i, backward))
+    # Python's numbers, as NumPy takes several times as long for a single pose
+    found, reached = poses.tolist(), known.tolist()
+    for start in (*np.flatnonzero(known).tolist(), *range(len(known))):
+        reached[start] = True
+        frontier = [start]
+        while len(frontier) > 0:
+            further = []
+            for node in frontier:
+                for neighbour, mean in neighbours.get(node, ()):
+                    if not reached[neighbour]:
+                        found[neighbour] = compose_one(found[node], mean)
+                        reached[neighbour] = True
+                        further.append(neighbour)
+            frontier = further
+    poses[:] = found
+
+
+def _fixed(text: GraphText, ids: IntArray) -> BoolArray:
+    """Return which nodes are fixed."""
+    fixed, names = np.zeros(len(ids), dtype=bool), text.rows['FIX'].ids.ravel()
+    rows = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
+    missing = np.flatnonzero(ids[rows] != names)
+    if len(missing) > 0:
+        line = text.rows['FIX'].lines[missing[0]]
+        raise FileFormatError(f'{text.where(line)}: FIX {names[missing[0]]}: there is no such '
+                              f'vertex')
+    fixed[rows] = True
+    return fixed
+
+
+class _HasRows(Protocol):
+    def rows(self) -> GraphRows: ...
+
+
+def write_g2o(graph: _HasRows, path: Path, ids: IntArray | None = None) -> None:
+    """
+    Write a graph so that its numbers read back bit for bit.
+
+    `ids` are numbers of the hidden nodes, by default their ids.
+    """
+    path.write_text(g2o_text(graph.rows(), ids), encoding='ascii')
+
+
+def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
+    """
+    Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
+
+    Edges and observed nodes that tell about the same as dense priors are the last lines. `ids` are
+    numbers of the hidden nodes, by default their ids.
+    """
+    ids = rows.node_ids if ids is None else ids
+    factors = rows.factors.renumbered(rows.rows_of)
+    used, lines = _is_used(factors), list[str]()
+    is_edge, n_biases = factors.j >= 0, int(np.sum(rows.is_bias))
+    written = np.where(
+        is_edge, np.isin(factors.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
+        & ~np.any(factors.constants, axis=1), ~rows.is_bias[factors.i])
+    n_edges, n_observed = np.sum(is_edge & ~written), np.sum(~is_edge & ~written)
+    if n_edges > 0 or n_biases > 0:
+        lines.append(f'# left out: {n_biases} biases, {n_edges} edges to them and {n_observed} '
+                     f'observed ones')
+    is_landmark = ~rows.is_pose & ~rows.is_bias
+    for tag, chosen in (('VERTEX_SE2', rows.is_pose), ('VERTEX_XY', is_landmark)):
+        numbers = _texts(rows.poses[chosen, :TAGS[tag].rows])
+        lines += [f'{tag} {name} {text}' for name, text in zip(
+            ids[chosen].tolist(), numbers, strict=True)]
+    lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
+    lines += _factor_lines(factors.rows(written), ids, used[written])
+    if len(rows.priors) > 0:
+        instead = standing_for(rows).renumbered(rows.rows_of)
+        lines += [f'{STANDING_FOR_PRIORS}of which there are {len(rows.priors)}: {len(instead)} '
+                  f'lines', *_factor_lines(instead, ids, np.ones(len(instead), dtype=bool))]
+    return '\n'.join(lines) + '\n'
+
+
+def _is_used(factors: Factors) -> BoolArray:
+    """
+    Return which measurements are used, shape (M,).
+
+    One with a correlated error has weight 0; an edge from its node to a bias holds it instead.
+    """
+    used = factors.weight > 0.0
+    to_bias = factors.rows((factors.kind == FactorKind.BIAS) & used)
+    held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
+    for k in np.flatnonzero(~used & (factors.j < 0)).tolist() if len(held) > 0 else ():
+        used[k] = (int(factors.i[k]), *factors.mean[k, :2].tolist()) in held
+    return np.asarray(used)
+
+
+def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]:
+    """Return a line for each factor, those of edges first, given which of them are used."""
+    moved = np.any(factors.offset != 0.0, axis=1)
+    placed = np.all(factors.information[:, 2] == 0.0, axis=1) & (factors.mean[:, 2] == 0.0)
+    tags = np.where(factors.j >= 0, np.array([factor.tag for factor in FACTORS.values()])[
+        factors.kind], np.where(moved, 'OBSERVED_SE2_OFFSET', np.where(
+            placed, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2')))
+    lines = np.empty(len(factors), dtype=object)
+    for tag in np.unique(tags).tolist():
+        layout, chosen = TAGS[tag], np.flatnonzero(tags == tag)
+        some = factors.rows(chosen)
+        row, column = np.triu_indices(layout.rows)
+        numbers = _texts(np.hstack((
+            some.offset[:, :3 * layout.has_offset], some.mean[:, :layout.rows],
+            full(upper(some.information))[:, row, column])))
+        ends = np.column_stack((ids[some.i], ids[some.j]))[:, :layout.n_ids]
+        lines[chosen] = [
+            f'{"" if is_used else NOT_USED}{tag} {" ".join(map(str, names))} {text}'
+            for is_used, names, text in zip(
+                used[chosen].tolist(), ends.tolist(), numbers, strict=True)]
+    return lines[np.argsort(factors.j < 0, kind='stable')].tolist()
+
+
+def _texts(rows: FloatArray) -> list[str]:
+    """Return the numbers of each row with the digits needed to read them back bit for bit."""
+    # the text of a list is made at once
+    return [repr(row)[1:-1].replace(',', '') for row in rows.tolist()]
+
+
+def standing_for(rows: GraphRows) -> Factors:
+    """
+    Return edges and observed nodes that tell no more of the poses than the priors of a graph.
+
+    They have the minimum of the priors, linear at the present poses, and their ends are ids.
+    Biases and landmarks in priors are marginalised out.
+    """
+    # takes long to load, and most graphs have none
+    from pose_graph_ros.core.marginalization.marginalize import schur_complement  # noqa: PLC0415
+    from pose_graph_ros.core.marginalization.sparsification import sparsify  # noqa: PLC0415
+
+    factors = []
+    for prior in rows.priors:
+        at = rows.rows_of(prior.nodes)
+        is_pose = rows.is_pose[at]
+        linear = model(prior, rows.poses[at], is_pose)
+        if not np.any(is_pose):
+            continue
+        U, u = schur_complement(
+            linear.information, -linear.gradient, np.flatnonzero(~is_pose))
+        sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
+                          anchored=prior.anchored)
+        factors.append(sparse.factors)
+    return Factors.joined(factors)

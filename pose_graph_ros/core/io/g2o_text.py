@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
@@ -19,28 +19,42 @@ from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS
 
+
+class Tag(NamedTuple):
+    """What is behind a tag: ids, an offset if it has one, mean, upper triangle of information."""
+
+    n_ids: int
+    rows: int   # of the mean: the first one, two or three coordinates
+    kind: FactorKind | None = None  # None if ids or information tell
+    has_information: bool = True
+    has_offset: bool = False
+    order: str = ''     # of the information: `toro`, `isam`, or row by row
+
+    @property
+    def n_numbers(self) -> int:
+        """Number of the values behind the ids."""
+        return (3 * self.has_offset + self.rows
+                + self.has_information * self.rows * (self.rows + 1) // 2)
+
+
 # Tags with the format that the caller names, see `edge2_order`.
 AMBIGUOUS = ('EDGE2', 'ODOMETRY')
-# Tags of kinds of edges that have one of their own.
-OWN_TAGS: dict[FactorKind, str] = {kind: factor.tag for kind, factor in FACTORS.items()
-                                 if factor.tag not in {'', 'EDGE_SE2'}}
-# Numbers of ids and of values behind each tag; FIX is followed by any number of ids.
-LAYOUT = {
-    'VERTEX_SE2': (1, 3),
-    'VERTEX2': (1, 3),
-    'VERTEX': (1, 3),
-    'EDGE_SE2': (2, 9),
-    'EDGE2': (2, 9),
-    'ODOMETRY': (2, 9),
-    'EDGE': (2, 9),
-    'EDGE_PRIOR_SE2': (1, 9),
-    'EDGE_PRIOR_SE2_XY': (1, 5),
-    'OBSERVED_SE2_OFFSET': (1, 12),
-    'VERTEX_XY': (1, 2),
-    **{tag: (2, len(FACTORS[kind].rows) * (len(FACTORS[kind].rows) + 3) // 2)
-       for kind, tag in OWN_TAGS.items()},
-    'LANDMARK': (2, 5),
+_EDGE_SE2, _VERTEX = Tag(2, 3), Tag(1, 3, has_information=False)
+TAGS = {
+    'FIX': Tag(1, 0, has_information=False),    # of each of its ids, as if it stood alone
+    'VERTEX_SE2': _VERTEX, 'VERTEX2': _VERTEX, 'VERTEX': _VERTEX,
+    'VERTEX_XY': Tag(1, 2, has_information=False),
+    'EDGE_SE2': _EDGE_SE2,
+    'EDGE': _EDGE_SE2._replace(order='toro'),
+    **dict.fromkeys(AMBIGUOUS, _EDGE_SE2),
+    **{factor.tag: Tag(2, len(factor.rows), kind) for kind, factor in FACTORS.items()
+       if factor.tag not in {'', 'EDGE_SE2'}},
+    'LANDMARK': Tag(2, 2, FactorKind.POINT, order='isam'),
+    'EDGE_PRIOR_SE2': Tag(1, 3),
+    'EDGE_PRIOR_SE2_XY': Tag(1, 2),
+    'OBSERVED_SE2_OFFSET': Tag(1, 3, has_offset=True),
 }
+MEASURED = [tag for tag, layout in TAGS.items() if layout.has_information]
 _SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
 _GZIP = b'\x1f\x8b'
 
@@ -74,8 +88,7 @@ class GraphText:
     """A file as columns of numbers."""
 
     path: Path
-    rows: dict[str, Lines]  # by tag, for all of `LAYOUT`
-    fixes: Lines  # ids behind `FIX`, one a row
+    rows: dict[str, Lines]  # by tag, for all of `TAGS`
     skipped: dict[str, int]  # number of lines with other tags
 
     def where(self, line: int) -> str:
@@ -103,8 +116,7 @@ def read_lines(path: Path) -> GraphText:
 
 def lines_of(path: Path, text: str) -> GraphText:
     """Return what is in the text of a file, as `read_lines`."""
-    found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in LAYOUT}
-    fixes: tuple[list[list[str]], list[int]] = ([], [])
+    found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in TAGS}
     skipped: dict[str, list[list[str]]] = {}
     for line, content in enumerate(text.splitlines(), 1):
         words = content.split()
@@ -115,28 +127,24 @@ def lines_of(path: Path, text: str) -> GraphText:
             tag, words = 'EDGE_SE2', ['EDGE_SE2', *words[1:3], *words[4:]]
         if tag in found:
             rows, lines = found[tag]
-            rows.append(words)
-            lines.append(line)
-        elif tag == 'FIX':
-            for word in words[1:]:
-                fixes[0].append(['FIX', word])
-                fixes[1].append(line)
+            several = [words] if tag != 'FIX' else [[tag, word] for word in words[1:]]
+            rows += several
+            lines += [line] * len(several)
         elif tag not in _SWITCHES:
             skipped.setdefault(tag, []).append([str(line), *words[1:2]])
-    _forget_landmarks(fixes, skipped)
-    if not any(lines for _, lines in found.values()):
+    found['FIX'] = _without_skipped(*found['FIX'], skipped)
+    if not any(lines for tag, (_, lines) in found.items() if tag != 'FIX'):
         _raise_empty(path, skipped)
     try:
-        tables = {tag: _lines(*each, *LAYOUT[tag]) for tag, each in found.items()}
-        fixed = _lines(*fixes, 1, 0)
+        tables = {tag: _lines(*each, TAGS[tag]) for tag, each in found.items()}
     except (ValueError, OverflowError):
-        _raise_first(path, {**found, 'FIX': fixes})
-    return GraphText(path, tables, fixed, {tag: len(each) for tag, each in skipped.items()})
+        _raise_first(path, found)
+    return GraphText(path, tables, {tag: len(each) for tag, each in skipped.items()})
 
 
-def _lines(words: list[list[str]], lines: list[int], n_ids: int, n_numbers: int) -> Lines:
+def _lines(words: list[list[str]], lines: list[int], tag: Tag) -> Lines:
     """Return lines as arrays; raise ValueError or OverflowError if one is malformed."""
-    n = len(words)
+    n, n_ids, n_numbers = len(words), tag.n_ids, tag.n_numbers
     if any(len(each) != 1 + n_ids + n_numbers for each in words):
         raise ValueError
     columns = [*zip(*words, strict=True)] if n > 0 else [()] * (1 + n_ids + n_numbers)
@@ -153,27 +161,26 @@ def _raise_first(path: Path, found: dict[str, tuple[list[list[str]], list[int]]]
     """Raise FileFormatError for the first line that is malformed."""
     for line, words in sorted((line, words) for rows, lines in found.values()
                               for line, words in zip(lines, rows, strict=True)):
-        tag = words[0]
-        layout = LAYOUT.get(tag, (1, 0))
+        tag = TAGS[words[0]]
         try:
-            _lines([words], [line], *layout)
+            _lines([words], [line], tag)
         except (ValueError, OverflowError) as error:
             raise FileFormatError(
-                f'{path}:{line}: {tag} is followed by {sum(layout)} numbers, got '
-                f'{len(words) - 1}: {" ".join(words[1:])}; ids are integers of 64 bits, the '
+                f'{path}:{line}: {words[0]} is followed by {tag.n_ids + tag.n_numbers} numbers, '
+                f'got {len(words) - 1}: {" ".join(words[1:])}; ids are integers of 64 bits, the '
                 f'others finite'
             ) from error
     raise AssertionError('no line is malformed')
 
 
-def _forget_landmarks(
-    fixes: tuple[list[list[str]], list[int]], skipped: dict[str, list[list[str]]],
-) -> None:
-    """Remove the FIX of vertices that were skipped."""
+def _without_skipped(
+    fixes: list[list[str]], lines: list[int], skipped: dict[str, list[list[str]]],
+) -> tuple[list[list[str]], list[int]]:
+    """Return the lines of FIX without those of vertices that were skipped."""
     names = {words[1] for tag, found in skipped.items() if tag.startswith('VERTEX')
              for words in found if len(words) > 1}
-    kept = [k for k, (_, name) in enumerate(fixes[0]) if name not in names]
-    fixes[0][:], fixes[1][:] = [fixes[0][k] for k in kept], [fixes[1][k] for k in kept]
+    kept = [k for k, (_, name) in enumerate(fixes) if name not in names]
+    return [fixes[k] for k in kept], [lines[k] for k in kept]
 
 
 def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:
@@ -183,5 +190,5 @@ def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:
                                   f'which is not supported: graphs are planar (SE2)')
         raise FileFormatError(
             f'{path}:{found[0][0]}: tag {tag!r} is not known, and there is no line with one of '
-            f'{", ".join(LAYOUT)}')
+            f'{", ".join(TAGS)}')
     raise FileFormatError(f'{path}: holds no vertex and no edge')

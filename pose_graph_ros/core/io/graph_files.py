@@ -35,14 +35,23 @@ from pose_graph_ros.core.graph.constraints import (
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import edges_of, OBSERVED, observed_of
-from pose_graph_ros.core.io.g2o_text import GraphText, lines_of
-from pose_graph_ros.core.io.g2o_writing import g2o_text, NOT_USED, STANDING_FOR_PRIORS
-from pose_graph_ros.core.io.json_values import annotations, decoded, encoded, MISMATCHES
+from pose_graph_ros.core.io.g2o import factors_of, g2o_text, NOT_USED, STANDING_FOR_PRIORS
+from pose_graph_ros.core.io.g2o_text import GraphText, lines_of, MEASURED, TAGS
 from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.saved_columns import Flags, Integers, Numbers, Rows3, Rows4, Rows6
+from pose_graph_ros.core.saved_columns import (
+    annotations,
+    decoded,
+    encoded,
+    Flags,
+    Integers,
+    MISMATCHES,
+    Numbers,
+    Rows3,
+    Rows4,
+    Rows6,
+)
 
 FORMAT = 'pose_graph_ros graph'
 VERSION = 6
@@ -268,14 +277,15 @@ def _factors(rows: SavedRows, text: GraphText) -> Factors:
     in_json = Factors(
         rows.other_i, rows.other_j, rows.other_mean, full(rows.other_information),
         np.zeros(len(rows.others), np.uint8), None, rows.other_constants, rows.other_k)
-    observed = Factors.joined([observed_of(tag, text.rows[tag]) for tag in OBSERVED])
-    lines = np.concatenate([text.rows[tag].lines for tag in OBSERVED])
-    table = Factors.joined([edges_of('EDGE_SE2', text.rows['EDGE_SE2']),
-                            observed.rows(np.argsort(lines)), in_json])
-    in_g2o, is_edge = np.ones(len(table), dtype=bool), np.isin(rows.factor_kind, IN_G2O)
-    in_g2o[rows.others] = False
-    place = np.concatenate((np.flatnonzero(is_edge), np.flatnonzero(in_g2o & ~is_edge),
-                            rows.others))
+    # others are in the JSON file
+    tags = [tag for tag in MEASURED if TAGS[tag].kind is None]
+    in_g2o = Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
+    # in which those of edges come first
+    lines = np.concatenate([text.rows[tag].lines for tag in tags])
+    table = Factors.joined([in_g2o.rows(np.argsort(lines)), in_json])
+    others = np.delete(np.arange(len(table)), rows.others)
+    is_edge = np.isin(rows.factor_kind[others], IN_G2O)
+    place = np.concatenate((others[is_edge], others[~is_edge], rows.others))
     return replace(table.rows(np.argsort(place)), kind=rows.factor_kind.astype(np.uint8),
                    weight=rows.factor_weight)
 

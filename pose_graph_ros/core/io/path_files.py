@@ -6,9 +6,11 @@ from collections.abc import Iterator
 import json
 import math
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -18,13 +20,17 @@ _XML = '<?xml version="1.0" encoding="UTF-8"?>'
 CREATOR = 'pose_graph_ros'
 
 
+def _rows(*columns: npt.NDArray[Any]) -> Iterator[tuple[Any, ...]]:
+    """Yield rows as plain numbers, in parts: a list of all of them takes ten times the memory."""
+    for begin in range(0, len(columns[0]), PART):
+        yield from zip(*(column[begin:begin + PART].tolist() for column in columns), strict=True)
+
+
 def kitti_lines(path: Trajectory) -> Iterator[str]:
     """Yield a line for each pose: the upper three rows of its 4x4 matrix; there are no stamps."""
-    for begin in range(0, len(path), PART):
-        poses = path.poses[begin:begin + PART]
-        cos, sin = np.cos(poses[:, 2]).tolist(), np.sin(poses[:, 2]).tolist()
-        for (x, y, _), c, s in zip(poses.tolist(), cos, sin, strict=True):
-            yield f'{c!r} {-s!r} 0 {x!r} {s!r} {c!r} 0 {y!r} 0 0 1 0'
+    headings = path.poses[:, 2]
+    for (x, y, _), c, s in _rows(path.poses, np.cos(headings), np.sin(headings)):
+        yield f'{c!r} {-s!r} 0 {x!r} {s!r} {c!r} 0 {y!r} 0 0 1 0'
 
 
 def csv_lines(path: Trajectory, covariances: Covariances) -> Iterator[str]:
@@ -35,13 +41,9 @@ def csv_lines(path: Trajectory, covariances: Covariances) -> Iterator[str]:
     """
     yield 'stamp,x,y,yaw,xx,xy,xyaw,yy,yyaw,yawyaw'
     rows, columns = np.triu_indices(3)
-    for begin in range(0, len(path), PART):
-        part = slice(begin, begin + PART)
-        for stamp, pose, upper in zip(
-                path.stamps_ns[part].tolist(), path.poses[part].tolist(),
-                covariances[part, rows, columns].tolist(), strict=True):
-            numbers = [*map(repr, pose), *('' if math.isnan(x) else repr(x) for x in upper)]
-            yield f'{seconds_text(stamp)},{",".join(numbers)}'
+    for stamp, pose, upper in _rows(path.stamps_ns, path.poses, covariances[:, rows, columns]):
+        numbers = [*map(repr, pose), *('' if math.isnan(x) else repr(x) for x in upper)]
+        yield f'{seconds_text(stamp)},{",".join(numbers)}'
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
@@ -57,14 +59,10 @@ def tum_text(trajectory: Trajectory) -> str:
 
 def _lines(trajectory: Trajectory) -> Iterator[str]:
     yield '# timestamp tx ty tz qx qy qz qw'
-    # in parts: a list of all numbers of a long path takes ten times its memory
-    for begin in range(0, len(trajectory), PART):
-        poses = trajectory.poses[begin:begin + PART]
-        half = poses[:, 2] / 2
-        for stamp, (x, y, _), qz, qw in zip(
-                trajectory.stamps_ns[begin:begin + PART].tolist(), poses.tolist(),
-                np.sin(half).tolist(), np.cos(half).tolist(), strict=True):
-            yield f'{seconds_text(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}'
+    half = trajectory.poses[:, 2] / 2
+    for stamp, (x, y, _), qz, qw in _rows(
+            trajectory.stamps_ns, trajectory.poses, np.sin(half), np.cos(half)):
+        yield f'{seconds_text(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}'
 
 
 def seconds_text(stamp_ns: int) -> str:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import networkx as nx
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array, eye_array
 
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
@@ -96,23 +97,17 @@ def hessian(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
     """Return the pattern of H, poses in the order of time and then biases."""
     free = np.flatnonzero(~graph.fixed)
     order = np.concatenate((free[graph.is_pose[free]], free[~graph.is_pose[free]]))
-    place = np.full(graph.n_nodes, -1)
-    place[order] = np.arange(len(order))
-    edges = graph.factors_by_row.edges
-    used = edges.weight > 0.0
-    ends = np.column_stack((edges.i, edges.j, edges.k))[used]
-    pairs = [np.column_stack((order, order))]
-    for a, b in ((0, 1), (0, 2), (1, 2)):
-        pairs += [ends[:, [a, b]], ends[:, [b, a]]]
-    for prior in graph.priors:
-        rows = graph.node_rows(prior.nodes)
-        pairs.append(np.column_stack([each.ravel() for each in np.meshgrid(rows, rows)]))
-    blocks = np.concatenate(pairs).astype(np.int64)
-    blocks = place[blocks[np.all(blocks >= 0, axis=1)]]
-    blocks = blocks[np.all(blocks >= 0, axis=1)]
-    numbers = np.unique(blocks[:, 0] * len(order) + blocks[:, 1])
-    blocks = np.column_stack(np.divmod(numbers, max(len(order), 1)))
-    return _binned([blocks], len(order), most_bins)
+    factors = graph.factors_by_row
+    ends = np.column_stack((factors.i, factors.j, factors.k))[factors.weight > 0.0]
+    of_priors = [graph.node_rows(prior.nodes) for prior in graph.priors]
+    # which terms have which nodes: nodes that share one have a block, and each has its own
+    nodes = np.concatenate([ends[ends >= 0], *of_priors])
+    terms = np.concatenate([np.nonzero(ends >= 0)[0], *(
+        np.full(len(rows), len(ends) + k) for k, rows in enumerate(of_priors))])
+    member = csr_array((np.ones(len(nodes)), (terms, nodes)),
+                       shape=(len(ends) + len(of_priors), graph.n_nodes))[:, order]
+    blocks = (member.T @ member + eye_array(len(order))).tocoo()
+    return _binned([np.column_stack(blocks.coords)], len(order), most_bins)
 
 
 def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:

@@ -6,5 +6,5 @@ Whether the residuals of each source are as large, and as independent, as its co
 The graph at its estimate comes in, with the covariances of all nodes. What goes out are the
 residuals by source, with what is expected of them, the factor on the claimed sigmas that they show
 and its uncertainty, and their correlation in time. Nothing is changed. Read first
-`source_residuals`, then `scale`.
+`source_residuals`, then `variance_components`.
 """

@@ -40,18 +40,16 @@ from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
-from pose_graph_ros.offline.residuals.scale import (
+from pose_graph_ros.offline.residuals.source_residuals import (
     bounded,
+    collect,
     fit,
+    inverse,
     LEAST_INDEPENDENT,
     ScaleFit,
-    whiteness,
-)
-from pose_graph_ros.offline.residuals.source_residuals import (
-    collect,
-    inverse,
     scales_in_use,
     SourceResiduals,
+    whiteness,
 )
 
 # Random signs for each trace: its error is half of that of the squares that it is compared to.

@@ -21,11 +21,6 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation import sensors
-from pose_graph_ros.offline.simulation.closures import (
-    measured,
-    revisits,
-    with_false,
-)
 from pose_graph_ros.offline.simulation.motion import Motion
 from pose_graph_ros.offline.simulation.recording import absolute, Course
 from pose_graph_ros.offline.simulation.settings import (
@@ -133,11 +128,12 @@ def _closures(way: Course, path: Motion, node_distance: float) -> tuple[Factors,
     # so that no two closures of a group have the same ends
     spacing = max(settings.false.spacing, 1.5 * node_distance)
     settings = replace(settings, false=replace(settings.false, spacing=spacing))
-    old, new = revisits(streams['closures'], path, np.arange(len(truth)), settings)
+    old, new = sensors.revisits(streams['closures'], path, np.arange(len(truth)), settings)
     found = streams['rate'].random(len(old)) < settings.rate
     old, new = old[found], new[found]
-    poses = measured(streams['closures'], truth.poses[old], truth.poses[new], settings)
-    every, missing = with_false(
+    poses = sensors.closure_poses(
+        streams['closures'], truth.poses[old], truth.poses[new], settings)
+    every, missing = sensors.with_false(
         streams['false'], path, settings, truth.stamps_ns[np.column_stack((old, new))], poses)
     every = every.rows(sensors.heard(every.later_ns, CLOSURES, way.setup.outages))
     ends = np.searchsorted(truth.stamps_ns, every.stamps_ns)

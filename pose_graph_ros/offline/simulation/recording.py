@@ -20,11 +20,6 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Seconds
 from pose_graph_ros.offline.simulation import sensors
-from pose_graph_ros.offline.simulation.closures import (
-    measured,
-    revisits,
-    with_false,
-)
 from pose_graph_ros.offline.simulation.motion import Motion, PERIOD_S
 from pose_graph_ros.offline.simulation.sensors import Measured
 from pose_graph_ros.offline.simulation.settings import (
@@ -119,7 +114,7 @@ def _states(
     stamps, values = sensors.positions(state('fixes'), truth, usual.fixes)
     ends, poses = _true_closures(state('closures'), motion, closures)
     sensors.moved(state('jumps'), stamps, values, usual.jumps_of(FIXES))
-    with_false(state('false'), motion, closures, ends[:0], poses[:0])
+    sensors.with_false(state('false'), motion, closures, ends[:0], poses[:0])
     state('truth')
     return states
 
@@ -195,7 +190,8 @@ def _closures(way: Course) -> tuple[Measured, int]:
         return Measured(none.reshape(0, 2), np.empty((0, 3)), none), 0
     ends, poses = _true_closures(way.streams['closures'], way.motion, settings)
     found = way.streams['rate'].random(len(ends)) < settings.rate
-    return with_false(way.streams['false'], way.motion, settings, ends[found], poses[found])
+    return sensors.with_false(
+        way.streams['false'], way.motion, settings, ends[found], poses[found])
 
 
 def _true_closures(
@@ -207,10 +203,10 @@ def _true_closures(
     places = np.unique(np.searchsorted(
         path.distance, np.arange(0.0, path.distance[-1], settings.place_distance)))
     places = places[stamps[places] >= stamps[0] + settings.first_s * 1e9]
-    old, new = revisits(generator, path, places, settings)
+    old, new = sensors.revisits(generator, path, places, settings)
     # stamps of a camera, which is not synchronised with the other sensors
     ends = stamps[places[np.column_stack((old, new))]]
     ends += generator.integers(1, round(PERIOD_S * 1e9), ends.shape)
     ends = np.minimum(ends, stamps[-1])
     poses = path.truth.at(ends)
-    return ends, measured(generator, poses[:, 0], poses[:, 1], settings)
+    return ends, sensors.closure_poses(generator, poses[:, 0], poses[:, 1], settings)

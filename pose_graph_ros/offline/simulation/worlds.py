@@ -20,11 +20,14 @@ import numpy as np
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.offline.simulation.motion import (
+    aisle_corners,
     follow,
     Limits,
     MARGIN_S,
     Motion,
     ramp,
+    rounded,
+    street_corners,
     wandering,
 )
 from pose_graph_ros.offline.simulation.settings import (
@@ -37,7 +40,6 @@ from pose_graph_ros.offline.simulation.settings import (
     Setup,
     Wheels,
 )
-from pose_graph_ros.offline.simulation.streets import aisle_corners, rounded, street_corners
 
 PATH_STEP = 0.05  # distance of the points of paths [m]
 AISLES, AISLE_SPACING, AISLE_DEPTH = 8, 4.0, 30.0  # of the hall; distances [m]

@@ -8,9 +8,9 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.alignment.consensus import TimeCorrelation
 from pose_graph_ros.core.alignment.estimator import (
     find_alignment,
+    Given,
     GraphAlignment,
     recheck,
 )
@@ -107,28 +107,32 @@ def integrated(heading: FloatArray, step: np.ndarray) -> FloatArray:
     return np.column_stack((path.real, path.imag, heading))
 
 
-def lasting(stamps: FloatArray, times: float | FloatArray) -> TimeCorrelation:
-    return TimeCorrelation(stamps, np.broadcast_to(times, stamps.shape))
+def lasting(
+    table: Factors, stamps: FloatArray, times: float | FloatArray,
+) -> Given:
+    return Given(table, stamps, np.broadcast_to(times, stamps.shape), POLICY, NOISE)
+
+
+def white(table: Factors) -> Given:
+    return lasting(table, np.zeros(len(table)), 0.0)
 
 
 def by(odometry: FloatArray, table: Factors) -> GraphAlignment:
     """Return what observed nodes with white noise say."""
-    return find_alignment(odometry, table, POLICY, NOISE, lasting(np.zeros(len(table)), 0.0))
+    return find_alignment(odometry, white(table))
 
 
 def found(drive: Drive, times: float | FloatArray | None = None) -> GraphAlignment:
     """Return what all positions of a drive say, whose errors last for some time."""
     if times is None:
         return by(drive.odometry, drive.observed)
-    return find_alignment(
-        drive.odometry, drive.observed, POLICY, NOISE, lasting(drive.stamp, times))
+    return find_alignment(drive.odometry, lasting(drive.observed, drive.stamp, times))
 
 
 def checked(
     solved: FloatArray, odometry: FloatArray, table: Factors, sigma: float = 0.0,
 ) -> GraphAlignment | None:
-    return recheck(solved, odometry, table, POLICY, NOISE,
-                   correlation=lasting(np.zeros(len(table)), 0.0), sigma=sigma)
+    return recheck(solved, odometry, white(table), sigma)
 
 
 @given(seeds, st.integers(2, 40), st.floats(0.5, 30.0))
@@ -153,8 +157,8 @@ def test_the_order_of_the_rows_changes_nothing(seed: int, n: int, fraction: floa
     some = some.moved(bad, 40.0 * rng.standard_normal((len(bad), 2)))
     order = rng.permutation(n)
     turn = found(some, 30.0)
-    other = find_alignment(some.odometry, some.observed.rows(order), POLICY, NOISE,
-                           lasting(some.stamp[order], 30.0))
+    other = find_alignment(
+        some.odometry, lasting(some.observed.rows(order), some.stamp[order], 30.0))
     assert (turn.sigma, turn.node) == (other.sigma, other.node)
     np.testing.assert_array_equal(turn.T_map_graph, other.T_map_graph)
 

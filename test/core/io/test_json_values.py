@@ -12,9 +12,10 @@ from hypothesis import given, strategies as st
 import numpy as np
 from saved_graphs import assert_same_value
 
-from pose_graph_ros.core.io.json_values import decoded, encoded
 from pose_graph_ros.core.saved_columns import (
     Choices,
+    decoded,
+    encoded,
     Flags,
     Integers,
     Matrix,

@@ -17,8 +17,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.g2o_writing import STANDING_FOR_PRIORS
+from pose_graph_ros.core.io.g2o import read_g2o, STANDING_FOR_PRIORS
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample

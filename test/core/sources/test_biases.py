@@ -20,8 +20,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.g2o_writing import write_g2o
+from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 ODOMETRY = np.diag([400.0, 900.0, 2500.0])

@@ -10,8 +10,7 @@ import pytest
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.replay import run_measurements
-from pose_graph_ros.offline.residuals.scale import fit, whiteness
-from pose_graph_ros.offline.residuals.source_residuals import SourceResiduals
+from pose_graph_ros.offline.residuals.source_residuals import fit, SourceResiduals, whiteness
 from pose_graph_ros.offline.residuals.variance_components import analyse, Analysis
 
 
