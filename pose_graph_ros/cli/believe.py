@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from pose_graph_ros.cli.arguments import METHODS
+from pose_graph_ros.cli.solve_starts import Problem
 from pose_graph_ros.core.batch.optimizer import (
     optimize,
     optimize_from_linear_start,
@@ -31,9 +32,6 @@ from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward
 from pose_graph_ros.core.judgement.residual_scale import give_scale
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import short
-
-if TYPE_CHECKING:
-    from pose_graph_ros.cli.solve import Problem
 
 TRIES = 5  # sets of closures that are tried to join parts that no odometry joins
 
@@ -181,7 +179,7 @@ def _joining(edges: Factors, closures: IntArray, part: IntArray, number: int) ->
 
 
 def doubt(
-    problem: 'Problem', method: str, sigma: Sequence[float],
+    problem: Problem, method: str, sigma: Sequence[float],
 ) -> tuple[IntArray, dict[str, Any], list[str]]:
     """
     Return rows of closures that are not believed, after giving them the weight 0.

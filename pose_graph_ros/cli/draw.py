@@ -23,9 +23,10 @@ from matplotlib.figure import Figure
 import networkx as nx
 import numpy as np
 
-from pose_graph_ros.cli.graph_input import NamedRows, read, rows_of
+from pose_graph_ros.cli.graph_input import read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.io.g2o import GraphFile
 from pose_graph_ros.offline.drawing import views
 from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, pattern
 from pose_graph_ros.offline.drawing.views import Role, Sort
@@ -65,16 +66,13 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     if (options.graph is None) != options.example:
         raise ConfigError('expected a graph or --example, and not both')
-    graphs: Sequence[tuple[str, NamedRows]]
-    if options.example:
-        graphs = [(title, NamedRows(rows, rows.node_ids)) for title, rows in views.five_states()]
-    else:
-        graphs = [('', read(options.graph, options.edge2))]
+    graphs = ([(title, GraphFile(rows, rows.node_ids)) for title, rows in views.five_states()]
+              if options.example else [('', read(options.graph, options.edge2))])
     notes: list[str] = []
     panels: list[Panel] = []
-    for title, (rows, ids) in graphs:
-        whole = views.factor_graph(rows, ids)
-        shown, n_cut = views.part(whole, _chosen(options, ids, whole))
+    for title, file in graphs:
+        whole = views.factor_graph(file.rows, file.ids)
+        shown, n_cut = views.part(whole, _chosen(options, file.ids, whole))
         view = views.VIEWS[options.view](shown)
         at, n_near = ((views.time_slices(view), 0) if options.view == 'dbn'
                       else views.map_places(view, spring=options.spring))

@@ -14,7 +14,6 @@ from operator import itemgetter
 from pathlib import Path
 import re
 import sys
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.graph.graph_update import GraphRows
 from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
@@ -30,14 +28,7 @@ GRAPH_SUFFIXES = ('.g2o', '.graph')
 SECOND = 1_000_000_000
 
 
-class NamedRows(NamedTuple):
-    """The rows of a graph, and the number of each hidden node in its file."""
-
-    rows: GraphRows
-    ids: IntArray
-
-
-def read(path: Path, edge2_order: str | None) -> NamedRows:
+def read(path: Path, edge2_order: str | None) -> GraphFile:
     """Return the graph in a file; warnings go to stderr. Raises FileFormatError."""
     side = path if path.suffix == '.json' else path.with_suffix('.json')
     if side == path or (side.is_file() and _begins_as_saved(side)):
@@ -45,9 +36,8 @@ def read(path: Path, edge2_order: str | None) -> NamedRows:
         from pose_graph_ros.core.io.graph_files import read_graph  # noqa: PLC0415
 
         rows = read_graph(path).rows
-        return NamedRows(rows, rows.node_ids)
-    file = read_file(path, edge2_order)
-    return NamedRows(file.rows, file.ids)
+        return GraphFile(rows, rows.node_ids)
+    return read_file(path, edge2_order)
 
 
 def read_file(path: Path, edge2_order: str | None) -> GraphFile:

@@ -9,19 +9,19 @@ import sys
 import numpy as np
 
 from pose_graph_ros.cli.arguments import LANDMARKS
-from pose_graph_ros.cli.graph_input import NamedRows, read, rows_of
+from pose_graph_ros.cli.graph_input import read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import standing_for, write_g2o
+from pose_graph_ros.core.io.g2o import GraphFile, standing_for, write_g2o
 from pose_graph_ros.core.marginalization.marginalize import marginalize
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     file = read(options.graph, options.edge2)
-    rows, ids = file
+    rows, ids = file.rows, file.ids
     leaving = _leaving(options, file)
     graph = Graph()
     graph.fill(rows)
@@ -68,7 +68,7 @@ def _with_edges_for_priors(graph: Graph) -> Graph:
     return without
 
 
-def _leaving(options: argparse.Namespace, file: NamedRows) -> IntArray:
+def _leaving(options: argparse.Namespace, file: GraphFile) -> IntArray:
     """Return the rows of the nodes that leave; raise ConfigError unless there are some."""
     if options.nodes == LANDMARKS:
         rows = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)

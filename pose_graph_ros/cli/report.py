@@ -27,15 +27,17 @@ import re
 from typing import Any
 import webbrowser
 
+from pose_graph_ros.adapters.bag_inputs import OPTIONS
 from pose_graph_ros.adapters.bags import BagError
-from pose_graph_ros.cli import replay, shared
+from pose_graph_ros.cli import replay
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.run.document import FILE, read_document
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
            'springs')  # keys of run.json that --json prints
-OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth')  # of bags alone
+OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth', *OPTIONS, 'param',
+             'hold_out')  # of bags alone
 PAGES = ('.html', '.htm')
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
 
@@ -88,10 +90,7 @@ def _file(options: argparse.Namespace) -> Path | None:
             raise FileFormatError(f'{first}: expected {FILE}, or a file with the suffix '
                                   f'{", ".join(BAG_SUFFIXES)}')
         return None
-    given = [name for name in OF_REPLAY if getattr(options, name) is not None]
-    given += [name for name, topic in shared.wanted_topics(options).items() if topic is not None]
-    given += ['param'] if options.param else []
-    given += ['hold_out'] if options.hold_out else []
+    given = [name for name in OF_REPLAY if getattr(options, name)]
     if len(given) > 0:
         option = {'begin': 'from'}.get(given[0], given[0]).replace('_', '-')
         raise ConfigError(f'--{option}: {first} has been run already; the option is for a bag')

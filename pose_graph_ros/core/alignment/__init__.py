@@ -4,7 +4,7 @@
 The motion that takes the graph from the odometry frame into the map.
 
 Observed nodes on hidden nodes and the poses of these by odometry come in; the pose of the odometry
-frame in the map comes out once it is known well enough. `estimator` fits motions to positions of
-which some are wrong, and requires that the fits of several parts of the drive agree; `monitor`
-decides when to align the graph and when to check that again. Read `monitor` first.
+frame in the map comes out once it is known well enough. `consensus` fits a motion to positions of
+which some are wrong, `estimator` requires that the fits of several parts of the drive agree, and
+`monitor` decides when to align the graph and when to check that again. Read `monitor` first.
 """

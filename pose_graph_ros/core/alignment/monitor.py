@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.estimator import Given, TUNED
+from pose_graph_ros.core.alignment.consensus import Given, TUNED
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray

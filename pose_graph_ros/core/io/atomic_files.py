@@ -3,7 +3,7 @@
 """
 Writing of several files at once, either all of them completely or none.
 
-Each file is written under a temporary name in its folder and synchronised to the disk. Then all
+Each file is written into a temporary folder beside it and synchronised to the disk. Then all
 are renamed in order; if that fails, the previous files are put back. Only if the machine stops
 during the renaming may new files lie beside old ones. A reader can detect that if the file with
 the checksums of the others comes last.
@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import contextlib
 import os
 from pathlib import Path
-import secrets
+from tempfile import TemporaryDirectory
 
 from pose_graph_ros.core.exceptions import FileWriteError
 
@@ -25,35 +25,32 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
     They are renamed in the order of `contents`. After a FileWriteError previous files are
     unchanged, and no temporary ones are left.
     """
-    suffix = f'.{secrets.token_hex(4)}'
-    fresh = {path: path.with_name(f'.{path.name}{suffix}.new') for path in contents}
-    old = {path: path.with_name(f'.{path.name}{suffix}.old') for path in contents}
+    folder = next(iter(contents)).parent
     renamed: list[Path] = []
     try:
-        for path in contents:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if path.is_dir():
-                raise IsADirectoryError(f'{path} is a folder')
-        for path, content in contents.items():
-            _write(fresh[path], content)
-        for path in contents:
-            if path.exists():
-                _back_up(path, old[path])
-        for path in contents:
-            os.replace(fresh[path], path)
-            renamed.append(path)
-        _sync_folder(next(iter(contents)).parent)
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix='.new', dir=folder, ignore_cleanup_errors=True) as name:
+            fresh, old = Path(name, 'fresh'), Path(name, 'old')
+            fresh.mkdir()
+            old.mkdir()
+            for path, content in contents.items():
+                if path.is_dir():
+                    raise IsADirectoryError(f'{path} is a folder')
+                _write(fresh / path.name, content)
+            for path in contents:
+                if path.exists():
+                    _back_up(path, old / path.name)
+            try:
+                for path in contents:
+                    os.replace(fresh / path.name, path)
+                    renamed.append(path)
+                _sync_folder(folder)
+            except BaseException:
+                _put_back(renamed, old)
+                raise
     except (OSError, ValueError) as error:
-        _put_back(renamed, old)
         names = ', '.join(str(path) for path in contents)
         raise FileWriteError(f'{names}: cannot be written: {error}') from error
-    except BaseException:
-        _put_back(renamed, old)
-        raise
-    finally:
-        for path in (*fresh.values(), *old.values()):
-            with contextlib.suppress(OSError, ValueError):
-                path.unlink(missing_ok=True)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -71,12 +68,12 @@ def _back_up(path: Path, name: Path) -> None:
         _write(name, path.read_bytes())
 
 
-def _put_back(renamed: list[Path], old: Mapping[Path, Path]) -> None:
+def _put_back(renamed: list[Path], old: Path) -> None:
     """Replace new files by the previous ones; remove those without a previous one."""
     for path in renamed:
         with contextlib.suppress(OSError):
-            if old[path].exists():
-                os.replace(old[path], path)
+            if (old / path.name).exists():
+                os.replace(old / path.name, path)
             else:
                 path.unlink()
 

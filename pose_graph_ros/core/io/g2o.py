@@ -45,7 +45,7 @@ connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, TYPE_CHECKING
@@ -98,8 +98,10 @@ class GraphFile:
 
     rows: GraphRows
     ids: IntArray  # id in the file of each hidden node, increasing
-    has_start: bool  # whether the file has the poses of all nodes; else missing ones were composed
-    skipped: dict[str, int]  # number of lines that were skipped, by their tag
+    # whether the file has the poses of all nodes; else missing ones were composed
+    has_start: bool = True
+    # number of lines that were skipped, by their tag
+    skipped: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # sentences about what was read otherwise than it is in the file
     edge2_order: str | None = None  # of `EDGE2_ORDERS`, as it was said or found out
     found_by: str = ''  # why this order, if it was found out

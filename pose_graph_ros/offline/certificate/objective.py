@@ -27,7 +27,7 @@ residuals `C_t t + C_z z` the best positions for given headings solve a real lin
 `L t = -C_t^T C_z z`, L a weighted Laplacian. What remains is f = z^H Q z, with
 `Q = C_z^H (C_z + C_t (positions per z))`, which is dense, but never formed: a product with it
 takes one sparse solve. M is the sparse form in (t, z) whose Schur complement Q is, with a block
-for each node. Headings may also be rows of r complex numbers each (`riemannian`): then t has r
+for each node. Headings may also be rows of r complex numbers each (`certify`): then t has r
 columns as well.
 """
 

@@ -8,9 +8,9 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
+from pose_graph_ros.core.alignment.consensus import Given
 from pose_graph_ros.core.alignment.estimator import (
     find_alignment,
-    Given,
     GraphAlignment,
     recheck,
 )

@@ -12,14 +12,13 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.offline.certificate.certify import certify, examined, Verdict
+from pose_graph_ros.offline.certificate.certify import certify, examined, minimized, Verdict
 from pose_graph_ros.offline.certificate.objective import (
     formulate,
     Formulation,
     NotCoveredError,
     QuadraticForm,
 )
-from pose_graph_ros.offline.certificate.riemannian import minimized
 
 
 def ring(n: int, winding: int) -> Graph:
