@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros import __version__
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
@@ -260,10 +259,10 @@ def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
     is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
     poses = np.zeros((len(node_ids), 3))
     poses[is_pose], poses[~is_pose] = vertices.numbers, rows.bias_values
-    kind = np.where(is_pose, NodeKind.POSE, NodeKind.BIAS).astype(np.int32)
+    kind = np.where(is_pose, NodeKind.POSE, NodeKind.BIAS).astype(np.uint8)
     if rows.landmarks is not None:
         kind[np.isin(node_ids, rows.landmarks)] = NodeKind.LANDMARK
-    dimension: npt.NDArray[Any] = np.where(kind == NodeKind.LANDMARK, 2, 3).astype(np.int32)
+    dimension = np.where(kind == NodeKind.LANDMARK, 2, 3)
     if rows.bias_dimensions is not None:
         dimension[~is_pose] = rows.bias_dimensions
     return GraphRows(
