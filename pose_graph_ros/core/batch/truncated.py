@@ -212,7 +212,7 @@ class TruncatedProblem:
         return (yield from self.choice(share <= 1.0))
 
     def improved(
-        self, choice: Choice, retests: int = 20, config: SolverConfig = CONFIG,
+        self, choice: Choice, retests: int = 20,
     ) -> Generator[None, None, Choice]:
         """
         Return a set that no retest lowers the cost of.
@@ -224,7 +224,7 @@ class TruncatedProblem:
             believed = choice.energies <= self.limits
             if np.array_equal(believed, choice.believed):
                 break
-            other = yield from self.choice(believed, config)
+            other = yield from self.choice(believed)
             if other is None or other.cost >= choice.cost:
                 break
             choice = other

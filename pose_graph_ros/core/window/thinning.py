@@ -78,22 +78,19 @@ def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | 
 
 def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
     """Return after how many of some poses no bias has measurements on both sides, at least one."""
-    edges = graph.factors
-    measured = np.flatnonzero((holder >= 0) & (edges.j >= 0))
-    if len(measured) == 0:
-        return np.arange(1, len(poses) + 1)
-    bias = np.where(edges.kind == FactorKind.TURN, edges.k, edges.j)[measured]
-    order = np.lexsort((holder[measured], bias))
-    bias, holder = bias[order], holder[measured][order]
-    begins = np.flatnonzero(np.diff(bias, prepend=-2))
-    ends = np.append(begins[1:], len(bias)) - 1
+    factors = graph.factors
+    measured = (holder >= 0) & (factors.j >= 0)
+    bias = np.where(factors.kind == FactorKind.TURN, factors.k, factors.j)[measured]
+    biases, which = np.unique(bias, return_inverse=True)
+    at = np.searchsorted(poses, holder[measured])
     # a bias is in use between its first and its last pose
-    opened = np.searchsorted(poses, holder[begins]), np.searchsorted(poses, holder[ends])
-    blocked = np.zeros(len(poses) + 2, dtype=np.int64)
-    np.add.at(blocked, opened[0] + 1, 1)
-    np.add.at(blocked, opened[1] + 1, -1)
-    free = np.cumsum(blocked)[:len(poses) + 1] == 0
-    return np.flatnonzero(free)[1:]
+    first, last = np.full(len(biases), len(poses)), np.zeros(len(biases), dtype=np.int64)
+    np.minimum.at(first, which, at)
+    np.maximum.at(last, which, at)
+    in_use = np.zeros(len(poses) + 2, dtype=np.int64)
+    np.add.at(in_use, first + 1, 1)
+    np.add.at(in_use, last + 1, -1)
+    return np.flatnonzero(np.cumsum(in_use)[:-1] == 0)[1:]
 
 
 def _size(graph: Graph, poses: IntArray, leaving: IntArray) -> int:
