@@ -41,7 +41,7 @@ class Parameter:
     """One parameter of the node or of a source."""
 
     name: str  # for a parameter of a source, without the name of the source
-    default: Value  # an empty list of numbers means that the parameter is unset
+    default: Value  # an empty list means that the parameter is unset
     unit: str
     description: str
     smallest: float | None = None  # bound of a number, or of each one in a list, inclusive
@@ -189,6 +189,9 @@ HEADING = Parameter(
 LEVER_ARM = Parameter(
     'lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
     'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,))
+BEACONS = Parameter(
+    'beacons', [], '', 'Beacons at known places: name, x and y in the map [m] of each, such as '
+    '"anchor_1 12.5 -3.0". Others are located by their ranges.', change=Change.UNCONFIGURED)
 YAW_OFFSET = Parameter(
     'yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3, 6.3)
 

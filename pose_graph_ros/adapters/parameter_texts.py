@@ -15,7 +15,8 @@ from pose_graph_ros.adapters.parameters import listed_sources, source_parameters
 from pose_graph_ros.adapters.sources import KINDS, TYPE
 
 # Examples for lists that are not set by default.
-_EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]'}
+_EXAMPLES = {'datum': '[0.0, 0.0]', 'covariance_override': '[1.0, 0.1]',
+             'beacons': '["anchor_1 12.5 -3.0"]'}
 
 
 def as_yaml() -> str:

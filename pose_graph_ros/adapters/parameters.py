@@ -139,7 +139,7 @@ def checked_value(parameter: Parameter, value: Any) -> Any:
     """Return the value of a parameter with the type in the table, such as a float for 5."""
     if not isinstance(parameter.default, list):
         return _checked(parameter, parameter.default, value)
-    item: Value = '' if parameter.name == 'sources' else 0.0
+    item: Value = '' if parameter.unit == '' else 0.0   # numbers in a list have a unit
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise _wrong(parameter, f'a list of {"names" if item == "" else "numbers"}', value)
     if len(parameter.sizes) > 0 and len(value) not in parameter.sizes:

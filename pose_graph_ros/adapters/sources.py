@@ -8,7 +8,7 @@ by which parameters. What the engine does with the measurements, `core.sources.k
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any
 
@@ -21,7 +21,13 @@ from pose_graph_ros.adapters.conversions import (
     odometry_sample,
 )
 from pose_graph_ros.adapters.parameter_table import Change, Parameter
-from pose_graph_ros.adapters.surroundings import fix, Surroundings, twist_odometry, yaw_rate
+from pose_graph_ros.adapters.surroundings import (
+    beacon_range,
+    fix,
+    Surroundings,
+    twist_odometry,
+    yaw_rate,
+)
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError
@@ -96,8 +102,11 @@ TWIST = Kind(
 GYRO = Kind(
     'gyro', _IMU, yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
     without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
+RANGE = Kind(
+    'range', 'sensor_msgs/msg/Range', beacon_range, config.RANGES,
+    (*table.of_measurements(config.RANGES), table.LEVER_ARM, table.BEACONS), in_frames=True)
 KINDS = {kind.name: kind
-         for kind in (ODOMETRY, GLOBAL_POSE, FIX, IMU, LOOP_CLOSURE, TWIST, GYRO)}
+         for kind in (ODOMETRY, GLOBAL_POSE, FIX, IMU, LOOP_CLOSURE, TWIST, GYRO, RANGE)}
 """Kinds of sources by name."""
 
 TYPE = Parameter('type', '', '', 'Type of the source.', choices=tuple(KINDS), change=Change.START)
@@ -123,6 +132,8 @@ class Source:
     yaw_offset: float = 0.0  # added to the yaw of an IMU [rad]
     mounting: str = 'tf'  # of a gyroscope: by /tf_static, or its z axis points `up` or `down`
     integrate: str = Integrate.POSE.value  # what the motion of odometry is taken from
+    # places of beacons in the map by name, as far as they are known [m]
+    beacons: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def needs_frame(self) -> bool:
@@ -145,8 +156,23 @@ def _source(name: str, own: Mapping[str, Any]) -> Source:
     given = _same(own, Source)
     if 'lever_arm' in given:
         given['lever_arm'] = tuple(given['lever_arm'])
+    if 'beacons' in given:
+        given['beacons'] = dict(_beacon(name, text) for text in given['beacons'])
     return Source(name, KINDS[own['type']],
                   time_offset_ns=round(own['time_offset'] * NANOSECONDS), **given)
+
+
+def _beacon(source: str, text: str) -> tuple[str, tuple[float, float]]:
+    """Return name and place of a beacon by the parameter `beacons`."""
+    try:
+        name, x, y = text.split()
+        place = float(x), float(y)
+    except ValueError:
+        place = math.nan, math.nan
+    if not all(abs(each) < 1e7 for each in place):
+        raise ConfigError(f'parameter {source}.beacons: expected name, x and y, such as '
+                          f'"anchor_1 12.5 -3.0", got {text!r}')
+    return name, place
 
 
 def source_names(listed: list[str]) -> list[str]:
@@ -206,8 +232,8 @@ def _same(
     own: Mapping[str, Any], settings: type, but: Collection[str] = (),
 ) -> dict[str, Any]:
     """Return the parameters that are named as the settings that they are."""
-    return {field.name: own[field.name] for field in fields(settings)
-            if field.name in own and field.name not in but}
+    return {each.name: own[each.name] for each in fields(settings)
+            if each.name in own and each.name not in but}
 
 
 def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:

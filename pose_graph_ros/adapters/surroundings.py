@@ -27,7 +27,7 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import compose_one, FloatArray, Pose
-from pose_graph_ros.core.measurements import Answer, Fix, OdometrySample, rejected, YawRate
+from pose_graph_ros.core.measurements import Answer, Fix, OdometrySample, Range, rejected, YawRate
 from pose_graph_ros.core.odometry.motion import integrated
 
 if TYPE_CHECKING:
@@ -214,13 +214,16 @@ class Surroundings:
         """Tell whether a message is in the robot's frame, or names none."""
         return frame(message.header.frame_id) in ('', self.base_frame)
 
-    def antenna(self, message: Message, source: 'Source') -> Antenna:
-        """Return where the antenna of a message is."""
-        given = np.array(source.lever_arm, dtype=np.float64)
-        if np.any(given):
-            return Antenna(given, 'parameter')
-        found = self.in_base(message)
-        return Antenna(given, 'none') if found is None else Antenna(found[1][:2], 'tf_static')
+    def lever_arm(self, name: str, source: 'Source') -> FloatArray:
+        """Return where the antenna of a message is, given its frame, and note it."""
+        given, origin = np.array(source.lever_arm, dtype=np.float64), 'parameter'
+        if not np.any(given):
+            found = self.frames.transform(name, self.base_frame)
+            origin = 'none' if found is None else 'tf_static'
+            given = given if found is None else found[1][:2]
+        self.antennas[source.name] = Antenna(given, origin)
+        self.without_lever_arm[source.name] += origin == 'none'
+        return given
 
 
 def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
@@ -249,10 +252,29 @@ def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
     if np.all(np.isfinite(cov)):
         with np.errstate(over='ignore', invalid='ignore'):
             cov = covariance.turned(cov, by.datum.yaw)
-    antenna = by.antennas[source.name] = by.antenna(message, source)
-    by.without_lever_arm[source.name] += antenna.origin == 'none'
     return Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
-               antenna.lever_arm)
+               by.lever_arm(frame(message.header.frame_id), source))
+
+
+def beacon_range(message: Message, source: 'Source', by: Surroundings) -> Range | Answer:
+    """
+    Return the range in a sensor_msgs/Range, or the reason for rejecting it.
+
+    Its frame is the name of the beacon, or those of antenna and beacon, such as `tag/anchor_1`.
+    """
+    antenna, _, beacon = frame(message.header.frame_id).rpartition('/')
+    if beacon == '':
+        return rejected('wrong_frame', 'expected the name of a beacon as the frame_id')
+    distance, least, most = float(message.range), message.min_range, message.max_range
+    if not math.isfinite(distance):
+        return rejected('not_finite', f'range {distance} m')
+    if most > least and not least <= distance <= most:
+        return rejected('out_of_range', f'range {distance} m, not from {least} to {most} m')
+    place = source.beacons.get(beacon)
+    # older messages have no variance
+    return Range(stamp_ns(message, source.time_offset_ns), beacon, distance,
+                 float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
+                 None if place is None else np.array(place))
 
 
 def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> YawRate | Answer:

@@ -123,8 +123,8 @@ class PoseGraphBackend:
 
     @property
     def n_waiting(self) -> int:
-        """Number of measurements that wait for odometry to reach their stamps."""
-        return len(self._pipeline.waiting)
+        """Number of measurements that wait for odometry to reach their stamps, or for a beacon."""
+        return len(self._pipeline.waiting) + len(self._pipeline.beacons)
 
     @property
     def n_quarantined(self) -> int:
@@ -177,6 +177,15 @@ class PoseGraphBackend:
             if stream.n_jumps > 0:
                 self.counts[source, 'jump'] = stream.n_jumps
         self._pipeline.attach_due()
+        if len(self._pipeline.beacons) > 0:
+            self._pipeline.queue.edges += self._pipeline.beacons.take_ready(
+                self.graph, self._apply, aligned=self._alignment.is_aligned)
+
+    def _apply(self, change: GraphUpdate) -> bool:
+        """Change the graph at once; return whether the solver could follow."""
+        result = self._smoother.update(change)
+        self.counts['solver', 'failed'] += result.status is Status.FAILED
+        return result.status is not Status.FAILED
 
     def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
         """Append a hidden node to the graph; return its id, or -1 if the solver failed."""

@@ -263,6 +263,10 @@ SET_POSES = MeasurementSource(robust=Robust.NONE)
 LOOP_CLOSURES = MeasurementSource(
     covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
 
+# defaults of a source of ranges to beacons; most messages do not say how accurate they are
+RANGES = MeasurementSource(
+    covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
+
 
 class HasDefaults(Protocol):
     """A kind of measurements."""

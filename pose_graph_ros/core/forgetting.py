@@ -247,7 +247,7 @@ class Forgetting:
         rows = graph.node_rows(nodes.ids[first:])
         row = int(rows[rows >= 0][0])
         # fixed ones of before may have been freed meanwhile
-        leaving = graph.node_ids[:row][~graph.is_bias[:row] & ~graph.fixed[:row]]
+        leaving = graph.node_ids[:row][graph.is_pose[:row] & ~graph.fixed[:row]]
         self._follow_alignment()
         stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
         asked = self._ask(leaving, NONE, int(graph.node_ids[np.argmax(stays)]))

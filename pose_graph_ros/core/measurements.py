@@ -119,9 +119,23 @@ class LoopClosure:
     defaults: ClassVar[MeasurementSource] = config.LOOP_CLOSURES
 
 
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Distance of a point of the robot, such as an antenna, from a beacon."""
+
+    stamp_ns: int
+    beacon: str  # name of the beacon
+    distance: float  # [m]
+    variance: float  # [m^2]; 0 if unknown
+    lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
+    place: FloatArray | None = None  # of the beacon in the map, shape (2,) [m]; None if unknown
+
+    defaults: ClassVar[MeasurementSource] = config.RANGES
+
+
 Absolute = GlobalPose | Position | HeadingOnly  # measurements relative to the map
 # measurements that are attached to hidden nodes by their stamps
-PoseMeasurement = Absolute | LoopClosure | Fix
+PoseMeasurement = Absolute | LoopClosure | Fix | Range
 Measurement = PoseMeasurement | YawRate
 
 

@@ -18,13 +18,14 @@ from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.exceptions import FileFormatError, NothingToSaveError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Factors, full, upper
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors, full, upper
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.judgement.texts import is_notable, sentence
 from pose_graph_ros.core.judgement.verdicts import Judged
+from pose_graph_ros.core.measurements import LoopClosure, Range
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import as_matrix, MISMATCHES
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -70,8 +71,8 @@ def capture(
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')
     attached = parts.pipeline.queue.observed + parts.quarantine.observed
-    left_out = parts.pipeline.waiting.measurements + [
-        (each.source, each.measurement) for each in attached]
+    left_out = (parts.pipeline.waiting.measurements + parts.pipeline.beacons.measurements
+                + [(each.source, each.measurement) for each in attached])
     seen, added = parts.pipeline.seen.saved(left_out), parts.factors.saved()
     sources = dict(added)
     for name, (stamps, references) in seen.items():
@@ -88,7 +89,8 @@ def capture(
         datum=datum, gyros=parts.pipeline.gyros.saved(
             parts.pipeline.queue.turns + parts.quarantine.turns),
         gyro_biases={
-            name: bias.saved() for name, bias in parts.factors.gyros.items()})
+            name: bias.saved() for name, bias in parts.factors.gyros.items()},
+        beacons=dict(parts.pipeline.beacons.ids))
 
 
 def restore(parts: Parts, saved: SavedGraph) -> None:
@@ -116,15 +118,18 @@ def _restore(parts: Parts, saved: SavedGraph) -> None:
         parts.pipeline.queue.turns += gyro.waiting
     for name, bias in saved.gyro_biases.items():
         parts.factors.gyro_bias(name).restore(bias)
+    parts.pipeline.beacons.ids |= saved.beacons
     parts.reweighting.restore(saved.losses)
     parts.alignment.load(saved.alignment)
     parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
     for queue, edges in (
             (parts.pipeline.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
-        table = Factors(edges.i, edges.j, edges.mean, full(edges.information), edges.kind)
+        table = Factors(edges.i, edges.j, edges.mean, full(edges.information), edges.kind,
+                        constants=edges.constants if len(edges.constants) > 0 else None)
         queue.edges += [
-            QueuedEdge(name, table.rows(slice(k, k + 1)), *stamps)
-            for k, (name, stamps) in enumerate(zip(
+            QueuedEdge(name, table.rows(slice(k, k + 1)), stamp_ns, reference_ns, kind=(
+                Range if table.kind[k] == FactorKind.RANGE else LoopClosure))
+            for k, (name, (stamp_ns, reference_ns)) in enumerate(zip(
                 edges.sources, edges.stamps_ns.tolist(), strict=True))]
 
 
@@ -133,4 +138,5 @@ def _saved_edges(queue: Queue) -> SavedEdges:
     stamps = np.array([(queued.stamp_ns, queued.reference_ns) for queued in queue.edges],
                       dtype=np.int64).reshape(-1, 2)
     return SavedEdges(tuple(queued.source for queued in queue.edges), table.i, table.j,
-                      table.mean, upper(table.information), table.kind.astype(np.int64), stamps)
+                      table.mean, upper(table.information), table.kind.astype(np.int64), stamps,
+                      table.constants)

@@ -4,12 +4,15 @@
 
 import math
 
-from harness import fix, imu, odometry, pose
+from harness import fix, imu, odometry, pose, transform
 import pytest
+from sensor_msgs.msg import Range as RangeMessage
+from tf2_msgs.msg import TFMessage
 
 from pose_graph_ros.adapters import conversions
 from pose_graph_ros.adapters.message_reader import MessageReader
-from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.parameters import checked, require_together
+from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import (
     Answer,
     GlobalPose,
@@ -87,6 +90,38 @@ def test_an_imu_without_an_orientation_is_refused() -> None:
     message = imu(1.0, 0.0)
     message.orientation.w = message.orientation.z = 0.0
     assert conversions.heading(message).reason == 'not_finite'
+
+
+def range_message(beacon: str, distance: float, variance: float = 0.0) -> RangeMessage:
+    message = RangeMessage(min_range=0.1, max_range=50.0, range=distance, variance=variance)
+    message.header.stamp.sec, message.header.frame_id = 3, beacon
+    return message
+
+
+def test_the_frame_of_a_range_names_the_beacon_and_perhaps_the_antenna() -> None:
+    given = MessageReader(checked({
+        'sources': ['odom', 'tags'], 'tags.type': 'range', 'tags.time_offset': 0.5,
+        'tags.beacons': ['door 1.5 -2', 'window 3 4e1']}))
+    one = given.read('tags', range_message('door', 7.5, 0.25))
+    assert (one.stamp_ns, one.beacon, one.distance, one.variance) == (
+        3_500_000_000, 'door', 7.5, 0.25)
+    assert (one.place.tolist(), one.lever_arm.tolist()) == ([1.5, -2.0], [0.0, 0.0])
+    given.frames.receive(TFMessage(transforms=[transform('base_link', 'tag', (0.75, -0.25, 1.0))]))
+    other = given.read('tags', range_message('tag/hall', 7.5))
+    assert (other.beacon, other.place, other.lever_arm.tolist()) == ('hall', None, [0.75, -0.25])
+    assert given.surroundings.without_lever_arm['tags'] == 1
+    for refused, reason in ((range_message('', 1.0), 'wrong_frame'),
+                            (range_message('door', math.nan), 'not_finite'),
+                            (range_message('door', math.inf), 'not_finite'),
+                            (range_message('door', 51.0), 'out_of_range')):
+        assert given.read('tags', refused).reason == reason
+
+
+@pytest.mark.parametrize('text', ['door', 'door 1', 'door 1 x', 'door 1 nan', 'door 1 2 3', ''])
+def test_a_beacon_without_name_and_place_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r'tags\.beacons: expected name, x and y'):
+        require_together(checked({
+            'sources': ['odom', 'tags'], 'tags.type': 'range', 'tags.beacons': [text]}))
 
 
 def reader(**values: object) -> MessageReader:

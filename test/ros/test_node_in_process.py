@@ -26,6 +26,7 @@ from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import get_parameter_value, Parameter
 from rclpy.task import Future
+from sensor_msgs.msg import Range
 from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.adapters.parameter_table import Change
@@ -241,6 +242,24 @@ def test_mistakes_around_the_node_are_logged_when_they_begin_and_end(
     for words in said:
         (line,) = [line for line in logged if words in line and 'over: ' not in line]
         assert '[WARN]' in line
+
+
+@pytest.mark.parametrize('managed', [{
+    'sources': ['odom', 'fix', 'tags'], 'tags.type': 'range', 'tags.beacons': ['door 3 4']}],
+    indirect=True)
+def test_a_range_to_a_beacon_of_the_map_waits_until_the_graph_lies_there(
+    managed: Managed,
+) -> None:
+    managed.start()
+    managed.publishers['tags'] = managed.local.advertise(Range, 'tags')
+    managed.drive(4.0, fixes=False)
+    message = Range(header=odometry_at(2.05).header, range=5.0, variance=0.01)
+    message.header.frame_id = 'door'
+    managed.send('tags', message)
+    managed.drive(6.0, 4.0, fixes=False)
+    status = managed.session.worker.status
+    assert (status.counts['tags', 'accepted'], status.pending) == (1, 1)
+    assert diagnostics.values(managed.session)['tags.lever_arm'] == '[0.000, 0.000] from none'
 
 
 def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> None:

@@ -64,8 +64,10 @@ def _whole(run: Run) -> Iterator[Finding]:
             'warning', 'the angle between odometry and map is unknown, as fixes are too few or '
             'from too short a path: drive farther', 'map')
     elif estimate.alignment is AlignmentState.LOCAL:
-        yield Finding('notice', 'nothing was measured in the map, so the path begins at its '
-                                'origin, and nothing but loop closures bounds its drift', 'map')
+        others = '' if len(run.backend.parts.pipeline.beacons.ids) == 0 else ' and beacons'
+        yield Finding(
+            'notice', 'nothing was measured in the map, so the path begins at its origin, and '
+            f'nothing but loop closures{others} bounds its drift', 'map')
     if run.backend.n_quarantined > 0:
         names = ', '.join(run.backend.set_aside(3))
         yield Finding('warning', f'{run.backend.n_quarantined} constraints are set aside because '

@@ -51,6 +51,7 @@ class SavedGraph:
     datum: MapOrigin | None  # of the map, if it has one
     gyros: Mapping[str, SavedGyro] = field(default_factory=dict)
     gyro_biases: Mapping[str, SavedGyroBias] = field(default_factory=dict)
+    beacons: Mapping[str, int] = field(default_factory=dict)  # ids of their landmarks, by name
 
     @property
     def path(self) -> FloatArray:

@@ -20,7 +20,7 @@ class ConstraintEnergy:
     unweighted: float  # energy without the weight, by the covariance alone
     freedom: int  # degrees of freedom, which is the expected value of the unweighted energy
     source: str  # source of the measurement; empty if unknown
-    kind: str  # `odometry`, `loop_closure`, `global_pose`, `position`, `heading`, or `bias`
+    kind: str  # such as `odometry`, `loop_closure`, `global_pose`, `position`, `range` or `bias`
     name: str  # readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`
     number: int = -1  # its id in the graph
     # numbers of the hidden nodes of the path that it has, in the order of the name
@@ -57,8 +57,8 @@ def _named(
     places = np.searchsorted(nodes.ids, ids[graph.is_pose[ends]]).tolist()
     origin, of_bias = factors.origin(number), factors.bias_origin(int(ids[0]))
     known = origin or of_bias
-    if len(ends) == 2 and factor['kind'] != FactorKind.BIAS:
-        kind = FactorKind(int(factor['kind'])).name.lower()
+    kind = FactorKind(int(factor['kind'])).name.lower()
+    if len(ends) == len(places) == 2:
         i, j = np.searchsorted(nodes.ids, ids).tolist()
         source = '' if origin is None else origin.source
         if origin is None and factor['kind'] == FactorKind.ODOMETRY:
@@ -67,7 +67,8 @@ def _named(
     else:
         if len(places) > 0:
             position, _, heading = factor['information'][DIAGONAL] > 0.0
-            kind = 'heading' if not position else 'global_pose' if heading else 'position'
+            if len(ends) == 1 or factor['kind'] == FactorKind.BIAS:
+                kind = 'heading' if not position else 'global_pose' if heading else 'position'
             where = f' near x{places[0]}'
         else:
             # one on a bias alone comes from no measurement and is named after the bias

@@ -73,8 +73,8 @@ class FactorBuilder:
         for _, chain in self._chains:
             chain.begin()
         self.new = [
-            NewConstraint(additions.add(edge), source, stamp_ns, LoopClosure, reference)
-            for source, edge, stamp_ns, reference in queue.edges]
+            NewConstraint(additions.add(edge), source, stamp_ns, kind, reference)
+            for source, edge, stamp_ns, reference, kind in queue.edges]
         self.new += [self._add(attached, additions) for attached in sorted(
             queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
         for turn in sorted(queue.turns, key=lambda turn: turn.stamp_ns):

@@ -10,7 +10,8 @@ make no hidden nodes, and a constraint depends neither on the order of arrival n
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
+import zlib
 
 import numpy as np
 
@@ -29,19 +30,30 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     PoseMeasurement,
     Position,
+    Range,
     rejected,
     value_defect,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources.beacons import Beacons, WaitingRange
 from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
 from pose_graph_ros.core.sources.validation import (
     check_closure,
     check_heading,
     check_pose,
     check_position,
+    check_range,
     Validated,
 )
+
+
+class Target(Protocol):
+    """Where constraints go, and what they are attached to."""
+
+    nodes: HiddenNodes
+    queue: Queue
+    beacons: Beacons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,14 +63,14 @@ class MeasurementKind:
     numbers: Callable[[Any], FloatArray]  # that must be valid coordinates
     # what is left of it with a valid covariance, or why it is rejected
     check: Callable[[Any, CovariancePolicy], Validated | Answer]
-    # puts its constraint into a queue, given its source and how its stamp is attached
-    attach: Callable[[Any, str, Attachment, HiddenNodes, Queue], Answer]
+    # hands its constraint over, given its source and how its stamp is attached
+    attach: Callable[[Any, str, Attachment, Target], Answer]
     # what it says of the robot in the map; None if that is nothing, or not valid
     in_map: Callable[[Any], Absolute | None] = lambda measurement: measurement
     # of those in the map, the observed node, and the variances of position and heading that the
     # motion since that node adds
     observed: Callable[[Any, Attachment], tuple[Factors, FloatArray]] | None = None
-    # tells those of one stamp apart: 0, the stamp of another pose [ns], or -2 - k for node k
+    # tells those of one stamp apart: 0, the stamp of another pose [ns], -2 - k for node k, or less
     key: Callable[[Any], int] = lambda _: 0
 
 
@@ -121,37 +133,45 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
 
 
 def _observe(
-    measurement: Absolute, source: str, attachment: Attachment, _: HiddenNodes, queue: Queue,
+    measurement: Absolute, source: str, attachment: Attachment, to: Target,
 ) -> Answer:
     factors, noise = observed(measurement, attachment)
-    queue.observed.append(AttachedMeasurement(source, factors, measurement, attachment, noise))
+    to.queue.observed.append(AttachedMeasurement(source, factors, measurement, attachment, noise))
     return ACCEPTED
 
 
-def _observe_fix(
-    measurement: Fix, source: str, attachment: Attachment, nodes: HiddenNodes, queue: Queue,
-) -> Answer:
+def _observe_fix(measurement: Fix, source: str, attachment: Attachment, to: Target) -> Answer:
     # the last step: only a fix that nothing else is wrong with may become the datum
     position = measurement.placed()
     if (defect := value_defect(position.position)) is not None:
         return rejected(defect, f'Fix: {position.position.tolist()} m from the datum')
-    return _observe(position, source, attachment, nodes, queue)
+    return _observe(position, source, attachment, to)
 
 
-def _join(
-    closure: LoopClosure, source: str, attachment: Attachment, nodes: HiddenNodes, queue: Queue,
-) -> Answer:
-    reference = attach_reference(nodes, closure)
+def _join(closure: LoopClosure, source: str, attachment: Attachment, to: Target) -> Answer:
+    reference = attach_reference(to.nodes, closure)
     if isinstance(reference, Answer):
         return reference
     if reference.node == attachment.node:
         return rejected('same_node', f'both ends are attached to hidden node {attachment.node}')
     reference_ns = closure.reference_ns
     if reference_ns is None:
-        reference_ns = int(nodes.stamps_ns[closure.reference_node])
-    queue.edges.append(QueuedEdge(
+        reference_ns = int(to.nodes.stamps_ns[closure.reference_node])
+    to.queue.edges.append(QueuedEdge(
         source, loop_closure_constraint(closure, reference, attachment), closure.stamp_ns,
         reference_ns))
+    return ACCEPTED
+
+
+def _reach(measurement: Range, source: str, attachment: Attachment, to: Target) -> Answer:
+    variance = measurement.variance + swept_variance(measurement, attachment)
+    antenna = se2.compose(attachment.motion, np.append(measurement.lever_arm, 0.0))
+    edge = Factors(     # to a landmark that there need not be yet
+        [attachment.node], [-1], [(measurement.distance, 0.0, 0.0)],
+        [np.diag((1.0 / variance, 0.0, 0.0))], [FactorKind.RANGE],
+        constants=[(antenna[0], antenna[1], 0.0, 0.0)])
+    to.beacons.add(WaitingRange(
+        QueuedEdge(source, edge, measurement.stamp_ns, kind=Range), measurement))
     return ACCEPTED
 
 
@@ -201,7 +221,7 @@ def _observed_pose(
         ), np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
 
 
-def swept_variance(measurement: Position, attachment: Attachment) -> float:
+def swept_variance(measurement: Position | Range, attachment: Attachment) -> float:
     """
     Return the variance that the motion since the node adds to a position [m^2].
 
@@ -263,5 +283,10 @@ KINDS: dict[type[PoseMeasurement], MeasurementKind] = {
         lambda each: each.pose, check_closure, _join, lambda _: None,
         key=lambda each: each.reference_ns if each.reference_ns is not None else (
             -1 if each.reference_node is None else -2 - each.reference_node)),
+    Range: MeasurementKind(
+        lambda each: np.concatenate((
+            (each.distance,), each.lever_arm, () if each.place is None else each.place)),
+        check_range, _reach, lambda _: None,
+        key=lambda each: -2**40 - zlib.crc32(each.beacon.encode())),
 }
 """What the engine asks of each kind of measurements, by its class."""

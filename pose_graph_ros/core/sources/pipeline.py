@@ -27,6 +27,7 @@ from pose_graph_ros.core.odometry.gyro import Gyros
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer
+from pose_graph_ros.core.sources.beacons import Beacons
 from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, validate
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_constraints import Queue
@@ -145,7 +146,7 @@ class MeasurementPipeline:
     """Measurements between their arrival and the update that adds them to the graph."""
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
-        self._nodes, self._config = nodes, config
+        self.nodes, self._config = nodes, config
         # yaw rates, from which rotations between the hidden nodes are made
         self.gyros = Gyros(nodes, config)
         # measurements that wait for odometry to reach their stamps
@@ -154,6 +155,7 @@ class MeasurementPipeline:
         self.queue = Queue()  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
         self.counts: Counter[tuple[str, str]] = Counter()
+        self.beacons = Beacons(self.counts)  # and the ranges that wait for them
         # detail of the newest refusal by source and reason
         self.refusals: dict[tuple[str, str], str] = {}
         # source and stamps [ns] of the newest loop closures that could not be attached
@@ -173,7 +175,7 @@ class MeasurementPipeline:
 
     def finish(self) -> None:
         """Settle all odometry and yaw rates, without waiting for older ones."""
-        self._nodes.finish()
+        self.nodes.finish()
         self.gyros.finish()
 
     def _take_turns(self) -> None:
@@ -198,7 +200,7 @@ class MeasurementPipeline:
         if settings.minimum_period > 0.0 and self.seen.near(
                 source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
             return rejected('thinned', f'less than {settings.minimum_period} s from another')
-        answer = (self._attach(checked, source) if due_ns(checked) <= self._nodes.covered_ns
+        answer = (self._attach(checked, source) if due_ns(checked) <= self.nodes.covered_ns
                   else self._wait(checked, source))
         if answer.status is not AnswerStatus.REJECTED:
             self.seen.add(source, checked)
@@ -223,7 +225,7 @@ class MeasurementPipeline:
         if len(self.gyros.streams) > 0:
             self._take_turns()
         if len(self.waiting) > 0:
-            for waiting in self.waiting.pop_due(self._nodes.covered_ns):
+            for waiting in self.waiting.pop_due(self.nodes.covered_ns):
                 self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
 
     def _attach(self, measurement: PoseMeasurement, source: str) -> Answer:
@@ -233,17 +235,16 @@ class MeasurementPipeline:
         return answer
 
     def _try_to_attach(self, measurement: PoseMeasurement, source: str) -> Answer:
-        attachment = attach(self._nodes, measurement.stamp_ns)
+        attachment = attach(self.nodes, measurement.stamp_ns)
         if isinstance(attachment, Answer):
             return attachment
         return KINDS[type(measurement)].attach(
-            measurement, source, attachment, self._nodes, self.queue)
+            measurement, source, attachment, self)
 
     def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
         """Attach a measurement to a hidden node, with no motion in between."""
         KINDS[type(measurement)].attach(
-            measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))), self._nodes,
-            self.queue)
+            measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))), self)
 
     def take_ready(self, *, aligned: bool) -> Queue:
         """
@@ -268,19 +269,20 @@ class MeasurementPipeline:
         needed = [stamp_ns for _, measurement in self.waiting.measurements
                   for stamp_ns in self._stamps_of(measurement)]
         for edge in self.queue.edges:
-            needed += [stamp_ns for stamp_ns in edge[2:] if stamp_ns >= 0]
+            needed += [stamp_ns for stamp_ns in (edge.stamp_ns, edge.reference_ns)
+                       if stamp_ns >= 0]
         if not aligned:
             needed += [each.measurement.stamp_ns for each in self.queue.observed
                        if each.is_placed]
-        begin_ns = self._nodes.last_frozen_ns
+        begin_ns = self.nodes.last_frozen_ns
         return min((stamp_ns for stamp_ns in needed if stamp_ns >= begin_ns), default=None)
 
     def _stamps_of(self, measurement: PoseMeasurement) -> Iterator[int]:
         """Yield the stamps that a measurement is attached at, as far as they are known [ns]."""
         yield measurement.stamp_ns
         other = key(measurement)
-        if 0 <= -2 - other < len(self._nodes):
-            yield int(self._nodes.stamps_ns[-2 - other])
+        if 0 <= -2 - other < len(self.nodes):
+            yield int(self.nodes.stamps_ns[-2 - other])
         elif other > 0:
             yield other
 

@@ -13,10 +13,10 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, FactorKinds, Factors
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.measurements import Absolute, PoseMeasurement
+from pose_graph_ros.core.measurements import Absolute, LoopClosure, PoseMeasurement
 from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, OdometryErrors
-from pose_graph_ros.core.saved_columns import Integers, Numbers, Pairs, Rows2, Rows3, Rows6
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Pairs, Rows2, Rows3, Rows4, Rows6
 from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, SavedBins
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -34,6 +34,8 @@ class SavedEdges:
     information: Rows6
     kind: FactorKinds
     stamps_ns: Pairs  # of a loop closure and of its other end [ns]; -1 for odometry
+    # columns of `Factors`; empty in files of older versions, which have no ranges
+    constants: Rows4 = field(default_factory=lambda: np.empty((0, 4)))
 
 
 class QueuedEdge(NamedTuple):
@@ -41,6 +43,7 @@ class QueuedEdge(NamedTuple):
     edge: Factors
     stamp_ns: int = -1  # of the loop closure [ns]; -1 for an edge of odometry
     reference_ns: int = -1  # stamp of its other end [ns]
+    kind: type[PoseMeasurement] = LoopClosure  # also of odometry
 
     @property
     def ends(self) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -125,7 +125,7 @@ def report(
     newest = newest[np.argsort(newest[:, 0], kind='stable')]
     newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
     stamps, observed = newest[:, 0], graph.factors_at(newest[:, 1])
-    if np.any(observed.j >= 0):     # all are edges to a bias with a given time constant
+    if np.any(observed.kind == FactorKind.BIAS):    # all are, with a given time constant
         errors, information = _biased_residuals(graph, observed)
         residuals = errors
     else:

@@ -24,6 +24,7 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     PoseMeasurement,
     Position,
+    Range,
     rejected,
 )
 
@@ -84,6 +85,19 @@ def check_heading(measurement: HeadingOnly, policy: CovariancePolicy) -> Validat
     if valid is None:
         return rejected('no_information', f'variance of a heading: {variance}')
     return Validated(replace(measurement, variance=valid), tuple(repairs))
+
+
+def check_range(measurement: Range, policy: CovariancePolicy) -> Validated | Answer:
+    """Return a range with a valid variance, or why it is rejected."""
+    if measurement.distance <= 0.0:
+        return rejected('no_information', f'a range of {measurement.distance} m')
+    variance = np.array([[measurement.variance]])
+    cov, repairs = _given(variance, policy)
+    if not 0.0 < cov[0, 0] <= covariance.LARGEST_VARIANCE:
+        cov, repairs = repaired(cov, policy), [*repairs, 'repaired_covariance_not_positive']
+    bounded = np.clip(policy.scale * cov[0, 0], policy.position_floor**2,
+                      policy.position_ceiling**2)
+    return Validated(replace(measurement, variance=float(bounded)), tuple(repairs))
 
 
 def _given(given: FloatArray, policy: CovariancePolicy) -> tuple[FloatArray, list[str]]:
