@@ -49,16 +49,9 @@ def follow(
     """
     Return the motion along a path every 10 ms, and when each point is reached, shape (P,) [s].
 
-    Parameters
-    ----------
-    path : ndarray, shape (P, 3)
-        Poses that are close to each other, with headings that are not wrapped [m, m, rad]; the
-        vehicle starts at rest at the first one.
-    stops : ndarray, shape (S,), indices of poses at which the vehicle stops
-    waits : ndarray, shape (1 + S,), how long it stands at the first pose and at each stop [s]
-    limits : Limits
-    duration_s : float, length of the motion [s]; the path is `MARGIN_S` longer
-
+    The path, shape (P, 3), has poses that are close to each other, with headings that are not
+    wrapped; it is `MARGIN_S` longer than the motion. The vehicle waits at the first pose, where it
+    starts at rest, and at the stops, which are indices of poses.
     """
     length = path_length(path)
     curvature = np.gradient(path[:, 2], length)
@@ -114,13 +107,7 @@ def gauss_markov(
     """
     Return samples of a stationary first-order Gauss-Markov process, shape (count,).
 
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    count : int
-    sigma, step : float
-        Standard deviation of each sample, and sample period divided by the time constant.
-
+    Sigma is that of each sample, the step a part of the time constant.
     """
     decay = np.exp(-step)
     noise = generator.normal(0.0, sigma * np.sqrt(1.0 - decay**2), count)
@@ -135,17 +122,9 @@ def street_corners(
     Return the crossings of a random drive through a grid of streets, shape (K, 2) [m].
 
     It begins in the middle, eastwards. It goes straight on with a probability of 3/5 where it can,
-    turns otherwise, and practically never goes back at once.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    length : float, of the drive at least [m]
-    spacing : ndarray, shape (S,)
-        Distances of the streets [m], for both axes; the second in reverse.
-    fresh : float
-        How much likelier than one driven before a new street is chosen.
-
+    turns otherwise, and practically never goes back at once. Distances of the streets are those of
+    both axes, of the second in reverse; a `fresh` street is so much likelier than one driven
+    before.
     """
     streets = np.concatenate(([0.0], np.cumsum(spacing)))
     avenues = np.concatenate(([0.0], np.cumsum(spacing[::-1])))
@@ -200,20 +179,10 @@ def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, 
     """
     Return points along straight lines with right-angled turns, and where the corners are on it.
 
-    Parameters
-    ----------
-    corners : ndarray, shape (K, 2)
-        Ends of the lines, which run along the axes and are longer than a turn [m]; the way begins
-        and ends in the middle of the first and the last one.
-    turn : float, arc length of a turn [m]
-    step : float, distance of the points along the path [m]
-
-    Returns
-    -------
-    points : ndarray, shape (P, 2) [m]
-    middles : ndarray, shape (L,)
-        Distance along the path at which the middle of each line is [m], between turns.
-
+    Given are the ends of the lines, which run along the axes and are longer than a turn; the way
+    begins and ends in the middle of the first and the last one. `turn` is the arc length of a turn
+    and `step` the distance of the points [m]. The middle of each line is given by its distance
+    along the path, shape (L,) [m].
     """
     ways = np.diff(corners, axis=0)
     turns = np.any(np.sign(ways[1:]) != np.sign(ways[:-1]), axis=1)

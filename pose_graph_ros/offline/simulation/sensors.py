@@ -155,16 +155,7 @@ def velocities(path: Trajectory) -> FloatArray:
 
 
 def yaw_rates(generator: np.random.Generator, heading: FloatArray, gyro: Gyro) -> FloatArray:
-    """
-    Return the yaw rates of a gyroscope, shape (R,) [rad/s].
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    heading : ndarray, shape (R,), true headings every `PERIOD_S`, not wrapped [rad]
-    gyro : Gyro
-
-    """
+    """Return yaw rates, (R,) [rad/s], given true headings every `PERIOD_S`, not wrapped [rad]."""
     n = len(heading)
     walk = np.cumsum(generator.normal(0.0, gyro.bias_walk * np.sqrt(PERIOD_S), n))
     bias = generator.normal(0.0, gyro.bias) + walk
@@ -264,16 +255,8 @@ def false_poses(
     """
     Return what false closures measure, shape (F, 3): nearly one place.
 
-    Those of a group agree with each other as true ones would, unless they are `loose`.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-    path : Motion
-    pairs : ndarray, shape (F, 2), indices of poses
-    groups : ndarray, shape (F,), numbers of the groups, in order
-    closures : Closures
-
+    Those of a group agree with each other as true ones would, unless they are `loose`. Pairs are
+    indices of poses, shape (F, 2); the numbers of their groups are in order.
     """
     looks = generator.normal(
         0.0, (0.5 * closures.radius, 0.25 * closures.radius, 0.05), (len(pairs), 3))

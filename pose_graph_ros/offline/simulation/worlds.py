@@ -78,16 +78,7 @@ class World:
 
 
 def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
-    """
-    Return a drive along the circuit.
-
-    Parameters
-    ----------
-    generator : numpy.random.Generator
-        Source of the random position within the lane and of the random waits at lights.
-    duration_s : float, length of the drive [s]
-
-    """
+    """Return a drive along the circuit, at random within the lane, with random waits at lights."""
     heading, stops, lap_length = _circuit(duration_s)
     path = wandering(generator, _streets(heading), CIRCUIT_STEP, LANE_SIGMA)
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))

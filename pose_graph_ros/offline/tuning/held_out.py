@@ -81,28 +81,15 @@ def stretch_length(duration: float, period: float, tau: float, folds: int) -> fl
     """
     Return how long the stretches are that are held out [s].
 
-    Parameters
-    ----------
-    duration, period, tau : float
-        Of the drive, between measurements, and time constant of their errors, 0 if white [s].
-    folds : int
-
+    All times are in seconds: of the drive, between measurements, and the time constant of their
+    errors, which is 0 if these are white.
     """
     wanted = max(SHORTEST, min(IN_TAU * tau, LONGEST), IN_PERIODS * period)
     return min(wanted, duration / (LEAST_STRETCHES * folds))
 
 
 def fold_of(stamps_ns: IntArray, start_ns: int, stretch: float, folds: int) -> IntArray:
-    """
-    Return in which fold measurements are held out, shape (M,).
-
-    Parameters
-    ----------
-    stamps_ns : ndarray, shape (M,) [ns]
-    start_ns, stretch : begin [ns] and length [s] of the first stretch
-    folds : int
-
-    """
+    """Return in which fold measurements are held out, (M,); the first begins at `start_ns`."""
     return np.asarray(((stamps_ns - start_ns) * 1e-9 / stretch).astype(np.int64) % folds)
 
 
@@ -148,11 +135,6 @@ def is_better(before: Errors, after: Errors, start_ns: int, stretch: float) -> b
 
     What differs between stretches, which are independent, is chance (F. Wilcoxon's signed ranks).
     The squared errors are to be smaller, and the predicted density higher.
-
-    Parameters
-    ----------
-    start_ns, stretch : begin [ns] and length [s] of the first stretch
-
     """
     stretches = ((before.stamps_ns - start_ns) * 1e-9 / stretch).astype(np.int64)
     squares = _gain(before.distances**2 - after.distances**2, stretches)
