@@ -9,7 +9,6 @@ from hypothesis import given, strategies as st
 import numpy as np
 
 from pose_graph_ros.core.config import OdometrySource
-from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.several_sources import find_silence, Silence
 from pose_graph_ros.core.odometry.stream import OdometryStream
@@ -86,11 +85,6 @@ def filled(times: Iterable[float]) -> OdometryStream:
     return one
 
 
-def ends(edges: Iterable[Factors]) -> list[tuple[int, int]]:
-    """Return the numbers of the hidden nodes that the edges connect."""
-    return [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for edge in edges]
-
-
 def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:
     before = filled(np.arange(0.55, 4.5, 0.1))
     after = OdometryStream(OdometrySource())
@@ -100,4 +94,6 @@ def test_no_edge_spans_a_restart_after_a_graph_was_loaded() -> None:
         after.add(OdometrySample(round(t * 1e9), np.array([1000.0 + t, 0.0, 0.0])))
     after.settle_all(after.newest_ns)
     assert NODES[3] < after.restarted_ns <= NODES[4]
-    assert ends(after.secondary_edges(NODES, ROWS)) == [(k, k + 1) for k in range(4, 9)]
+    # the edges connect consecutive nodes after it
+    assert [(int(edge.i[0]) // 2, int(edge.j[0]) // 2) for edge in after.secondary_edges(
+        NODES, ROWS)] == [(k, k + 1) for k in range(4, 9)]
