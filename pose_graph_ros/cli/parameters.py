@@ -4,7 +4,7 @@
 
 import argparse
 
-from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
+from pose_graph_ros.adapters.parameters import as_markdown, as_yaml, sources_as_markdown
 
 
 def execute(options: argparse.Namespace) -> int:

@@ -11,11 +11,11 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter as RosParameter
 
 from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
-from pose_graph_ros.adapters.parameter_texts import constraints
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
     changed,
     checked,
+    constraints,
     is_own,
     is_same,
     listed_sources,

@@ -15,18 +15,16 @@ import pytest
 import yaml
 
 from pose_graph_ros.adapters.parameter_table import Change, Parameter
-from pose_graph_ros.adapters.parameter_texts import (
-    as_markdown,
-    as_yaml,
-    sources_as_markdown,
-)
 from pose_graph_ros.adapters.parameters import (
     all_parameters,
+    as_markdown,
+    as_yaml,
     changed,
     checked,
     explanation,
     is_own,
     require_together,
+    sources_as_markdown,
 )
 from pose_graph_ros.adapters.sources import (
     backend_config,

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from pose_graph_ros import __version__
-from pose_graph_ros.adapters.parameter_texts import as_markdown, as_yaml, sources_as_markdown
+from pose_graph_ros.adapters.parameters import as_markdown, as_yaml, sources_as_markdown
 from pose_graph_ros.cli.main import main, SUMMARIES
 
 TOOLS = tuple(SUMMARIES)

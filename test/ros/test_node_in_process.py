@@ -30,8 +30,7 @@ from sensor_msgs.msg import Range
 from std_srvs.srv import SetBool, Trigger
 
 from pose_graph_ros.adapters.parameter_table import Change
-from pose_graph_ros.adapters.parameter_texts import constraints
-from pose_graph_ros.adapters.parameters import all_parameters, checked
+from pose_graph_ros.adapters.parameters import all_parameters, checked, constraints
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros import diagnostics, requests, services
 from pose_graph_ros.ros.concerns import concerns
