@@ -15,12 +15,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from pose_graph_ros.cli.arguments import STARTS
-from pose_graph_ros.core.batch.levenberg_marquardt import (
-    BatchResult,
-    SAME_MINIMUM,
-    Start,
-    Status,
-)
+from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, PlainOptimizer
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -262,8 +257,7 @@ def with_certificate(
         graph.set_poses(made.poses)
         other = solve(problem, 'present')
         found = other.result.chi2
-        if (other.result.status is not Status.FAILED
-                and found < solution.result.chi2 * (1.0 - SAME_MINIMUM)):
+        if other.result.is_better_than(solution.result):
             solution = Solution(other.result, 'minimum of the chordal objective',
                                 other.determined, solution.tried)
         else:

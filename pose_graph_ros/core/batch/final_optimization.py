@@ -94,9 +94,7 @@ def _optimize_robustly(
                     graph, reweighting.all_changes(graph, factor), config, solve) or result
         if result.status is not Status.FAILED:
             result = _reweighted(graph, reweighting, result, config, solve)
-        failed = result.status is Status.FAILED
-        if best is None or best.status is Status.FAILED or (
-                not failed and result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
+        if best is None or result.is_better_than(best):
             best, poses, weights = result, graph.poses.copy(), graph.weights
     assert best is not None
     graph.set_weights(weights)

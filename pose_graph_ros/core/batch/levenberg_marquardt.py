@@ -103,6 +103,11 @@ class BatchResult:
     chi2: float  # at the poses after the call
     start: Start = Start.PRESENT
 
+    def is_better_than(self, other: 'BatchResult') -> bool:
+        """Tell whether it is a lower minimum than another one, or than a failure."""
+        return self.status is not Status.FAILED and (
+            other.status is Status.FAILED or self.chi2 < other.chi2 * (1.0 - SAME_MINIMUM))
+
 
 def is_trusted(result: BatchResult, before: float) -> bool:
     """Tell whether a start has led to a minimum that is not above chi2 of the poses before."""

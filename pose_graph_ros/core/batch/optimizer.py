@@ -111,8 +111,7 @@ def _from_starts(
         yield
         result = replace(
             (yield from _minimize(graph, few, chi2_of(graph))), start=start)
-        if result.status is not Status.FAILED and (
-                best.status is Status.FAILED or result.chi2 < best.chi2 * (1.0 - SAME_MINIMUM)):
+        if result.is_better_than(best):
             best, best_poses = result, graph.poses.copy()
         if is_trusted(result, chi2):
             break
@@ -138,17 +137,16 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
     result = solve(graph, config)
     if not _is_observed(graph):
         return result
-    poses = graph.poses.copy()
+    poses = before if result.status is Status.FAILED else graph.poses.copy()
     try:
         graph.set_poses(linear_starts.joint(graph))
         other = solve(graph, config)
     except LinearSolveError:
-        other = None
-    if (other is None or other.status is Status.FAILED
-            or not other.chi2 < result.chi2 * (1.0 - SAME_MINIMUM)):
-        graph.set_poses(before if result.status is Status.FAILED else poses)
-        return result
-    return other
+        other = result
+    if other.is_better_than(result):
+        return other
+    graph.set_poses(poses)
+    return result
 
 
 def _is_observed(graph: Graph) -> bool:
