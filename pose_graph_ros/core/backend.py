@@ -41,7 +41,7 @@ from pose_graph_ros.core.sources import constraint_names as cn
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.kinds import attach, validate
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
-from pose_graph_ros.core.sources.source_constraints import Queue, QueuedEdge
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.core.transaction import (
     checked,
@@ -94,7 +94,8 @@ class PoseGraphBackend:
         self.gyro_differences = self._pipeline.gyros.differences
         self.counts = self._pipeline.counts  # of answers by source and 'accepted' or the reason
         self.refusals = self._pipeline.refusals  # details of the newest ones by source and reason
-        self._quarantine, self._alignment = Queue(), AlignmentMonitor(self._config)
+        self._quarantine: list[Queued] = []
+        self._alignment = AlignmentMonitor(self._config)
         self.parts = Parts(  # what it is made of, for tools
             self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
             self._pipeline, self._quarantine, self._judge, self._smoother)
@@ -133,7 +134,7 @@ class PoseGraphBackend:
 
     def set_aside(self, n: int) -> list[str]:
         """Return the names of the newest n constraints that were set aside."""
-        return cn.queued(self._quarantine.newest(n), self._nodes)[-n:]
+        return cn.queued(self._quarantine[-n:], self._nodes)
 
     @property
     def revision(self) -> int:
@@ -170,15 +171,15 @@ class PoseGraphBackend:
 
     def _collect(self) -> None:
         """Collect secondary edges and counts of odometry; attach measurements that are due."""
-        self._pipeline.queue.edges += [
-            QueuedEdge(*edge) for edge in self._nodes.take_secondary_edges()]
+        self._pipeline.queue += [
+            Queued(*edge) for edge in self._nodes.take_secondary_edges()]
         self._pipeline.count_sorted(self._nodes.streams)
         for source, stream in self._nodes.streams.items():
             if stream.n_jumps > 0:
                 self.counts[source, 'jump'] = stream.n_jumps
         self._pipeline.attach_due()
         if len(self._pipeline.beacons) > 0:
-            self._pipeline.queue.edges += self._pipeline.beacons.take_ready(
+            self._pipeline.queue += self._pipeline.beacons.take_ready(
                 self.graph, self._apply, aligned=self._alignment.is_aligned)
 
     def _apply(self, change: GraphUpdate) -> bool:
@@ -266,11 +267,11 @@ class PoseGraphBackend:
         Constraints that make it fail are set aside and named by the report.
         """
         report, untried = self._update()
-        self._pipeline.queue = untried.joined(self._pipeline.queue)
+        self._pipeline.queue = untried + self._pipeline.queue
         self._forgetting.step(self._config)
         return report
 
-    def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, Queue]:
+    def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, list[Queued]]:
         """Return the report of an update, and the constraints for which it had no time."""
         return update_isolated(
             partial(self._add_queue, at_once=at_once), self._settle, self._pipeline,
@@ -280,27 +281,27 @@ class PoseGraphBackend:
         """Tell whether an update without new constraints succeeds."""
         return succeeds(self._smoother, GraphUpdate())
 
-    def _add_queue(self, *, at_once: bool) -> tuple[UpdateReport, Queue]:
+    def _add_queue(self, *, at_once: bool) -> tuple[UpdateReport, list[Queued]]:
         """Add the constraints in the queue and solve; return those that it could not add."""
         if self.graph.n_nodes == 0:
-            return UpdateReport(Status.CONVERGED), Queue()
+            return UpdateReport(Status.CONVERGED), []
         if self._waits and self._judge.solves_later and not at_once:
             self._judge.work()
-            return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), Queue()
-        queue, T_map_graph, graph = Queue(), None, self.graph
+            return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), []
+        queue: list[Queued] = []
+        T_map_graph, graph = None, self.graph
         with Transaction() as transaction:
             transaction.keep(self._alignment, 'state', 'sigma')
-            T_map_graph = self._alignment.find(graph, self._pipeline.queue.observed, self._nodes)
+            T_map_graph = self._alignment.find(graph, self._pipeline.queue, self._nodes)
             queue = self._pipeline.take_ready(aligned=self._alignment.is_aligned)
             if len(queue) == 0 and self._settled:
-                return UpdateReport(Status.CONVERGED, chi2=self._chi2), Queue()
+                return UpdateReport(Status.CONVERGED, chi2=self._chi2), []
             freed: list[int] = []
             if T_map_graph is not None:
                 transaction.callback(graph.set_poses, graph.poses.copy())
                 graph.set_poses(se2.compose(T_map_graph, graph.poses))
                 # measurements fix the gauge from now on, and the first node is no longer fixed
                 freed = graph.node_ids[graph.fixed].tolist()
-            transaction.callback(self._factors.rollback)
             change = self._factors.build(queue, graph)._replace(free=freed)
             transaction.callback(self._judge.rollback)
             change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
@@ -319,7 +320,7 @@ class PoseGraphBackend:
             self._nodes.move_frozen(T_map_graph)
         self._factors.commit()
         self._judge.commit()
-        self._alignment.add(queue.observed)
+        self._alignment.add(queue)
         self._refiner.restart()
         result, self._settled = self._refiner.reweight(result)
         # in a larger graph an update does not change all weights of odometry
@@ -328,7 +329,7 @@ class PoseGraphBackend:
         self._evaluate()
         return UpdateReport(
             result.status, '', len(queue), result.iterations, self._chi2, result.relinearized,
-            result.eliminated, result.visited), Queue()
+            result.eliminated, result.visited), []
 
     def refine(self) -> Refinement:
         """Do an iteration from the estimate of an update to the optimum; `optimize` needs none."""

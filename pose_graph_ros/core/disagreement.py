@@ -91,7 +91,7 @@ def edges_by_source(
 ) -> Mapping[tuple[str, str], IntArray]:
     """Return the ids of the edges between poses by source and kind."""
     ids, edges = graph.factor_ids, graph.factors
-    others = factors.pose_edges()
+    others = factors.edges()
     found: dict[tuple[str, str], IntArray] = {}
     known = np.concatenate([np.empty(0, dtype=np.int64), *others.values()])
     primary = np.flatnonzero((edges.kind == FactorKind.ODOMETRY) & ~np.isin(ids, known))
@@ -103,11 +103,9 @@ def edges_by_source(
     for source, each in others.items():
         there = each[graph.factor_rows(each) >= 0]
         kinds = graph.factors_at(there).kind
-        for kind in (FactorKind.LOOP_CLOSURE, FactorKind.ODOMETRY):
+        for kind in (FactorKind.LOOP_CLOSURE, FactorKind.ODOMETRY, FactorKind.TURN):
             if np.any(kinds == kind):
                 found.setdefault((source, kind.name.lower()), there[kinds == kind])
-    for source, bias in factors.gyros.items():
-        found[source, 'turn'] = bias.edges[graph.factor_rows(bias.edges) >= 0]
     return found
 
 

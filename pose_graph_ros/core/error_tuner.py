@@ -12,14 +12,14 @@ At the end of a stream the statistics are those that all measurements show, what
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import FactorKind
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Measured
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -32,14 +32,16 @@ from pose_graph_ros.core.odometry.motion import (
 )
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources import error_estimate
-from pose_graph_ros.core.sources.error_likelihood import PastPath
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.gauss_markov import (
+from pose_graph_ros.core.sources.bias import (
     Additions,
+    BiasChain,
     CorrelatedErrors,
-    GaussMarkovBias,
+    held_by_bias,
+    Process,
 )
-from pose_graph_ros.core.sources.source_constraints import SourceConstraints
+from pose_graph_ros.core.sources.error_likelihood import PastPath
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder, SourceState
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.transaction import succeeds
 
 # Number of measurements that a step moves, online and at the end of a stream.
@@ -53,11 +55,11 @@ class _Change:
     """A change of the error model of a source that is under way."""
 
     source: str
-    model: GaussMarkovBias | None  # the new model; None for white errors
+    errors: CorrelatedErrors | None  # the new ones; None for white errors
     remaining: IntArray  # numbers of the measurements to be moved, the next ones last
     before: IntArray  # id of the edge that held each measurement at the beginning, or -1
+    bias: BiasChain = field(default_factory=BiasChain)  # what is in the graph for it
     undoing: bool = False
-    failed: GaussMarkovBias | None = None  # the model that it was, if it is undone
 
 
 @dataclass(slots=True)
@@ -109,7 +111,7 @@ class ErrorTuner:
                 next(self._search.steps)
             except StopIteration as end:
                 search, self._search = self._search, None
-                constraints = self._factors.constraints(search.source)
+                constraints = self._factors.sources[search.source]
                 constraints.next_estimate = search.next_estimate
                 found: error_estimate.Estimate = end.value
                 if _far(constraints.odometry, found):
@@ -143,7 +145,7 @@ class ErrorTuner:
         # moving the measurements of one source changes none of another one
         weights = self._judge.final_weights()
         for source in sources:
-            constraints = self._factors.constraints(source)
+            constraints = self._factors.sources[source]
             found = to_the_end(self._steps(constraints, weights))
             if found.odometry.rate != 0.0:
                 found = to_the_end(self._steps(constraints, weights, reference=found.odometry))
@@ -167,22 +169,20 @@ class ErrorTuner:
         """
         graph, past = self._smoother.graph, dict[str, PastPath]()
         for source in self._factors.finding():
-            constraints = self._factors.constraints(source)
-            gone = np.flatnonzero(constraints.leaving(factors))
-            used = gone[constraints.are_used(graph)[gone]]
-            stamps_ns, ids = constraints.rows.values[used].T
+            constraints = self._factors.sources[source]
+            used = constraints.measured.values[
+                constraints.leaving(factors) & constraints.are_used(graph)]
             past[source] = error_estimate.left_behind(
-                graph, self._odometry(AS_CLAIMED), stamps_ns, ids, past=constraints.past,
-                node=first)
+                graph, self._odometry(AS_CLAIMED), used['stamp_ns'], used['id'],
+                past=constraints.past, node=first)
         change = self._change
-        model = None if change is None else change.model or change.failed
-        others = {} if change is None or model is None else {change.source: model}
+        others = {} if change is None else {change.source: change.bias}
         return self._factors.leaving_biases(factors, others), past
 
     @property
     def needed(self) -> list[int]:
         """Ids of the poses from which odometry leads to the measurements that are left."""
-        every = (self._factors.constraints(source).past for source in self._factors.finding())
+        every = (self._factors.sources[source].past for source in self._factors.finding())
         return [past.node for past in every if past is not None]
 
     def forget(
@@ -191,12 +191,10 @@ class ErrorTuner:
         """Forget what has left the graph, by ids; keep what `leaving` has returned of it."""
         kept, change = self._factors.forget(nodes, factors), self._change
         for source, path in past.items():
-            self._factors.constraints(source).past = path
+            self._factors.sources[source].past = path
         if change is None:
             return
-        for model in (change.model, change.failed):
-            if model is not None:
-                model.forget({*nodes.tolist()})
+        change.bias = change.bias.without(nodes)
         numbers = kept[change.source]
         numbers = numbers[numbers < len(change.before)]
         change.remaining = np.flatnonzero(np.isin(numbers, change.remaining))
@@ -230,7 +228,7 @@ class ErrorTuner:
         """Return the errors of odometry that are given, or that most measurements show."""
         if self._given is not None:
             return self._given
-        sources = [self._factors.constraints(source) for source in self._factors.finding()]
+        sources = [self._factors.sources[source] for source in self._factors.finding()]
         found = max(sources, key=lambda one: one.n_ever, default=None)
         if found is None:
             return AS_CLAIMED
@@ -267,7 +265,7 @@ class ErrorTuner:
         graph = self._smoother.graph
         factors = graph.factor_records
         primary = factors['kind'] == FactorKind.ODOMETRY
-        others = np.concatenate([[], *self._factors.pose_edges().values()]).astype(np.int64)
+        others = np.concatenate([[], *self._factors.edges().values()]).astype(np.int64)
         primary[graph.factor_rows(others)] = False
         later = graph.node_ids[factors['ends'][:, 1]]
         primary &= ~np.isin(later, self._nodes.relocated_ids)
@@ -275,7 +273,7 @@ class ErrorTuner:
 
     def _next_search(self) -> _Search | None:
         for source in self._factors.due_for_estimate():
-            constraints = self._factors.constraints(source)
+            constraints = self._factors.sources[source]
             steps = self._steps(
                 constraints, self._smoother.graph.weights,
                 correlated=self._factors.errors_in_use(source) is not None,
@@ -284,15 +282,14 @@ class ErrorTuner:
         return None
 
     def _steps(
-        self, constraints: SourceConstraints, weights: FloatArray, *,
+        self, constraints: SourceState, weights: FloatArray, *,
         correlated: bool = False, reference: OdometryErrors = AS_CLAIMED,
     ) -> error_estimate.Search:
         """Search with the measurements of a source that have a weight, of those given by row."""
         graph = self._smoother.graph
-        used = constraints.rows.values[constraints.are_used(graph, weights)]
+        used = constraints.measured.values[constraints.are_used(graph, weights)]
         path = yield from error_estimate.measured_path(
-            graph, self._odometry(reference), used[:, 0], used[:, 1],
-            constraints.past)
+            graph, self._odometry(reference), used['stamp_ns'], used['id'], constraints.past)
         return (yield from error_estimate.search(path, correlated=correlated))
 
     def _odometry(self, reference: OdometryErrors) -> error_estimate.PathOdometry:
@@ -301,64 +298,63 @@ class ErrorTuner:
 
     def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""
-        constraints = self._factors.constraints(source)
-        n = len(constraints)
+        constraints = self._factors.sources[source]
         self._change = _Change(
-            source, None if errors is None else GaussMarkovBias(errors), np.arange(n),
-            constraints.edges.values.copy())
+            source, errors, np.arange(len(constraints)), constraints.measured['held_by'].copy())
 
     def _move(self, most: int) -> bool:
         """Move some measurements to the new model; return False if that has failed for good."""
         change = self._change
         assert change is not None
-        constraints = self._factors.constraints(change.source)
+        constraints = self._factors.sources[change.source]
         if not change.undoing:  # those that came meanwhile
             known = len(change.before)
             change.remaining = np.append(change.remaining, np.arange(known, len(constraints)))
-            change.before = np.append(change.before, constraints.edges.values[known:])
+            change.before = np.append(change.before, constraints.measured['held_by'][known:])
         some = change.remaining[-most:]
         if self._apply(change, constraints, some):
             change.remaining = change.remaining[:len(change.remaining) - len(some)]
             if len(change.remaining) == 0:
-                if not change.undoing:
-                    self._factors.set_error_model(change.source, change.model)
-                elif change.failed is not None:
-                    self._factors.abandon(change.failed)
+                if change.undoing:
+                    self._factors.abandon(change.bias)
+                else:
+                    bias = None if change.errors is None else change.bias
+                    self._factors.set_errors(change.source, change.errors, bias)
                 self._change = None
             return True
         if change.undoing:
             return False    # tried again at the next step
         self.n_failures += 1
-        moved = np.flatnonzero(constraints.edges.values[:len(change.before)] != change.before)
-        change.undoing, change.remaining = True, moved
-        change.failed, change.model = change.model, None
+        held_by = constraints.measured['held_by'][:len(change.before)]
+        moved = np.flatnonzero(held_by != change.before)
+        change.undoing, change.remaining, change.errors = True, moved, None
         return True
 
-    def _apply(self, change: _Change, constraints: SourceConstraints, some: IntArray) -> bool:
+    def _apply(self, change: _Change, constraints: SourceState, some: IntArray) -> bool:
         """Have others hold some measurements; return whether the solver succeeded."""
-        graph, model = self._smoother.graph, change.model
+        graph, bias = self._smoother.graph, change.bias
         held = constraints.held(some)
         weights = graph.weights[graph.factor_rows(held)]
-        additions = Additions(graph.next_ids)
-        added = constraints.rows.values[some]
+        additions, rows = Additions(graph.next_ids), constraints.measured.values[some]
         new = change.before[some] if change.undoing else np.full(len(some), -1)
-        if model is not None:
-            model.begin()
-            table = graph.factors_at(added[:, 1])
-            for k, (stamp_ns, weight) in enumerate(
-                    zip(added[:, 0].tolist(), weights.tolist(), strict=True)):
-                one = table.rows(slice(k, k + 1)).weighted(weight)
-                new[k] = model.add(stamp_ns, one, constraints.noise.values[some[k]], additions)
         wanted = dict.fromkeys(held.tolist(), 0.0)
-        if model is None:
-            wanted |= dict(zip(np.where(new >= 0, new, added[:, 1]).tolist(), weights.tolist(),
-                                strict=True))
+        if change.errors is None:
+            wanted |= dict(zip(np.where(new >= 0, new, rows['id']).tolist(), weights.tolist(),
+                               strict=True))
+        else:
+            table = graph.factors_at(rows['id'])
+            bias = bias.with_bins(
+                rows['stamp_ns'], Process.correlated(change.errors), additions, np.zeros(3))
+            new = additions.add(Factors.joined([
+                held_by_bias(
+                    Queued(change.source, table.rows(slice(k, k + 1)), int(row['stamp_ns']),
+                           noise=row['noise']), bias, change.errors)
+                for k, row in enumerate(rows)]).weighted(weights))
         update = additions.update()._replace(weigh=wanted)
         if not succeeds(self._smoother, update):
-            if model is not None:
-                model.rollback()
             return False
-        constraints.edges.values[some] = new
+        change.bias = bias
+        constraints.measured['held_by'][some] = new
         after = constraints.held(some)
         self._judge.moved(held, after)
         for one, to in zip(held.tolist(), after.tolist(), strict=True):
@@ -366,7 +362,7 @@ class ErrorTuner:
         return True
 
 
-def _next_estimate(constraints: SourceConstraints) -> int:
+def _next_estimate(constraints: SourceState) -> int:
     """Return at how many measurements of a source the estimate after the next one is due."""
     return constraints.n_gone + math.ceil(1.3 * len(constraints))
 

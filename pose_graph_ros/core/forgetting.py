@@ -225,8 +225,7 @@ class Forgetting:
         """Return the ids of nodes that do not leave, as something is to be added to them."""
         parts, found = self._parts, [*self._tuner.needed]
         for queue in (parts.pipeline.queue, parts.quarantine):
-            found += [end for each in queue.edges for end in each.ends]
-            found += [each.attachment.node for each in queue.observed]
+            found += [node for each in queue for node in each.nodes]
         return np.array(found, dtype=np.int64)
 
     def _step_of_window(self, window: WindowConfig) -> None:
@@ -234,8 +233,7 @@ class Forgetting:
         nodes, parts = self._parts.nodes, self._parts
         n = n_leaving(window, nodes)
         if n > 0:
-            n = n_leaving(window, nodes, parts.pipeline.needed_ns(
-                aligned=parts.alignment.is_aligned))
+            n = n_leaving(window, nodes, parts.pipeline.needed_ns)
         if n > 0 and len(nodes) >= self._rest:
             self._freeze(n, window.prior)
 
@@ -300,6 +298,8 @@ class Forgetting:
         """Count constraints that were to be added to nodes that have left."""
         pipeline, gone = self._parts.pipeline, {*nodes.tolist()}
         for queue in (pipeline.queue, self._parts.quarantine):
-            for source in queue.drop(gone):
-                pipeline.count(source, rejected(
+            lost = [each for each in queue if not gone.isdisjoint(each.nodes)]
+            queue[:] = [each for each in queue if gone.isdisjoint(each.nodes)]
+            for each in lost:
+                pipeline.count(each.source, rejected(
                     'before_window', 'its hidden node left the graph before it was added'))

@@ -23,15 +23,8 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.measurements import Absolute
-from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.gauss_markov import (
-    biased_constraint,
-    CorrelatedErrors,
-    GaussMarkovBias,
-)
 from pose_graph_ros.core.sources.kinds import KINDS, observed
 
 
@@ -52,7 +45,7 @@ def estimate(
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
-        waiting = placed(parts.pipeline.queue.observed + parts.quarantine.observed)
+        waiting = placed(parts.pipeline.queue + parts.quarantine)
         if len(waiting) > 0:
             shift, cov = estimator.guess(graph.poses, newest, in_rows(graph, waiting))
             newest = newest + shift
@@ -156,22 +149,11 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
         measurement = KINDS[type(given)].in_map(given)
         if measurement is None:
             continue
-        model = parts.factors.error_model(source)
         settings = parts.factors.config.measurement_source(source, type(measurement))
         found.append((
-            _edge(measurement, attachment, model),
+            parts.factors.preview(observed(source, measurement, attachment)),
             settings.robust is Robust.JUDGED or settings.applied_loss is not Loss.NONE))
     return found
-
-
-def _edge(
-    measurement: Absolute, attachment: Attachment, model: GaussMarkovBias | None,
-) -> Factors:
-    """Return a measurement as an edge to the last state of the bias before it, or to none, -1."""
-    factors, noise = observed(measurement, attachment)
-    edge = None if model is None else model.preview(measurement.stamp_ns, factors, noise)
-    return edge if edge is not None else biased_constraint(
-        factors, noise, -1, 1.0, CorrelatedErrors(0.0, 0.0, 1.0))
 
 
 def _joint(smoother: IncrementalSmoother, ids: Sequence[int]) -> FloatArray:

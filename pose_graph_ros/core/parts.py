@@ -5,43 +5,30 @@ What the engine is made of, and the way from there to a saved graph and back.
 
 The graph is saved with the odometry samples next to the hidden nodes and those of the last minute.
 If odometry continues without interruption, later estimates are therefore the same as without
-saving. Measurements that wait for odometry or for the alignment are not saved; they can be sent
-again.
+saving. Measurements that wait for odometry are not saved; they can be sent again.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
-
-import numpy as np
 
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.exceptions import FileFormatError, NothingToSaveError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors, full, upper
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.judgement.texts import is_notable, sentence
 from pose_graph_ros.core.judgement.verdicts import Judged
-from pose_graph_ros.core.measurements import LoopClosure, Range
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.saved_columns import as_matrix, MISMATCHES
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
-from pose_graph_ros.core.sources.source_constraints import (
-    Queue,
-    QueuedEdge,
-    SavedEdges,
-    SavedSource,
-)
+from pose_graph_ros.core.sources.queued import Queued, SavedQueue
 
-_NONE: IntArray = np.empty(0, dtype=np.int64)
 # Of each source, the number of believed closures whose verdicts are saved as sentences.
 MOST_BELIEVED = 2000
-_NO_CONSTRAINTS = SavedSource(_NONE, _NONE, _NONE.reshape(0, 2), 0, _NONE, None)
 
 
 class Parts(NamedTuple):
@@ -53,7 +40,7 @@ class Parts(NamedTuple):
     reweighting: Reweighting
     alignment: AlignmentMonitor
     pipeline: MeasurementPipeline
-    quarantine: Queue
+    quarantine: list[Queued]
     """Constraints that were set aside after a failed update."""
     judge: Judge
     smoother: IncrementalSmoother
@@ -65,31 +52,22 @@ def capture(
     """
     Return the state of an engine as a value; NothingToSaveError if there is no hidden node.
 
-    Measurements that wait are left out and do not count as seen. Edges in the queue for the next
-    update are saved. The covariance is that of the newest hidden node, in map axes.
+    Measurements that wait for odometry are left out and do not count as seen. The covariance is
+    that of the newest hidden node, in map axes.
     """
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')
-    attached = parts.pipeline.queue.observed + parts.quarantine.observed
-    left_out = (parts.pipeline.waiting.measurements + parts.pipeline.beacons.measurements
-                + [(each.source, each.measurement) for each in attached])
-    seen, added = parts.pipeline.seen.saved(left_out), parts.factors.saved()
-    sources = dict(added)
-    for name, (stamps, references) in seen.items():
-        sources[name] = replace(
-            added.get(name, _NO_CONSTRAINTS), seen_ns=stamps, seen_references=references)
+    left_out = parts.pipeline.waiting.measurements + parts.pipeline.beacons.measurements
     return SavedGraph(
-        rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=sources,
+        rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=parts.factors.saved(),
+        seen=parts.pipeline.seen.saved(left_out),
         losses=parts.reweighting.saved(), alignment=parts.alignment.saved(),
-        waiting=_saved_edges(parts.pipeline.queue),
-        set_aside=_saved_edges(parts.quarantine), judgement=parts.judge.saved(),
+        waiting=SavedQueue.of(parts.pipeline.queue),
+        set_aside=SavedQueue.of(parts.quarantine), judgement=parts.judge.saved(),
         verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
                   if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
         newest_covariance=as_matrix(newest_covariance), chi2=chi2, n_left_out=len(left_out),
-        datum=datum, gyros=parts.pipeline.gyros.saved(
-            parts.pipeline.queue.turns + parts.quarantine.turns),
-        gyro_biases={
-            name: bias.saved() for name, bias in parts.factors.gyros.items()},
+        datum=datum, gyros=parts.pipeline.gyros.saved(),
         beacons=dict(parts.pipeline.beacons.ids))
 
 
@@ -110,33 +88,13 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
 def _restore(parts: Parts, saved: SavedGraph) -> None:
     parts.graph.fill(saved.rows)
     parts.nodes.restore(saved.nodes)
-    for name, source in saved.sources.items():
-        parts.pipeline.seen.restore(name, source.seen_ns, source.seen_references)
-        parts.factors.restore(name, source)
+    parts.pipeline.seen.restore(saved.seen)
+    parts.factors.restore(saved.sources)
     for name, gyro in saved.gyros.items():
         parts.pipeline.gyros.restore(name, gyro)
-        parts.pipeline.queue.turns += gyro.waiting
-    for name, bias in saved.gyro_biases.items():
-        parts.factors.gyro_bias(name).restore(bias)
     parts.pipeline.beacons.ids |= saved.beacons
     parts.reweighting.restore(saved.losses)
     parts.alignment.load(saved.alignment)
     parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
-    for queue, edges in (
-            (parts.pipeline.queue, saved.waiting), (parts.quarantine, saved.set_aside)):
-        table = Factors(edges.i, edges.j, edges.mean, full(edges.information), edges.kind,
-                        constants=edges.constants if len(edges.constants) > 0 else None)
-        queue.edges += [
-            QueuedEdge(name, table.rows(slice(k, k + 1)), stamp_ns, reference_ns, kind=(
-                Range if table.kind[k] == FactorKind.RANGE else LoopClosure))
-            for k, (name, (stamp_ns, reference_ns)) in enumerate(zip(
-                edges.sources, edges.stamps_ns.tolist(), strict=True))]
-
-
-def _saved_edges(queue: Queue) -> SavedEdges:
-    table = Factors.joined([queued.edge for queued in queue.edges])
-    stamps = np.array([(queued.stamp_ns, queued.reference_ns) for queued in queue.edges],
-                      dtype=np.int64).reshape(-1, 2)
-    return SavedEdges(tuple(queued.source for queued in queue.edges), table.i, table.j,
-                      table.mean, upper(table.information), table.kind.astype(np.int64), stamps,
-                      table.constants)
+    parts.pipeline.queue += saved.waiting.queue()
+    parts.quarantine.extend(saved.set_aside.queue())

@@ -30,6 +30,12 @@ class Column(NamedTuple):
     shape: tuple[int, ...] = ()
 
 
+class Records(NamedTuple):
+    """Type of the rows of a `GrowingArray` with named columns."""
+
+    dtype: np.dtype[Any]
+
+
 class Choices(NamedTuple):
     """
     Members of an enumeration, as an array of numbers: values of an `IntEnum`, else positions.
@@ -83,6 +89,8 @@ def encoded(value: Any, kind: Any = None) -> Any:
         names = {number: name for name, number in choices.numbers.items()}
         used, which = np.unique(value, return_inverse=True)
         return {'names': [names[number] for number in used.tolist()], 'of': which.tolist()}
+    if get_origin(kind) is Annotated and isinstance(get_args(kind)[1], Records):
+        return {name: value[name].tolist() for name in value.values.dtype.names}
     if isinstance(value, tuple):
         return [encoded(each) for each in value]
     return value.tolist() if isinstance(value, np.ndarray) else value
@@ -101,7 +109,8 @@ def decoded(kind: Any, plain: Any) -> Any:
     """Return the value that `encoded` was given."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        return _array(arguments[1], plain)
+        array = _array(arguments[1], plain)
+        return arguments[0].of(array) if isinstance(arguments[1], Records) else array
     if origin in (UnionType, Union):     # of something and None
         return None if plain is None else decoded(arguments[0], plain)
     if origin is tuple:
@@ -116,8 +125,18 @@ def decoded(kind: Any, plain: Any) -> Any:
     return kind(plain)
 
 
-def _array(column: Choices | Column, plain: Any) -> npt.NDArray[Any]:
+def _array(column: Choices | Column | Records, plain: Any) -> npt.NDArray[Any]:
+    if isinstance(column, Records):
+        return _table(column.dtype, plain)
     if isinstance(column, Column):
         return np.array(plain, dtype=column.kind).reshape(-1, *column.shape)
     numbers = [column.numbers[name] for name in plain['names']]
     return np.array(numbers, dtype=np.int64)[np.array(plain['of'], dtype=np.int64)]
+
+
+def _table(dtype: np.dtype[Any], plain: Any) -> npt.NDArray[Any]:
+    """Return records from their columns."""
+    rows = np.empty(len(plain[(dtype.names or ())[0]]), dtype)
+    for name in rows.dtype.names or ():
+        rows[name] = np.reshape(plain[name], rows[name].shape)
+    return rows

@@ -20,7 +20,7 @@ from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
-from pose_graph_ros.core.sources.source_constraints import Queue
+from pose_graph_ros.core.sources.queued import Queued
 
 Solved = TypeVar('Solved', UpdateResult, UpdateReport)
 
@@ -76,13 +76,13 @@ MOST_ATTEMPTS = 32
 
 
 # adds what is in the queue of the pipeline; returns the report, and the constraints left over
-Update = Callable[[], tuple[UpdateReport, Queue]]
+Update = Callable[[], tuple[UpdateReport, list[Queued]]]
 
 
 def update_isolated(
     add_queue: Update, can_solve: Callable[[], bool], pipeline: MeasurementPipeline,
-    quarantine: Queue, name: Callable[[Queue], str],
-) -> tuple[UpdateReport, Queue]:
+    quarantine: list[Queued], name: Callable[[list[Queued]], str],
+) -> tuple[UpdateReport, list[Queued]]:
     """
     Return the report of an update, and the constraints that were not tried in it.
 
@@ -94,12 +94,12 @@ def update_isolated(
     pipeline.counts['solver', 'failed'] += 1
     if len(failed) == 0 or (len(failed) > 1 and not can_solve()):
         quarantine.extend(failed)
-        return report, Queue()
+        return report, []
     added = [report]
 
-    def attempt(part: Queue) -> str:
+    def attempt(part: list[Queued]) -> str:
         waiting = pipeline.queue
-        pipeline.queue = part.joined(waiting)
+        pipeline.queue = part + waiting
         again, _ = add_queue()
         if again.status is Status.FAILED:
             pipeline.queue = waiting
@@ -119,29 +119,29 @@ def update_isolated(
 
 
 def update_with_all(
-    update: Update, pipeline: MeasurementPipeline, quarantine: Queue,
+    update: Update, pipeline: MeasurementPipeline, quarantine: list[Queued],
 ) -> UpdateReport:
     """
     Return one report of updates with all constraints in the queue, then with those set aside.
     """
     report, untried = update()
     while len(untried) > 0:     # each update sets at least one aside
-        pipeline.queue = untried.joined(pipeline.queue)
+        pipeline.queue = untried + pipeline.queue
         again, untried = update()
         report = report.before(again)
     if len(quarantine) > 0:
-        pipeline.queue.extend(quarantine)
-        quarantine.replace_by(Queue())
+        pipeline.queue += quarantine
+        quarantine.clear()
         again, untried = update()
         # they are the first ones the next time
-        quarantine.replace_by(untried.joined(quarantine))
+        quarantine[:] = untried + quarantine
         report = report.before(again)
     return report
 
 
 def isolate(
-    failed: Queue, reason: str, attempt: Callable[[Queue], str],
-) -> tuple[list[tuple[Queue, str]], Queue]:
+    failed: list[Queued], reason: str, attempt: Callable[[list[Queued]], str],
+) -> tuple[list[tuple[list[Queued], str]], list[Queued]]:
     """
     Return the bad constraints of a queue that cannot be added whole, after adding the rest.
 
@@ -149,16 +149,17 @@ def isolate(
 
     `attempt` adds all constraints of a queue, or none; it returns why it cannot, or ''.
     """
-    bad: list[tuple[Queue, str]] = []
-    suspects, untried, attempts = failed, Queue(), 0
+    bad: list[tuple[list[Queued], str]] = []
+    suspects, attempts = failed, 0
+    untried: list[Queued] = []
     while True:
         while len(suspects) > 1:
             if attempts >= MOST_ATTEMPTS:
-                return bad, suspects.joined(untried)
-            half, rest = suspects.halves()
+                return bad, suspects + untried
+            half, rest = suspects[:len(suspects) // 2], suspects[len(suspects) // 2:]
             attempts, reason = attempts + 1, attempt(half)
             suspects, untried = (
-                (rest, untried) if reason == '' else (half, rest.joined(untried)))
+                (rest, untried) if reason == '' else (half, rest + untried))
         if reason == '':    # suspected because all others were added
             attempts, reason = attempts + 1, attempt(suspects)
         if reason != '':
@@ -167,5 +168,5 @@ def isolate(
             return bad, untried
         attempts, reason = attempts + 1, attempt(untried)
         if reason == '':
-            return bad, Queue()
-        suspects, untried = untried, Queue()
+            return bad, []
+        suspects, untried = untried, []

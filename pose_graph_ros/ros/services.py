@@ -192,7 +192,7 @@ class Services:
         finally:
             self._saving = False
         left_out = '' if saved.n_left_out == 0 else (
-            f'; not in it: {saved.n_left_out} that wait for odometry or for the alignment')
+            f'; not in it: {saved.n_left_out} that wait for odometry')
         return (f'{len(saved.nodes.ids)} hidden nodes in {files[0]}, with '
                 f'{files[1].name} and {files[2].name}{left_out}')
 

@@ -22,7 +22,7 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.smoother.incremental import UpdateResult
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+from pose_graph_ros.core.sources.bias import CorrelatedErrors
 
 SECOND = 1_000_000_000
 TAU = 20.0
@@ -77,9 +77,9 @@ def path(backend: PoseGraphBackend) -> np.ndarray:
 
 def assert_each_held_once(backend: PoseGraphBackend) -> None:
     """Each fix counts once: as an edge to a bias, or as an observed node."""
-    constraints = backend._factors.constraints('fix')
-    every, as_edges = backend.graph.weights, constraints.edges.values
-    weights = every[constraints.rows.values[:, 1]]
+    constraints = backend._factors.sources['fix']
+    every, as_edges = backend.graph.weights, constraints.measured['held_by']
+    weights = every[constraints.measured['id']]
     np.testing.assert_array_equal(weights > 0.0, as_edges < 0)
     assert np.all(every[as_edges[as_edges >= 0]] > 0.0)
     held = np.zeros(len(every), dtype=bool)
@@ -97,7 +97,7 @@ def test_correlated_errors_are_found_online_and_the_whole_past_is_changed() -> N
     assert 0.4 < found.correlated + found.white < 2.5
     while not backend.refine().finished:
         pass
-    assert np.all(backend._factors.constraints('fix').edges.values >= 0)
+    assert np.all(backend._factors.sources['fix'].measured['held_by'] >= 0)
     assert_each_held_once(backend)
     white = fed(drive(1, TAU), replace(SOURCE, correlation_time=0.0))
     sigmas = [np.sqrt(each.estimate().covariance[0, 0]) for each in (white, backend)]
@@ -181,7 +181,7 @@ def test_a_change_that_fails_is_undone_as_a_whole(
     assert calls > 3
     assert tuner.n_failures == 1
     assert in_use(backend) is None
-    assert np.all(backend._factors.constraints('fix').edges.values == -1)
+    assert np.all(backend._factors.sources['fix'].measured['held_by'] == -1)
     assert_each_held_once(backend)
     assert backend.optimize().status is Status.CONVERGED
     np.testing.assert_allclose(path(backend), white, atol=1e-9)

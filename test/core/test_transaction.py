@@ -21,7 +21,7 @@ from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample, Position
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.source_constraints import Queue, QueuedEdge
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.transaction import isolate
 
 SECOND = 1_000_000_000
@@ -137,12 +137,12 @@ class Picky(IncrementalSmoother):
         return super().update(update, **options)
 
 
-def queue_of(numbers: range) -> Queue:
-    return Queue([QueuedEdge(str(k), Factors()) for k in numbers], [])
+def queue_of(numbers: range) -> list[Queued]:
+    return [Queued(str(k), Factors()) for k in numbers]
 
 
-def names(queue: Queue) -> list[int]:
-    return [int(queued.source) for queued in queue.edges]
+def names(queue: list[Queued]) -> list[int]:
+    return [int(queued.source) for queued in queue]
 
 
 @given(st.integers(1, 200), st.data())
@@ -151,7 +151,7 @@ def test_all_but_the_bad_ones_are_added_once(n: int, data: st.DataObject) -> Non
     added: list[int] = []
     attempts = []
 
-    def attempt(part: Queue) -> str:
+    def attempt(part: list[Queued]) -> str:
         attempts.append(len(part))
         if bad.isdisjoint(names(part)):
             added.extend(names(part))

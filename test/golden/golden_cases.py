@@ -224,6 +224,12 @@ LOADED = {
     'version_1': Loaded('version_1'),
     # with a window, thinning, judged closures, slow errors of fixes and of a gyroscope
     'version_4': Loaded('version_4', {**GYRO, **THIN, 'window.nodes': 45.0}),
+    # with a window, late fixes with a given correlation time and some whose errors were found to
+    # be correlated, a gyroscope, and a rotation and a closure that wait
+    'version_6': Loaded('version_6', {
+        'sources': ['odom', 'fix', 'rear', 'gyro'], 'rear.type': 'fix',
+        'rear.correlation_time': 20.0, 'gyro.mounting': 'up', 'gyro.bias_period': 5.0,
+        'fix.robust': 'none', 'window.nodes': 45.0}),
 }
 
 TOOLS = {

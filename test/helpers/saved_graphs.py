@@ -10,6 +10,7 @@ import numpy as np
 from test_delay_invariance import Event, feed
 
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, OdometrySource
 from pose_graph_ros.core.measurements import OdometrySample
 
@@ -45,6 +46,8 @@ def straight_line(config: BackendConfig = LINE_ODOMETRY) -> PoseGraphBackend:
 def assert_same_value(one: Any, other: Any, where: str = '') -> None:
     """Assert that two values have the same types and numbers."""
     assert type(one) is type(other), where
+    if isinstance(one, GrowingArray):
+        one, other = one.values, other.values
     if isinstance(one, np.ndarray):
         assert one.dtype == other.dtype, where
         np.testing.assert_array_equal(one, other, err_msg=where)

@@ -14,8 +14,8 @@ from pose_graph_ros.cli.run.recorder import Run
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.offline.residuals.source_residuals import (
     RowFit,
     ScaleFit,

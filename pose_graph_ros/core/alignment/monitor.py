@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,16 +14,10 @@ from pose_graph_ros.core.alignment.consensus import Given, TUNED
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import (
-    FactorKinds,
-    Factors,
-    full,
-    upper,
-)
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.saved_columns import Integers, Rows3, Rows6
-from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement
+from pose_graph_ros.core.sources.queued import Queued, SavedQueue
 
 
 class AlignmentState(Enum):
@@ -43,22 +36,7 @@ class SavedAlignment:
     state: str
     sigma: float | None  # standard deviation of the angle [rad]; None for infinite
     next_verdict: int  # number of measurements at which the angle is checked next
-    sources: tuple[str, ...]
-    source: Integers  # index of each measurement's source, shape (M,)
-    stamps_ns: Integers
-    node: Integers  # columns of `Factors`, as the four below; shape (M,)
-    offset: Rows3
-    mean: Rows3
-    information: Rows6  # upper triangles, shape (M, 6)
-    kind: FactorKinds
-
-
-class Evidence(NamedTuple):
-    """A measurement for the next check of the angle."""
-
-    source: str
-    stamp_ns: int
-    observed: Factors
+    evidence: SavedQueue
 
 
 class AlignmentMonitor:
@@ -73,7 +51,7 @@ class AlignmentMonitor:
         self._config = config
         self.state = AlignmentState.LOCAL
         self.sigma = np.inf  # standard deviation of the angle when it was found [rad]
-        self._evidence: list[Evidence] = []
+        self._evidence: list[Queued] = []
         self._next_recheck = TUNED.first_recheck
 
     def configure(self, config: BackendConfig) -> None:
@@ -81,7 +59,7 @@ class AlignmentMonitor:
         self._config = config
 
     def find(
-        self, graph: Graph, waiting: list[AttachedMeasurement], nodes: HiddenNodes,
+        self, graph: Graph, waiting: list[Queued], nodes: HiddenNodes,
     ) -> FloatArray | None:
         """
         Return the motion of the graph into the map if it is found, and update the state.
@@ -89,19 +67,20 @@ class AlignmentMonitor:
         It has the shape (3,), and is None if the graph is aligned already, or the angle is not
         known well enough.
         """
+        waiting = [each for each in waiting if each.is_in_map]
         if self.state is AlignmentState.ALIGNED or len(placed(waiting)) == 0:
             return None
         found = estimator.find_alignment(
-            nodes.recent_poses(graph), self._given(nodes, [*map(_evidence_of, waiting)]))
+            nodes.recent_poses(graph), self._given(nodes, waiting))
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
                       else AlignmentState.ALIGNED)
         self.sigma = found.sigma
         return found.T_map_graph
 
-    def add(self, added: list[AttachedMeasurement]) -> None:
+    def add(self, added: list[Queued]) -> None:
         """Store the measurements that were added to the graph for the next check."""
         if self._next_recheck <= TUNED.last_recheck:
-            self._evidence += map(_evidence_of, placed(added))
+            self._evidence += placed(added)
 
     def stop_rechecking(self) -> None:
         """Stop checking the angle, because the path is not that of odometry any more."""
@@ -110,7 +89,7 @@ class AlignmentMonitor:
 
     def forget(self, node: int) -> None:
         """Drop the stored measurements on hidden nodes before one, by its id."""
-        self._evidence = [each for each in self._evidence if each.observed.i[0] >= node]
+        self._evidence = [each for each in self._evidence if each.factor.i[0] >= node]
 
     def recheck(self, graph: Graph, nodes: HiddenNodes) -> FloatArray | None:
         """
@@ -140,7 +119,7 @@ class AlignmentMonitor:
         poses[rows] = moved
         return poses
 
-    def _given(self, nodes: HiddenNodes, evidence: list[Evidence]) -> Given:
+    def _given(self, nodes: HiddenNodes, evidence: list[Queued]) -> Given:
         """Return measurements by rows of `HiddenNodes.recent_poses`, and what is assumed."""
         ids = nodes.ids[nodes.n_frozen:]    # which has no biases
         observed = _table(evidence).renumbered(lambda some: np.searchsorted(ids, some))
@@ -162,42 +141,27 @@ class AlignmentMonitor:
 
     def saved(self) -> SavedAlignment:
         """Return the state and the stored measurements."""
-        table = _table(self._evidence)
-        names = tuple(dict.fromkeys(each.source for each in self._evidence))
-        source, stamps = (np.array(numbers, dtype=np.int64) for numbers in (
-            [names.index(each.source) for each in self._evidence],
-            [each.stamp_ns for each in self._evidence]))
         return SavedAlignment(
             self.state.value, float(self.sigma) if np.isfinite(self.sigma) else None,
-            self._next_recheck, names, source, stamps, table.i, table.offset, table.mean,
-            upper(table.information), table.kind.astype(np.int64))
+            self._next_recheck, SavedQueue.of(self._evidence))
 
     def load(self, saved: SavedAlignment) -> None:
         """Set state and measurements to saved ones."""
         self.state = AlignmentState(saved.state)
         self.sigma = np.inf if saved.sigma is None else saved.sigma
         self._next_recheck = saved.next_verdict
-        table = Factors.on(saved.node, saved.offset, saved.mean, full(saved.information),
-                              saved.kind)
-        self._evidence = [
-            Evidence(saved.sources[source], stamp_ns, table.rows(slice(k, k + 1)))
-            for k, (source, stamp_ns) in enumerate(
-                zip(saved.source.tolist(), saved.stamps_ns.tolist(), strict=True))]
+        self._evidence = saved.evidence.queue()
 
 
-def placed(attached: list[AttachedMeasurement]) -> list[AttachedMeasurement]:
-    """Return the measurements that contain a position: all but headings."""
-    return [each for each in attached if each.is_placed]
+def placed(queue: Sequence[Queued]) -> list[Queued]:
+    """Return the measurements in the map that contain a position: all but headings."""
+    return [each for each in queue if each.is_placed]
 
 
-def in_rows(graph: Graph, measurements: Sequence[AttachedMeasurement]) -> Factors:
+def in_rows(graph: Graph, measurements: Sequence[Queued]) -> Factors:
     """Return the observed nodes of measurements, with the rows of their hidden nodes."""
     return _table(measurements).renumbered(graph.node_rows)
 
 
-def _evidence_of(attached: AttachedMeasurement) -> Evidence:
-    return Evidence(attached.source, attached.measurement.stamp_ns, attached.observed)
-
-
-def _table(measurements: Sequence[AttachedMeasurement | Evidence]) -> Factors:
-    return Factors.joined([each.observed for each in measurements])
+def _table(measurements: Sequence[Queued]) -> Factors:
+    return Factors.joined([each.factor for each in measurements])

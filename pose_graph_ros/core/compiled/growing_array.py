@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """An array that rows are appended to, at amortised constant cost per row."""
 
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,18 @@ class GrowingArray:
 
     def __len__(self) -> int:
         return self._size
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """Return a column of records, a view as `values`."""
+        column: npt.NDArray[Any] = self.values[name]
+        return column
+
+    @classmethod
+    def of(cls, rows: npt.NDArray[Any]) -> Self:
+        """Return an array that begins with some rows."""
+        array = cls(rows.shape[1:], rows.dtype)
+        array.append(rows)
+        return array
 
     @property
     def values(self) -> npt.NDArray[Any]:

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.saved_columns import Choices
+from pose_graph_ros.core.saved_columns import Choices, Column, Integers, Numbers, Rows3, Rows4
 
 
 class NodeKind(IntEnum):
@@ -125,22 +125,22 @@ def _filled(size: int, value: float, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
 class Factors:
     """M factors; raises GraphUpdateError for ends and kinds that are no integers."""
 
-    i: IntArray     # nodes that they start from, or that are observed
-    j: IntArray     # nodes that they lead to; -1 for one end, in the map
+    i: Integers     # nodes that they start from, or that are observed
+    j: Integers     # nodes that they lead to; -1 for one end, in the map
     # measured poses of j in i, shape (M, 3) [m, m, rad]; with one end and of edges to a bias those
     # of i in the map, of ranges the distance (r, 0, 0)
-    mean: FloatArray
+    mean: Rows3
     # inverse covariances of the errors, shape (M, 3, 3), in the frames of the measured poses; of
     # edges to a bias in map axes; zero in rows that the error of the kind has not
-    information: FloatArray
-    kind: KindArray
-    weight: FloatArray  # what the information is multiplied by: 0 removed, by default 1
+    information: Annotated[FloatArray, Column(float, (3, 3))]
+    kind: Annotated[KindArray, Choices(FactorKind)]
+    weight: Numbers  # what the information is multiplied by: 0 removed, by default 1
     # what else the error depends on, shape (M, 4): with one end the offset (o_x, o_y, o_th, 0)
     # [m, m, rad], that is, motion by odometry since the node, then the lever arm; of edges to a
     # bias the offset in i and the factors of the bias, (o_x, o_y, f_t, f_th) [m, m, m, rad]; of a
     # range (o_x, o_y), of a turn f_th, the duration [s]
-    constants: FloatArray
-    k: IntArray     # third nodes: of turns the bias; -1, the default, for none
+    constants: Rows4
+    k: Integers     # third nodes: of turns the bias; -1, the default, for none
 
     def __init__(
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,

@@ -53,7 +53,7 @@ from pose_graph_ros.core.saved_columns import (
 )
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 6
+VERSION = 7
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'

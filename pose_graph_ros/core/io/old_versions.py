@@ -7,13 +7,21 @@ Version 1 holds losses and kinds as numbers, version 2 holds names. Neither has 
 version 3 the ids of hidden nodes are `rows`. In version 4 loop closures may have doubted odometry.
 Up to version 5 closures and fixes have columns of their own in judgements, samples that wait are
 columns as well, and edges and observed nodes have ids of their own; those of observed nodes follow
-here on those of the edges.
+here on those of the edges. Up to version 6 biases of gyroscopes and of other sources are chains of
+two kinds, and what waits and what may align the graph are columns with other names.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from itertools import count
 from typing import Any
+
+import numpy as np
+
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors, full
+from pose_graph_ros.core.odometry.gyro import Turn
+from pose_graph_ros.core.saved_columns import encoded
+from pose_graph_ros.core.sources.queued import SavedQueue, turn
 
 LOSSES = ('none', 'huber', 'cauchy')
 EDGES = ('odometry', 'loop_closure', 'bias')
@@ -37,7 +45,7 @@ _NOT_JUDGED: dict[str, Any] = {
 
 
 def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
-    """Return the members of a file of an older version as those of version 6."""
+    """Return the members of a file of an older version as those of version 7."""
     for member, name in NUMBERED if version < 2 else ():
         column = {'names': list(NUMBERED[member, name]), 'of': members[member][name]}
         members[member] = {**members[member], name: column}
@@ -63,7 +71,9 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
                 gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
     if 3 <= version < 6:
         members['judgement'] = _judgement(**members['judgement'])
-    return _with_one_table(members) if version < 6 else members
+    if version < 6:
+        members = _with_one_table(members)
+    return _with_states(members) if version < 7 else members
 
 
 def _list_samples(stream: dict[str, Any]) -> None:
@@ -197,3 +207,84 @@ def _joined(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 def _renamed(kinds: dict[str, Any]) -> dict[str, Any]:
     return {**kinds, 'names': [
         'node_prior' if name == 'prior' else name for name in kinds['names']]}
+
+
+def _with_states(members: dict[str, Any]) -> dict[str, Any]:
+    """Return members with one state of each source, and queues as tables of factors."""
+    sources, gyros = members.pop('sources'), members.pop('gyro_biases', {})
+    rotations = [queued for gyro in members.get('gyros', {}).values()
+                 for each in gyro.pop('waiting') for queued in turn(Turn(**each))]
+    for name in ('waiting', 'set_aside'):
+        old = members[name]
+        members[name] = _queue(old['sources'], old['stamps_ns'], Factors(
+            old['i'], old['j'], *_measured(old)))
+    members['waiting'] = encoded(SavedQueue.of([*members['waiting'].queue(), *rotations]))
+    members['set_aside'] = encoded(members['set_aside'])
+    old = members['alignment']
+    evidence = _queue([old['sources'][k] for k in old['source']],
+                      [[stamp_ns, -1] for stamp_ns in old['stamps_ns']], Factors.on(
+                          old['node'], np.reshape(old['offset'], (-1, 3)), *_measured(old)))
+    members['alignment'] = {'evidence': encoded(evidence), **{
+        name: old[name] for name in ('state', 'sigma', 'next_verdict')}}
+    return {**members, 'seen': {name: {
+        'stamps_ns': each['seen_ns'], 'references': each['seen_references']}
+        for name, each in sources.items()}, 'sources': {
+        **{name: _state(**each) for name, each in sources.items()},
+        **{name: _state_of_gyro(**each) for name, each in gyros.items()}}}
+
+
+def _queue(sources: list[str], stamps_ns: list[list[int]], factors: Factors) -> SavedQueue:
+    n = len(sources)
+    return SavedQueue(tuple(sources), factors, np.reshape(np.array(stamps_ns, np.int64), (n, 2)),
+                      np.zeros((n, 2)))
+
+
+def _measured(old: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """Return mean, information and kind of factors."""
+    kind = old['kind']
+    return (np.reshape(old['mean'], (-1, 3)), full(np.reshape(old['information'], (-1, 6))),
+            np.array([FactorKind[kind['names'][k].upper()] for k in kind['of']], np.uint8))
+
+
+def _state(
+    *, rows: list[list[int]], ties: list[int], bins: dict[str, Any] | None, **others: Any,
+) -> dict[str, Any]:
+    """Return the state of a source of measurements or closures."""
+    n, noise, odometry = len(rows), others.get('noise', ()), others.get('odometry', ())
+    variance = others.get('odometry_scale', 1.0)**2
+    past, bias = others.get('past'), None
+    if bins is not None:
+        # each edge was that of the state behind it, as seen from the one with the prior
+        at = bins['ties'].index(-1) if -1 in bins['ties'] else 0
+        bias = _chain(bins, bins['rows'], [-1, *bins['ties'][:at], *bins['ties'][at + 1:]], at)
+    return {
+        'measured': {
+            'stamp_ns': [stamp_ns for stamp_ns, _ in rows], 'id': [number for _, number in rows],
+            'held_by': others.get('edges') or n * [-1],
+            'noise': noise if len(noise) == n else n * [[0.0, 0.0]]},
+        'edges': {'stamp_ns': len(ties) * [-1], 'id': ties}, 'bias': bias,
+        # an older version knew less of odometry
+        'past': past if past is not None and past.get('lever') else None,
+        'odometry': dict(zip(('way', 'turn', 'rate', 'scale'),
+                             odometry or (variance, variance, 0.0, 0.0), strict=True)),
+        **{name: others[name] for name in ('errors', 'n_otherwise', 'n_gone', 'next_estimate')
+           if name in others}}
+
+
+def _state_of_gyro(
+    *, width_ns: int, numbers: list[int], ids: list[int], edges: list[list[int]],
+) -> dict[str, Any]:
+    begins_ns = {node: number * width_ns for node, number in zip(ids, numbers, strict=True)}
+    return {
+        **_state(rows=[], ties=[], bins=None),
+        'edges': {'stamp_ns': [begins_ns[node] for _, node in edges],
+                  'id': [number for number, _ in edges]},
+        'bias': _chain({'width_ns': width_ns, 'numbers': numbers}, ids, len(ids) * [-1], 0)}
+
+
+def _chain(
+    bins: dict[str, Any], nodes: list[int], ties: list[int], anchor: int,
+) -> dict[str, Any]:
+    return {'begins_ns': [number * bins['width_ns'] for number in bins['numbers']],
+            'nodes': nodes, 'ties': ties[:len(nodes)], 'bin_ns': bins['width_ns'],
+            'anchor': nodes[anchor] if len(nodes) > 0 else -1}

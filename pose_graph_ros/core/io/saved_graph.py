@@ -21,8 +21,9 @@ from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.odometry.gyro import SavedGyro
 from pose_graph_ros.core.odometry.node_table import SavedNodes
 from pose_graph_ros.core.saved_columns import Matrix
-from pose_graph_ros.core.sources.gyro_bias import SavedGyroBias
-from pose_graph_ros.core.sources.source_constraints import SavedEdges, SavedSource
+from pose_graph_ros.core.sources.factor_builder import SourceState
+from pose_graph_ros.core.sources.pipeline import SavedStamps
+from pose_graph_ros.core.sources.queued import SavedQueue
 
 # Tolerances within which a datum equals that of the saved graph [m], [rad].
 SAME_PLACE = 0.01
@@ -37,11 +38,12 @@ class SavedGraph:
 
     rows: GraphRows
     nodes: SavedNodes
-    sources: Mapping[str, SavedSource]
+    sources: Mapping[str, SourceState]
+    seen: Mapping[str, SavedStamps]
     losses: SavedLosses
     alignment: SavedAlignment
-    waiting: SavedEdges  # edges for the next update
-    set_aside: SavedEdges  # after a failed solve, for the next full optimisation
+    waiting: SavedQueue  # constraints for the next update
+    set_aside: SavedQueue  # after a failed solve, for the next full optimisation
     judgement: SavedJudgement  # what is believed, and who has decided so
     # the same for people, of all closures and all that is not believed: a sentence by id
     verdicts: Mapping[str, str]
@@ -50,7 +52,6 @@ class SavedGraph:
     n_left_out: int  # received measurements that are neither in the graph nor saved
     datum: MapOrigin | None  # of the map, if it has one
     gyros: Mapping[str, SavedGyro] = field(default_factory=dict)
-    gyro_biases: Mapping[str, SavedGyroBias] = field(default_factory=dict)
     beacons: Mapping[str, int] = field(default_factory=dict)  # ids of their landmarks, by name
 
     @property

@@ -41,7 +41,7 @@ from pose_graph_ros.core.judgement.verdicts import (
 )
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.source_constraints import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 
 class ClosureJudge:

@@ -41,7 +41,7 @@ from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.saved_columns import Integers, Numbers
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.source_constraints import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ from pose_graph_ros.core.saved_columns import (
     Numbers,
     Pairs,
 )
-from pose_graph_ros.core.sources.source_constraints import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 # State of a constraint before it came.
 NEW = -1

@@ -19,7 +19,7 @@ from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.sources.gauss_markov import STRETCH
+from pose_graph_ros.core.sources.bias import STRETCH
 
 # Least sigmas of a measurement while it is judged, and a factor on its covariance: what is stated
 # is often too small [m], [rad].

@@ -20,7 +20,7 @@ that both claim.
 
 import bisect
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -187,11 +187,6 @@ class Turn(NamedTuple):
     rest_rate: float = 0.0  # mean rate at rest, which is the bias [rad/s]
     rest_variance: float = 0.0  # of that rate [rad^2/s^2]; 0 if the robot was not at rest
 
-    @property
-    def ends(self) -> tuple[int, ...]:
-        """Ids of the nodes that it is on."""
-        return self.i, self.j
-
 
 @dataclass(frozen=True, slots=True)
 class SavedGyro:
@@ -199,7 +194,6 @@ class SavedGyro:
 
     rates: tuple[YawRate, ...]  # from the last node on that was reached
     next_node: int  # number of the hidden node that the next rotation leads to
-    waiting: tuple[Turn, ...]  # rotations that are not in the graph yet
 
 
 class GyroStream(ReorderBuffer[YawRate]):
@@ -423,12 +417,10 @@ class Gyros:
                 return angle - bias * seconds, variance
         return None
 
-    def saved(self, waiting: Sequence[Turn]) -> dict[str, SavedGyro]:
-        """Return the state of each gyroscope, with the rotations that wait for an update."""
-        return {source: SavedGyro(
-            stream.samples, stream.next_node,
-            tuple(turn for turn in waiting if turn.source == source))
-            for source, stream in self.streams.items()}
+    def saved(self) -> dict[str, SavedGyro]:
+        """Return the state of each gyroscope."""
+        return {source: SavedGyro(stream.samples, stream.next_node)
+                for source, stream in self.streams.items()}
 
     def restore(self, source: str, saved: SavedGyro) -> None:
         """Restore the saved state of a gyroscope."""

@@ -26,7 +26,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.measurements import Range
-from pose_graph_ros.core.sources.source_constraints import QueuedEdge
+from pose_graph_ros.core.sources.queued import Queued
 
 HELD = 0.01  # sigma of a given place [m]
 LOOSE = 1000.0  # sigma of a start that is no measurement, relative to a node [m]
@@ -36,7 +36,7 @@ DRIFT = 0.02  # of the way between the points, as a share
 
 
 class WaitingRange(NamedTuple):
-    queued: QueuedEdge  # an edge to the landmark -1
+    queued: Queued  # an edge to the landmark -1
     measurement: Range
 
 
@@ -68,15 +68,15 @@ class Beacons:
 
     def take_ready(
         self, graph: Graph, apply: Callable[[GraphUpdate], bool], *, aligned: bool,
-    ) -> list[QueuedEdge]:
+    ) -> list[Queued]:
         """
         Take the ranges that can be added to the graph, after making the landmarks for them.
 
         `apply` changes the graph, and returns whether it could.
         """
-        ready: list[QueuedEdge] = []
+        ready: list[Queued] = []
         for beacon, ranges in [*self._waiting.items()]:
-            kept = [each for each in ranges if graph.node_rows(each.queued.edge.i)[0] >= 0]
+            kept = [each for each in ranges if graph.node_rows(each.queued.factor.i)[0] >= 0]
             for gone in ranges[:len(ranges) - len(kept)]:
                 self._counts[gone.queued.source, 'before_window'] += 1
             self._waiting[beacon] = kept
@@ -86,8 +86,8 @@ class Beacons:
                 if start is not None and apply(start):
                     self.ids[beacon] = landmark
             if beacon in self.ids:
-                ready += [each.queued._replace(edge=replace(
-                    each.queued.edge, j=np.array([self.ids[beacon]]))) for each in kept]
+                ready += [each.queued._replace(factor=replace(
+                    each.queued.factor, j=np.array([self.ids[beacon]]))) for each in kept]
             if beacon in self.ids or len(kept) == 0:
                 del self._waiting[beacon]
         return ready
@@ -106,7 +106,7 @@ class Beacons:
             return None
         # again when there are a fifth more; of the most that wait, with each
         self._next_try[beacon] = min(len(ranges) + len(ranges) // 5 + 1, MOST_WAITING)
-        edges = Factors.joined([each.queued.edge for each in ranges])
+        edges = Factors.joined([each.queued.factor for each in ranges])
         poses = graph.poses_of(edges.i)
         place = located(se2.transform(poses, edges.constants[:, :2]), edges.mean[:, 0],
                         1.0 / np.sqrt(edges.information[:, 0, 0]))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the constraints with the largest energies: source, stamp and hidden nodes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy as np
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.graph_view import DIAGONAL, factor_table, FactorTable
+from pose_graph_ros.core.measurements import Range
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.source_constraints import Queue
+from pose_graph_ros.core.sources.queued import Queued
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,41 +55,40 @@ def _named(
     number, factor = int(graph.factor_ids[row]), table.records[row]
     ends = factor['ends'][:2]
     ends = ends[ends >= 0]
-    ids = graph.node_ids[ends]
-    places = np.searchsorted(nodes.ids, ids[graph.is_pose[ends]]).tolist()
-    origin, of_bias = factors.origin(number), factors.bias_origin(int(ids[0]))
-    known = origin or of_bias
+    places = np.searchsorted(nodes.ids, graph.node_ids[ends[graph.is_pose[ends]]]).tolist()
     kind = FactorKind(int(factor['kind'])).name.lower()
-    if len(ends) == len(places) == 2:
-        i, j = np.searchsorted(nodes.ids, ids).tolist()
-        source = '' if origin is None else origin.source
-        if origin is None and factor['kind'] == FactorKind.ODOMETRY:
-            source = nodes.primary_at(int(nodes.stamps_ns[j]))
-        name = f'{source or kind} x{i} - x{j}'
+    origin, of_bias = factors.origin(number), factors.bias_origin(int(graph.node_ids[ends[0]]))
+    known = origin or of_bias
+    source = '' if origin is None else origin.source
+    if len(places) == 2:
+        if origin is None and kind == 'odometry':
+            source = nodes.primary_at(int(nodes.stamps_ns[places[1]]))
+        name = _name(source or kind, places)
+    elif len(places) == 1:
+        position, _, heading = factor['information'][DIAGONAL] > 0.0
+        if len(ends) == 1 or kind == 'bias':
+            kind = 'heading' if not position else 'global_pose' if heading else 'position'
+        name = _name(source or kind, places, -1 if origin is None else origin.stamp_ns)
     else:
-        if len(places) > 0:
-            position, _, heading = factor['information'][DIAGONAL] > 0.0
-            if len(ends) == 1 or factor['kind'] == FactorKind.BIAS:
-                kind = 'heading' if not position else 'global_pose' if heading else 'position'
-            where = f' near x{places[0]}'
-        else:
-            # one on a bias alone comes from no measurement and is named after the bias
-            origin, kind, where = of_bias, 'bias', ''
-        source, name = '', f'{kind}{where}'
-        if origin is not None:
-            source = origin.source
-            what = f'error of {source}' if kind == 'bias' else source
-            name = f'{what} at {origin.stamp_ns * 1e-9:.3f} s{where}'
+        # one on a bias alone comes from no measurement and is named after the bias
+        kind, source = 'bias', '' if of_bias is None else of_bias.source
+        name = kind if of_bias is None else _name(f'error of {source}', (), of_bias.stamp_ns)
     return ConstraintEnergy(
         energy, float(table.energies[row]), int(table.freedom[row]), source, kind, name,
         number, tuple(places), -1 if known is None else known.stamp_ns)
 
 
-def queued(queue: Queue, nodes: HiddenNodes) -> list[str]:
+def _name(what: str, places: Sequence[int], stamp_ns: int = -1) -> str:
+    """Return a readable name, as `ConstraintEnergy` has it."""
+    if len(places) == 2:
+        return '{} x{} - x{}'.format(what, *places)
+    return ''.join((what, f' at {stamp_ns * 1e-9:.3f} s' if stamp_ns >= 0 else '',
+                    *(f' near x{place}' for place in places)))
+
+
+def queued(queue: Sequence[Queued], nodes: HiddenNodes) -> list[str]:
     """Return the names of constraints that are not in the graph, as in `ConstraintEnergy`."""
-    ends = [(each.source, each.ends) for each in queue.edges]
-    ends += [(each.source, each.ends) for each in queue.turns]
-    return ['{} x{} - x{}'.format(source, *np.searchsorted(nodes.ids, pair).tolist())
-            for source, pair in ends] + [
-        f'{each.source} at {each.measurement.stamp_ns * 1e-9:.3f} s near '
-        f'x{int(np.searchsorted(nodes.ids, each.attachment.node))}' for each in queue.observed]
+    # a landmark is no node of the path
+    places = [each.nodes[:1 if each.measured is Range else 2] for each in queue]
+    return [_name(each.source, np.searchsorted(nodes.ids, of).tolist(), each.stamp_ns)
+            for each, of in zip(queue, places, strict=True)]

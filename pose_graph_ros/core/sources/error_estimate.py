@@ -30,6 +30,7 @@ from pose_graph_ros.core.graph.constraints import (
 )
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.error_likelihood import (
     chain_motions,
     filtered,
@@ -37,7 +38,6 @@ from pose_graph_ros.core.sources.error_likelihood import (
     no_past,
     PastPath,
 )
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
 from pose_graph_ros.core.sources.settings import SOURCES
 
 # Place of the noise of odometry in a point, from the end; that of turns, if way has its own.

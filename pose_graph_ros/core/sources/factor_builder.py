@@ -1,37 +1,135 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""From attached measurements to one update of the graph."""
+"""From queued constraints to one update of the graph, and what is kept of each source."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
+from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, PoseMeasurement
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.saved_columns import Records
 from pose_graph_ros.core.sources import source_report
-from pose_graph_ros.core.sources.gauss_markov import (
+from pose_graph_ros.core.sources.bias import (
     Additions,
     BiasChain,
     CorrelatedErrors,
-    GaussMarkovBias,
+    held_by_bias,
+    Process,
 )
-from pose_graph_ros.core.sources.gyro_bias import GyroBias
+from pose_graph_ros.core.sources.error_likelihood import PastPath
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
-from pose_graph_ros.core.sources.source_constraints import (
-    AttachedMeasurement,
-    ConstraintOrigin,
-    NewConstraint,
-    NO_NOISE,
-    Queue,
-    SavedSource,
-    SourceConstraints,
-)
 from pose_graph_ros.core.sources.source_report import SourceReport
+
+# A measurement in the map, or of a landmark: its stamp [ns], the id of what it was first added as,
+# that of the edge that holds it instead, or -1, and `Queued.noise`.
+MEASURED = np.dtype([('stamp_ns', 'i8'), ('id', 'i8'), ('held_by', 'i8'), ('noise', 'f8', 2)])
+# An edge between poses: `Queued.stamp_ns`, and its id.
+EDGE = np.dtype([('stamp_ns', 'i8'), ('id', 'i8')])
+
+
+@dataclass(slots=True)
+class SourceState:
+    """
+    What the graph has of one source; it is saved as it is.
+
+    A measurement whose error was found to be correlated keeps its observed node, with weight 0;
+    an edge to the bias holds it instead. So it can become white again, or get another bias. With a
+    given correlation time that edge is what it is added as.
+    """
+
+    measured: Annotated[GrowingArray, Records(MEASURED)] = field(
+        default_factory=lambda: GrowingArray((), MEASURED))
+    edges: Annotated[GrowingArray, Records(EDGE)] = field(
+        default_factory=lambda: GrowingArray((), EDGE))  # but those of primary odometry
+    bias: BiasChain | None = None  # of errors that are correlated, or of a gyroscope
+    errors: CorrelatedErrors | None = None  # found ones in use; None for white or given ones
+    n_otherwise: int = 0  # constraints of a loaded graph that were added under other settings
+    n_gone: int = 0  # number of measurements that have left the graph
+    past: PastPath | None = None  # their positions, where the errors are estimated
+    # number of measurements at which the errors are estimated next
+    next_estimate: int = SOURCES.least_positions
+    odometry: OdometryErrors = AS_CLAIMED  # errors of odometry that the measurements show
+
+    def __len__(self) -> int:
+        return len(self.measured)
+
+    @property
+    def n_ever(self) -> int:
+        """Number of measurements, with those that have left the graph."""
+        return len(self) + self.n_gone
+
+    def append(self, queued: Queued, number: int, held_by: int) -> None:
+        """Append a constraint: the id of what it was added as, and of the edge that holds it."""
+        if queued.measured is LoopClosure:
+            self.edges.append_one((queued.stamp_ns, number))
+        else:
+            self.measured.append_one((queued.stamp_ns, number, held_by, queued.noise.tolist()))
+
+    def leaving(self, factors: IntArray) -> BoolArray:
+        return np.isin(self.measured['id'], factors)
+
+    def oldest_ns(self, factors: IntArray) -> int | None:
+        """Return the stamp of the oldest constraint that stays once others leave; None without."""
+        stamps_ns = np.concatenate([
+            table['stamp_ns'][~np.isin(table['id'], factors)]
+            for table in (self.measured, self.edges)])
+        return int(np.min(stamps_ns)) if len(stamps_ns) > 0 else None
+
+    def forget(self, nodes: IntArray, factors: IntArray) -> IntArray:
+        """Return the numbers of the measurements that are left, after forgetting the others."""
+        kept = np.flatnonzero(~self.leaving(factors))
+        self.n_gone += len(self) - len(kept)
+        for table in (self.measured, self.edges):
+            gone = np.isin(table['id'], factors)
+            if np.any(gone):
+                table.select(np.flatnonzero(~gone))
+        if self.bias is not None:
+            self.bias = self.bias.without(nodes)
+        return kept
+
+    def held(self, which: IntArray | slice = slice(None)) -> IntArray:
+        """Return the ids of the factors that hold some measurements."""
+        some = self.measured.values[which]
+        return np.where(some['held_by'] >= 0, some['held_by'], some['id'])
+
+    def are_used(self, graph: Graph, weights: FloatArray | None = None) -> BoolArray:
+        """Tell which measurements have a weight, in the graph or given by row."""
+        weights = graph.weights if weights is None else weights
+        return np.asarray(weights[graph.factor_rows(self.held())] > 0.0)
+
+
+class Origin(NamedTuple):
+    """The measurement that a constraint was made from, or the bin of a bias."""
+
+    source: str
+    stamp_ns: int  # [ns]; -1 for an edge between poses
+
+
+class NewConstraint(NamedTuple):
+    """A constraint in the update that was built last."""
+
+    number: int  # its id
+    source: str
+    stamp_ns: int  # of the measurement [ns]; -1 for an edge of odometry
+    kind: type[PoseMeasurement]  # `LoopClosure` for all edges between poses
+    reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
+    held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
+
+    @property
+    def held(self) -> int:
+        """Id of the factor that holds it."""
+        return self.held_by if self.held_by >= 0 else self.number
 
 
 class FactorBuilder:
@@ -39,274 +137,256 @@ class FactorBuilder:
     Builds updates of the graph from queues of constraints.
 
     A measurement with a white error becomes an observed node. If the errors of its source are
-    correlated in time, it becomes an edge to a state of the source's bias (`GaussMarkovBias`).
-    Once the graph has taken the update, the constraints are registered for reweighting, and the
-    source of each is recorded.
+    correlated in time, it becomes an edge to a state of the source's bias. Nothing is changed
+    before `commit` says that the graph has taken the update: then the constraints are registered
+    for reweighting and with their sources.
     """
 
     def __init__(self, config: BackendConfig, reweighting: Reweighting) -> None:
         self.config = config    # for later updates; error models keep their own settings
         self._reweighting = reweighting
-        # of the sources whose errors are correlated in time
-        self._error_models: dict[str, GaussMarkovBias] = {}
-        self._constraints: dict[str, SourceConstraints] = {}
-        self._pose_edges: dict[str, GrowingArray] = {}  # ids of the edges between poses, by source
+        self.sources: dict[str, SourceState] = {}
         self.new: list[NewConstraint] = []  # constraints of the update that was built last
-        # biases of gyroscopes, and the edges of their rotations
-        self.gyros: dict[str, GyroBias] = {}
+        # what it was built from, as far as a source keeps it, and the chains that it makes
+        self._queued: list[Queued] = []
+        self._chains: dict[str, BiasChain] = {}
         self._abandoned: list[int] = []  # ids of biases that hold no measurement any more
-
-    @property
-    def _chains(self) -> list[tuple[str, BiasChain]]:
-        return [*self._error_models.items(), *self.gyros.items()]
+        # of each source the newest report, and the number of measurements when it was made, 0 if
+        # none of them was used
+        self._reports: dict[str, tuple[SourceReport, int]] = {}
 
     @property
     def n_measurements(self) -> int:
         """Number of measurements in the graph, without loop closures."""
-        return sum(len(each) + each.n_otherwise for each in self._constraints.values())
+        return sum(len(each) + each.n_otherwise for each in self.sources.values())
 
-    def build(self, queue: Queue, graph: Graph) -> GraphUpdate:
-        """
-        Return the update that adds a queue to the graph, to be followed by `commit` or `rollback`.
-        """
+    def build(self, queue: Sequence[Queued], graph: Graph) -> GraphUpdate:
+        """Return the update that adds a queue to the graph, to be followed by `commit`."""
         additions = Additions(graph.next_ids)
-        for _, chain in self._chains:
-            chain.begin()
-        self.new = [
-            NewConstraint(additions.add(edge), source, stamp_ns, kind, reference)
-            for source, edge, stamp_ns, reference, kind in queue.edges]
-        self.new += [self._add(attached, additions) for attached in sorted(
-            queue.observed, key=lambda attached: attached.measurement.stamp_ns)]
-        for turn in sorted(queue.turns, key=lambda turn: turn.stamp_ns):
-            self.gyro_bias(turn.source).add(turn, graph, additions)
+        queue = sorted(queue, key=_order)
+        self._chains = self._with_bins(queue, graph, additions)
+        self.new, self._queued = [], []
+        for queued in queue:
+            source, factor, edge = queued.source, queued.factor, None
+            errors = self._errors(queued) if queued.is_in_map else None
+            if errors is not None:
+                edge = held_by_bias(queued, self._chains[source], errors)
+                if not self._settings(source, queued.measured).finds_correlation:
+                    factor, edge = edge, None
+            elif queued.needs_bias:
+                factor = queued.on_bias(self._chains[source].state(queued.stamp_ns))
+            number = int(additions.add(factor if edge is None else factor.weighted(0.0))[0])
+            if len(queued.nodes) == 0:
+                continue    # it has a say on the bias alone
+            self._queued.append(queued)
+            self.new.append(NewConstraint(
+                number, source, queued.stamp_ns, queued.measured, queued.reference_ns,
+                -1 if edge is None else int(additions.add(edge)[0])))
         return additions.update()
 
-    def _add(self, attached: AttachedMeasurement, additions: Additions) -> NewConstraint:
-        """Add a measurement to an update, as the errors of its source ask for."""
-        source, observed, measurement, *_ = attached
-        kind, stamp_ns = type(measurement), measurement.stamp_ns
-        settings = self.config.measurement_source(source, kind)
-        model = self._error_model(source, settings)
-        noise = NO_NOISE if settings.correlation_time == 0.0 else attached.noise
-        if model is None:
-            return NewConstraint(
-                additions.add(observed), source, stamp_ns, kind, noise=noise)
-        if not settings.finds_correlation:
-            return NewConstraint(
-                model.add(stamp_ns, observed, noise, additions), source, stamp_ns, kind)
-        added = additions.add(observed.weighted(0.0))
-        edge = model.add(stamp_ns, observed, noise, additions)
-        return NewConstraint(added, source, stamp_ns, kind, noise=noise, held_by=edge)
+    def _with_bins(
+        self, queue: Sequence[Queued], graph: Graph, additions: Additions,
+    ) -> dict[str, BiasChain]:
+        """Return the chains of sources with the states that a queue needs, which are added."""
+        needed: dict[tuple[str, Process], list[Queued]] = {}
+        for queued in queue:
+            errors = self._errors(queued) if queued.is_in_map else None
+            if errors is not None:
+                process = Process.correlated(errors)
+            elif queued.needs_bias:
+                process = Process.of_gyro(self.config.gyro(queued.source))
+            else:
+                continue
+            needed.setdefault((queued.source, process), []).append(queued)
+        chains = {}
+        for (source, process), some in needed.items():
+            known, value = self._state(source).bias, np.zeros(3)
+            chain = BiasChain() if known is None else known
+            if len(process.growth) > 0 and len(chain) > 0:
+                value = graph.poses_of(chain.nodes[-1])
+            elif len(process.growth) > 0:
+                value = next((each.factor.mean[0] for each in some if len(each.nodes) == 0), value)
+            stamps_ns = np.array([each.stamp_ns for each in some])
+            chains[source] = chain.with_bins(stamps_ns, process, additions, value)
+        return chains
 
-    def gyro_bias(self, source: str) -> GyroBias:
-        """Return the bias of a gyroscope, which may be new."""
-        return self.gyros.setdefault(source, GyroBias(self.config.gyro(source)))
+    def commit(self) -> None:
+        for queued, new in zip(self._queued, self.new, strict=True):
+            self.sources.setdefault(new.source, SourceState()).append(
+                queued, new.number, new.held_by)
+            if queued.needs_bias:
+                continue    # a rotation has no loss
+            odometry = self.config.odometry.get(new.source) if new.stamp_ns < 0 else None
+            settings = odometry or self._settings(new.source, new.kind)
+            loss = (settings.loss if isinstance(settings, OdometrySource)
+                    else settings.applied_loss)
+            threshold = settings.rejection_threshold
+            self._reweighting.add(new.number, loss, threshold)
+            if new.held_by >= 0:
+                self._reweighting.add(new.held_by, loss, threshold)
+                self._reweighting.set_base_weight(new.number, 0.0)
+        for source, chain in self._chains.items():
+            self.sources.setdefault(source, SourceState()).bias = chain
+
+    def _settings(
+        self, source: str, kind: type[PoseMeasurement] = GlobalPose,
+    ) -> MeasurementSource:
+        return self.config.measurement_source(source, kind)
+
+    def _state(self, source: str) -> SourceState:
+        return self.sources.get(source, SourceState())
+
+    def has(self, source: str) -> bool:
+        """Tell whether a source has, or had, measurements in the map."""
+        state = self._state(source)
+        return state.n_ever + state.n_otherwise > 0
+
+    def _errors(self, queued: Queued) -> CorrelatedErrors | None:
+        """Return the correlated errors that a measurement is treated with; None for white ones."""
+        settings = self._settings(queued.source, queued.measured)
+        return (self._state(queued.source).errors if settings.finds_correlation
+                else _given(settings))
+
+    def preview(self, queued: Queued) -> Factors:
+        """Return a measurement as an edge to the last state of the bias before it, or to -1."""
+        return held_by_bias(queued, self._state(queued.source).bias, self._errors(queued))
+
+    def errors_in_use(self, source: str) -> CorrelatedErrors | None:
+        """Return the statistics of the errors of a source in use; None for white errors."""
+        state = self._state(source)
+        if state.bias is None or state.errors is not None:
+            return state.errors
+        return _given(self._settings(source))
+
+    def set_errors(
+        self, source: str, errors: CorrelatedErrors | None, bias: BiasChain | None,
+    ) -> None:
+        """Treat the measurements of a source with other errors, whose bias is in the graph."""
+        state = self.sources[source]
+        self.abandon(state.bias)
+        state.errors, state.bias = errors, bias
+        self._reports.pop(source, None)
+
+    def abandon(self, bias: BiasChain | None) -> None:
+        """Let the states of a bias that holds no measurement leave with the next nodes."""
+        self._abandoned += [] if bias is None else bias.nodes.tolist()
 
     def gyro_rates(self, graph: Graph) -> dict[str, float]:
         """Return the newest estimate of the bias of each gyroscope [rad/s]."""
-        rows = {source: int(graph.node_rows(bias.newest)) for source, bias in self.gyros.items()}
-        return {source: float(graph.poses[row, 0]) for source, row in rows.items() if row >= 0}
-
-    def error_model(self, source: str) -> GaussMarkovBias | None:
-        """Return the model of the errors of a source in use; None for white errors."""
-        return self._error_models.get(source)
-
-    def _error_model(
-        self, source: str, settings: MeasurementSource,
-    ) -> GaussMarkovBias | None:
-        """Return the model of the correlated errors of a source; None for white errors."""
-        if settings.correlation_time == 0.0:
-            return None
-        if source not in self._error_models and not settings.finds_correlation:
-            self._error_models[source] = GaussMarkovBias(
-                CorrelatedErrors(settings.correlation_time, 1.0, SOURCES.white_share))
-        return self._error_models.get(source)
+        chains = {source: state.bias for source, state in self.sources.items()
+                  if not self.has(source)}
+        return {source: float(graph.poses_of(chain.nodes[-1])[0])
+                for source, chain in chains.items() if chain is not None and len(chain) > 0}
 
     def finding(self) -> list[str]:
         """Return the sources whose errors are estimated and that have measurements."""
-        return [source for source, constraints in self._constraints.items()
-                if constraints.n_ever >= SOURCES.least_positions
+        return [source for source, state in self.sources.items()
+                if state.n_ever >= SOURCES.least_positions
                 and self._settings(source).finds_correlation]
 
     def due_for_estimate(self) -> list[str]:
         """Return those of `finding` with enough new measurements for another estimate."""
-        return [source for source in self.finding() if self._constraints[source].n_ever
-                >= self._constraints[source].next_estimate]
+        return [source for source in self.finding()
+                if self.sources[source].n_ever >= self.sources[source].next_estimate]
 
-    def has(self, source: str) -> bool:
-        return source in self._constraints
-
-    def constraints(self, source: str) -> SourceConstraints:
-        return self._constraints[source]
-
-    def pose_edges(self) -> dict[str, IntArray]:
+    def edges(self) -> dict[str, IntArray]:
         """Return the ids of the edges between poses, by source, without primary odometry."""
-        return {source: edges.values for source, edges in self._pose_edges.items()}
+        return {source: state.edges['id'] for source, state in self.sources.items()
+                if len(state.edges) > 0}
 
     def held(self) -> dict[str, tuple[IntArray, IntArray]]:
         """Return the stamps of all measurements in the map [ns], and ids of what holds them."""
-        return {source: (each.rows.values[:, 0], each.held())
-                for source, each in self._constraints.items()}
-
-    def errors_in_use(self, source: str) -> CorrelatedErrors | None:
-        """Return the statistics of the errors of a source in use; None for white errors."""
-        model = self._error_models.get(source)
-        return None if model is None or model.errors.tau == 0.0 else model.errors
-
-    def set_error_model(self, source: str, model: GaussMarkovBias | None) -> None:
-        old = self._error_models.pop(source, None)
-        if old is not None:
-            self.abandon(old)
-        if model is not None:
-            model.begin()   # what it has by now is in the graph
-            self._error_models[source] = model
-        self._constraints[source].n_reported = 0
-
-    def abandon(self, model: GaussMarkovBias) -> None:
-        """Let the states of a bias that holds no measurement leave with the next nodes."""
-        self._abandoned += model.nodes
+        return {source: (state.measured['stamp_ns'], state.held())
+                for source, state in self.sources.items() if self.has(source)}
 
     def leaving_biases(
-        self, factors: IntArray, others: Mapping[str, GaussMarkovBias],
+        self, factors: IntArray, others: Mapping[str, BiasChain],
     ) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned]
-        for gyro in self.gyros.values():
-            biases += gyro.leaving(factors)
-        for source, constraints in self._constraints.items():
-            models = [each[source] for each in (self._error_models, others) if source in each]
-            left = constraints.rows.values[~constraints.leaving(factors), 0]
-            oldest_ns = int(np.min(left)) if len(left) > 0 else None
-            for model in models:
-                biases += model.leaving(oldest_ns)
+        for source, state in self.sources.items():
+            oldest_ns = state.oldest_ns(factors)
+            for chain in (state.bias, others.get(source)):
+                biases += [] if chain is None else chain.leaving(oldest_ns)
         return biases
 
     def forget(self, nodes: IntArray, factors: IntArray) -> dict[str, IntArray]:
         """Return the numbers of the measurements that are left, after forgetting the others."""
-        gone, kept = {*nodes.tolist()}, {}
-        for _, chain in self._chains:
-            chain.forget(gone)
-        for gyro in self.gyros.values():
-            gyro.forget_factors(factors)
+        gone = {*nodes.tolist()}
         self._abandoned = [node for node in self._abandoned if node not in gone]
-        for source, constraints in self._constraints.items():
-            kept[source] = constraints.forget(constraints.leaving(factors))
-        for known in self._pose_edges.values():
-            known.select(np.flatnonzero(~np.isin(known.values, factors)))
-        return kept
+        return {source: state.forget(nodes, factors) for source, state in self.sources.items()}
 
-    def rollback(self) -> None:
-        for _, chain in self._chains:
-            chain.rollback()
-
-    def commit(self) -> None:
-        for number, source, stamp_ns, kind, _, noise, held_by in self.new:
-            odometry = self.config.odometry.get(source) if stamp_ns < 0 else None
-            settings = odometry or self.config.measurement_source(source, kind)
-            loss = (settings.loss if isinstance(settings, OdometrySource)
-                    else settings.applied_loss)
-            threshold = settings.rejection_threshold
-            self._reweighting.add(number, loss, threshold)
-            if held_by >= 0:
-                self._reweighting.add(held_by, loss, threshold)
-                self._reweighting.set_base_weight(number, 0.0)
-            if kind is not LoopClosure:
-                constraints = self._constraints.setdefault(source, SourceConstraints())
-                constraints.append(stamp_ns, number, noise, held_by)
-            else:
-                edges = self._pose_edges.setdefault(source, GrowingArray((), np.int64))
-                edges.append_one(number)
-        # from here on there is nothing that `rollback` could forget
-        for _, chain in self._chains:
-            chain.begin()
-
-    def origin(self, number: int) -> ConstraintOrigin | None:
+    def origin(self, number: int) -> Origin | None:
         """Return where a constraint comes from; None if this builder has not added it."""
-        for source, constraints in self._constraints.items():
-            stamp_ns = constraints.stamp_ns(number)
-            if stamp_ns is not None:
-                return ConstraintOrigin(source, stamp_ns)
-        for source, edges in self._pose_edges.items():
-            at = int(np.searchsorted(edges.values, number))
-            if at < len(edges) and edges.values[at] == number:
-                return ConstraintOrigin(source, -1)
-        for source, gyro in self.gyros.items():
-            if number in gyro.edges:
-                return ConstraintOrigin(source, -1)
+        for source, state in self.sources.items():
+            some = state.measured.values
+            for row in some[(some['id'] == number) | (some['held_by'] == number)]:
+                return Origin(source, int(row['stamp_ns']))
+            if number in state.edges['id']:
+                return Origin(source, -1)
         return None
 
-    def bias_origin(self, node: int) -> ConstraintOrigin | None:
+    def bias_origin(self, node: int) -> Origin | None:
         """Return the source of a bias, by its id, and when its bin begins."""
-        for source, chain in self._chains:
-            begin_ns = chain.begin_ns(node)
-            if begin_ns is not None:
-                return ConstraintOrigin(source, begin_ns)
+        for source, state in self.sources.items():
+            if state.bias is not None and node in state.bias.nodes:
+                at = np.flatnonzero(state.bias.nodes == node)[0]
+                return Origin(source, int(state.bias.begins_ns[at]))
         return None
 
-    def saved(self) -> dict[str, SavedSource]:
-        """Return the state of each source, with empty `seen_ns` and `seen_references`."""
-        result, none = {}, np.empty(0, dtype=np.int64)
-        for source in dict.fromkeys((*self._constraints, *self._pose_edges)):
-            model = self._error_models.get(source)
-            constraints = self._constraints.get(source, SourceConstraints())
-            edges = self._pose_edges.get(source, GrowingArray((), np.int64))
-            saved = SavedSource(
-                none, none, constraints.rows.values.copy(), constraints.n_otherwise,
-                edges.values.copy(),
-                None if model is None else model.saved(),
-                n_gone=constraints.n_gone)
-            if self._settings(source).finds_correlation:
-                saved = replace(
-                    saved, errors=self.errors_in_use(source),
-                    noise=constraints.noise.values.copy(), edges=constraints.edges.values.copy(),
-                    next_estimate=constraints.next_estimate,
-                    odometry=np.array(constraints.odometry), past=constraints.past)
-            result[source] = saved
-        return result
+    def saved(self) -> dict[str, SourceState]:
+        """Return a copy of the state of each source."""
+        return deepcopy(self.sources)
 
-    def restore(self, source: str, saved: SavedSource) -> None:
+    def restore(self, saved: Mapping[str, SourceState]) -> None:
         """
-        Restore the state of a source from what `saved` has returned.
+        Restore what `saved` has returned.
 
-        If its settings now ask for another error model, its constraints stay in the graph as they
-        are, and new measurements start a model of their own.
+        If the settings of a source now ask for another error model, its constraints stay in the
+        graph as they are, and new measurements start a model of their own.
         """
-        if len(saved.ties) > 0:
-            self._pose_edges[source] = GrowingArray((), np.int64)
-            self._pose_edges[source].append(saved.ties)
-        if len(saved.rows) + saved.n_otherwise == 0:
-            return
-        settings = self._settings(source)
-        if settings.finds_correlation and saved.errors is not None:
-            self._error_models[source] = GaussMarkovBias(saved.errors)
-        model = self._error_model(source, settings)
-        if model is None:
-            same = saved.bins is None
-        else:
-            same = saved.bins is not None and model.restore(saved.bins)
-        if not same and settings.finds_correlation:
-            self._error_models.pop(source, None)
-        same = same and settings.finds_correlation >= (saved.errors is not None)
-        self._constraints[source] = constraints = SourceConstraints()
-        if same:
-            constraints.restore(saved)
-        constraints.n_otherwise = saved.n_otherwise + len(saved.rows) - len(constraints)
-
-    def _settings(self, source: str) -> MeasurementSource:
-        return self.config.measurement_source(source, GlobalPose)
+        self.sources = deepcopy({**saved})
+        for source, state in self.sources.items():
+            if not self.has(source):
+                continue
+            settings = self._settings(source)
+            errors = state.errors if settings.finds_correlation else _given(settings)
+            wanted_ns, bin_ns = (
+                0 if errors is None else Process.correlated(errors).bin_ns,
+                0 if state.bias is None else state.bias.bin_ns)
+            found = state.errors is not None
+            if bin_ns != wanted_ns or found > settings.finds_correlation:
+                self.sources[source] = SourceState(
+                    edges=state.edges, n_otherwise=state.n_otherwise + len(state))
 
     def reports(self, graph: Graph) -> dict[str, SourceReport]:
         """Return how well the newest measurements of each source fit the estimate."""
-        for source, constraints in self._constraints.items():
-            n, before = constraints.n_ever, constraints.n_reported
-            if n - before > SOURCES.more_residuals * min(len(constraints), before):
-                constraints.report = self.report(source, graph)
-                constraints.n_reported = n if constraints.report.n > 0 else 0
-        return {source: each.report for source, each in self._constraints.items()
-                if each.report is not None and each.report.energy > 0.0}
+        for source, state in self.sources.items():
+            _, before = self._reports.get(source, (None, 0))
+            if state.n_ever - before > SOURCES.more_residuals * min(len(state), before):
+                report = self.report(source, graph)
+                self._reports[source] = report, state.n_ever if report.n > 0 else 0
+        return {source: report for source, (report, _) in self._reports.items()
+                if report.energy > 0.0}
 
     def report(self, source: str, graph: Graph) -> SourceReport:
-        constraints = self._constraints[source]
+        """Return how well the newest measurements of a source fit the estimate."""
+        state = self.sources[source]
+        used = state.measured.values[state.are_used(graph)]
         return source_report.report(
-            graph, constraints.rows.values[constraints.are_used(graph)],
-            in_use=self.errors_in_use(source), found=self._settings(source).finds_correlation)
+            graph, used['stamp_ns'], used['id'], in_use=self.errors_in_use(source),
+            found=self._settings(source).finds_correlation)
+
+
+def _given(settings: MeasurementSource) -> CorrelatedErrors | None:
+    """Return the statistics of errors with a given time constant; None without."""
+    if settings.finds_correlation or settings.correlation_time == 0.0:
+        return None
+    return CorrelatedErrors(settings.correlation_time, 1.0, SOURCES.white_share)
+
+
+def _order(queued: Queued) -> tuple[int, int]:
+    """Sort by kind, and by stamp but for closures and odometry."""
+    if queued.needs_bias:
+        return 2, queued.stamp_ns
+    return (1, queued.stamp_ns) if queued.is_in_map else (0, 0)

@@ -37,7 +37,7 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.sources.beacons import Beacons, WaitingRange
-from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement, Queue, QueuedEdge
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.validation import (
     check_closure,
     check_heading,
@@ -52,7 +52,7 @@ class Target(Protocol):
     """Where constraints go, and what they are attached to."""
 
     nodes: HiddenNodes
-    queue: Queue
+    queue: list[Queued]
     beacons: Beacons
 
 
@@ -135,8 +135,7 @@ def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | A
 def _observe(
     measurement: Absolute, source: str, attachment: Attachment, to: Target,
 ) -> Answer:
-    factors, noise = observed(measurement, attachment)
-    to.queue.observed.append(AttachedMeasurement(source, factors, measurement, attachment, noise))
+    to.queue.append(observed(source, measurement, attachment))
     return ACCEPTED
 
 
@@ -157,7 +156,7 @@ def _join(closure: LoopClosure, source: str, attachment: Attachment, to: Target)
     reference_ns = closure.reference_ns
     if reference_ns is None:
         reference_ns = int(to.nodes.stamps_ns[closure.reference_node])
-    to.queue.edges.append(QueuedEdge(
+    to.queue.append(Queued(
         source, loop_closure_constraint(closure, reference, attachment), closure.stamp_ns,
         reference_ns))
     return ACCEPTED
@@ -171,21 +170,18 @@ def _reach(measurement: Range, source: str, attachment: Attachment, to: Target) 
         [np.diag((1.0 / variance, 0.0, 0.0))], [FactorKind.RANGE],
         constants=[(antenna[0], antenna[1], 0.0, 0.0)])
     to.beacons.add(WaitingRange(
-        QueuedEdge(source, edge, measurement.stamp_ns, kind=Range), measurement))
+        Queued(source, edge, measurement.stamp_ns), measurement))
     return ACCEPTED
 
 
 # --- their constraints
 
-def observed(measurement: Absolute, attachment: Attachment) -> tuple[Factors, FloatArray]:
-    """
-    Return the observed node of a measurement in the map.
-
-    With it come the variances of position and heading that the motion since the node adds.
-    """
+def observed(source: str, measurement: Absolute, attachment: Attachment) -> Queued:
+    """Return the constraint of a measurement in the map, if its error is treated as white."""
     of_kind = KINDS[type(measurement)].observed
     assert of_kind is not None, 'it is in the map'
-    return of_kind(measurement, attachment)
+    factor, noise = of_kind(measurement, attachment)
+    return Queued(source, factor, measurement.stamp_ns, noise=noise)
 
 
 def _observed_position(

@@ -4,15 +4,16 @@
 
 from array import array
 import bisect
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.measurements import (
     Absolute,
     Answer,
@@ -27,10 +28,11 @@ from pose_graph_ros.core.odometry.gyro import Gyros
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer
+from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.beacons import Beacons
-from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, validate
+from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, observed, validate
+from pose_graph_ros.core.sources.queued import Queued, turn
 from pose_graph_ros.core.sources.settings import SOURCES
-from pose_graph_ros.core.sources.source_constraints import Queue
 
 
 class WaitingMeasurement(NamedTuple):
@@ -76,15 +78,21 @@ class WaitingMeasurements:
         return bisect.bisect_right(self._waiting, stamp_ns, key=lambda each: each.due_ns)
 
 
-_NO_STAMPS: 'array[int]' = array('q')
+@dataclass(frozen=True, slots=True)
+class SavedStamps:
+    """Stamps of the measurements of a source that were seen [ns], ascending, and references."""
+
+    stamps_ns: Integers
+    references: Integers
 
 
 class SeenStamps:
     """Stamps and references of the measurements seen so far, by source; 16 bytes each."""
 
     def __init__(self) -> None:
-        self._stamps: dict[str, array[int]] = {}
-        self._references: dict[str, array[int]] = {}
+        # sorted stamps [ns], and a reference for each
+        self._seen = defaultdict[str, tuple['array[int]', 'array[int]']](
+            lambda: (array('q'), array('q')))
 
     def has(self, source: str, measurement: PoseMeasurement) -> bool:
         """Tell whether a measurement with the same stamp and reference was added."""
@@ -92,54 +100,48 @@ class SeenStamps:
 
     def near(self, source: str, stamp_ns: int, period_ns: int) -> bool:
         """Tell whether the source has a stamp closer than a period to a given one."""
-        stamps = self._stamps.get(source, _NO_STAMPS)
-        at = bisect.bisect_left(stamps, stamp_ns)
-        return ((at > 0 and stamp_ns - stamps[at - 1] < period_ns)
-                or (at < len(stamps) and stamps[at] - stamp_ns < period_ns))
+        stamps, _ = self._seen[source]
+        at = bisect.bisect_right(stamps, stamp_ns - period_ns)
+        return at < len(stamps) and stamps[at] < stamp_ns + period_ns
 
     def add(self, source: str, measurement: PoseMeasurement) -> None:
-        stamps = self._stamps.setdefault(source, array('q'))
+        stamps, references = self._seen[source]
         at = bisect.bisect_right(stamps, measurement.stamp_ns)
         stamps.insert(at, measurement.stamp_ns)
-        self._references.setdefault(source, array('q')).insert(at, key(measurement))
+        references.insert(at, key(measurement))
 
     def remove(self, source: str, measurement: PoseMeasurement) -> None:
         at = self._find(source, measurement)
-        if at >= 0:
-            del self._stamps[source][at], self._references[source][at]
+        for column in self._seen[source] if at >= 0 else ():
+            del column[at]
 
     def forget(self, before_ns: int) -> None:
         """Forget all stamps before one [ns]: such measurements are refused for another reason."""
-        for source, stamps in self._stamps.items():
+        for stamps, references in self._seen.values():
             n = bisect.bisect_left(stamps, before_ns)
-            del stamps[:n], self._references[source][:n]
+            del stamps[:n], references[:n]
 
-    def saved(
-        self, without: list[tuple[str, PoseMeasurement]],
-    ) -> dict[str, tuple[IntArray, IntArray]]:
-        """Return stamps and references, shape (M,) each, by source, without some measurements."""
-        left_out: dict[str, list[int]] = {}
+    def saved(self, without: list[tuple[str, PoseMeasurement]]) -> dict[str, SavedStamps]:
+        """Return stamps and references, by source, without some measurements."""
+        rows = defaultdict[str, list[int]](list)
         for source, measurement in without:
-            left_out.setdefault(source, []).append(self._find(source, measurement))
-        result = {}
-        for source, stamps in self._stamps.items():
-            rows = [at for at in left_out.get(source, ()) if at >= 0]
-            result[source] = (np.delete(np.array(stamps), rows),
-                              np.delete(np.array(self._references[source]), rows))
-        return result
+            if (at := self._find(source, measurement)) >= 0:
+                rows[source].append(at)
+        return {source: SavedStamps(*(
+            np.delete(np.array(column, dtype=np.int64), rows[source]) for column in columns))
+            for source, columns in self._seen.items()}
 
-    def restore(self, source: str, stamps_ns: IntArray, references: IntArray) -> None:
-        self._stamps[source] = array('q', stamps_ns.tolist())
-        self._references[source] = array('q', references.tolist())
+    def restore(self, saved: Mapping[str, SavedStamps]) -> None:
+        for source, each in saved.items():
+            self._seen[source] = (
+                array('q', each.stamps_ns.tolist()), array('q', each.references.tolist()))
 
     def _find(self, source: str, measurement: PoseMeasurement) -> int:
-        stamps = self._stamps.get(source)
-        if stamps is None:
-            return -1
-        begin = bisect.bisect_left(stamps, measurement.stamp_ns)
-        end = bisect.bisect_right(stamps, measurement.stamp_ns)
-        own, references = key(measurement), self._references[source]
-        return next((at for at in range(begin, end) if references[at] == own), -1)
+        stamps, references = self._seen[source]
+        same = range(bisect.bisect_left(stamps, measurement.stamp_ns),
+                     bisect.bisect_right(stamps, measurement.stamp_ns))
+        own = key(measurement)
+        return next((at for at in same if references[at] == own), -1)
 
 
 class MeasurementPipeline:
@@ -152,7 +154,7 @@ class MeasurementPipeline:
         # measurements that wait for odometry to reach their stamps
         self.waiting = WaitingMeasurements()
         self.seen = SeenStamps()  # stamps of the measurements that were accepted or wait
-        self.queue = Queue()  # constraints for the next update
+        self.queue: list[Queued] = []  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
         self.counts: Counter[tuple[str, str]] = Counter()
         self.beacons = Beacons(self.counts)  # and the ranges that wait for them
@@ -182,7 +184,7 @@ class MeasurementPipeline:
         """Make the rotations that are due, and count what happened to the rates."""
         gyros = self.gyros
         gyros.extend()
-        self.queue.turns += gyros.new
+        self.queue += itertools.chain.from_iterable(map(turn, gyros.new))
         gyros.new.clear()
         self.counts.update(gyros.counts)
         gyros.counts.clear()
@@ -238,43 +240,36 @@ class MeasurementPipeline:
         attachment = attach(self.nodes, measurement.stamp_ns)
         if isinstance(attachment, Answer):
             return attachment
-        return KINDS[type(measurement)].attach(
-            measurement, source, attachment, self)
+        return KINDS[type(measurement)].attach(measurement, source, attachment, self)
 
     def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
         """Attach a measurement to a hidden node, with no motion in between."""
-        KINDS[type(measurement)].attach(
-            measurement, source, Attachment(node, np.zeros(3), np.zeros((3, 3))), self)
+        self.queue.append(observed(
+            source, measurement, Attachment(node, np.zeros(3), np.zeros((3, 3)))))
 
-    def take_ready(self, *, aligned: bool) -> Queue:
+    def take_ready(self, *, aligned: bool) -> list[Queued]:
         """
         Take the constraints out of the queue that can be added to the graph.
 
-        If the graph is not aligned with the map, observed nodes stay in the queue; the oldest ones
-        beyond `most_unaligned` are dropped and counted.
+        If the graph is not aligned with the map, measurements in it stay in the queue; the oldest
+        ones beyond `most_unaligned` are dropped and counted.
         """
-        ready = Queue(edges=self.queue.edges, turns=self.queue.turns)
-        self.queue.edges, self.queue.turns = [], []
-        if aligned:
-            ready.observed, self.queue.observed = self.queue.observed, []
-        else:
-            # bounds the memory of a robot that is not aligned for days
-            excess = self.queue.observed[:-SOURCES.most_unaligned]
-            del self.queue.observed[:len(excess)]
-            self.counts.update((dropped.source, 'dropped_unaligned') for dropped in excess)
+        waiting = [] if aligned else [each for each in self.queue if each.is_in_map]
+        ready = [each for each in self.queue if aligned or not each.is_in_map]
+        # bounds the memory of a robot that is not aligned for days
+        self.queue = waiting[-SOURCES.most_unaligned:]
+        excess = waiting[:len(waiting) - len(self.queue)]
+        self.counts.update((dropped.source, 'dropped_unaligned') for dropped in excess)
         return ready
 
-    def needed_ns(self, *, aligned: bool) -> int | None:
-        """Return the earliest stamp that something is attached at, or may align [ns]."""
+    @property
+    def needed_ns(self) -> int | None:
+        """Earliest stamp that something is attached at, or may align [ns]; None without one."""
         needed = [stamp_ns for _, measurement in self.waiting.measurements
                   for stamp_ns in self._stamps_of(measurement)]
-        for edge in self.queue.edges:
-            needed += [stamp_ns for stamp_ns in (edge.stamp_ns, edge.reference_ns)
-                       if stamp_ns >= 0]
-        if not aligned:
-            needed += [each.measurement.stamp_ns for each in self.queue.observed
-                       if each.is_placed]
-        begin_ns = self.nodes.last_frozen_ns
+        needed += [stamp_ns for each in self.queue if each.factor.kind[0] != FactorKind.HEADING
+                   for stamp_ns in (each.stamp_ns, each.reference_ns)]
+        begin_ns = max(self.nodes.last_frozen_ns, 0)
         return min((stamp_ns for stamp_ns in needed if stamp_ns >= begin_ns), default=None)
 
     def _stamps_of(self, measurement: PoseMeasurement) -> Iterator[int]:

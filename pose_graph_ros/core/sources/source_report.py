@@ -10,7 +10,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.settings import SOURCES
 
 
@@ -82,7 +82,6 @@ def autocovariances(stamps_ns: IntArray, residuals: FloatArray) -> tuple[IntArra
 
 
 
-
 class SourceReport(NamedTuple):
     n: int  # number of its measurements that are used
     # mean squared residual of a coordinate, in units of its sigma; 0 if there is none
@@ -111,17 +110,17 @@ class SourceReport(NamedTuple):
 
 
 def report(
-    graph: Graph, rows: IntArray, *, in_use: CorrelatedErrors | None,
+    graph: Graph, stamps_ns: IntArray, ids: IntArray, *, in_use: CorrelatedErrors | None,
     found: bool = False,
 ) -> SourceReport:
     """
     Return how well the newest measurements of a source fit the estimate.
 
-    Rows are stamp [ns] and id of each measurement that is used, in the order of their addition: of
-    an edge to a bias, or of an observed node. `found` says that statistics are estimated from the
-    errors.
+    Stamps [ns] and ids are those of the measurements that are used, in the order of their
+    addition: of an edge to a bias, or of an observed node. `found` says that statistics are
+    estimated from the errors.
     """
-    newest = rows[-SOURCES.most_residuals:]
+    newest = np.column_stack((stamps_ns, ids))[-SOURCES.most_residuals:]
     newest = newest[np.argsort(newest[:, 0], kind='stable')]
     newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
     stamps, observed = newest[:, 0], graph.factors_at(newest[:, 1])
@@ -136,7 +135,7 @@ def report(
         stamps, residuals = stamps[placed], residuals[placed]
     energy = float(np.einsum('ki,kij,kj->', errors, information, errors))
     n_measured = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0))
-    return SourceReport(len(rows), energy / max(n_measured, 1),
+    return SourceReport(len(ids), energy / max(n_measured, 1),
                         estimate(stamps, residuals), in_use, found)
 
 

@@ -64,8 +64,8 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.sources.bias import CorrelatedErrors, STRETCH
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors, STRETCH
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_report import autocovariances, estimate
 

@@ -123,19 +123,17 @@ def noise_of(
     None if there are too few positions.
     """
     graph, nodes = parts.graph, parts.nodes
-    constraints = parts.factors.constraints(source)
-    order = np.argsort(constraints.rows.values[:, 0], kind='stable')
-    rows, moved = constraints.rows.values[order], constraints.noise.values[order, 0]
-    used = ~np.isin(rows[:, 0], np.array([*without], dtype=np.int64))
-    rows, moved = rows[used], moved[used]
+    rows = parts.factors.sources[source].measured.values
+    rows = rows[~np.isin(rows['stamp_ns'], np.array([*without], dtype=np.int64))]
+    rows = rows[np.argsort(rows['stamp_ns'], kind='stable')]
     path = to_the_end(measured_path(
         graph, PathOdometry(nodes.ids, nodes.stamps_ns, nodes.errors, nodes.errors),
-        rows[:, 0], rows[:, 1]))
+        rows['stamp_ns'], rows['id']))
     if len(path.seconds) < 2 * SOURCES.least_positions:
         return None
     # a factor on what is claimed is none on what the motion since the node adds
-    stamps_ns = rows[0, 0] + np.rint(1e9 * path.seconds).astype(np.int64)
-    added = moved[np.searchsorted(rows[:, 0], stamps_ns)]
+    stamps_ns = rows['stamp_ns'][0] + np.rint(1e9 * path.seconds).astype(np.int64)
+    added = rows['noise'][np.searchsorted(rows['stamp_ns'], stamps_ns), 0]
     return fitted(path._replace(variance=np.maximum(
         path.variance - added, SMALLEST * path.variance)))
 

@@ -22,7 +22,7 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.sources.kinds import observed
-from pose_graph_ros.core.sources.source_constraints import AttachedMeasurement
+from pose_graph_ros.core.sources.queued import Queued
 
 SECOND = 1_000_000_000
 CONFIG, SOURCE = BackendConfig(), OdometrySource()
@@ -61,23 +61,19 @@ def graph_at(poses: FloatArray) -> Graph:
 GRAPH = graph_at(NODES.odometry)
 
 
-def attached(
-    measurement: Absolute, node: int, source: str = 'fix',
-) -> AttachedMeasurement:
-    attachment = Attachment(node, np.zeros(3), np.zeros((3, 3)))
-    return AttachedMeasurement(
-        source, observed(measurement, attachment)[0], measurement, attachment)
+def attached(measurement: Absolute, node: int, source: str = 'fix') -> Queued:
+    return observed(source, measurement, Attachment(node, np.zeros(3), np.zeros((3, 3))))
 
 
 def fixes(
     nodes: range, T_map_odom: FloatArray = T_MAP_ODOM, source: str = 'fix',
-) -> list[AttachedMeasurement]:
+) -> list[Queued]:
     where = se2.compose(T_map_odom, NODES.odometry)[:, :2]
     return [attached(Position((k + 1) * SECOND, where[k], 0.04 * np.eye(2), np.zeros(2)), k,
                      source) for k in nodes]
 
 
-def aligned_with(first: list[AttachedMeasurement]) -> AlignmentMonitor:
+def aligned_with(first: list[Queued]) -> AlignmentMonitor:
     monitor_ = AlignmentMonitor(CONFIG)
     assert monitor_.find(GRAPH, first, NODES) is not None
     monitor_.add(first)
@@ -115,7 +111,8 @@ def test_biases_in_the_graph_are_no_way_of_the_robot() -> None:
     among_biases = HiddenNodes(CONFIG, lambda *_: ids.pop(0))
     drive(among_biases, 12, begin=(900.0, 400.0, 0.0))
     numbers = among_biases.ids.tolist()
-    moved = [attached(each.measurement, numbers[k]) for k, each in enumerate(where)]
+    moved = [each._replace(factor=replace(each.factor, i=np.array([number])))
+             for each, number in zip(where, numbers, strict=True)]
     assert some.find(graph, moved, among_biases) is not None
     assert alone.find(graph_at(nodes.odometry), where, nodes) is not None
     assert some.sigma == pytest.approx(alone.sigma)
@@ -157,7 +154,7 @@ def test_a_saved_monitor_decides_as_the_first_one_would_have(n: int) -> None:
     other.load(one.saved())
     assert (other.state, other.sigma) == (one.state, one.sigma)
     assert_same_value(other.saved(), one.saved())
-    assert one.saved().sources == (('gps', 'beacon')[:min(n, 2)] if n != 1 else ('gps',))
+    assert one.saved().evidence.sources == min(n, 5) * ('gps',) + (n - 5) * ('beacon',)
     for each in (one, other):
         each.add(fixes(range(n, 50)))
     solved = graph_at(se2.compose(wrong, NODES.odometry))
@@ -174,7 +171,7 @@ def test_what_was_measured_on_nodes_that_have_left_is_no_evidence_any_more() -> 
     some = aligned_with(fixes(range(5), wrong))
     some.add(fixes(range(5, 65)))
     some.forget(30)
-    assert some.saved().node.tolist() == list(range(30, 65))
+    assert some.saved().evidence.factors.i.tolist() == list(range(30, 65))
     nodes.forget(graph.poses[:30])
     found = some.recheck(graph, nodes)
     assert found is not None
@@ -191,5 +188,5 @@ def test_checks_end_when_the_path_is_not_that_of_odometry_any_more() -> None:
     some = aligned_with(fixes(range(5), wrong))
     some.stop_rechecking()
     some.add(fixes(range(5, 65)))
-    assert len(some.saved().node) == 0
+    assert len(some.saved().evidence.sources) == 0
     assert some.recheck(graph_at(se2.compose(wrong, NODES.odometry)), NODES) is None

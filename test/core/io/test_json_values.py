@@ -12,6 +12,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 from saved_graphs import assert_same_value
 
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.saved_columns import (
     Choices,
     decoded,
@@ -21,6 +22,7 @@ from pose_graph_ros.core.saved_columns import (
     Matrix,
     Numbers,
     Pairs,
+    Records,
     Rows3,
 )
 
@@ -47,6 +49,14 @@ class Colour(IntEnum):
 class Chosen:
     sizes: Annotated[np.ndarray, Choices(Size)]
     colours: Annotated[np.ndarray, Choices(Colour)]
+
+
+ROW = np.dtype([('id', 'i8'), ('x', 'f8', 3)])
+
+
+@dataclass(frozen=True)
+class Kept:
+    table: Annotated[GrowingArray, Records(ROW)]
 
 
 class Tuple(NamedTuple):
@@ -101,3 +111,11 @@ def test_members_of_enumerations_are_names(sizes: np.ndarray, colours: np.ndarra
         tuple(Size)[k].value for k in sizes]
     assert [plain['colours']['names'][k] for k in plain['colours']['of']] == [
         Colour(k).name.lower() for k in colours]
+
+
+@given(arrays(st.tuples(whole, pose), ROW))
+def test_a_table_of_records_comes_back_from_its_columns(rows: np.ndarray) -> None:
+    value = Kept(GrowingArray.of(rows))
+    plain = json.loads(json.dumps(encoded(value)))
+    assert plain['table'] == {name: rows[name].tolist() for name in ('id', 'x')}
+    assert_same_value(decoded(Kept, plain), value)

@@ -89,13 +89,13 @@ def used(backend: PoseGraphBackend, verdict: Verdict) -> bool:
 
 def assert_weights_are_as_decided(backend: PoseGraphBackend) -> None:
     """Each measurement has a weight in the row that holds it, if it is believed, and no other."""
-    constraints = backend._factors.constraints('fix')
+    constraints = backend._factors.sources['fix']
     held = constraints.held(np.arange(len(constraints)))
-    rows = dict(zip(constraints.rows.values[:, 0].tolist(), held.tolist(), strict=True))
+    rows = dict(zip(constraints.measured['stamp_ns'].tolist(), held.tolist(), strict=True))
     for verdict in backend.verdicts():
         assert verdict.number == rows[verdict.stamp_ns]
         assert used(backend, verdict) is verdict.state.in_graph
-    added = constraints.rows.values[:, 1]
+    added = constraints.measured['id']
     assert np.all(backend.graph.weights[added[added != held]] == 0.0)
 
 
@@ -196,7 +196,6 @@ def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
         backend._judge.before(backend._factors.new, change, 0)
         n_turned += judge.states.records[:n].tobytes() != before[0]
         backend._judge.rollback()
-        backend._factors.rollback()
         assert everything(backend) == before
         smoother.broken = False
         backend.update()

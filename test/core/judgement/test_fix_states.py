@@ -8,7 +8,7 @@ import numpy as np
 from pose_graph_ros.core.judgement.fix_states import FixStates
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED
 from pose_graph_ros.core.measurements import Position
-from pose_graph_ros.core.sources.source_constraints import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 
 @settings(deadline=None, max_examples=50)

@@ -16,7 +16,7 @@ from pose_graph_ros.core.judgement.runs import Run, Transition
 from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED, State, WAITING
 from pose_graph_ros.core.measurements import LoopClosure
-from pose_graph_ros.core.sources.source_constraints import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 SECOND = 1_000_000_000
 seeds = st.integers(0, 2**32 - 1)

@@ -8,7 +8,7 @@ from pose_graph_ros.core.judgement.fix_states import FixStates
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS
 from pose_graph_ros.core.judgement.verdicts import AUTO, BELIEVED, DOUBTED, OUT
 from pose_graph_ros.core.measurements import Position
-from pose_graph_ros.core.sources.source_constraints import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 constraints = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()), max_size=40)
 

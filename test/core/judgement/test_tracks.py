@@ -18,7 +18,7 @@ from pose_graph_ros.core.judgement.tracks import (
     observations,
     Track,
 )
-from pose_graph_ros.core.sources.gauss_markov import STRETCH
+from pose_graph_ros.core.sources.bias import STRETCH
 
 seeds = st.integers(0, 2**32 - 1)
 

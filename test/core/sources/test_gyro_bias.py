@@ -30,7 +30,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.source_constraints import Queue
+from pose_graph_ros.core.sources.queued import turn
 
 Events = list[tuple[str, OdometrySample | Measurement]]
 
@@ -87,7 +87,7 @@ def test_rest_measures_the_bias() -> None:
     backend = finished(events)
     value = backend.gyro_biases(backend.graph)['gyro']
     assert value == pytest.approx(bias, abs=4.0 * GYRO.sigma_rate / np.sqrt(8.0))
-    state = backend.graph.node_rows(np.array([backend._factors.gyros['gyro'].newest]))[0]
+    state = backend.graph.node_rows(backend._factors.sources['gyro'].bias.nodes)[-1]
     sigma = np.sqrt(backend._smoother.covariances()[state, 0, 0])
     assert sigma == pytest.approx(GYRO.sigma_rate / np.sqrt(8.66), rel=0.1)
 
@@ -236,5 +236,6 @@ def test_each_of_two_gyroscopes_goes_on_from_its_own_bias_within_an_update() -> 
     turns = [Turn(source, k, k + 1, round((1.0 + 20.0 * k) * SECOND), 0.0, 1e-4, 1.0,
                   rest_rate=rate, rest_variance=1e-6)
              for k in range(3) for source, rate in (('left', 0.02), ('right', -0.01))]
-    update = FactorBuilder(BackendConfig(), Reweighting()).build(Queue(turns=turns), graph)
-    assert update.biases[:, 0].tolist() == [0.02, -0.01] * 3
+    update = FactorBuilder(BackendConfig(), Reweighting()).build(
+        [each for given in turns for each in turn(given)], graph)
+    assert update.biases[:, 0].tolist() == [0.02] * 3 + [-0.01] * 3

@@ -102,7 +102,7 @@ def test_a_true_measurement_in_the_map_has_no_error_at_the_true_nodes(
             (GlobalPose(stamp, pose, np.eye(3)), FactorKind.GLOBAL_POSE, [0, 1, 2]),
             (Position(stamp, position, np.eye(2), lever_arm), FactorKind.POSITION, [0, 1]),
             (HeadingOnly(stamp, float(pose[2]), 1.0), FactorKind.HEADING, [2])):
-        constraint, _ = kinds.observed(measurement, anchored(stamp))
+        constraint = kinds.observed('source', measurement, anchored(stamp)).factor
         assert constraint.kind[0] == kind
         error = error_functions.errors(NODES, constraint)
         np.testing.assert_allclose(error[:, rows], 0.0, atol=ROUNDING)
@@ -152,7 +152,8 @@ def test_the_noise_of_a_global_pose_is_that_of_samples() -> None:
     measured = pose + draws(MAP_COVARIANCE, rng)
     moved = se2.compose(tiled(NODES[attachment.node]), noisy_motions(attachment, rng))
     errors = se2.between(measured, moved)     # (3.52) through the offset
-    constraint, _ = kinds.observed(GlobalPose(STAMP, pose, MAP_COVARIANCE), attachment)
+    constraint = kinds.observed(
+        'source', GlobalPose(STAMP, pose, MAP_COVARIANCE), attachment).factor
     assert_agree(np.cov(errors.T), covariance_of(constraint))
 
 
@@ -164,7 +165,8 @@ def test_the_noise_of_a_position_is_at_least_that_of_samples() -> None:
     measured = where + draws(covariance, rng)
     moved = se2.compose(tiled(NODES[attachment.node]), noisy_motions(attachment, rng))
     errors = se2.transform(moved, lever_arm) - measured     # in map axes
-    constraint, _ = kinds.observed(Position(STAMP, where, covariance, lever_arm), attachment)
+    constraint = kinds.observed(
+        'source', Position(STAMP, where, covariance, lever_arm), attachment).factor
     claimed = np.linalg.inv(constraint.information[0, :2, :2])
     sampled = np.cov(errors.T)
     # the variance is not too small in any direction, and not too large in the worst one
@@ -193,7 +195,7 @@ def test_the_noise_of_a_heading_is_that_of_samples() -> None:
     attachment, heading = anchored(STAMP, NOISY), float(truth(STAMP)[2])
     moved = se2.compose(tiled(NODES[attachment.node]), noisy_motions(attachment, rng))
     errors = se2.wrap(moved[:, 2] - heading - 0.01 * rng.standard_normal(N_SAMPLES))
-    constraint, _ = kinds.observed(HeadingOnly(STAMP, heading, 1e-4), attachment)
+    constraint = kinds.observed('source', HeadingOnly(STAMP, heading, 1e-4), attachment).factor
     assert constraint.kind[0] == FactorKind.HEADING
     assert np.var(errors) == pytest.approx(1.0 / constraint.information[0, 2, 2], rel=SAMPLING)
     np.testing.assert_array_equal(constraint.information[0, :2], 0.0)

@@ -8,7 +8,7 @@ import pytest
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.sources.gauss_markov import CorrelatedErrors
+from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.source_report import report
 
 KNOWN = CorrelatedErrors(20.0, 1.0, 0.05)
@@ -38,14 +38,14 @@ def observed(residuals: np.ndarray, sigma: float, *, turn: float = 0.0) -> Graph
     return graph
 
 
-def in_time(n: int) -> np.ndarray:
-    return np.column_stack((SECOND * np.arange(n), np.arange(n)))
+def in_time(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return SECOND * np.arange(n), np.arange(n)
 
 
 @pytest.mark.parametrize('turn', [0.0, 2.0])
 def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) -> None:
     residuals = np.random.default_rng(1).normal(0.0, 1.0, (200, 2))
-    found = report(observed(residuals, 0.5, turn=turn), in_time(200), in_use=None)
+    found = report(observed(residuals, 0.5, turn=turn), *in_time(200), in_use=None)
     assert found.n == 200
     assert found.energy == pytest.approx(np.mean(residuals**2) / 0.25)
     assert not found.errors.significant
@@ -60,7 +60,7 @@ def test_the_energy_is_the_mean_square_of_a_coordinate_in_sigmas(turn: float) ->
 def test_errors_that_are_treated_as_white_but_are_not_are_noticed(
     white: bool, sigma: float, tau: float, wrong: bool,
 ) -> None:
-    found = report(observed(gauss_markov(600, tau), sigma), in_time(600),
+    found = report(observed(gauss_markov(600, tau), sigma), *in_time(600),
                    in_use=None if white else KNOWN)
     assert found.wrongly_white is wrong
 
@@ -80,7 +80,7 @@ def test_of_a_biased_source_the_whole_error_counts_not_the_white_rest() -> None:
             np.arange(n), n + np.arange(n),
             np.column_stack((se2.transform(poses, arm) - error, np.zeros(n))), information,
             [FactorKind.BIAS] * n, constants=np.tile((*arm, factor, 0.0), (n, 1)))))
-    found = report(graph, in_time(n), in_use=KNOWN)
+    found = report(graph, *in_time(n), in_use=KNOWN)
     variance = np.mean(error**2)
     assert found.energy == pytest.approx(variance, rel=0.02)
     assert found.errors.significant

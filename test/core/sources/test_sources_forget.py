@@ -4,60 +4,63 @@
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from test_gauss_markov import position, SECOND, TAU
+from test_gauss_markov import SECOND, TAU
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED
+from pose_graph_ros.core.sources.bias import (
+    Additions,
+    BiasChain,
+    CorrelatedErrors,
+    Process,
+)
 from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
 from pose_graph_ros.core.sources.error_likelihood import no_past
-from pose_graph_ros.core.sources.gauss_markov import Additions, CorrelatedErrors, GaussMarkovBias
-from pose_graph_ros.core.sources.kinds import observed
 from pose_graph_ros.core.sources.settings import SOURCES
 
-NOWHERE = Attachment(0, np.zeros(3), np.zeros((3, 3)))
-ERRORS = CorrelatedErrors(TAU, 1.0, 0.05)
+PROCESS = Process.correlated(CorrelatedErrors(TAU, 1.0, 0.05))
 
 
 class Chain:
     """A bias with the information of its states, of which the oldest can leave."""
 
     def __init__(self) -> None:
-        self.bias, self.next = GaussMarkovBias(ERRORS), NextIds(0, 0)
+        self.bias, self.next = BiasChain(), NextIds(0, 0)
         self.bins: dict[int, int] = {}
         """Bin of each state."""
         self.edges: dict[int, tuple[int, int, float, float]] = {}
         self.priors: dict[int, int] = {}
         self.carried: int | None = None
 
-    def add(self, second: int) -> None:
-        additions = Additions(self.next)
-        self.bias.begin()
-        edge = self.bias.add(second * SECOND, observed(
-            position(second), NOWHERE)[0], np.zeros(2), additions)
-        for number, one in enumerate(additions.factors, self.next.factor):
+    def add(self, seconds: set[int]) -> None:
+        additions, known = Additions(self.next), {*self.bins.values()}
+        self.bias = self.bias.with_bins(
+            np.array([*seconds]) * SECOND, PROCESS, additions, np.zeros(3))
+        new = range(self.next.node, self.next.node + len(additions.biases))
+        self.bins.update(zip(new, sorted(seconds - known), strict=True))
+        added = Factors.joined(additions.factors)
+        for number, one in enumerate(map(added.rows, np.arange(len(added))[:, None]),
+                                     self.next.factor):
             if one.j[0] < 0:
                 self.priors[number] = int(one.i[0])
-            elif number == edge:
-                self.bins.setdefault(int(one.j[0]), second)
             else:
                 self.edges[number] = (int(one.i[0]), int(one.j[0]), float(one.constants[0, 2]),
                                       float(one.information[0, 0, 0]))
         for number in additions.remove:
             del (self.edges if number in self.edges else self.priors)[number]
-        self.next = NextIds(*(n + len(new) for n, new in zip(self.next, (
-            additions.biases, additions.factors), strict=True)))
+        self.next = NextIds(self.next.node + len(new), self.next.factor + len(added))
 
     def forget(self, oldest: int) -> None:
         """Let the states leave that nothing needs if there is a measurement in this bin."""
         gone = self.bias.leaving(oldest * SECOND)
-        self.bias.forget(gone)
+        self.bias = self.bias.without(gone)
         self.bins = {node: second for node, second in self.bins.items() if node not in gone}
-        if any(self.carried in (None, node) for node in gone):
+        if not {self.carried, *self.priors.values()} - {*gone, None}:
             # a stationary process: what is left of it begins with a variance of 1
-            self.carried = self.bias.nodes[0]
+            self.carried = int(self.bias.nodes[0])
         self.edges = {number: edge for number, edge in self.edges.items()
                       if edge[0] not in gone and edge[1] not in gone}
         self.priors = {number: node for number, node in self.priors.items() if node not in gone}
@@ -76,24 +79,22 @@ class Chain:
         return np.array([self.bins[node] for node in nodes]), np.linalg.inv(information)
 
 
-@given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), min_size=1, max_size=25))
+@given(st.lists(st.tuples(
+    st.sets(st.integers(0, 40), min_size=1, max_size=4), st.integers(0, 40)), min_size=1,
+    max_size=25))
 def test_a_bias_of_which_old_states_have_left_stays_the_same_process(
-    steps: list[tuple[int, int]],
+    steps: list[tuple[set[int], int]],
 ) -> None:
     chain, end = Chain(), 0
-    for second, oldest in steps:
-        chain.add(second)
+    for seconds, oldest in steps:
+        chain.add(seconds)
         end = max(end, oldest // 2)
         if oldest % 3 == 0:
             chain.forget(end)
-        seconds, cov = chain.covariance()
+        bins, cov = chain.covariance()
         np.testing.assert_allclose(
-            cov, np.exp(-np.abs(seconds[:, None] - seconds) / TAU), atol=1e-9)
-        assert chain.bias.nodes == sorted(chain.bins, key=chain.bins.__getitem__)
-    saved, other = chain.bias.saved(), GaussMarkovBias(ERRORS)
-    assert other.restore(saved)
-    assert other.saved().ties.tolist() == saved.ties.tolist()
-    assert other.leaving(50 * SECOND) == chain.bias.leaving(50 * SECOND)
+            cov, np.exp(-np.abs(bins[:, None] - bins) / TAU), atol=1e-9)
+        assert chain.bias.nodes.tolist() == sorted(chain.bins, key=chain.bins.__getitem__)
     assert chain.bias.nodes[-1] not in chain.bias.leaving(None)
 
 

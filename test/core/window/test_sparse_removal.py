@@ -13,11 +13,14 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.marginalization.marginalize import equations, marginalize
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.gauss_markov import (
+from pose_graph_ros.core.sources.bias import (
     Additions,
+    BiasChain,
     CorrelatedErrors,
-    GaussMarkovBias,
+    held_by_bias,
+    Process,
 )
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.window.sparse_removal import (
     crowded_edges,
     cut_chains,
@@ -94,7 +97,7 @@ def test_fewer_edges_take_the_place_of_many() -> None:
 N = 18
 
 
-def drive(seed: int, tau: float, *, headings: bool) -> tuple[Graph, GaussMarkovBias]:
+def drive(seed: int, tau: float, *, headings: bool) -> tuple[Graph, BiasChain]:
     """
     Return a graph in which all constraints agree, with a fix each second, and its biases.
 
@@ -112,15 +115,19 @@ def drive(seed: int, tau: float, *, headings: bool) -> tuple[Graph, GaussMarkovB
         Factors(i, i + 1, steps, np.tile(np.diag((400.0, 900.0, 1e4)), (N - 1, 1, 1)), 0 * i),
         Factors([1], [N - 3], se2.between(poses[[1]], poses[[N - 3]]),
                 np.diag((50.0, 20.0, 100.0))[None], [FactorKind.LOOP_CLOSURE])])))
-    model, additions = GaussMarkovBias(CorrelatedErrors(tau, 1.0, 0.1)), Additions(graph.next_ids)
+    errors, additions = CorrelatedErrors(tau, 1.0, 0.1), Additions(graph.next_ids)
+    bias = BiasChain().with_bins(
+        1_000_000_000 * np.arange(N), Process.correlated(errors), additions, np.zeros(3))
     for k in range(N):
         kind = FactorKind.GLOBAL_POSE if headings else FactorKind.POSITION
         mean = poses[[k]] if headings else np.append(poses[k, :2], 0.0)[None]
-        model.add(k * 1_000_000_000, Factors.on(
-            [k], mean=mean, information=[np.diag((1.0, 1.0, 25.0 * headings))], kind=[kind]),
-            np.array((0.01, 0.001)), additions)
+        observed = Factors.on(
+            [k], mean=mean, information=[np.diag((1.0, 1.0, 25.0 * headings))], kind=[kind])
+        additions.add(held_by_bias(
+            Queued('fix', observed, k * 1_000_000_000, noise=np.array((0.01, 0.001))), bias,
+            errors))
     graph.apply(additions.update())
-    return graph, model
+    return graph, bias
 
 
 def joint_covariance(graph: Graph, nodes: list[int]) -> FloatArray:
@@ -135,7 +142,7 @@ def joint_covariance(graph: Graph, nodes: list[int]) -> FloatArray:
 def test_where_a_chain_is_cut_no_covariance_becomes_smaller(
     seed: int, tau: float, headings: bool,
 ) -> None:
-    graph, model = drive(seed, tau, headings=headings)
+    graph, bias = drive(seed, tau, headings=headings)
     before_poses, rng = graph.poses.copy(), np.random.default_rng(seed)
     first = graph.node_ids.copy()
     before = joint_covariance(graph, first.tolist())
@@ -146,7 +153,7 @@ def test_where_a_chain_is_cut_no_covariance_becomes_smaller(
         segment = next_segment(graph, older, leaving)
         if segment is None:
             break
-        biases = np.array(model.leaving(segment.after * 1_000_000_000))
+        biases = np.array(bias.leaving(segment.after * 1_000_000_000))
         cuts, _ = cut_chains(graph, biases)
         assert len(cuts) == 1
         leaving = leaving[np.isin(leaving, segment.poses)]
@@ -154,7 +161,7 @@ def test_where_a_chain_is_cut_no_covariance_becomes_smaller(
             graph, np.sort(np.append(leaving, biases)), segment.factors)
         assert update is not None
         smoother.update(update)
-        model.forget(set(biases.tolist()))
+        bias = bias.without(biases)
         kept = graph.node_ids.tolist()
         columns = (3 * np.searchsorted(first, kept)[:, None] + np.arange(3)).ravel()
         after = joint_covariance(graph, kept)

@@ -1,0 +1,115 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Constraints on their way into the graph."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.measurements import (
+    GlobalPose,
+    HeadingOnly,
+    LoopClosure,
+    PoseMeasurement,
+    Position,
+    Range,
+)
+from pose_graph_ros.core.odometry.gyro import Turn
+from pose_graph_ros.core.saved_columns import Pairs, Rows2
+
+NO_NOISE: Final[FloatArray] = np.zeros(2)
+
+
+class Queued(NamedTuple):
+    """
+    A constraint for the next update, with what is needed to add, to name and to undo it.
+
+    An end at a state of the bias of its source is -1 until then.
+    """
+
+    source: str
+    factor: Factors  # one row
+    stamp_ns: int = -1  # of the measurement [ns]; -1 for an edge of odometry
+    reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
+    # what the motion since the node adds to the variances of its position and heading
+    noise: FloatArray = NO_NOISE
+
+    @property
+    def measured(self) -> type[PoseMeasurement]:
+        """What was measured; `LoopClosure` for all edges between poses."""
+        kinds = {FactorKind.GLOBAL_POSE: GlobalPose, FactorKind.POSITION: Position,
+                 FactorKind.HEADING: HeadingOnly, FactorKind.RANGE: Range}
+        return kinds.get(FactorKind(int(self.factor.kind[0])), LoopClosure)
+
+    @property
+    def nodes(self) -> list[int]:
+        """Ids of the nodes that it is on, without biases."""
+        return [int(end[0]) for end in (self.factor.i, self.factor.j) if end[0] >= 0]
+
+    @property
+    def is_in_map(self) -> bool:
+        """Whether it is a measurement relative to the map."""
+        return int(self.factor.kind[0]) >= FactorKind.GLOBAL_POSE and len(self.nodes) == 1
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether it is one that contains a position: not if it is a heading."""
+        return self.is_in_map and int(self.factor.kind[0]) != FactorKind.HEADING
+
+    @property
+    def needs_bias(self) -> bool:
+        """Whether one of its ends is a state of the bias, as those of a gyroscope."""
+        return len(self.nodes) == 0 or int(self.factor.kind[0]) == FactorKind.TURN
+
+    def on_bias(self, state: int) -> Factors:
+        """Return its factor with a state of the bias, by its id."""
+        if len(self.nodes) == 0:
+            return replace(self.factor, i=np.array([state]))
+        return replace(self.factor, k=np.array([state]))
+
+
+@dataclass(frozen=True, slots=True)
+class SavedQueue:
+    """The columns of a queue."""
+
+    sources: tuple[str, ...]
+    factors: Factors
+    stamps_ns: Pairs  # of measurements and of the other ends of loop closures [ns]
+    noise: Rows2
+
+    @classmethod
+    def of(cls, queue: Sequence[Queued]) -> 'SavedQueue':
+        stamps_ns = np.array([(each.stamp_ns, each.reference_ns) for each in queue], np.int64)
+        return cls(tuple(each.source for each in queue),
+                   Factors.joined([each.factor for each in queue]), stamps_ns.reshape(-1, 2),
+                   np.array([each.noise for each in queue]).reshape(-1, 2))
+
+    def queue(self) -> list[Queued]:
+        return [Queued(source, self.factors.rows(slice(k, k + 1)), stamp_ns, reference_ns, noise)
+                for k, (source, (stamp_ns, reference_ns), noise) in enumerate(zip(
+                    self.sources, self.stamps_ns.tolist(), self.noise, strict=True))]
+
+
+def turn(given: Turn) -> list[Queued]:
+    """
+    Return the constraints of a rotation by a gyroscope.
+
+    These are an edge with three ends, two hidden nodes and the bias, and, of rates at rest, an
+    observation of the bias.
+    """
+    information = np.zeros((1, 3, 3))
+    information[0, 2, 2] = 1.0 / given.variance
+    queued = [Queued(given.source, Factors(
+        [given.i], [given.j], [(0.0, 0.0, given.angle)], information, [FactorKind.TURN],
+        constants=[(0.0, 0.0, 0.0, given.seconds)]), given.stamp_ns)]
+    if given.rest_variance > 0.0:
+        information = np.zeros((1, 3, 3))
+        information[0, 0, 0] = 1.0 / given.rest_variance
+        queued.append(Queued(given.source, Factors.on(
+            [-1], None, [(given.rest_rate, 0.0, 0.0)], information, [FactorKind.GLOBAL_POSE]),
+            given.stamp_ns))
+    return queued
