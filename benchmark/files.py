@@ -84,5 +84,5 @@ def online(name: str, graph: Graph, *, has_start: bool) -> World:
                          f'others: no online run')
     kind = np.full(len(edges), FactorKind.LOOP_CLOSURE)
     kind[stops[:-1]] = FactorKind.ODOMETRY
-    return replace(world, edges=replace(world.edges, kind=kind), truth=None,
+    return replace(world, edges=world.edges.replaced(kind=kind), truth=None,
                    start=graph.poses.copy() if has_start else None)

@@ -65,8 +65,8 @@ def believe(
     is_closure = is_motion & (np.abs(place[edges.j] - place[edges.i]) != 1)
     kind = np.where(is_closure, FactorKind.LOOP_CLOSURE, np.where(
         is_motion, FactorKind.ODOMETRY, edges.kind)).astype(np.uint8)
-    edges = replace(edges, kind=kind)
-    softened = replace(edges, information=np.where(
+    edges = edges.replaced(kind=kind)
+    softened = edges.replaced(information=np.where(
         is_closure[:, None, None], floored(edges, sigmas).information, edges.information))
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))
     odometry = edges.rows(is_motion & ~is_closure)
@@ -111,7 +111,7 @@ def _not_worse(
     """Return the result, or what is better by the sigmas that it has found, near other poses."""
     closures, information = result.closures, edges.information.copy()
     information[closures] *= result.scale**-2.0
-    scaled = replace(edges, information=information)
+    scaled = edges.replaced(information=information)
     problem = TruncatedProblem(_filled(graph, scaled), closures, result.poses)
     result = replace(result, cost=problem.cost_at(result.poses), cost_of_all=(
         None if plain is None else problem.cost_at(plain)))

@@ -349,7 +349,7 @@ class ErrorTuner:
                 held_by_bias(
                     Queued(change.source, table.rows(slice(k, k + 1)), int(row['stamp_ns']),
                            noise=row['noise']), bias, change.errors)
-                for k, row in enumerate(rows)]).weighted(weights))
+                for k, row in enumerate(rows)]).replaced(weight=weights))
         update = additions.update()._replace(weigh=wanted)
         if not succeeds(self._smoother, update):
             return False

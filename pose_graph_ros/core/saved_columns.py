@@ -97,12 +97,13 @@ def encoded(value: Any, kind: Any = None) -> Any:
 
 
 def _has_fields(kind: Any) -> bool:
-    return is_dataclass(kind) or hasattr(kind, '_fields')
+    return is_dataclass(kind) or hasattr(kind, '_fields') or hasattr(kind, 'ANNOTATIONS')
 
 
 def annotations(kind: Any) -> Mapping[str, Any]:
-    """Return the annotations of the fields of a class."""
-    return get_type_hints(kind, include_extras=True)
+    """Return the annotations of the fields of a class, which may have them as ANNOTATIONS."""
+    own: Mapping[str, Any] | None = getattr(kind, 'ANNOTATIONS', None)
+    return get_type_hints(kind, include_extras=True) if own is None else own
 
 
 def decoded(kind: Any, plain: Any) -> Any:

@@ -149,12 +149,7 @@ def _weighed(table: Any, removed: Any, weights: Any) -> Any:
     weight[list(removed)] = 0.0
     for row, value in weights.items():
         weight[row] = value
-    return _with_weight(table, weight)
-
-
-def _with_weight(table: Any, weight: FloatArray) -> Any:
-    columns = {name: getattr(table, name) for name in table.__dataclass_fields__}
-    return type(table)(**{**columns, 'weight': weight})
+    return table.replaced(weight=weight)
 
 
 def frame_turn(graph: Graph, c: int) -> float:
@@ -176,9 +171,9 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     """
     edges, observed = graph.factors_by_row.edges, graph.factors_by_row.observed
     if nodes is not None:
-        edges = _with_weight(edges, edges.weight * (
+        edges = edges.replaced(weight=edges.weight * (
             np.isin(edges.i, nodes) | np.isin(edges.j, nodes)))
-        observed = _with_weight(observed, observed.weight * np.isin(observed.i, nodes))
+        observed = observed.replaced(weight=observed.weight * np.isin(observed.i, nodes))
     m, k = len(edges), len(observed)
     is_edge = graph.factors_by_row.j >= 0
     table, headings = graph.factor_records, graph.node_records['reference'][:, 2]

@@ -65,26 +65,7 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
     any_fixed, any_padded, anchored = False, False, 0
     for k in range(n_frontal):
         v = members[k]
-        at = nodes[v].factor_list
-        while at >= 0:
-            e, side = at >> 2, at & 3
-            f = tb.factors(head)[e]
-            at = f.next[side]
-            at_i, at_j = _place(head, f.ends[0]), _place(head, f.ends[1])
-            at_k = _place(head, f.ends[2])
-            # one between frontal nodes is in all their lists: added from the first of its ends
-            if (at_i < 0 or (f.ends[1] >= 0 and at_j < 0) or (f.ends[2] >= 0 and at_k < 0)
-                    or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
-                continue
-            if terms > RELINEARIZED:
-                normal_equations.add_complex(head, e, terms == HEADINGS, at_i, at_j, front, ld)
-                continue
-            if terms == RELINEARIZED:
-                transaction_log.log_factor(head, e)
-                factors.linearize(head, e)
-            f.owner = c
-            anchored |= anchors(f.kind)
-            normal_equations.add(head, e, at_i, at_j, at_k, front, ld)
+        anchored |= _add_factors(head, v, c, terms, rows, front, ld)
         scale_t = nodes[v].scale_t * nodes[v].scale_t
         scale_r = nodes[v].scale_r * nodes[v].scale_r
         least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
@@ -135,6 +116,36 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
         scale += arm2 * (front[i] + front[i + ld + 1])
     cliques[c].slip_scale = 0.25 * scale
     return -1
+
+
+@kernel
+def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add the factors of a frontal node of a clique to its front, which has so many frontal rows.
+
+    Return whether one of them anchors the clique.
+    """
+    anchored, at = False, tb.nodes(head)[v].factor_list
+    while at >= 0:
+        e, side = at >> 2, at & 3
+        f = tb.factors(head)[e]
+        at = f.next[side]
+        at_i, at_j, at_k = (
+            _place(head, f.ends[0]), _place(head, f.ends[1]), _place(head, f.ends[2]))
+        # one between frontal nodes is in all their lists: added from the first of its ends
+        if (at_i < 0 or (f.ends[1] >= 0 and at_j < 0) or (f.ends[2] >= 0 and at_k < 0)
+                or (side > 0 and at_i < rows) or (side == 2 and at_j < rows)):
+            continue
+        if terms > RELINEARIZED:
+            normal_equations.add_complex(head, e, terms == HEADINGS, at_i, at_j, front, ld)
+            continue
+        if terms == RELINEARIZED:
+            transaction_log.log_factor(head, e)
+            factors.linearize(head, e)
+        f.owner = c
+        anchored |= anchors(f.kind)
+        normal_equations.add(head, e, (at_i, at_j, at_k), front, ld)
+    return anchored
 
 
 @kernel

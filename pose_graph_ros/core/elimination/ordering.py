@@ -19,15 +19,21 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 
-# Columns of the table of nodes and elements; an element has the number of its eliminated node.
-# BEGIN, LENGTH: of its list in `iw`. N_IN: number of elements at the front of a node's list.
-# WEIGHT: nodes in the supernode of a principal node; 0: not principal. SIZE: number of nodes in an
-# element; 0: absorbed. ABSORBER: what has absorbed an element. OUTSIDE: w of the paper, a
-# flag and the nodes of an element that are not in the new one. MEMBER: next node of the supernode,
-# MEMBER_END the last one. DEGREE: approximate; FIRST, AFTER, BEFORE: doubly linked lists of the
-# principal nodes by it. BUCKET, BUCKET_NEXT: lists by the hash of a node's list, its CODE.
-(BEGIN, LENGTH, N_IN, WEIGHT, SIZE, ABSORBER, OUTSIDE, MEMBER, MEMBER_END, MARK, DEGREE, FIRST,
- AFTER, BEFORE, BUCKET, BUCKET_NEXT, CODE, COLUMNS) = range(18)
+# A node or an element; an element has the number of its eliminated node.
+ENTRY = np.dtype([(name, 'i8') for name in (
+    'begin', 'length',  # of its list in `iw`
+    'n_in',     # number of elements at the front of a node's list
+    'weight',   # nodes in the supernode of a principal node; 0: not principal
+    'size',     # number of nodes in an element; 0: absorbed
+    'absorber',     # what has absorbed an element
+    'outside',  # w of the paper: a flag and the nodes of an element that are not in the new one
+    'member', 'member_end',     # next node of the supernode, and the last one
+    'mark',
+    'degree',   # approximate
+    'first', 'after', 'before',     # doubly linked lists of the principal nodes by degree
+    'bucket', 'bucket_next',    # lists by the hash of a node's list, its `code`
+    'code',
+)])
 
 
 @kernel(allocates=True)
@@ -42,23 +48,23 @@ def grown(array, size):  # type: ignore[no-untyped-def]
 @kernel
 def _insert(t, i):  # type: ignore[no-untyped-def]
     """Put node i at the front of the list of its degree."""
-    d = t[i, DEGREE]
-    t[i, BEFORE] = -1
-    t[i, AFTER] = t[d, FIRST]
-    if t[d, FIRST] >= 0:
-        t[t[d, FIRST], BEFORE] = i
-    t[d, FIRST] = i
+    d = t[i].degree
+    t[i].before = -1
+    t[i].after = t[d].first
+    if t[d].first >= 0:
+        t[t[d].first].before = i
+    t[d].first = i
 
 
 @kernel
 def _remove(t, i):  # type: ignore[no-untyped-def]
     """Remove node i from the list of its degree."""
-    if t[i, BEFORE] >= 0:
-        t[t[i, BEFORE], AFTER] = t[i, AFTER]
+    if t[i].before >= 0:
+        t[t[i].before].after = t[i].after
     else:
-        t[t[i, DEGREE], FIRST] = t[i, AFTER]
-    if t[i, AFTER] >= 0:
-        t[t[i, AFTER], BEFORE] = t[i, BEFORE]
+        t[t[i].degree].first = t[i].after
+    if t[i].after >= 0:
+        t[t[i].after].before = t[i].before
 
 
 @kernel
@@ -67,34 +73,31 @@ def _put(t, i, nodes, end):  # type: ignore[no-untyped-def]
     while i >= 0:
         nodes[end] = i
         end += 1
-        i = t[i, MEMBER]
+        i = t[i].member
     return end
 
 
 @kernel
 def _fill(t, n, start, iw):  # type: ignore[no-untyped-def]
-    """Write the first rows of nodes and elements, whose lists begin at `start`."""
+    """Write the first state of nodes and elements, whose lists begin at `start`."""
     for i in range(len(t)):
-        for m in range(COLUMNS):
-            t[i, m] = 0
-        t[i, ABSORBER] = t[i, MEMBER] = t[i, FIRST] = t[i, AFTER] = t[i, BEFORE] = -1
-        t[i, BUCKET] = t[i, BUCKET_NEXT] = -1
-        t[i, MEMBER_END] = i
-        t[i, BEGIN] = start[i]
-        t[i, LENGTH] = start[i + 1] - start[i]
+        e = t[i]
+        e.n_in = e.weight = e.size = e.outside = e.mark = e.degree = e.code = 0
+        e.absorber = e.member = e.first = e.after = e.before = e.bucket = e.bucket_next = -1
+        e.member_end, e.begin, e.length = i, start[i], start[i + 1] - start[i]
         if i < n:
-            t[i, WEIGHT] = 1
+            e.weight = 1
         else:
-            t[i, SIZE] = t[i, LENGTH]
+            e.size = e.length
     for i in range(n):
         d = 0
-        for k in range(t[i, BEGIN], t[i, BEGIN] + t[i, LENGTH]):
+        for k in range(t[i].begin, t[i].begin + t[i].length):
             if iw[k] >= n:
-                t[i, N_IN] += 1
-                d += t[iw[k], SIZE] - 1
+                t[i].n_in += 1
+                d += t[iw[k]].size - 1
             else:
                 d += 1
-        t[i, DEGREE] = min(d, n - 1)
+        t[i].degree = min(d, n - 1)
 
 
 @kernel
@@ -105,25 +108,25 @@ def _write_element(t, iw, p, stamp, top):  # type: ignore[no-untyped-def]
     Return where they end, and their number.
     """
     n = 0
-    for k in range(t[p, BEGIN], t[p, BEGIN] + t[p, LENGTH]):
+    for k in range(t[p].begin, t[p].begin + t[p].length):
         e = iw[k]
-        if k < t[p, BEGIN] + t[p, N_IN]:
-            if t[e, SIZE] == 0:
+        if k < t[p].begin + t[p].n_in:
+            if t[e].size == 0:
                 continue
-            for m in range(t[e, BEGIN], t[e, BEGIN] + t[e, LENGTH]):
+            for m in range(t[e].begin, t[e].begin + t[e].length):
                 i = iw[m]
-                if t[i, WEIGHT] > 0 and t[i, MARK] != stamp:
-                    t[i, MARK] = stamp
+                if t[i].weight > 0 and t[i].mark != stamp:
+                    t[i].mark = stamp
                     iw[top] = i
                     top += 1
-                    n += t[i, WEIGHT]
-            t[e, SIZE] = 0
-            t[e, ABSORBER] = p
-        elif t[e, WEIGHT] > 0 and t[e, MARK] != stamp:
-            t[e, MARK] = stamp
+                    n += t[i].weight
+            t[e].size = 0
+            t[e].absorber = p
+        elif t[e].weight > 0 and t[e].mark != stamp:
+            t[e].mark = stamp
             iw[top] = e
             top += 1
-            n += t[e, WEIGHT]
+            n += t[e].weight
     return top, n
 
 
@@ -132,12 +135,12 @@ def _count_outside(t, iw, first, last, flag):  # type: ignore[no-untyped-def]
     """Count how many nodes of each other element are not in the new one."""
     for k in range(first, last):
         i = iw[k]
-        for m in range(t[i, BEGIN], t[i, BEGIN] + t[i, N_IN]):
+        for m in range(t[i].begin, t[i].begin + t[i].n_in):
             e = iw[m]
-            if t[e, SIZE] > 0:
-                if t[e, OUTSIDE] < flag:
-                    t[e, OUTSIDE] = flag + t[e, SIZE]
-                t[e, OUTSIDE] -= t[i, WEIGHT]
+            if t[e].size > 0:
+                if t[e].outside < flag:
+                    t[e].outside = flag + t[e].size
+                t[e].outside -= t[i].weight
 
 
 @kernel
@@ -149,23 +152,23 @@ def _prune(t, iw, i, p, flag, stamp, absorbs):  # type: ignore[no-untyped-def]
     Aggressive absorption: an element all of whose nodes are in the new one goes, but not for a
     node before all others, as what is below such a node leaves with it.
     """
-    to, d, h = t[i, BEGIN], 0, np.int64(0)
-    for m in range(t[i, BEGIN], t[i, BEGIN] + t[i, N_IN]):
+    to, d, h = t[i].begin, 0, np.int64(0)
+    for m in range(t[i].begin, t[i].begin + t[i].n_in):
         e = iw[m]
-        if t[e, SIZE] > 0:
-            if t[e, OUTSIDE] > flag or not absorbs:
-                d += t[e, OUTSIDE] - flag
+        if t[e].size > 0:
+            if t[e].outside > flag or not absorbs:
+                d += t[e].outside - flag
                 iw[to] = e
                 to += 1
                 h += e
             else:
-                t[e, SIZE] = 0
-                t[e, ABSORBER] = p
+                t[e].size = 0
+                t[e].absorber = p
     first_node = to
-    for m in range(t[i, BEGIN] + t[i, N_IN], t[i, BEGIN] + t[i, LENGTH]):
+    for m in range(t[i].begin + t[i].n_in, t[i].begin + t[i].length):
         j = iw[m]
-        if t[j, WEIGHT] > 0 and t[j, MARK] != stamp:
-            d += t[j, WEIGHT]
+        if t[j].weight > 0 and t[j].mark != stamp:
+            d += t[j].weight
             iw[to] = j
             to += 1
             h += j
@@ -178,81 +181,101 @@ def _merge_twins(t, iw, first, last, n_first, stamp):  # type: ignore[no-untyped
     for k in range(first, last):
         i = iw[k]
         if i < n_first:
-            t[i, BUCKET_NEXT] = t[t[i, CODE], BUCKET]
-            t[t[i, CODE], BUCKET] = i
+            t[i].bucket_next = t[t[i].code].bucket
+            t[t[i].code].bucket = i
     for k in range(first, last):
         i = iw[k]
-        if i >= n_first or t[t[i, CODE], BUCKET] < 0:
+        if i >= n_first or t[t[i].code].bucket < 0:
             continue
-        i, t[t[i, CODE], BUCKET] = t[t[i, CODE], BUCKET], -1
+        i, t[t[i].code].bucket = t[t[i].code].bucket, -1
         while i >= 0:
-            if t[i, WEIGHT] > 0 and t[i, BUCKET_NEXT] >= 0:
+            if t[i].weight > 0 and t[i].bucket_next >= 0:
                 stamp += 1
-                for m in range(t[i, BEGIN], t[i, BEGIN] + t[i, LENGTH]):
-                    t[iw[m], MARK] = stamp
-                j = t[i, BUCKET_NEXT]
+                for m in range(t[i].begin, t[i].begin + t[i].length):
+                    t[iw[m]].mark = stamp
+                j = t[i].bucket_next
                 while j >= 0:
-                    if t[j, WEIGHT] > 0 and _is_marked(t, iw, j, i, stamp):
-                        t[i, DEGREE] -= t[j, WEIGHT]
-                        t[i, WEIGHT] += t[j, WEIGHT]
-                        t[j, WEIGHT] = 0
-                        t[t[i, MEMBER_END], MEMBER] = j
-                        t[i, MEMBER_END] = t[j, MEMBER_END]
-                    j = t[j, BUCKET_NEXT]
-            i = t[i, BUCKET_NEXT]
+                    if t[j].weight > 0 and _is_marked(t, iw, j, i, stamp):
+                        t[i].degree -= t[j].weight
+                        t[i].weight += t[j].weight
+                        t[j].weight = 0
+                        t[t[i].member_end].member = j
+                        t[i].member_end = t[j].member_end
+                    j = t[j].bucket_next
+            i = t[i].bucket_next
     return stamp
 
 
 @kernel
 def _is_marked(t, iw, j, i, stamp):  # type: ignore[no-untyped-def]
     """Tell whether node j has the list of node i, whose entries are marked."""
-    same = t[j, LENGTH] == t[i, LENGTH] and t[j, N_IN] == t[i, N_IN]
-    m = t[j, BEGIN]
-    while same and m < t[j, BEGIN] + t[j, LENGTH]:
-        same = t[iw[m], MARK] == stamp
+    same = t[j].length == t[i].length and t[j].n_in == t[i].n_in
+    m = t[j].begin
+    while same and m < t[j].begin + t[j].length:
+        same = t[iw[m]].mark == stamp
         m += 1
     return same
+
+
+@kernel
+def _shorten_lists(t, iw, p, within, stamps, nodes, sums):  # type: ignore[no-untyped-def]
+    """
+    Update the members of the new element p, which are `iw[new:top]`, and keep those that stay.
+
+    Return where they end, where `nodes` end, and the numbers of nodes that are eliminated and in
+    the element. Those all of whose neighbours are in the element are eliminated with p.
+    """
+    (n, new, top, n_before, n_first), (flag, stamp) = within, stamps
+    nodes_end, eliminated, element_size = sums
+    keep = new
+    for k in range(new, top):
+        i = iw[k]
+        if i < n_first:
+            _remove(t, i)
+        d, first_node, to, h = _prune(t, iw, i, p, flag, stamp, p >= n_before)
+        if d == 0 and i < n_first and (p >= n_before or first_node == t[i].begin):
+            nodes_end = _put(t, i, nodes, nodes_end)
+            eliminated += t[i].weight
+            element_size -= t[i].weight
+            t[i].weight = 0
+            continue
+        # the new element comes first; there is room, as at least one entry was removed
+        iw[to] = iw[first_node]
+        iw[first_node] = iw[t[i].begin]
+        iw[t[i].begin] = p
+        t[i].n_in = first_node - t[i].begin + 1
+        t[i].length = to - t[i].begin + 1
+        t[i].degree = min(t[i].degree, d) + element_size - t[i].weight
+        t[i].code = (h + p) % n
+        iw[keep] = i
+        keep += 1
+    return keep, nodes_end, eliminated, element_size
 
 
 @kernel(signature=(INTEGER, INTEGER, INTEGER, INTEGER, INDICES, INDICES), allocates=True)
 def minimum_degree(n, n_elements, n_before, n_last, start, adjacency):  # type: ignore[no-untyped-def]
     """
-    Order n nodes and return the cliques of the elimination, children before parents.
+    Order nodes 0 to n - 1; return the cliques of the elimination, children before parents.
 
-    Parameters
-    ----------
-    n, n_elements : int, nodes are 0 to n - 1, elements from the start n to n + n_elements - 1
-    n_before : int, number of nodes, the first of the list, that are eliminated before all others
-    n_last : int, number of nodes, the last of the list, that are eliminated last, in their order
-    start : ndarray of int32, shape (n + n_elements + 1,), where each list begins in `adjacency`
-    adjacency : ndarray of int32
-        For a node, first the elements that it is a member of (numbers from n on), then its
-        neighbours, without repetitions; for an element, its nodes.
-
-    Returns
-    -------
-    n_cliques : int
-    offset : ndarray of int32, where the nodes of each clique begin in `nodes`, and the last end
-    n_frontal : ndarray of int32, number of frontal nodes, which come before the separator
-    parent : ndarray of int32, shape (n_cliques + n_elements,)
-        Parent of each clique, -1 for a root, then of each element from the start. The nodes of the
-        parent include the separator, or the nodes of the element.
-    nodes : ndarray of int32, nodes of all cliques
-
+    Elements from the start have the numbers from n on. The first `n_before` nodes are eliminated
+    before all others, the last `n_last` after them in their order. Of entry k the list begins at
+    `adjacency[start[k]]`: elements that a node is a member of, then its neighbours, without
+    repetitions; or the nodes of an element. Returned are the number of cliques; where the nodes of
+    each begin in `nodes`, and the last end; their numbers of frontal nodes, which come first; the
+    parent of each clique, or -1, then of each element from the start, whose nodes include the
+    separator or the nodes of the element; and `nodes`.
     """
     iw = np.empty(start[n + n_elements] + 4 * n + 16, np.int32)
     end = np.int64(start[n + n_elements])
     for k in range(end):    # a slice assignment would take two seconds to compile
         iw[k] = adjacency[k]
-    t = np.empty((n + n_elements, COLUMNS), np.int64)
+    t = np.empty(n + n_elements, ENTRY)
     _fill(t, n, start, iw)
     n_first = n_before if n_before > 0 else n - n_last
     for i in range(n_first):
         _insert(t, i)
-    offset = np.empty(n + 1, np.int64)
-    n_frontal = np.empty(n, np.int32)
-    nodes = np.empty(4 * n + 16, np.int32)
-    nodes_end = np.int64(0)
+    offset, n_frontal = np.empty(n + 1, np.int64), np.empty(n, np.int32)
+    nodes, nodes_end = np.empty(4 * n + 16, np.int32), np.int64(0)
     n_cliques = smallest = eliminated = stamp = 0
     flag = np.int64(1)
     next_last = n - n_last
@@ -260,74 +283,50 @@ def minimum_degree(n, n_elements, n_before, n_last, start, adjacency):  # type: 
         if eliminated == n_first and n_first < n - n_last:  # the nodes before all others are done
             n_first = n - n_last
             for i in range(n_before, n_first):
-                t[i, DEGREE] = max(min(t[i, DEGREE], n - eliminated - 1), 0)
+                t[i].degree = max(min(t[i].degree, n - eliminated - 1), 0)
                 _insert(t, i)
             smallest = 0
         if eliminated < n_first:
-            while t[smallest, FIRST] < 0:
+            while t[smallest].first < 0:
                 smallest += 1
-            p = t[smallest, FIRST]
+            p = t[smallest].first
             _remove(t, p)
         else:
             p = next_last
             next_last += 1
-        bound = np.int64(t[p, LENGTH])
-        for k in range(t[p, BEGIN], t[p, BEGIN] + t[p, N_IN]):
-            bound += t[iw[k], LENGTH]
-        if end + bound > len(iw):
-            iw = grown(iw, end + bound)
+        bound = end + t[p].length
+        for k in range(t[p].begin, t[p].begin + t[p].n_in):
+            bound += t[iw[k]].length
+        if bound > len(iw):
+            iw = grown(iw, bound)
         if nodes_end + n > len(nodes):
             nodes = grown(nodes, nodes_end + n)
         stamp += 1
-        t[p, MARK] = stamp
-        weight_p = t[p, WEIGHT]
-        t[p, WEIGHT] = 0
-        eliminated += weight_p
+        t[p].mark = stamp
+        eliminated += t[p].weight
+        t[p].weight = 0
         new = end
-        top, element_size = _write_element(t, iw, p, stamp, new)
+        top, size = _write_element(t, iw, p, stamp, new)
         _count_outside(t, iw, new, top, flag)
         offset[n_cliques] = nodes_end
         nodes_end = _put(t, p, nodes, nodes_end)
-        keep = new
-        for k in range(new, top):
-            i = iw[k]
-            if i < n_first:
-                _remove(t, i)
-            d, first_node, to, h = _prune(t, iw, i, p, flag, stamp, p >= n_before)
-            if d == 0 and i < n_first and (p >= n_before or first_node == t[i, BEGIN]):
-                # mass elimination: all its neighbours are in the new element
-                nodes_end = _put(t, i, nodes, nodes_end)
-                eliminated += t[i, WEIGHT]
-                element_size -= t[i, WEIGHT]
-                t[i, WEIGHT] = 0
-                continue
-            # the new element comes first; there is room, as at least one entry was removed
-            iw[to] = iw[first_node]
-            iw[first_node] = iw[t[i, BEGIN]]
-            iw[t[i, BEGIN]] = p
-            t[i, N_IN] = first_node - t[i, BEGIN] + 1
-            t[i, LENGTH] = to - t[i, BEGIN] + 1
-            t[i, DEGREE] = min(t[i, DEGREE], d) + element_size - t[i, WEIGHT]
-            t[i, CODE] = (h + p) % n
-            iw[keep] = i
-            keep += 1
+        keep, nodes_end, eliminated, size = _shorten_lists(
+            t, iw, p, (n, new, top, n_before, n_first), (flag, stamp), nodes,
+            (nodes_end, eliminated, size))
         if eliminated < n_first:
             stamp = _merge_twins(t, iw, new, keep, n_first, stamp)
         n_frontal[n_cliques] = nodes_end - offset[n_cliques]
-        end = new
         for k in range(new, keep):
             i = iw[k]
-            if t[i, WEIGHT] > 0:
+            if t[i].weight > 0:
                 iw[end] = i
                 end += 1
                 nodes_end = _put(t, i, nodes, nodes_end)
                 if i < n_first:
-                    t[i, DEGREE] = max(min(t[i, DEGREE], n - eliminated - t[i, WEIGHT]), 0)
-                    smallest = min(smallest, t[i, DEGREE])
+                    t[i].degree = max(min(t[i].degree, n - eliminated - t[i].weight), 0)
+                    smallest = min(smallest, t[i].degree)
                     _insert(t, i)
-        t[p, BEGIN] = new
-        t[p, LENGTH] = end - new
-        t[p, SIZE] = element_size
+        t[p].begin, t[p].length, t[p].size = new, end - new, size
         n_cliques += 1
         flag += n + 1
     offset[n_cliques] = nodes_end
@@ -344,6 +343,6 @@ def _parents(t, n, n_cliques, offset, nodes):  # type: ignore[no-untyped-def]
     parent = np.full(n_cliques + n_elements, -1, np.int32)
     for k in range(n_cliques + n_elements):
         e = nodes[offset[k]] if k < n_cliques else n + k - n_cliques
-        if t[e, ABSORBER] >= 0:
-            parent[k] = clique_of[t[e, ABSORBER]]
+        if t[e].absorber >= 0:
+            parent[k] = clique_of[t[e].absorber]
     return parent

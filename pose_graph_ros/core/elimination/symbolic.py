@@ -21,7 +21,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import FLAG, INDICES, INTEGER, INTEGERS, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
-from pose_graph_ros.core.elimination.ordering import minimum_degree
+from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 
 # Number of the newest nodes that are eliminated last, since the next constraints involve them.
@@ -84,12 +84,32 @@ def _other_ends(factors, e, side):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
+def _orphans(head, marked, loose, stamp):  # type: ignore[no-untyped-def]
+    """Return the children of cliques marked with a stamp that are not, then the loose priors."""
+    cliques = tb.cliques(head)
+    orphans = np.empty(len(loose) + 16, np.int32)
+    n = 0
+    for k in range(len(marked)):
+        c = cliques[marked[k]].child
+        while c >= 0:
+            if cliques[c].marked != stamp:
+                if n + len(loose) == len(orphans):
+                    orphans = grown(orphans, 0)
+                orphans[n] = c
+                n += 1
+            c = cliques[c].sibling
+    for k in range(len(loose)):
+        orphans[n + k] = loose[k]
+    return orphans[:n + len(loose)]
+
+
+@kernel(allocates=True)
 def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     """
     Return the orphans, and the quotient graph of the affected nodes with them as elements.
 
     Orphans are children of marked cliques that are not marked themselves, then the loose priors.
-    Marked cliques have FRONT_SERIAL of the head in their column MARKED. The graph is given as
+    Marked cliques have FRONT_SERIAL of the head in their field `marked`. The graph is given as
     `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
     """
     cliques = tb.cliques(head)
@@ -100,25 +120,7 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     for k in range(n):
         nodes[affected[k]].index = k
         nodes[affected[k]].front = serial
-    stamp = serial - 1
-    n_orphans = len(loose)
-    for k in range(len(marked)):
-        c = cliques[marked[k]].child
-        while c >= 0:
-            if cliques[c].marked != stamp:
-                n_orphans += 1
-            c = cliques[c].sibling
-    orphans = np.empty(n_orphans, np.int32)
-    n_orphans = 0
-    for k in range(len(marked)):
-        c = cliques[marked[k]].child
-        while c >= 0:
-            if cliques[c].marked != stamp:
-                orphans[n_orphans] = c
-                n_orphans += 1
-            c = cliques[c].sibling
-    for k in range(len(loose)):
-        orphans[n_orphans + k] = loose[k]
+    orphans = _orphans(head, marked, loose, serial - 1)
     n_orphans = len(orphans)
     # which orphans each node is a member of
     first = np.zeros(n + 1, np.int32)

@@ -3,7 +3,6 @@
 """Which ids are in use, and checks of all that goes into a graph; they raise GraphUpdateError."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +10,17 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
+from pose_graph_ros.core.graph.constraints import (
+    FactorKind,
+    FACTORS,
+    Factors,
+    NodeKind,
+    RECORD,
+)
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
 SEMIDEFINITE_TOLERANCE = 1e-5
-# Shapes of the rows of columns that are not of numbers.
-_ROW_SHAPES = {'mean': (3,), 'information': (3, 3), 'constants': (4,)}
 
 
 class RowError(GraphUpdateError):
@@ -77,20 +80,14 @@ def check(
     """
     Raise for invalid factors, with the row, what was expected and the value.
 
-    Invalid are wrong shapes, kinds or nodes, negative weights, a factor from a node to itself, a
+    Invalid are wrong kinds or nodes, negative weights, a factor from a node to itself, a
     node of a kind that the kind of factor does not have for this end, numbers that are not finite,
     numbers in rows that an error has not, an information matrix that is zero, not symmetric or not
     positive semidefinite. `kind` has the `NodeKind` of the hidden nodes, by row; by default
     `dimension` is 2 for landmarks and 3 for others, and ids are rows.
     """
     ids = Ids(len(kind)) if nodes is None else nodes
-    columns = {item.name: getattr(table, item.name) for item in fields(table)}
-    for key, column in columns.items():
-        expected = (len(table), *_ROW_SHAPES.get(key, ()))
-        if column.shape != expected:
-            raise GraphUpdateError(
-                f'Factors.{key}: expected shape {expected}, got {column.shape}')
-    for key, column in columns.items():
+    for key, column in zip(RECORD.fields or (), table.columns, strict=True):
         _refuse_rows(~np.isfinite(column), f'Factors.{key} is not finite', column)
     for end, least in ((table.i, 0), (table.j, -1), (table.k, -1)):
         _refuse_rows((end < least) | (end >= ids.end),

@@ -15,11 +15,9 @@ of all kinds. Nothing in here is compiled, so that programs which read a file an
 need not load Numba.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from operator import attrgetter
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -89,104 +87,118 @@ FACTORS = {
        for kind in FactorKind if kind >= FactorKind.GLOBAL_POSE},
 }
 
-KindArray = npt.NDArray[np.uint8]
+_NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
 FactorKinds = Annotated[IntArray, Choices(FactorKind)]
 
-# The constructor of the frozen table sets columns by this.
-_set = object.__setattr__
-_NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
-_FLOAT, _INT, _KIND = (np.dtype(kind) for kind in (np.float64, np.int64, np.uint8))
+# One factor, as it goes into a graph and comes out of it. The fields are in the order of the
+# arguments of `Factors`, whose comments say what they are.
+RECORD = np.dtype([
+    ('i', 'i8'), ('j', 'i8'), ('mean', 'f8', (3,)), ('information', 'f8', (3, 3)), ('kind', 'i8'),
+    ('weight', 'f8'), ('constants', 'f8', (4,)), ('k', 'i8')])
+_INTEGERS = frozenset({'i', 'j', 'kind', 'k'})
+_WITH_DEFAULTS = frozenset({'weight', 'constants', 'k'})    # for which a number will do
+_AS_BYTES = np.dtype((np.void, RECORD.itemsize))    # NumPy takes rows six times as fast
 
 
-def _numbers(values: npt.ArrayLike) -> FloatArray:
-    """Return an array of floats."""
-    if type(values) is np.ndarray and values.dtype is _FLOAT:
-        return values   # the usual case, in a third of the time
-    return np.asarray(values, dtype=_FLOAT)
+class _Column:
+    """A field of all records, as an attribute."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, table: 'Factors', owner: type) -> npt.NDArray[Any]:
+        column: npt.NDArray[Any] = table.records[self._name]
+        return column
 
 
-def _integers(values: npt.ArrayLike, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """Return an array of integers; raise for numbers of another type instead of rounding them."""
-    if type(values) is np.ndarray and values.dtype is dtype:
-        return values
-    array = np.asarray(values)
-    if array.size > 0 and array.dtype.kind not in 'iu':
-        raise GraphUpdateError(f'expected integers, got {array.dtype} {array.tolist()}')
-    return array.astype(dtype, copy=False)
-
-
-def _filled(size: int, value: float, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    column = np.empty(size, dtype)
-    column.fill(value)  # np.full takes three times as long for short arrays
-    return column
-
-
-@dataclass(frozen=True, slots=True)
 class Factors:
-    """M factors; raises GraphUpdateError for ends and kinds that are no integers."""
+    """
+    M factors, as records with views of their columns.
 
-    i: Integers     # nodes that they start from, or that are observed
-    j: Integers     # nodes that they lead to; -1 for one end, in the map
+    Raises GraphUpdateError for a column of another shape, and for ends and kinds that are no
+    integers.
+    """
+
+    __slots__ = ('records',)
+    # of the columns in files
+    ANNOTATIONS: ClassVar[Mapping[str, Any]] = {
+        'i': Integers, 'j': Integers, 'mean': Rows3,
+        'information': Annotated[FloatArray, Column(float, (3, 3))], 'kind': FactorKinds,
+        'weight': Numbers, 'constants': Rows4, 'k': Integers}
+
+    i = _Column()       # nodes that they start from, or that are observed
+    j = _Column()       # nodes that they lead to; -1 for one end, in the map
     # measured poses of j in i, shape (M, 3) [m, m, rad]; with one end and of edges to a bias those
     # of i in the map, of ranges the distance (r, 0, 0)
-    mean: Rows3
+    mean = _Column()
     # inverse covariances of the errors, shape (M, 3, 3), in the frames of the measured poses; of
     # edges to a bias in map axes; zero in rows that the error of the kind has not
-    information: Annotated[FloatArray, Column(float, (3, 3))]
-    kind: Annotated[KindArray, Choices(FactorKind)]
-    weight: Numbers  # what the information is multiplied by: 0 removed, by default 1
+    information = _Column()
+    kind = _Column()
+    weight = _Column()  # what the information is multiplied by: 0 removed, by default 1
     # what else the error depends on, shape (M, 4): with one end the offset (o_x, o_y, o_th, 0)
     # [m, m, rad], that is, motion by odometry since the node, then the lever arm; of edges to a
     # bias the offset in i and the factors of the bias, (o_x, o_y, f_t, f_th) [m, m, m, rad]; of a
     # range (o_x, o_y), of a turn f_th, the duration [s]
-    constants: Rows4
-    k: Integers     # third nodes: of turns the bias; -1, the default, for none
+    constants = _Column()
+    k = _Column()       # third nodes: of turns the bias; -1, the default, for none
 
     def __init__(
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,
         information: npt.ArrayLike = _NO_MATRICES, kind: npt.ArrayLike = (),
-        weight: npt.ArrayLike | None = None, constants: npt.ArrayLike | None = None,
-        k: npt.ArrayLike | None = None,
+        weight: npt.ArrayLike = 1.0, constants: npt.ArrayLike = 0.0, k: npt.ArrayLike = -1,
     ) -> None:
-        i = _integers(i, _INT)
-        n = len(i)
-        _set(self, 'i', i)
-        _set(self, 'j', _integers(j, _INT))
-        _set(self, 'mean', _numbers(mean))
-        _set(self, 'information', _numbers(information))
-        _set(self, 'kind', _integers(kind, _KIND))
-        _set(self, 'weight', _filled(n, 1.0, _FLOAT) if weight is None else _numbers(weight))
-        _set(self, 'constants', np.zeros((n, 4)) if constants is None else _numbers(constants))
-        _set(self, 'k', _filled(n, -1, _INT) if k is None else _integers(k, _INT))
+        self.records = np.empty(len(np.atleast_1d(i)), RECORD)
+        self.assign(i=i, j=j, mean=mean, information=information, kind=kind, weight=weight,
+                    constants=constants, k=k)
+
+    def assign(self, **columns: npt.ArrayLike) -> None:
+        """Set columns; a single number will do for weight, constants and k."""
+        for name, values in columns.items():
+            column, array = self.records[name], np.asarray(values)
+            if array.shape != column.shape and (array.ndim > 0 or name not in _WITH_DEFAULTS):
+                raise GraphUpdateError(
+                    f'Factors.{name}: expected shape {column.shape}, got {array.shape}')
+            if name in _INTEGERS and array.dtype.kind not in 'iu' and array.size > 0:
+                raise GraphUpdateError(
+                    f'Factors.{name}: expected integers, got {array.dtype} {array.tolist()}')
+            column[...] = array
 
     @classmethod
     def on(
         cls, node: npt.ArrayLike = (), offset: npt.ArrayLike | None = None,
         mean: npt.ArrayLike = _NO_ROWS, information: npt.ArrayLike = _NO_MATRICES,
-        kind: npt.ArrayLike = (), weight: npt.ArrayLike | None = None,
+        kind: npt.ArrayLike = (), weight: npt.ArrayLike = 1.0,
     ) -> 'Factors':
         """Return observed nodes; the offset is the identity by default."""
-        node = _integers(node, _INT)
-        constants = np.zeros((len(node), 4))
+        node = np.asarray(node)
+        table = cls(node, np.full(len(node), -1), mean, information, kind, weight)
         if offset is not None:
-            constants[:, :3] = offset
-        return cls(node, _filled(len(node), -1, _INT), mean, information, kind, weight, constants)
+            table.constants[:, :3] = offset
+        return table
+
+    @classmethod
+    def of(cls, records: npt.NDArray[Any]) -> 'Factors':
+        """Return a table of records, which are not copied."""
+        table = cls.__new__(cls)
+        table.records = records
+        return table
 
     def __len__(self) -> int:
-        return len(self.i)
+        return len(self.records)
 
     @classmethod
     def joined(cls, tables: 'Sequence[Factors]') -> 'Factors':
         """Return one table with the rows of several, in order."""
         if len(tables) == 0:
             return cls()
-        return cls(*map(np.concatenate, zip(*(table.columns for table in tables), strict=True)))
+        return cls.of(np.concatenate([
+            table.records.view(_AS_BYTES) for table in tables]).view(RECORD))
 
     @property
     def columns(self) -> tuple[npt.NDArray[Any], ...]:
         """All columns, in the order of the constructor's arguments."""
-        columns: tuple[npt.NDArray[Any], ...] = _COLUMNS(self)
-        return columns
+        return tuple(self.records[name] for name in RECORD.fields or ())
 
     @property
     def offset(self) -> FloatArray:
@@ -209,27 +221,24 @@ class Factors:
         return np.asarray(self.weight[:, None, None] * self.information)
 
     def rows(self, index: IntArray | BoolArray | slice) -> 'Factors':
-        """Return a table of some rows."""
-        return Factors(*(column[index] for column in self.columns))
+        """Return a table of some rows; of a slice it is a view."""
+        if isinstance(index, slice):
+            return Factors.of(self.records[index])
+        return Factors.of(self.records.view(_AS_BYTES)[index].view(RECORD))
 
-    def weighted(self, weight: npt.ArrayLike) -> 'Factors':
-        """Return the same factors with other weights, or all with the same one."""
-        return replace(self, weight=np.broadcast_to(weight, (len(self),)).astype(np.float64))
+    def replaced(self, **columns: npt.ArrayLike) -> 'Factors':
+        """Return the same factors with other columns; for a weight a single number will do."""
+        table = Factors.of(self.records.copy())
+        table.assign(**columns)
+        return table
 
     def renumbered(self, number: Callable[[IntArray], IntArray]) -> 'Factors':
         """Return the same factors with other numbers for their nodes, e.g. rows for ids."""
-        def of(end: IntArray) -> IntArray:
+        table = Factors.of(self.records.copy())
+        for end in (table.i, table.j, table.k):
             present = end >= 0
-            if np.all(present):
-                return number(end)
-            changed = end.copy()
-            changed[present] = number(end[present])
-            return changed
-
-        return replace(self, i=number(self.i), j=of(self.j), k=of(self.k))
-
-
-_COLUMNS = attrgetter(*(item.name for item in fields(Factors)))
+            end[present] = number(end[present])
+        return table
 
 
 def full(triangles: FloatArray) -> FloatArray:

@@ -190,46 +190,33 @@ def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
             touch(head, v)
 
 
-@kernel
-def _lengths_agree(columns):  # type: ignore[no-untyped-def]
-    i, j, mean, information, kind, weight, constants, k = columns
-    n = len(i)
-    return (mean.shape == (n, 3) and information.shape == (n, 3, 3) and constants.shape == (n, 4)
-            and len(j) == n and len(kind) == n and len(weight) == n and len(k) == n)
-
-
-@kernel(signature=(tb.HEAD, ROWS, ROWS, BYTES, INTEGERS, INTEGERS, ROWS, MATRICES, BYTES, NUMBERS,
-                   ROWS, INTEGERS, FLAG))
-def add_rows(  # type: ignore[no-untyped-def]
-    head, hidden, others, types, i, j, mean, information, kind, weight, constants, k, checked,
-):
+@kernel(signature=(tb.HEAD, ROWS, ROWS, BYTES, tb.RECORDS, FLAG))
+def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-untyped-def]
     """
     Return ADDED after adding hidden nodes and factors, all of them, or why none.
 
     NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and
     `checks.check` has not accepted them (`checked`). `others` are values of new nodes that are no
-    poses, with their `checks.node_types`; the columns of factors follow.
+    poses, with their `checks.node_types`; the records are those of `Factors`.
     """
-    columns = i, j, mean, information, kind, weight, constants, k
     first = head[tb.N_NODES]
     first_other = first + len(hidden)
     n_nodes = first_other + len(others)
-    n_factors = head[tb.N_FACTORS] + len(i)
-    if (hidden.shape[1] != 3 or others.shape[1] != 3 or len(types) != len(others)
-            or not _lengths_agree(columns)):
+    n_factors = head[tb.N_FACTORS] + len(records)
+    if hidden.shape[1] != 3 or others.shape[1] != 3 or len(types) != len(others):
         return UNSOUND
     if n_nodes + head[tb.N_PRIORS] > head[tb.NODE_ROOM] or n_factors > head[tb.FACTOR_ROOM]:
         return NO_ROOM
     # rows behind the ends are not part of the graph yet
     valid = rows.write_nodes(head, first, hidden)
     valid = rows.write_nodes(head, first_other, others) and valid
-    valid = rows.write_rows(head, n_nodes, first_other, types, columns) and valid
+    valid = rows.write_rows(head, n_nodes, first_other, types, records) and valid
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
     _start_nodes(head, first, first_other, types)
     head[tb.N_FACTORS] = n_factors
-    for e in range(n_factors - len(i), n_factors):
+    for e in range(n_factors - len(records), n_factors):
         _start(head, e)
     return ADDED
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.compiled.jit import BYTES, INTEGERS, kernel, ROWS
+from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.factors import model, prepare
-from pose_graph_ros.core.graph.tables import FACTOR
+from pose_graph_ros.core.graph.tables import FACTOR, RECORDS
 
 
 def errors(poses: Poses, factors: Factors) -> FloatArray:
@@ -27,8 +27,7 @@ def errors(poses: Poses, factors: Factors) -> FloatArray:
     They are in the frames of the measured poses, those of edges to a bias in map axes.
     """
     error = np.empty((len(factors), 3))
-    _write_errors(*map(_writable, (poses, *(getattr(factors, name) for name in (
-        'i', 'j', 'k', 'mean', 'kind', 'constants')))), error)
+    _write_errors(*map(_writable, (poses, factors.records)), error)
     observed = factors.j < 0    # of which (3.52) has the other sign
     if np.any(observed):
         error[observed] *= -1.0
@@ -42,23 +41,25 @@ def _writable(column: Any) -> npt.NDArray[Any]:
 
 
 @kernel
-def write_data(f, kind, mean, constants):  # type: ignore[no-untyped-def]
-    """Write what the error of a factor depends on into its record."""
-    f.mean[0], f.mean[1], f.mean[2] = mean[0], mean[1], mean[2]
+def write_data(f, new):  # type: ignore[no-untyped-def]
+    """Write what the error of a factor depends on, from a record of `Factors`."""
+    for m in range(3):
+        f.mean[m] = new.mean[m]
     for m in range(4):
-        f.constants[m] = constants[m]
-    prepare(f, kind)
+        f.constants[m] = new.constants[m]
+    prepare(f, new.kind)
 
 
-@kernel(signature=(ROWS, INTEGERS, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS), allocates=True)
-def _write_errors(poses, i, j, k, mean, kind, constants, error):  # type: ignore[no-untyped-def]
+@kernel(signature=(ROWS, RECORDS, ROWS), allocates=True)
+def _write_errors(poses, records, error):  # type: ignore[no-untyped-def]
     record = np.empty(1, FACTOR)
-    for e in range(len(i)):
+    for e in range(len(records)):
         f = record[0]   # in here, as Numba frees the array after its last use
-        write_data(f, kind[e], mean[e], constants[e])
-        third = constants[e, 3] * poses[k[e], 0] if k[e] >= 0 else 0.0
+        new = records[e]
+        write_data(f, new)
+        third = new.constants[3] * poses[new.k, 0] if new.k >= 0 else 0.0
         error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
-            f, kind[e], poses[i[e]], poses[j[e] if j[e] >= 0 else i[e]], third)
+            f, new.kind, poses[new.i], poses[new.j if new.j >= 0 else new.i], third)
 
 
 def energies(error: FloatArray, information: FloatArray) -> FloatArray:

@@ -63,7 +63,7 @@ class Graph(GraphContents):
         columns: tuple[npt.NDArray[Any], ...] = ()
         checked = False
         try:
-            columns = update.hidden, *others, *update.factors.columns
+            columns = update.hidden, *others, update.factors.records
             code = editing.add_rows(self.memory.head, *columns, checked)
         except (TypeError, ValueError):
             code = editing.UNSOUND  # arrays of types that the kernel is not compiled for
@@ -131,7 +131,7 @@ class Graph(GraphContents):
         factors = update.factors if len(update.factors) > 0 else NO_FACTORS
         checks.check(factors, kind, dimension, nodes)
         return tuple(np.array(column, order='C')
-                     for column in (hidden, *others, *factors.columns))
+                     for column in (hidden, *others, factors.records))
 
     def ensure(self, n_nodes: int, n_factors: int) -> None:
         """Make the tables and the transaction log large enough for a graph of this size."""

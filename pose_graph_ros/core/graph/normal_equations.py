@@ -66,8 +66,9 @@ def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _add(f, kind, start, end, a, b, k, front, ld):  # type: ignore[no-untyped-def]
-    """Add a factor to a front; parameters as for `add`, rows as for `model`."""
+def _add(f, kind, start, end, at, front, ld):  # type: ignore[no-untyped-def]
+    """Add a factor to a front; `start` and `end` are its nodes i and j, others as for `add`."""
+    a, b, k = at
     c, s = frame(f, kind)
     xx, xy, xt, yy, yt, tt = _turned(f, c, s)
     ft, fth = factors_of_end(f, kind)
@@ -131,19 +132,19 @@ def _add_third(front, ld, at, factor, of_i, of_j, gth):  # type: ignore[no-untyp
 
 
 @kernel
-def add(head, e, a, b, k, front, ld):  # type: ignore[no-untyped-def]
+def add(head, e, at, front, ld):  # type: ignore[no-untyped-def]
     """
-    Add a factor to a front, in which the blocks of its ends i, j and k begin at a, b and k.
+    Add a factor to a front; `at` says where the blocks of its ends i, j and k begin, -1 for none.
 
-    b and k may be -1. The front is an upper triangle, stored by rows of `ld` numbers, the last of
-    which is the right-hand side.
+    The front is an upper triangle, stored by rows of `ld` numbers, the last of which is the
+    right-hand side.
     """
     nodes, f = tb.nodes(head), tb.factors(head)[e]
     kind, i, j, _ = kind_and_ends(f)
     if kind < BIAS:
-        _add(f, ODOMETRY, nodes[i], nodes[j], a, b, -1, front, ld)
+        _add(f, ODOMETRY, nodes[i], nodes[j], (at[0], at[1], -1), front, ld)
     else:
-        _add(f, kind, nodes[i], nodes[j], a, b, k, front, ld)
+        _add(f, kind, nodes[i], nodes[j], at, front, ld)
 
 
 @kernel

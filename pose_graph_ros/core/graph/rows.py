@@ -207,37 +207,37 @@ def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def write_rows(head, n_nodes, first_other, types, columns):  # type: ignore[no-untyped-def]
+def write_rows(head, n_nodes, first_other, types, records):  # type: ignore[no-untyped-def]
     """
-    Write new factors, columns of `Factors`, behind the last row; return whether all are valid.
+    Write new factors, records of `Factors`, behind the last row; return whether all are valid.
 
     The graph will have n_nodes nodes, from row `first_other` on with these `checks.node_types`.
     """
-    i, j, mean, information, kind, weight, constants, third = columns
     valid = True
-    for k in range(len(i)):
-        e = head[tb.N_FACTORS] + k
-        a, b, c = node_row(head, i[k]), _end_row(head, j[k]), _end_row(head, third[k])
-        valid = write_row(head, e, a, b, mean[k], information[k], kind[k], weight[k]) and valid
-        f = tb.factors(head)[e]
+    for k in range(len(records)):
+        e, new = head[tb.N_FACTORS] + k, records[k]
+        a, b, c = node_row(head, new.i), _end_row(head, new.j), _end_row(head, new.k)
+        valid = write_row(
+            head, e, a, b, new.mean, new.information, new.kind, new.weight) and valid
+        f, kind = tb.factors(head)[e], new.kind
         f.ends[2] = c
         for m in range(4):
-            f.constants[m] = constants[k, m]
-            valid = _is_finite(constants[k, m]) and valid
+            f.constants[m] = new.constants[m]
+            valid = _is_finite(new.constants[m]) and valid
         valid = (valid and 0 <= a < n_nodes and -1 <= b < n_nodes and -1 <= c < n_nodes
-                 and kind[k] < len(_ROWS))
+                 and 0 <= kind < len(_ROWS))
         if valid:
             ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
                     _node(head, c, first_other, types))
             for m in range(3):
-                valid = valid and (_ENDS[kind[k], m] >> ends[m][0]) & 1 == 1
-            if kind[k] == factors.BIAS:     # of the rows that both nodes have
+                valid = valid and (_ENDS[kind, m] >> ends[m][0]) & 1 == 1
+            if kind == factors.BIAS:     # of the rows that both nodes have
                 valid = valid and _has_rows_only(
                     f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
-            elif kind[k] >= factors.OBSERVED:
+            elif kind >= factors.OBSERVED:
                 valid = valid and _has_rows_only(f, (1 << ends[0][1]) - 1, False)
-            elif kind[k] > factors.BIAS:
-                valid = valid and _has_rows_only(f, _ROWS[kind[k]], True)
+            elif kind > factors.BIAS:
+                valid = valid and _has_rows_only(f, _ROWS[kind], True)
     return valid
 
 

@@ -29,8 +29,10 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.jit import INTEGERS
 from pose_graph_ros.core.compiled.numba_internals import populate_array
+from pose_graph_ros.core.graph.constraints import RECORD
 
-HEAD = INTEGERS     # the type of the head, in signatures of kernels
+# Types of the head and of records of `Factors`, in signatures of kernels.
+HEAD, RECORDS = INTEGERS, types.Array(from_dtype(RECORD), 1, 'C')
 
 # --- records ------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 import hashlib
 import json
 import os
@@ -275,7 +275,7 @@ def _factors(rows: SavedRows, text: GraphText) -> Factors:
     """Return the factors from both files."""
     in_json = Factors(
         rows.other_i, rows.other_j, rows.other_mean, full(rows.other_information),
-        np.zeros(len(rows.others), np.uint8), None, rows.other_constants, rows.other_k)
+        np.zeros(len(rows.others), np.int64), constants=rows.other_constants, k=rows.other_k)
     # others are in the JSON file
     tags = [tag for tag in MEASURED if TAGS[tag].kind is None]
     in_g2o = Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
@@ -285,8 +285,8 @@ def _factors(rows: SavedRows, text: GraphText) -> Factors:
     others = np.delete(np.arange(len(table)), rows.others)
     is_edge = np.isin(rows.factor_kind[others], IN_G2O)
     place = np.concatenate((others[is_edge], others[~is_edge], rows.others))
-    return replace(table.rows(np.argsort(place)), kind=rows.factor_kind.astype(np.uint8),
-                   weight=rows.factor_weight)
+    return table.rows(np.argsort(place)).replaced(
+        kind=rows.factor_kind, weight=rows.factor_weight)
 
 
 def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:

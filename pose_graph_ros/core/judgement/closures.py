@@ -9,7 +9,6 @@ of the measured pose, and so are all covariances here.
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -185,7 +184,7 @@ def floored(edges: Factors, sigmas: FloatArray = FLOORS) -> Factors:
     # (C + D)^-1 = I (1 + D I)^-1 with D the diagonal of what is missing
     softer = information @ np.linalg.inv(np.eye(3) + missing[:, :, None] * information)
     softer = 0.5 * (softer + softer.transpose(0, 2, 1))
-    return replace(edges, information=softer)
+    return edges.replaced(information=softer)
 
 
 def forward(edges: Factors) -> Factors:
@@ -200,7 +199,7 @@ def forward(edges: Factors) -> Factors:
     mean[back] = se2.inverse(edges.mean[back])
     adjoint = se2.adjoint(mean[back])
     information[back] = adjoint.transpose(0, 2, 1) @ information[back] @ adjoint
-    return replace(edges, i=i, j=j, mean=mean, information=information)
+    return edges.replaced(i=i, j=j, mean=mean, information=information)
 
 
 @kernel(signature=(ROWS, MATRICES, NUMBERS))

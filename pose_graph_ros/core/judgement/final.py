@@ -23,7 +23,6 @@ from pose_graph_ros.core.batch.truncated import (
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closures import floored, forward, GATE
@@ -227,12 +226,7 @@ def decide(
 def _copy(graph: Graph, closures: IntArray) -> Graph:
     """Return a copy of a graph in which closures, by id, have the information to decide by."""
     rows, copy, at = graph.rows(), Graph(), graph.factor_rows(closures)
-    factors = rows.factors
-    columns = factors.i.copy(), factors.j.copy(), factors.mean.copy(), factors.information.copy()
-    own = floored(forward(factors.rows(at)))
-    for column, values in zip(
-            columns, (own.i, own.j, own.mean, own.information), strict=True):
-        column[at] = values
-    copy.fill(rows._replace(factors=Factors(
-        *columns, factors.kind, factors.weight, factors.constants, factors.k)))
+    factors = rows.factors.replaced()
+    factors.records[at] = floored(forward(factors.rows(at))).records
+    copy.fill(rows._replace(factors=factors))
     return copy

@@ -146,7 +146,7 @@ class Judge:
             if self._reweighting.knows(number):
                 later[number] = wanted.pop(number)
         return change._replace(
-            factors=replace(change.factors, weight=weights), weigh=wanted), later
+            factors=change.factors.replaced(weight=weights), weigh=wanted), later
 
     def may_solve(self) -> bool:
         """Tell whether an update that has diverged may solve for all at once."""
@@ -301,4 +301,4 @@ class Judge:
 def _weighed(change: GraphUpdate, numbers: IntArray, weights: FloatArray) -> GraphUpdate:
     every = change.factors.weight.copy()
     every[numbers] = weights
-    return change._replace(factors=replace(change.factors, weight=every))
+    return change._replace(factors=change.factors.replaced(weight=every))

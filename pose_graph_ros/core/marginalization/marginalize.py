@@ -232,8 +232,8 @@ def assemble(head, front):  # type: ignore[no-untyped-def]
         f = tb.factors(head)[e]
         if f.weight > 0.0:
             # a missing end has no block: -1
-            at_j, at_k = max(3 * f.ends[1], -1), max(3 * f.ends[2], -1)
-            normal_equations.add(head, e, 3 * f.ends[0], at_j, at_k, flat, ld)
+            at = 3 * f.ends[0], max(3 * f.ends[1], -1), max(3 * f.ends[2], -1)
+            normal_equations.add(head, e, at, flat, ld)
 
 
 def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) -> float:

@@ -117,7 +117,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     front, root, least = work_f[:6 * ld], work_f[6 * ld:6 * ld + 3 * ld_root], work_f[250:253]
     front[:] = 0.0
     _root_equations(head, last, old.values, front, ld)
-    normal_equations.add(head, e, 0, 3, -1, front, ld)
+    normal_equations.add(head, e, (0, 3, -1), front, ld)
     scale_t, scale_r = nodes[last].scale_t, nodes[last].scale_r
     scale_by(head, e, weight)
     _set_least_pivots(head, last, least)

@@ -22,9 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import (
-    BYTES,
     INTEGER,
-    INTEGERS,
     kernel,
     MATRICES,
     ROWS,
@@ -59,8 +57,7 @@ class Innovations(NamedTuple):
 def innovations(head: IntArray, edges: Factors) -> Innovations:
     """Return by how much edges, not in the graph or with weight 0, disagree with the estimate."""
     result = Innovations(np.empty((len(edges), 3)), np.empty((len(edges), 3, 3)))
-    columns = edges.i, edges.j, edges.mean, edges.kind, edges.constants
-    _write_innovations(head, *map(np.ascontiguousarray, columns), *result)
+    _write_innovations(head, np.ascontiguousarray(edges.records), *result)
     return result
 
 
@@ -90,17 +87,18 @@ def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
     _write_covariance(head, i, of_i, j, of_j, out)
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, INTEGERS, ROWS, BYTES, ROWS, ROWS, MATRICES), allocates=True)
-def _write_innovations(head, i, j, mean, kind, constants, error, out):  # type: ignore[no-untyped-def]
-    """Write errors, (M, 3), of edges given by columns of `Factors`, and J P J^T, (M, 3, 3)."""
+@kernel(signature=(tb.HEAD, tb.RECORDS, ROWS, MATRICES), allocates=True)
+def _write_innovations(head, records, error, out):  # type: ignore[no-untyped-def]
+    """Write errors, (M, 3), of edges given by records of `Factors`, and J P J^T, (M, 3, 3)."""
     nodes = tb.nodes(head)
     record, start_j, end_j = np.empty(1, tb.FACTOR), np.empty((3, 3)), np.empty((3, 3))
-    for k in range(len(i)):
+    for k in range(len(records)):
         f = record[0]   # in here, as Numba frees the array after its last use
-        write_data(f, kind[k], mean[k], constants[k])
+        new = records[k]
+        write_data(f, new)
         _edge_jacobians(
-            f, kind[k], nodes[i[k]].pose, nodes[j[k]].pose, error[k], start_j, end_j)
-        _write_covariance(head, i[k], start_j, j[k], end_j, out[k])
+            f, new.kind, nodes[new.i].pose, nodes[new.j].pose, error[k], start_j, end_j)
+        _write_covariance(head, new.i, start_j, new.j, end_j, out[k])
 
 
 @kernel

@@ -175,7 +175,7 @@ class FactorBuilder:
                     factor, edge = edge, None
             elif queued.needs_bias:
                 factor = queued.on_bias(self._chains[source].state(queued.stamp_ns))
-            number = int(additions.add(factor if edge is None else factor.weighted(0.0))[0])
+            number = int(additions.add(factor if edge is None else factor.replaced(weight=0.0))[0])
             if len(queued.nodes) == 0:
                 continue    # it has a say on the bias alone
             self._queued.append(queued)

@@ -23,7 +23,6 @@ such errors are taken for independent, nothing is known of the others either.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 import math
 from typing import Any, NamedTuple
 
@@ -127,7 +126,7 @@ def _linearized(poses: FloatArray, table: Factors) -> tuple[FloatArray, FloatArr
             step = np.zeros(3)
             step[k] = 1e-5   # m or rad
             moved = np.concatenate((poses, poses + step, poses - step))
-            after, before = (errors(moved, replace(table, **{
+            after, before = (errors(moved, table.replaced(**{
                 name: np.where(ends < 0, ends, ends + part * n)})) for part in (1, 2))
             change = after - before
             change[:, 2] = se2.wrap(change[:, 2])

@@ -3,7 +3,6 @@
 """The batch optimisation against other solvers, stored optima and the meaning of its result."""
 
 from collections.abc import Callable
-from dataclasses import replace
 import hashlib
 import json
 from pathlib import Path
@@ -159,7 +158,7 @@ def test_a_map_far_from_its_origin_converges_to_the_same_shape() -> None:
     near.apply(GraphUpdate(factors=observed, free=[0]))
     shift = np.array([691_000.0, 5_334_000.0, 0.0])     # as UTM has it
     far.apply(GraphUpdate(near.poses + shift, Factors.joined([
-        near.factors.edges, replace(observed, mean=observed.mean + shift)])))
+        near.factors.edges, observed.replaced(mean=observed.mean + shift)])))
     for graph in (near, far):
         assert optimizer.optimize(graph, SolverConfig()).status is Status.CONVERGED
     # a double has steps of 1e-9 m there

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The optimiser without compiled kernels against the one with them."""
 
-from dataclasses import replace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -100,7 +99,7 @@ def test_what_overflows_is_no_result_and_no_warning(start: Start) -> None:
         scale = 10.0 ** rng.uniform(-140.0, 140.0, (len(edges), 1, 1))
         mean = edges.mean * [*10.0 ** rng.uniform(0.0, 90.0, 2), 1.0]
         plain = PlainGraph(graph.rows().with_factors(Factors.joined([
-            replace(edges, information=scale * edges.information, mean=mean),
+            edges.replaced(information=scale * edges.information, mean=mean),
             graph.factors.observed])))
         before = plain.poses.copy()
         if PlainOptimizer(plain, CONFIG).optimize(start) is None:

@@ -361,7 +361,7 @@ def test_a_chain_made_with_another_weight_follows_what_pulls_at_it(weight: float
         extended.extend(mean, POSE_INFORMATION, weight)
         updated.update(GraphUpdate(
             hidden=se2.compose(updated.poses[-1], mean)[None],
-            factors=replace(link(k - 1, k, mean), weight=np.array([weight]))))
+            factors=link(k - 1, k, mean).replaced(weight=weight)))
     for smoother in (extended, updated):
         # odometry counts as claimed again, and a fix moves the end
         smoother.update(GraphUpdate(weigh=dict.fromkeys(range(1, 60), 1.0)))

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Certificates of global optimality against dense matrices and many starts."""
 
-from dataclasses import replace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -207,7 +206,7 @@ def test_the_objective_is_nowhere_above_chi2_if_it_says_so(seed: int) -> None:
     isotropic = Graph()
     isotropic.apply(GraphUpdate(
         graph.poses.copy(), Factors.joined([
-            replace(edges, information=np.eye(3) * rng.uniform(0.1, 9.0, (len(edges), 1, 1))),
+            edges.replaced(information=np.eye(3) * rng.uniform(0.1, 9.0, (len(edges), 1, 1))),
             observed]), fix=np.flatnonzero(graph.fixed).tolist()))
     form = formulate(isotropic)
     assert form.below_chi2
