@@ -285,8 +285,8 @@ def factors_of(
             lines.ids[:, 1] == lines.ids[:, 0] + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     if layout.kind is not None:
         kind[:] = layout.kind
-    return Factors(i, j, mean if nodes is None else se2.wrapped(mean), information, kind, None,
-                   constants)
+    return Factors(i, j, mean if nodes is None else se2.wrapped(mean), information, kind,
+                   constants=constants)
 
 
 def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> None:
