@@ -159,9 +159,10 @@ class Factors:
             if array.shape != column.shape and (array.ndim > 0 or name not in _WITH_DEFAULTS):
                 raise GraphUpdateError(
                     f'Factors.{name}: expected shape {column.shape}, got {array.shape}')
-            if name in _INTEGERS and array.dtype.kind not in 'iu' and array.size > 0:
+            kinds, what = ('iu', 'integers') if name in _INTEGERS else ('iuf', 'numbers')
+            if array.dtype.kind not in kinds and array.size > 0:
                 raise GraphUpdateError(
-                    f'Factors.{name}: expected integers, got {array.dtype} {array.tolist()}')
+                    f'Factors.{name}: expected {what}, got {array.dtype} {array.tolist()}')
             column[...] = array
 
     @classmethod

@@ -300,7 +300,7 @@ def added(case: str) -> GraphUpdate:
             dimensions=[1, 2, 3],
             factors=Factors.joined([
                 Factors([1, 2], [11, 12], [(1.0, 2.0, 0.0), (3.0, 4.0, 0.2)],
-                        [place, place + turn], [FactorKind.BIAS] * 2, None,
+                        [place, place + turn], [FactorKind.BIAS] * 2, 1.0,
                         [(0.0, 0.0, 1.0, 1.0)] * 2),
                 Factors.on([10, 11, 12], None, np.zeros((3, 3)), [end, place, place + turn],
                            [FactorKind.GLOBAL_POSE] * 3)]))
@@ -310,7 +310,7 @@ def added(case: str) -> GraphUpdate:
             Factors([0, 1, 2], [10, 11, 10], [(3.0, 1.0, 0.0), (4.0, -2.0, 0.0), (1.2, 0.0, 0.0)],
                     [place, place, distance],
                     [FactorKind.POINT, FactorKind.POINT, FactorKind.RANGE],
-                    None, [(0.0,) * 4, (0.0,) * 4, (0.2, -0.1, 0.0, 0.0)]),
+                    1.0, [(0.0,) * 4, (0.0,) * 4, (0.2, -0.1, 0.0, 0.0)]),
             Factors.on([11], None, [(5.0, -2.0, 0.0)], [place], [FactorKind.POSITION])]))
 
 
