@@ -16,7 +16,6 @@ beacon starts is no measurement of it, so the optimum does not depend on it.
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,8 +85,8 @@ class Beacons:
                 if start is not None and apply(start):
                     self.ids[beacon] = landmark
             if beacon in self.ids:
-                ready += [each.queued._replace(factor=replace(
-                    each.queued.factor, j=np.array([self.ids[beacon]]))) for each in kept]
+                ready += [each.queued._replace(factor=each.queued.factor.replaced(
+                    j=[self.ids[beacon]])) for each in kept]
             if beacon in self.ids or len(kept) == 0:
                 del self._waiting[beacon]
         return ready

@@ -3,7 +3,7 @@
 """Constraints on their way into the graph."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -68,8 +68,8 @@ class Queued(NamedTuple):
     def on_bias(self, state: int) -> Factors:
         """Return its factor with a state of the bias, by its id."""
         if len(self.nodes) == 0:
-            return replace(self.factor, i=np.array([state]))
-        return replace(self.factor, k=np.array([state]))
+            return self.factor.replaced(i=[state])
+        return self.factor.replaced(k=[state])
 
 
 @dataclass(frozen=True, slots=True)
