@@ -62,12 +62,6 @@ class Hour:
     """Number of answers so far."""
 
 
-def resident() -> float:
-    """Return the resident memory of this process [MB]."""
-    gc.collect()
-    return resident_bytes() * 1e-6
-
-
 def drive(course: Course, config: BackendConfig, part: float) -> Iterator[Hour]:
     """
     Drive a course, and yield what became of each part of it.
@@ -126,13 +120,14 @@ def _hour(
     backend: PoseGraphBackend, hours: float, updates: list[float], squares: list[float],
     means: dict[str, float],
 ) -> Hour:
-    graph = backend.graph
-    head = graph.memory.head
+    gc.collect()
+    graph, head = backend.graph, backend.graph.memory.head
     return Hour(
-        hours, resident(), graph.n_nodes, len(graph.factors.edges), len(graph.factors.observed),
+        hours, 1e-6 * resident_bytes(), graph.n_nodes, len(graph.factors.edges),
+        len(graph.factors.observed),
         8e-6 * float(head[tb.POOL_F_END]) + 4e-6 * float(head[tb.POOL_I_END]),
-        float(np.sqrt(np.mean(squares))),
-        means, 1e3 * float(np.percentile(updates, 99)), 1e3 * max(updates),
+        float(np.sqrt(np.mean(squares))), means, 1e3 * float(np.percentile(updates, 99)),
+        1e3 * max(updates),
         {f'{source} {answer}': n for (source, answer), n in backend.counts.items()})
 
 

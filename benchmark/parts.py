@@ -347,18 +347,14 @@ def chain_memory(n: int) -> None:
     """Run a chain and print how much the process has grown [bytes]; for a process of its own."""
     ours.warm_up()
     world = chain(n)
-    grown: list[int] = []
-    peak = 0
+    sizes: list[int] = []
 
     def look(_: ours.IncrementalSmoother, k: int) -> None:
-        nonlocal peak
-        if k in (0, n - 1):
-            grown.append(resident_bytes())
-        if k % 1000 == 0:
-            peak = max(peak, resident_bytes())
+        if k % 1000 == 0 or k == n - 1:
+            sizes.append(resident_bytes())
 
     run = ours.run(world, Plan(), look)
-    print(json.dumps({'grown': grown[1] - grown[0], 'peak': max(peak, grown[1]) - grown[0],
+    print(json.dumps({'grown': sizes[-1] - sizes[0], 'peak': max(sizes) - sizes[0],
                       'seconds': float(np.sum(run.seconds))}))
 
 

@@ -266,9 +266,9 @@ def street_path(
 
     """
     points = street_corners(rng, (n + 1) * step, spacing, fresh=fresh)
-    along = np.concatenate(([0.0], np.cumsum(np.sum(np.abs(np.diff(points, axis=0)), axis=1))))
-    at = step * np.arange(n + 1)
-    path = np.column_stack([np.interp(at, along, points[:, axis]) for axis in (0, 1)])
+    along = np.append(0.0, np.cumsum(np.sum(np.abs(np.diff(points, axis=0)), axis=1)))
+    path = np.column_stack([
+        np.interp(step * np.arange(n + 1), along, of_axis) for of_axis in points.T])
     if rounding > 0:
         path = uniform_filter1d(path, 2 * rounding + 1, axis=0, mode='nearest')
     moves = np.diff(path, axis=0)
@@ -280,9 +280,7 @@ def grid(n: int = 3500, seed: int = SEED) -> World:
     rng = np.random.default_rng(seed)
     truth = street_path(rng, n, 1.0, np.full(12, 4.0), fresh=1.0)
     pairs = _pairs(truth, rng, round(0.558 * n), radius=1.5, gap=4, per_node=5)
-    sigma = (0.023, 0.023, 0.023)
-    edges = joined(truth, pairs, sigma, rng, pessimism=6.5)
-    return arranged('grid', truth, edges)
+    return arranged('grid', truth, joined(truth, pairs, (0.023,) * 3, rng, pessimism=6.5))
 
 
 def city(n: int = 10000, seed: int = SEED) -> World:
@@ -290,8 +288,7 @@ def city(n: int = 10000, seed: int = SEED) -> World:
     rng = np.random.default_rng(seed)
     truth = street_path(rng, n, 1.0, np.full(12, 10.0), fresh=3.0)
     pairs = _pairs(truth, rng, round(1.069 * n), radius=1.6, gap=5, per_node=8)
-    sigma = (0.018, 0.018, 0.0125)
-    edges = joined(truth, pairs, sigma, rng, pessimism=8.0)
+    edges = joined(truth, pairs, (0.018, 0.018, 0.0125), rng, pessimism=8.0)
     observed = seen(truth, np.arange(20, n, 20), (1.5, 1.5, 1.0), rng, heading=False)
     return arranged('city GPS', truth, edges, observed)
 

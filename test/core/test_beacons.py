@@ -58,8 +58,8 @@ def drive(seed: int = 1, *, known: bool = False, wrong: float = 0.0) -> Events:
     return events
 
 
-def run(events: Events, config: BackendConfig = CONFIG) -> PoseGraphBackend:
-    backend = PoseGraphBackend(config)
+def run(events: Events, backend: PoseGraphBackend | None = None) -> PoseGraphBackend:
+    backend = PoseGraphBackend(CONFIG) if backend is None else backend
     feed(backend, events)
     backend.optimize()
     return backend
@@ -115,16 +115,14 @@ def test_the_order_of_arrival_does_not_matter() -> None:
 
 
 def test_beacons_at_known_places_hold_the_path_in_the_map() -> None:
-    start = GlobalPose(
-        SECOND, se2.compose(T_MAP_ODOM, TRUTH[0]), np.diag((0.25, 0.25, 0.01)))
+    start = GlobalPose(SECOND, se2.compose(T_MAP_ODOM, TRUTH[0]), np.diag((0.25, 0.25, 0.01)))
     events = drive(known=True)
     backend = PoseGraphBackend(CONFIG)
     feed(backend, events[:100])
     assert len(places(backend)) == 0, 'the graph does not lie in the map yet'
     assert backend.n_waiting > 0
     backend.add_measurement(start, 'start')
-    feed(backend, events[100:])
-    backend.optimize()
+    run(events[100:], backend)
     assert np.max(errors(backend, T_MAP_ODOM)) < 0.4
     for name, place in places(backend).items():
         assert place == pytest.approx(se2.transform(T_MAP_ODOM, np.array(BEACONS[name])), abs=0.05)
@@ -138,14 +136,13 @@ def test_a_saved_graph_goes_on_with_its_beacons() -> None:
     second = PoseGraphBackend.restored(CONFIG, first.saved())
     assert places(second).keys() == places(first).keys() != set()
     for backend in (first, second):
-        feed(backend, events[2000:])
-        backend.optimize()
+        run(events[2000:], backend)
     np.testing.assert_allclose(
         first.estimate().path.poses, second.estimate().path.poses, atol=1e-6)
 
 
 def test_beacons_stay_when_nodes_leave() -> None:
-    backend = run(drive(), replace(CONFIG, window=WindowConfig(nodes=40)))
+    backend = run(drive(), PoseGraphBackend(replace(CONFIG, window=WindowConfig(nodes=40))))
     assert backend.estimate().n_frozen > 20
     assert len(places(backend)) == 4
     # what has left was placed while the beacons were not known well

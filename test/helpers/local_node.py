@@ -74,23 +74,21 @@ class LocalNode:
         """Return a list of the messages that the client receives, once both sides match."""
         messages: list[Any] = []
         subscription = self.client.create_subscription(kind, topic, messages.append, qos)
-        name = subscription.topic_name
-        self.spin_until(
-            lambda: subscription.get_publisher_count() > 0 and all(
-                publisher.get_subscription_count() > 0
-                for publisher in self.node.publishers if publisher.topic_name == name),
-            f'{topic} is matched')
+        self._match(subscription.get_publisher_count, [
+            publisher.get_subscription_count for publisher in self.node.publishers
+            if publisher.topic_name == subscription.topic_name])
         return messages
+
+    def _match(self, mine: Callable[[], int], theirs: list[Callable[[], int]]) -> None:
+        """Serve callbacks until both sides of a topic count each other."""
+        self.spin_until(lambda: all(count() > 0 for count in (mine, *theirs)), 'it is matched')
 
     def advertise(self, kind: type, topic: str) -> Publisher:
         """Return a publisher of the client, once the node's subscription matches it."""
         publisher = self.client.create_publisher(kind, topic, RELIABLE)
-        name = publisher.topic_name
-        self.spin_until(
-            lambda: publisher.get_subscription_count() > 0 and all(
-                subscription.get_publisher_count() > 0
-                for subscription in self.node.subscriptions if subscription.topic_name == name),
-            f'{topic} is matched')
+        self._match(publisher.get_subscription_count, [
+            subscription.get_publisher_count for subscription in self.node.subscriptions
+            if subscription.topic_name == publisher.topic_name])
         return publisher
 
 

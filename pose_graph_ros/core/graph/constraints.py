@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The kinds of nodes, and the factors (constraints) as struct of arrays.
+The kinds of nodes, and the factors (constraints) as records.
 
 A factor has one, two or three hidden nodes for ends. One with two ends, an *edge*, leads from node
 i to node j and has the measured pose of j in i. One with a single end, an *observed node*, has a

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph: hidden nodes and factors, as struct of arrays."""
+"""The pose graph: hidden nodes and factors, as tables of records."""
 
 from collections.abc import Collection
 from typing import Any
