@@ -235,7 +235,8 @@ def restart(head):  # type: ignore[no-untyped-def]
         nodes[v].touched = 0
         touch(head, v)
     for e in range(head[tb.N_FACTORS]):
-        tb.factors(head)[e].waits = 0
-        if tb.factors(head)[e].weight > 0.0:
+        f = tb.factors(head)[e]
+        f.waits = 0
+        if f.weight > 0.0:
             _evaluate(head, e)
     prior_rows.add_energies(head)

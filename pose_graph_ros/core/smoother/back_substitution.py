@@ -88,7 +88,7 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
     n_frontal, n_separator = row.n_frontal, row.n_separator
     rows, n = 3 * n_frontal, 3 * (n_frontal + n_separator)
     members = pool_i[row.members:row.members + n_frontal + n_separator]
-    phi = tb.cliques(head)[c].turn
+    phi = row.turn
     alpha = tb.scalars(head)[0].alpha
     if row.anchored == 0:
         alpha *= FREE_FRACTION
@@ -123,15 +123,14 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
 @kernel
 def _set_turn(head, c, parent_turn):  # type: ignore[no-untyped-def]
     """Set the angle of a clique's frame; list the clique if its slip is large."""
-    cliques, work_i = tb.cliques(head), tb.work_i(head)
-    f = cliques[c]
-    if cliques[c].anchored != 0:
-        f.turn = 0.0
+    clique, work_i = tb.cliques(head)[c], tb.work_i(head)
+    if clique.anchored != 0:
+        clique.turn = 0.0
         return
-    f.turn = clique_frames.present_turn(head, c)
-    slip = f.turn - f.turn_seen - parent_turn
+    clique.turn = clique_frames.present_turn(head, c)
+    slip = clique.turn - clique.turn_seen - parent_turn
     slip2 = slip * slip
-    error2 = slip2 * (slip2 * f.slip_scale + USUAL_ENERGY)
+    error2 = slip2 * (slip2 * clique.slip_scale + USUAL_ENERGY)
     if error2 > tb.scalars(head)[0].share:
         work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = c
         head[tb.N_TURNED] += 1
@@ -316,7 +315,6 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
     changed = work_i[3 * head[tb.NODE_ROOM]:]
     for k in range(head[tb.N_CHANGED]):
         f = nodes[changed[k]]
-        f.seen[0], f.seen[1], f.seen[2] = (
-            f.delta[0], f.delta[1], f.delta[2])
+        f.seen[0], f.seen[1], f.seen[2] = f.delta[0], f.delta[1], f.delta[2]
     scalars.n_moved += head[tb.N_CHANGED]
     head[tb.N_VISITED] += n_visited

@@ -56,15 +56,15 @@ def _check(head):  # type: ignore[no-untyped-def]
     for n in range(head[tb.N_CHECKS]):
         at = tb.nodes(head)[checks[n]].factor_list
         while at >= 0:
-            e = at >> 2
-            if tb.factors(head)[e].checked != iteration:
-                tb.factors(head)[e].checked = iteration
-                if tb.factors(head)[e].owner != owner:
-                    owner = tb.factors(head)[e].owner
+            e, f = at >> 2, tb.factors(head)[at >> 2]
+            if f.checked != iteration:
+                f.checked = iteration
+                if f.owner != owner:
+                    owner = f.owner
                     phi = clique_frames.present_turn(head, owner)
                     frame = (phi, math.cos(phi), math.sin(phi))
                 _check_factor(head, e, frame)
-            at = tb.factors(head)[e].next[at & 3]
+            at = f.next[at & 3]
 
 
 @kernel
@@ -126,10 +126,11 @@ def relinearize(head):  # type: ignore[no-untyped-def]
         e = waiting[n]
         transaction_log.log_factor(head, e)
         set_waits(head, e, 0)
-        if _bin(tb.factors(head)[e].error2 / allowed) < cut:
+        f = tb.factors(head)[e]
+        if _bin(f.error2 / allowed) < cut:
             head[tb.N_RELINEARIZED] += 1
             factors.linearize(head, e)
-            for v in tb.factors(head)[e].ends:
+            for v in f.ends:
                 if v >= 0:
                     _touch(head, v)
     for n in range(head[tb.N_TURNED]):

@@ -111,7 +111,7 @@ def test_biases_in_the_graph_are_no_way_of_the_robot() -> None:
     among_biases = HiddenNodes(CONFIG, lambda *_: ids.pop(0))
     drive(among_biases, 12, begin=(900.0, 400.0, 0.0))
     numbers = among_biases.ids.tolist()
-    moved = [each._replace(factor=replace(each.factor, i=np.array([number])))
+    moved = [each._replace(factor=each.factor.replaced(i=[number]))
              for each, number in zip(where, numbers, strict=True)]
     assert some.find(graph, moved, among_biases) is not None
     assert alone.find(graph_at(nodes.odometry), where, nodes) is not None
