@@ -127,7 +127,7 @@ def located(points: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> Float
     centre = np.mean(points, axis=0)
     points = points - centre
     sigmas = sigmas + DRIFT * np.hypot(points[:, 0], points[:, 1])
-    weights = (2.0 * ranges * sigmas)**-2
+    weights = (2.0 * np.maximum(ranges, sigmas) * sigmas)**-2
     squares = np.sum(points**2, axis=1) - ranges**2
     rows = 2.0 * (points - np.average(points, axis=0, weights=weights))
     normal = rows.T @ (weights[:, None] * rows)
@@ -140,7 +140,10 @@ def located(points: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> Float
         distances = np.hypot(away[:, 0], away[:, 1]) + 1e-9
         errors, rows = (distances - ranges) / sigmas, away / (distances * sigmas)[:, None]
         robust = 1.0 / (1.0 + (errors / 3.0)**2)
-        place = place - np.linalg.solve(
-            rows.T @ (robust[:, None] * rows), rows.T @ (robust * errors))
+        try:
+            place = place - np.linalg.solve(
+                rows.T @ (robust[:, None] * rows), rows.T @ (robust * errors))
+        except np.linalg.LinAlgError:   # so far away that all ranges are parallel
+            return None
     # if they do not agree, more of them will
     return np.asarray(place + centre) if np.median(np.abs(errors)) < 3.0 else None
