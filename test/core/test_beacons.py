@@ -20,7 +20,6 @@ BEACONS = {'a': (-4.0, 3.0), 'b': (22.0, -2.0), 'c': (18.0, 20.0), 'd': (-3.0, 1
 ARM = np.array([0.4, -0.2])
 SIGMA = 0.1
 T_MAP_ODOM = np.array([30.0, -12.0, 1.1])
-NOT_MOVED = np.zeros(3)
 CONFIG = BackendConfig(measurements={'tags': RANGES})
 
 Events = list[tuple[int, str, Any]]
@@ -72,11 +71,11 @@ def feed(backend: PoseGraphBackend, events: Events) -> None:
             backend.update()
 
 
-def errors(backend: PoseGraphBackend, T: FloatArray = NOT_MOVED) -> FloatArray:
+def errors(backend: PoseGraphBackend, T: tuple[float, ...] = (0.0, 0.0, 0.0)) -> FloatArray:
     """Return how far the path is off the truth [m]."""
     found = backend.estimate().path
     at = np.round((found.stamps_ns / SECOND - 1.0) * 10.0).astype(int)
-    true = se2.compose(T, TRUTH[np.minimum(at, len(TRUTH) - 1)])
+    true = se2.compose(np.array(T), TRUTH[np.minimum(at, len(TRUTH) - 1)])
     return np.hypot(*(found.poses - true)[:, :2].T)
 
 
@@ -122,7 +121,7 @@ def test_beacons_at_known_places_hold_the_path_in_the_map() -> None:
     assert backend.n_waiting > 0
     backend.add_measurement(start, 'start')
     run(events[100:], backend)
-    assert np.max(errors(backend, T_MAP_ODOM)) < 0.4
+    assert np.max(errors(backend, tuple(T_MAP_ODOM))) < 0.4
     for name, place in places(backend).items():
         assert place == pytest.approx(se2.transform(T_MAP_ODOM, np.array(BEACONS[name])), abs=0.05)
 

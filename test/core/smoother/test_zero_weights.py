@@ -87,5 +87,4 @@ def test_adding_them_solves_nothing() -> None:
     result = twins.full.update(GraphUpdate(factors=idle))
     assert result[2:6] == (0, 0, 0, 0)
     np.testing.assert_array_equal(graph.memory['cliques'], cliques)
-    assert set(differences(before, state(graph))) == {
-        'factors', 'factor_id', 'next'}
+    assert set(differences(before, state(graph))) == {'factors', 'factor_id', 'next'}
