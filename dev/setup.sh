@@ -128,6 +128,6 @@ if [[ " $* " != *' --demo '* ]]; then
     step tf2_msgs 'building tf2_msgs (about 10 s)' dev/tf2_msgs build_tf2 ||
         warn "no /tf: needs g++, cmake, make, python3-dev; in a sourced ROS tf2_msgs (log: $LOG)"
 fi
-step kernels 'compiling the solver (20 s to a minute)' "cache:${NUMBA_CACHE_DIR:-} pose_graph_ros/core" \
+step kernels 'compiling the solver (20 s to two minutes)' "cache:${NUMBA_CACHE_DIR:-} pose_graph_ros/core" \
     "$VENV/bin/python" -m pose_graph_ros.cli.main compile-kernels ||
     warn "the solver is compiled at its first start: $(tail -n 1 "$LOG")"

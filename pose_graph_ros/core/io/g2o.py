@@ -242,6 +242,8 @@ def _without_loops(rows: dict[str, Lines]) -> tuple[dict[str, Lines], tuple[str,
 def _numbered(text: GraphText, rows: dict[str, Lines]) -> tuple[Lines, tuple[str, ...]]:
     """Return the lines of `LANDMARK`, landmarks with other numbers than poses, and a note."""
     seen = rows['LANDMARK']
+    if len(seen) == 0:
+        return seen, ()
     poses = [seen.ids[:, 0], *(table.ids.ravel() for tag, table in rows.items()
                                if tag != 'LANDMARK')]
     others, names = np.unique(np.concatenate(poses)), seen.ids[:, 1]

@@ -315,7 +315,7 @@ class OdometryStream(ReorderBuffer[Received]):
         stamp_ns, raw, twist = sample.stamp_ns, sample.pose, sample.twist
         if before is None:
             return Instant(raw, next_row(None, stamp_ns, raw), None,
-                            SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False, twist=twist)
+                           SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
         integrates = self._source.integrate is Integrate.TWIST
         motion = (integrated(before.twist, twist, elapsed) if integrates
@@ -336,7 +336,7 @@ class OdometryStream(ReorderBuffer[Received]):
                     if self._source.noise_from is NoiseFrom.TWIST else NOTHING)
         row = next_row(before.row, stamp_ns, pose, variance)
         return Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
-                        jumped=False, twist=twist)
+                       jumped=False, twist=twist)
 
 
 def _after_jump(before: Instant, sample: Received, elapsed: float) -> Instant:
@@ -358,7 +358,7 @@ def _elsewhere(
     row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
     offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
     return Instant(sample.pose, row, offset, SpeedWindow(speeds, sample.stamp_ns, pose),
-                    jumped=True, restarted=restarted, twist=sample.twist)
+                   jumped=True, restarted=restarted, twist=sample.twist)
 
 
 def _described(before: Instant, after: Instant) -> str:

@@ -198,9 +198,9 @@ class FactorBuilder:
             else:
                 continue
             needed.setdefault((queued.source, process), []).append(queued)
-        chains = {}
+        chains = dict[str, BiasChain]()
         for (source, process), some in needed.items():
-            known, value = self._state(source).bias, np.zeros(3)
+            known, value = chains.get(source, self._state(source).bias), np.zeros(3)
             chain = BiasChain() if known is None else known
             if len(process.growth) > 0 and len(chain) > 0:
                 value = graph.poses_of(chain.nodes[-1])
