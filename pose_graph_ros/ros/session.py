@@ -109,7 +109,7 @@ class Session:
 
         if not is_cached():
             self.compiling = True
-            logger.info('compiling kernels, up to a minute and only at the first start; '
+            logger.info('compiling kernels, up to two minutes, only at the first start; '
                         'measurements wait until then, none is lost')
         seconds = warm_up(stopped)
         if not stopped():   # else another worker may be compiling by now
