@@ -37,7 +37,7 @@ HEAD, RECORDS = INTEGERS, types.Array(from_dtype(RECORD), 1, 'C')
 # --- records ------------------------------------------------------------------------------------
 
 NODE: Final = np.dtype([
-    # of these a solve changes those up to `checked_turn`, the SOLUTION, only
+    # a solve changes only the fields up to `checked_turn`; see SOLUTION
     ('pose', 'f8', (3,)),       # in the map, theta in [-pi, pi) [m, m, rad]
     ('delta', 'f8', (3,)),      # solution, the pose minus `reference`, theta not wrapped
     ('seen', 'f8', (3,)),       # `delta` that the cliques below were last solved with
@@ -86,7 +86,7 @@ FACTOR: Final = np.dtype([
     ('logged', 'i4'),
     ('energy_logged', 'i4'),
     ('kind', 'i4'),             # `FactorKind`
-    # a check changes those from here on, the ENERGY, only
+    # a check changes only the fields from here on; see ENERGY
     ('error2', 'f8'),           # squared linearization error, weighted [sigma^2]
     ('energy', 'f8'),           # e^T information e, weighted [sigma^2]
     ('checked', 'i4'),          # stamp (ITERATION) of the last check of the linearization
@@ -163,7 +163,7 @@ TABLES: Final[dict[str, np.dtype[Any]]] = {
     ) for name in names}}
 NAMES: Final = tuple(TABLES)
 WORD: Final = 8     # bytes; the size of a record is a multiple of it
-# Words of a node up to the end of its solution, and of a factor before its energy.
+# Number of words of a node that a solve changes, and of a factor that a check leaves as they are.
 SOLUTION: Final[int] = NODE.fields['scale_t'][1] // WORD    # type: ignore[index]
 ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index]
 

@@ -58,7 +58,11 @@ class Target(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementKind:
-    """What the engine asks of a kind of measurements; the functions take one of them first."""
+    """
+    What the engine asks of a kind of measurements.
+
+    The first argument of each function is a measurement of that kind.
+    """
 
     numbers: Callable[[Any], FloatArray]  # that must be valid coordinates
     # what is left of it with a valid covariance, or why it is rejected

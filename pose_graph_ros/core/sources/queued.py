@@ -28,7 +28,7 @@ class Queued(NamedTuple):
     """
     A constraint for the next update, with what is needed to add, to name and to undo it.
 
-    An end at a state of the bias of its source is -1 until then.
+    An end at a state of the bias of its source is -1 until it is added.
     """
 
     source: str
