@@ -106,8 +106,8 @@ def demo(parser: argparse.ArgumentParser) -> None:
     """
     Play a bag to the node over DDS, and write the corrected path and a picture.
 
-    The node and the player run as separate processes in a ROS domain of their own, restricted to
-    this machine. Without a bag, a drive with known ground truth is simulated first.
+    The node runs as a process of its own, in a ROS domain that nobody else uses, on this machine
+    alone. Without a bag, a drive with known ground truth is simulated first.
     """
     parser.add_argument('--bag', type=Path,
                         help='rosbag2 folder, .mcap or .db3 (default: a simulated drive)')

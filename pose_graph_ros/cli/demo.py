@@ -13,6 +13,7 @@ import argparse
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 import fcntl
+import importlib
 from importlib.util import find_spec
 import json
 import os
@@ -31,7 +32,7 @@ from pose_graph_ros.adapters.conversions import stamp_ns
 from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import drive_in
-from pose_graph_ros.cli.results import write_results
+from pose_graph_ros.cli.run.document import write_results
 from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.cli.simulate import write_drive
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -45,11 +46,10 @@ from pose_graph_ros.offline.simulation.worlds import WORLDS
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
 DIAGNOSTICS, ODOMETRY = '/diagnostics', '/odometry/filtered'
-NOT_CONVERGED = 3  # exit code of the player, whose module cannot be imported without ROS
 
 
 class DemoError(PoseGraphError):
-    """A process of the demo failed, which the message names."""
+    """The node of the demo failed."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -67,7 +67,7 @@ def execute(options: argparse.Namespace) -> int:
     for source, topic in inputs.topics.items():
         print(f'  {source:<13} {topic}')
     start = time.monotonic()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the processes on SIGTERM
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # also stop the node on SIGTERM
     converged = _run(bag_path, inputs, values, options)
     seconds = time.monotonic() - start
     saved, recorder = read_graph(options.out / GRAPH), Recorder()
@@ -151,28 +151,30 @@ def _run(
                     '-p', f'graph_file:={json.dumps(str((options.out / GRAPH).resolve()))}']
     if find_spec('tf2_msgs') is None:  # make demo does not build it for the simulated drive
         node_command += ['-p', 'publish_tf:=false']
-    player = [sys.executable, '-m', 'pose_graph_ros.ros.player', str(bag.resolve()),
-              str((options.out / RECORDED).resolve()), '--rate', str(options.rate),
-              '--hold-out', str(inputs.hold_out)]
-    for name, topic in inputs.topics.items():
-        player += ['--input', name, inputs.kinds[name].name, values[f'{name}.topic'], topic]
     with tempfile.TemporaryDirectory(prefix='pose_graph_') as log, \
             isolated_environment(Path(log)) as env:
-        processes = [node := subprocess.Popen(node_command, env=env)]
+        before = dict(os.environ)
+        os.environ.update(env)
         try:
-            processes.append(subprocess.Popen(player, env=env))
-            while processes[1].poll() is None:
-                if node.poll() is not None:
-                    raise DemoError(f'the node ended early, with code {node.returncode}')
-                time.sleep(0.1)
+            try:
+                player = importlib.import_module('pose_graph_ros.ros.player')
+            except ImportError as error:  # all other tools work without ROS
+                raise DemoError(f'ROS 2 is not there: {error}') from error
+            node = subprocess.Popen(node_command)
+            try:
+                converged = player.play(
+                    bag, options.out / RECORDED, inputs,
+                    {name: values[f'{name}.topic'] for name in inputs.topics}, rate=options.rate,
+                    is_running=lambda: node.poll() is None)
+            finally:
+                code = _stop(node)
         finally:
-            codes = [_stop(process) for process in reversed(processes)]
-        if codes[-1] != 0:
-            raise DemoError(f'the node ended with code {codes[-1]}')
+            os.environ.clear()
+            os.environ.update(before)
+        if code != 0:
+            raise DemoError(f'the node ended with code {code}')
         print('the node stopped cleanly')
-        if codes[0] not in (0, NOT_CONVERGED):
-            raise DemoError(f'the player ended with code {codes[0]}')
-        return codes[0] == 0
+        return bool(converged)
 
 
 @contextmanager

@@ -1,30 +1,30 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Play a bag to the node over DDS, from a separate process, and record the node's outputs.
+Play a bag to the node over DDS, as drivers would, and record the node's outputs.
 
 No message is lost: the writers are reliable, and the node's queues hold all messages that it has
 not processed yet, by its own count. At the end it is asked for the final optimisation and path,
 and to save its graph.
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
 import rclpy
 from rclpy.client import Client
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
@@ -35,9 +35,9 @@ from pose_graph_ros.adapters.bag_inputs import (
     STATIC_FRAMES,
 )
 from pose_graph_ros.adapters.bag_writer import BagWriter
-from pose_graph_ros.adapters.bags import BagError, MessageError, open_bag
+from pose_graph_ros.adapters.bags import MessageError, open_bag
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
-from pose_graph_ros.adapters.sources import KINDS
+from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros.transforms import message_class, TF_TYPE, TFMessage
 
@@ -48,7 +48,6 @@ RECORDED, KEPT = ('pose', 'filtered_odometry', 'diagnostics'), ('path', 'verdict
 RELIABLE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-NOT_CONVERGED = 3  # exit code if all was played and recorded, without convergence at the end
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,17 +65,20 @@ class Patience:
 PATIENCE = Patience()
 
 
-class PlayError(Exception):
+class PlayError(PoseGraphError):
     """The node did not respond as expected; the message says how."""
 
 
 class Player(Node):
     """Publishes a bag and records the node's outputs."""
 
-    def __init__(self, inputs: Inputs, topics: Mapping[str, str]) -> None:
-        super().__init__('pose_graph_player')
-        self._inputs = inputs
-        self._executor = SingleThreadedExecutor()
+    def __init__(
+        self, inputs: Inputs, topics: Mapping[str, str], context: Context,
+        is_running: Callable[[], bool],
+    ) -> None:
+        super().__init__('pose_graph_player', context=context)
+        self._inputs, self._is_running = inputs, is_running
+        self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self)
         self._writers = {source: self.create_publisher(
             message_class(kind.message_type), topics[source], RELIABLE)
@@ -126,6 +128,8 @@ class Player(Node):
         """Receive messages until a condition holds, at most for a time [s]."""
         end = time.monotonic() + timeout
         while not done():
+            if not self._is_running():
+                raise PlayError('the node ended early')
             if time.monotonic() > end:
                 raise PlayError(f'{failure} (waited {timeout:g} s)')
             self._executor.spin_once(timeout_sec=0.05)
@@ -224,41 +228,26 @@ class Player(Node):
                 writer.write(*message)
 
 
-def main(args: list[str] | None = None) -> int:
-    """Play a bag and return the exit code; `pose-graph demo` passes the arguments."""
-    parser = argparse.ArgumentParser(prog='player', description=__doc__)
-    parser.add_argument('bag', type=Path)
-    parser.add_argument('out', type=Path, help='folder of the rosbag2 to write')
-    parser.add_argument('--input', nargs=4, action='append', default=[],
-                        metavar=('SOURCE', 'TYPE', 'NODE_TOPIC', 'BAG_TOPIC'))
-    parser.add_argument('--hold-out', type=int, default=0)
-    parser.add_argument('--rate', type=float, default=20.0)
-    options = parser.parse_args(args)
-    inputs = Inputs({source: topic for source, _, _, topic in options.input},
-                    {source: KINDS[kind] for source, kind, _, _ in options.input},
-                    options.hold_out)
-    rclpy.init()
+def play(
+    bag: Path, out: Path, inputs: Inputs, topics: Mapping[str, str], *, rate: float,
+    is_running: Callable[[], bool],
+) -> bool:
+    """
+    Play a bag to the node on its topics, and write its outputs as a rosbag2.
+
+    Return whether the final optimisation converged. `is_running` tells whether the node still is.
+    """
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        player = Player(inputs, {source: topic for source, _, topic, _ in options.input})
-        published = player.play(options.bag, options.rate)
+        player = Player(inputs, topics, context, is_running)
+        published = player.play(bag, rate)
         success, answer = player.request_final_optimization()
         player.save_graph()
-        player.write(options.out)
+        player.write(out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '
               f'path of {player.n_poses} poses')
-        if not success:
-            print(f'player: ~/optimize: {answer}', file=sys.stderr)
-            return NOT_CONVERGED
-    except (PlayError, BagError) as error:
-        print(f'player: {error}', file=sys.stderr)
-        return 1
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return 130
     finally:
-        rclpy.try_shutdown()
-    return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())
+        rclpy.try_shutdown(context=context)
+    return success
