@@ -29,9 +29,9 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     Position,
 )
-from pose_graph_ros.offline.simulation.graph import composed
-from pose_graph_ros.offline.simulation.motion import path_length
+from pose_graph_ros.offline.simulation.recording import composed
 from pose_graph_ros.offline.simulation.sensors import model_variances
+from pose_graph_ros.offline.simulation.worlds import path_length
 
 SECOND = 1_000_000_000
 START_NS = 1_000 * SECOND

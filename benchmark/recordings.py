@@ -32,8 +32,8 @@ from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
-from pose_graph_ros.offline.simulation.graph import composed
-from pose_graph_ros.offline.simulation.motion import path_length
+from pose_graph_ros.offline.simulation.recording import composed
+from pose_graph_ros.offline.simulation.worlds import path_length
 
 SECOND = 1_000_000_000
 TRUE, FAR = 3.0, 6.0

@@ -52,7 +52,7 @@ from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.closures import floored, FLOORS
-from pose_graph_ros.offline.simulation.graph import composed
+from pose_graph_ros.offline.simulation.recording import composed
 from pose_graph_ros.offline.simulation.settings import FalseClosures
 
 TITLE = 'Wrong measurements'

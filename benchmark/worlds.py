@@ -37,8 +37,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.offline.simulation.graph import composed
-from pose_graph_ros.offline.simulation.motion import street_corners
+from pose_graph_ros.offline.simulation.recording import composed
+from pose_graph_ros.offline.simulation.worlds import street_corners
 
 SEED = 20260
 CHAIN_SIGMA = (0.05, 0.02, 0.003)

@@ -12,16 +12,14 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import FactorKind
-from pose_graph_ros.offline.simulation.graph import graph_of, odometry_edges
-from pose_graph_ros.offline.simulation.motion import path_length
-from pose_graph_ros.offline.simulation.recording import course
+from pose_graph_ros.offline.simulation.recording import course, graph_of, odometry_edges
 from pose_graph_ros.offline.simulation.settings import (
     ClaimedSigma,
     CLOSURES,
     FalseClosures,
     Setup,
 )
-from pose_graph_ros.offline.simulation.worlds import WORLDS
+from pose_graph_ros.offline.simulation.worlds import path_length, WORLDS
 
 LEAST_WRONG = 3.5
 """Smallest error of a closure that is meant to be wrong [m]."""

@@ -5,5 +5,5 @@ Convert between ROS formats and the values of the engine, without rclpy.
 
 Bags, ROS messages and parameter values come in; measurements, settings of the engine and
 serialised messages go out. The node and the offline tools share these modules. Read first
-`sources`, whose table has the kinds of sources, then `message_reader`.
+`sources`, which has the table of the kinds of sources, and what reads their messages.
 """

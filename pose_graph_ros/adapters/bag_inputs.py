@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import (
     CLOSURES,
     GLOBAL_POSE,
     Kind,
     KNOWN_SOURCES,
+    MessageReader,
     ODOMETRY,
     Source,
 )

@@ -3,50 +3,51 @@
 """
 Convert ROS messages to measurements.
 
-The functions accept any object with the fields of the message, from rclpy or from a bag reader.
+The functions accept any object with the fields of the message, from rclpy or from a bag reader,
+its source, and what else it is read by.
 Invalid data never raises: they return an `Answer` with the reason. Covariances are passed on
 unchanged; `core.sources.validation` applies the covariance policy of the source.
 """
 
 from collections.abc import Sequence
+from functools import partial
 import math
 import re
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pose_graph_ros.adapters.surroundings import frame, IntegratedTwist, Message, Surroundings
+from pose_graph_ros.core.config import Integrate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose, wrap_one
 from pose_graph_ros.core.measurements import (
     Answer,
+    Fix,
     GlobalPose,
     HeadingOnly,
     LARGEST_COORDINATE,
     LoopClosure,
     OdometrySample,
+    Range,
     rejected,
+    YawRate,
 )
-from pose_graph_ros.core.quantities import NANOSECONDS, Radians
+from pose_graph_ros.core.quantities import NANOSECONDS
+
+if TYPE_CHECKING:
+    from pose_graph_ros.adapters.sources import Source
 
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # rows and columns of x, y and yaw in a 6x6 covariance
 
 _REFERENCE_NODE = re.compile(r'x(\d{1,18})')
 _REFERENCE_TIME = re.compile(r'@(\d{1,10})(?:\.(\d{1,9}))?')
 
-Message = Any
-"""A ROS message of any reader."""
-
-
 def stamp_ns(message: Message, offset_ns: int = 0) -> int:
     """Return the stamp of a message's header plus an offset [ns]; a stamp of 0 stays 0."""
     stamp = message.header.stamp
     whole = int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
     return whole + offset_ns if whole > 0 else whole
-
-
-def frame(name: str) -> str:
-    """Return a frame id without a leading slash, which drivers from ROS 1 may still send."""
-    return name.removeprefix('/')
 
 
 def yaw_of(q: Message) -> float | None:
@@ -66,7 +67,7 @@ def planar_pose(pose: Message) -> FloatArray | None:
 
 
 def odometry_sample(
-    message: Message, offset_ns: int = 0, *, with_twist: bool = False,
+    message: Message, source: 'Source', _by: Surroundings,
 ) -> OdometrySample | Answer:
     """
     Return the sample in a nav_msgs/Odometry, or the reason for rejecting it.
@@ -81,11 +82,12 @@ def odometry_sample(
         return rejected('too_large', f'odometry pose {pose.tolist()}')
     linear = message.twist.twist.linear
     speed = math.hypot(linear.x, linear.y)
-    twist = planar_twist(message.twist.twist) if with_twist else None
+    integrated = source.integrate == Integrate.TWIST.value
+    twist = planar_twist(message.twist.twist) if integrated else None
     if isinstance(twist, Answer):
         return twist
     return OdometrySample(
-        stamp_ns(message, offset_ns), pose, speed if math.isfinite(speed) else 0.0,
+        stamp_ns(message, source.time_offset_ns), pose, speed if math.isfinite(speed) else 0.0,
         twist_variance(message.twist.covariance), twist)
 
 
@@ -105,7 +107,12 @@ def twist_variance(values: Sequence[float]) -> FloatArray | None:
     return np.array(variance) if usable and any(variance) else None
 
 
-def global_pose(
+def global_pose(message: Message, source: 'Source', by: Surroundings) -> GlobalPose | Answer:
+    """Return the pose in the map of a PoseWithCovarianceStamped, or why it is rejected."""
+    return pose_in(message, (by.map_frame,), source.time_offset_ns)
+
+
+def pose_in(
     message: Message, frames: Sequence[str], offset_ns: int = 0,
 ) -> GlobalPose | Answer:
     """
@@ -123,9 +130,7 @@ def global_pose(
     return GlobalPose(stamp_ns(message, offset_ns), pose, _planar(message.pose.covariance))
 
 
-def heading(
-    message: Message, map_yaw: Radians = 0.0, yaw_offset: Radians = 0.0, offset_ns: int = 0,
-) -> HeadingOnly | Answer:
+def heading(message: Message, source: 'Source', by: Surroundings) -> HeadingOnly | Answer:
     """
     Return the heading in a sensor_msgs/Imu with an absolute yaw, or the reason for rejecting it.
     """
@@ -135,11 +140,14 @@ def heading(
     if yaw is None:
         q = message.orientation
         return rejected('not_finite', f'quaternion ({q.x}, {q.y}, {q.z}, {q.w})')
-    return HeadingOnly(stamp_ns(message, offset_ns), float(se2.wrap(yaw + yaw_offset - map_yaw)),
+    return HeadingOnly(stamp_ns(message, source.time_offset_ns),
+                       float(se2.wrap(yaw + source.yaw_offset - by.datum.yaw)),
                        float(message.orientation_covariance[8]))
 
 
-def loop_closure(message: Message, offset_ns: int = 0) -> LoopClosure | Answer:
+def loop_closure(
+    message: Message, source: 'Source', _by: Surroundings,
+) -> LoopClosure | Answer:
     """
     Return the loop closure in a PoseWithCovarianceStamped, or the reason for rejecting it.
 
@@ -149,6 +157,7 @@ def loop_closure(message: Message, offset_ns: int = 0) -> LoopClosure | Answer:
     pose = planar_pose(message.pose.pose)
     if pose is None:
         return _bad_pose(message.pose.pose)
+    offset_ns = source.time_offset_ns
     named, stamp = message.header.frame_id, stamp_ns(message, offset_ns)
     cov = _planar(message.pose.covariance)
     if (node := _REFERENCE_NODE.fullmatch(named)) is not None:
@@ -159,6 +168,110 @@ def loop_closure(message: Message, offset_ns: int = 0) -> LoopClosure | Answer:
             int(time[1]) * NANOSECONDS + nanoseconds + offset_ns))
     return rejected('wrong_frame', f'expected a hidden node such as x42 or a time such as '
                                    f'@1695.250000000, got {named!r}')
+
+
+def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
+    """
+    Return the fix in a sensor_msgs/NavSatFix, or the reason for rejecting it.
+
+    An unknown covariance is returned as zeros.
+    """
+    if message.status.status == -1:
+        return rejected('no_fix', 'the receiver reports no fix')
+    latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return rejected('not_finite', f'latitude {latitude}, longitude {longitude}')
+    # an altitude of NaN means that it is unknown, and passes
+    if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > 1e5:
+        return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
+                                        f'altitude {altitude}')
+    stamp = stamp_ns(message, source.time_offset_ns)
+    if stamp <= 0:
+        return rejected('zero_stamp', 'a fix without a stamp')
+    if by.datum.is_awaited:
+        return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
+    cov = np.zeros((2, 2))
+    if message.position_covariance_type != 0:
+        cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
+    if np.all(np.isfinite(cov)):
+        with np.errstate(over='ignore', invalid='ignore'):
+            cov = covariance.turned(cov, by.datum.yaw)
+    return Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
+               by.lever_arm(frame(message.header.frame_id), source))
+
+
+def beacon_range(message: Message, source: 'Source', by: Surroundings) -> Range | Answer:
+    """
+    Return the range in a sensor_msgs/Range, or the reason for rejecting it.
+
+    Its frame is the name of the beacon, or those of antenna and beacon, such as `tag/anchor_1`.
+    """
+    antenna, _, beacon = frame(message.header.frame_id).rpartition('/')
+    if beacon == '':
+        return rejected('wrong_frame', 'expected the name of a beacon as the frame_id')
+    distance, least, most = float(message.range), message.min_range, message.max_range
+    if not math.isfinite(distance):
+        return rejected('not_finite', f'range {distance} m')
+    if most > least and not least <= distance <= most:
+        return rejected('out_of_range', f'range {distance} m, not from {least} to {most} m')
+    place = source.beacons.get(beacon)
+    # older messages have no variance
+    return Range(stamp_ns(message, source.time_offset_ns), beacon, distance,
+                 float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
+                 None if place is None else np.array(place))
+
+
+def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> YawRate | Answer:
+    """Return the yaw rate in a sensor_msgs/Imu, or the reason for rejecting it."""
+    values = message.angular_velocity_covariance
+    if values[0] == -1.0:   # by the definition of the message
+        return rejected('no_angular_velocity', 'the sensor reports no angular velocity')
+    velocity = message.angular_velocity
+    if source.mounting != 'tf' or by.is_of_base(message):
+        rate, variance = -velocity.z if source.mounting == 'down' else velocity.z, values[8]
+    else:
+        found = by.in_base(message)
+        if found is None:
+            return rejected('unknown_frame', (
+                f'no transform from {frame(message.header.frame_id)!r} to {by.base_frame!r} on '
+                f'/tf_static: publish it, or set {source.name}.mounting'))
+        up = found[0][2]
+        rate = float(up @ (velocity.x, velocity.y, velocity.z))
+        variance = up @ np.asarray(values, dtype=float).reshape(3, 3) @ up
+    if not math.isfinite(rate):
+        return rejected('not_finite', (
+            f'angular velocity ({velocity.x}, {velocity.y}, {velocity.z})'))
+    return YawRate(stamp_ns(message, source.time_offset_ns), float(rate),
+                   float(variance) if variance > 0.0 else 0.0)
+
+
+def twist_odometry(
+    message: Message, source: 'Source', by: Surroundings,
+) -> OdometrySample | Answer:
+    """Return the odometry by a TwistWithCovarianceStamped, or the reason for rejecting it."""
+    twist = planar_twist(message.twist.twist)
+    if isinstance(twist, Answer):
+        return twist
+    if not by.is_of_base(message):
+        found = by.in_base(message)
+        if found is None:
+            return rejected('wrong_frame', (
+                f'expected frame {by.base_frame!r} or one with a transform to it on '
+                f'/tf_static, got {frame(message.header.frame_id)!r}'))
+        twist = _at_base(twist, *found)
+    stamp = stamp_ns(message, source.time_offset_ns)
+    whole = by.twists.get(source.name, IntegratedTwist()).then(stamp, twist)
+    by.twists[source.name] = whole
+    return OdometrySample(stamp, np.array(whole.pose), math.hypot(twist[0], twist[1]),
+                          twist_variance(message.twist.covariance), twist)
+
+
+def _at_base(twist: Pose, rotation: FloatArray, place: FloatArray) -> Pose:
+    """Return the twist of the robot from that of a sensor at a place in its frame."""
+    x, y, rate = twist
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    return (c * x - s * y + rate * float(place[1]), s * x + c * y - rate * float(place[0]), rate)
 
 
 def _planar(covariance_6x6: Message) -> FloatArray:

@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The kinds of sources, each of them one row of a table, and the sources by the ROS parameters.
+The kinds of sources, each one row of a table; sources by the ROS parameters, and their messages.
 
 A row says what messages a kind has and what they become, which settings the engine has for it, and
 by which parameters. What the engine does with the measurements, `core.sources.kinds` says.
@@ -12,26 +12,20 @@ from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any
 
-from pose_graph_ros.adapters import parameter_table as table
-from pose_graph_ros.adapters.conversions import (
-    global_pose,
-    heading,
-    loop_closure,
-    Message,
-    odometry_sample,
-)
+from pose_graph_ros.adapters import conversions, parameter_table as table
 from pose_graph_ros.adapters.parameter_table import Change, Parameter
 from pose_graph_ros.adapters.surroundings import (
-    beacon_range,
-    fix,
+    datum_of,
+    frame,
+    Message,
+    StaticFrames,
     Surroundings,
-    twist_odometry,
-    yaw_rate,
 )
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
+from pose_graph_ros.core.odometry.time_keeper import TimeKeeper
 from pose_graph_ros.core.quantities import NANOSECONDS
 
 # The graph is reset if the clock or the stamps of odometry jump back by more than this [ns].
@@ -72,38 +66,32 @@ class Kind:
 
 
 ODOMETRY = Kind(
-    'odometry', 'nav_msgs/msg/Odometry',
-    lambda message, source, _: odometry_sample(
-        message, source.time_offset_ns, with_twist=source.integrate == Integrate.TWIST.value),
-    OdometrySource(), (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
+    'odometry', 'nav_msgs/msg/Odometry', conversions.odometry_sample, OdometrySource(),
+    (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
 GLOBAL_POSE = Kind(
-    'global_pose', _POSE,
-    lambda message, source, by: global_pose(message, (by.map_frame,), source.time_offset_ns),
-    config.POSITIONS, (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
+    'global_pose', _POSE, conversions.global_pose, config.POSITIONS,
+    (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
     without_frame='it is taken for {map}, the map_frame')
 FIX = Kind(
-    'fix', 'sensor_msgs/msg/NavSatFix', fix, config.POSITIONS,
+    'fix', 'sensor_msgs/msg/NavSatFix', conversions.fix, config.POSITIONS,
     (*table.in_the_map(config.POSITIONS), table.LEVER_ARM), in_map=True, on_earth=True,
     in_frames=True,
     without_frame='its antenna is taken to be in {base}: set {name}.lever_arm')
 IMU = Kind(
-    'imu', _IMU,
-    lambda message, source, by: heading(
-        message, by.datum.yaw, source.yaw_offset, source.time_offset_ns),
-    config.HEADINGS, (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
+    'imu', _IMU, conversions.heading, config.HEADINGS,
+    (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
 LOOP_CLOSURE = Kind(
-    'loop_closure', _POSE,
-    lambda message, source, _: loop_closure(message, source.time_offset_ns),
-    config.LOOP_CLOSURES, table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
+    'loop_closure', _POSE, conversions.loop_closure, config.LOOP_CLOSURES,
+    table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
 TWIST = Kind(
-    'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', twist_odometry,
+    'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', conversions.twist_odometry,
     OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
     without_frame='it is taken for {base}, the base_link_frame')
 GYRO = Kind(
-    'gyro', _IMU, yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
+    'gyro', _IMU, conversions.yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
     without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
 RANGE = Kind(
-    'range', 'sensor_msgs/msg/Range', beacon_range, config.RANGES,
+    'range', 'sensor_msgs/msg/Range', conversions.beacon_range, config.RANGES,
     (*table.of_measurements(config.RANGES), table.LEVER_ARM, table.BEACONS), in_frames=True)
 KINDS = {kind.name: kind
          for kind in (ODOMETRY, GLOBAL_POSE, FIX, IMU, LOOP_CLOSURE, TWIST, GYRO, RANGE)}
@@ -248,3 +236,48 @@ def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> M
         # for Tukey's loss that for 95 % of the accuracy of least squares [sigma]
         rejection_threshold=(5.0 if loss is config.Loss.TUKEY else default.rejection_threshold),
         correlation_time=own.get('correlation_time', 0.0))
+
+
+class MessageReader:
+    """Converts the messages of all sources to measurements, by the checked parameters."""
+
+    def __init__(
+        self, values: Mapping[str, Any], frames: StaticFrames | None = None,
+        keeper: TimeKeeper | None = None,
+    ) -> None:
+        self.sources = {source.name: source for source in source_list(values)}  # sources by name
+        self.keeper = keeper or TimeKeeper(
+            [name for name, source in self.sources.items() if source.kind.is_odometry],
+            CLOCK_JUMP_NS)
+        self.frames = StaticFrames() if frames is None else frames
+        self.datum = datum_of(values)
+        self.surroundings = Surroundings(
+            frame(values['map_frame']), frame(values['base_link_frame']), self.datum, self.frames)
+
+    def configure(self, values: Mapping[str, Any]) -> None:
+        """
+        Use other time offsets, lever arms, yaw offsets and mountings for messages from now on.
+
+        Sources, topics, frames, datum, static transforms and counts stay.
+        """
+        for source in source_list(values):
+            before = self.sources[source.name]
+            self.keeper.shift(source.name, source.time_offset_ns - before.time_offset_ns)
+            self.sources[source.name] = source
+
+    def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+        """Return the measurement in a message of a source, or the reason for rejecting it."""
+        measurement = self.convert(name, message)
+        if isinstance(measurement, Answer):
+            return measurement
+        return self.keeper.judge(name, measurement).refusal or measurement
+
+    def convert(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+        """Return the same without a judgement of its stamp."""
+        source = self.sources[name]
+        measurement = source.kind.convert(message, source, self.surroundings)
+        if not isinstance(measurement, Answer) and (
+                # the seconds have 31 bits, of which one hour is left for offsets
+                measurement.stamp_ns > (2**31 - 3600) * NANOSECONDS):
+            return rejected('stamp_out_of_range', f'{measurement.stamp_ns} ns')
+        return measurement

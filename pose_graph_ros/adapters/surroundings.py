@@ -2,36 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """
 What some messages cannot be read without: the frames of the robot, and the datum of the map.
-
-The conversions here need them: those of fixes, of yaw rates, and of twists.
 """
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 import math
 import threading
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.adapters.conversions import (
-    frame,
-    Message,
-    planar_twist,
-    stamp_ns,
-    twist_variance,
-)
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import compose_one, FloatArray, Pose
-from pose_graph_ros.core.measurements import Answer, Fix, OdometrySample, Range, rejected, YawRate
 from pose_graph_ros.core.odometry.motion import integrated
 
 if TYPE_CHECKING:
     from pose_graph_ros.adapters.sources import Source
+
+Message = Any
+"""A ROS message of any reader."""
+
+
+def frame(name: str) -> str:
+    """Return a frame id without a leading slash, which drivers from ROS 1 may still send."""
+    return name.removeprefix('/')
 
 
 class Datum:
@@ -224,107 +220,3 @@ class Surroundings:
         self.antennas[source.name] = Antenna(given, origin)
         self.without_lever_arm[source.name] += origin == 'none'
         return given
-
-
-def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
-    """
-    Return the fix in a sensor_msgs/NavSatFix, or the reason for rejecting it.
-
-    An unknown covariance is returned as zeros.
-    """
-    if message.status.status == -1:
-        return rejected('no_fix', 'the receiver reports no fix')
-    latitude, longitude, altitude = message.latitude, message.longitude, message.altitude
-    if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        return rejected('not_finite', f'latitude {latitude}, longitude {longitude}')
-    # an altitude of NaN means that it is unknown, and passes
-    if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > 1e5:
-        return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
-                                        f'altitude {altitude}')
-    stamp = stamp_ns(message, source.time_offset_ns)
-    if stamp <= 0:
-        return rejected('zero_stamp', 'a fix without a stamp')
-    if by.datum.is_awaited:
-        return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
-    cov = np.zeros((2, 2))
-    if message.position_covariance_type != 0:
-        cov = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
-    if np.all(np.isfinite(cov)):
-        with np.errstate(over='ignore', invalid='ignore'):
-            cov = covariance.turned(cov, by.datum.yaw)
-    return Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
-               by.lever_arm(frame(message.header.frame_id), source))
-
-
-def beacon_range(message: Message, source: 'Source', by: Surroundings) -> Range | Answer:
-    """
-    Return the range in a sensor_msgs/Range, or the reason for rejecting it.
-
-    Its frame is the name of the beacon, or those of antenna and beacon, such as `tag/anchor_1`.
-    """
-    antenna, _, beacon = frame(message.header.frame_id).rpartition('/')
-    if beacon == '':
-        return rejected('wrong_frame', 'expected the name of a beacon as the frame_id')
-    distance, least, most = float(message.range), message.min_range, message.max_range
-    if not math.isfinite(distance):
-        return rejected('not_finite', f'range {distance} m')
-    if most > least and not least <= distance <= most:
-        return rejected('out_of_range', f'range {distance} m, not from {least} to {most} m')
-    place = source.beacons.get(beacon)
-    # older messages have no variance
-    return Range(stamp_ns(message, source.time_offset_ns), beacon, distance,
-                 float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
-                 None if place is None else np.array(place))
-
-
-def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> YawRate | Answer:
-    """Return the yaw rate in a sensor_msgs/Imu, or the reason for rejecting it."""
-    values = message.angular_velocity_covariance
-    if values[0] == -1.0:   # by the definition of the message
-        return rejected('no_angular_velocity', 'the sensor reports no angular velocity')
-    velocity = message.angular_velocity
-    if source.mounting != 'tf' or by.is_of_base(message):
-        rate, variance = -velocity.z if source.mounting == 'down' else velocity.z, values[8]
-    else:
-        found = by.in_base(message)
-        if found is None:
-            return rejected('unknown_frame', (
-                f'no transform from {frame(message.header.frame_id)!r} to {by.base_frame!r} on '
-                f'/tf_static: publish it, or set {source.name}.mounting'))
-        up = found[0][2]
-        rate = float(up @ (velocity.x, velocity.y, velocity.z))
-        variance = up @ np.asarray(values, dtype=float).reshape(3, 3) @ up
-    if not math.isfinite(rate):
-        return rejected('not_finite', (
-            f'angular velocity ({velocity.x}, {velocity.y}, {velocity.z})'))
-    return YawRate(stamp_ns(message, source.time_offset_ns), float(rate),
-                   float(variance) if variance > 0.0 else 0.0)
-
-
-def twist_odometry(
-    message: Message, source: 'Source', by: Surroundings,
-) -> OdometrySample | Answer:
-    """Return the odometry by a TwistWithCovarianceStamped, or the reason for rejecting it."""
-    twist = planar_twist(message.twist.twist)
-    if isinstance(twist, Answer):
-        return twist
-    if not by.is_of_base(message):
-        found = by.in_base(message)
-        if found is None:
-            return rejected('wrong_frame', (
-                f'expected frame {by.base_frame!r} or one with a transform to it on '
-                f'/tf_static, got {frame(message.header.frame_id)!r}'))
-        twist = _at_base(twist, *found)
-    stamp = stamp_ns(message, source.time_offset_ns)
-    whole = by.twists.get(source.name, IntegratedTwist()).then(stamp, twist)
-    by.twists[source.name] = whole
-    return OdometrySample(stamp, np.array(whole.pose), math.hypot(twist[0], twist[1]),
-                          twist_variance(message.twist.covariance), twist)
-
-
-def _at_base(twist: Pose, rotation: FloatArray, place: FloatArray) -> Pose:
-    """Return the twist of the robot from that of a sensor at a place in its frame."""
-    x, y, rate = twist
-    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-    c, s = math.cos(yaw), math.sin(yaw)
-    return (c * x - s * y + rate * float(place[1]), s * x + c * y - rate * float(place[0]), rate)

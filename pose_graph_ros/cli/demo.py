@@ -184,7 +184,15 @@ def isolated_environment(log: Path) -> Iterator[dict[str, str]]:
 
     No other program of this package uses their domain until the context is left.
     """
-    with _free_domain() as domain:
+    with ExitStack() as locks:
+        for domain in random.SystemRandom().sample(range(1, 101), 100):
+            try:
+                lock = locks.enter_context(open(
+                    f'{tempfile.gettempdir()}/pose_graph_ros_domain_{domain}', 'a'))
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                continue  # it is used; if all are, the last one is used twice
         env = dict(os.environ)
         # set by a sourced ROS, but not by the wheels from PyPI
         env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
@@ -193,30 +201,6 @@ def isolated_environment(log: Path) -> Iterator[dict[str, str]]:
         env['ROS_LOG_DIR'] = str(log)
         env.pop('ROS_LOCALHOST_ONLY', None)
         yield env
-
-
-@contextmanager
-def _free_domain() -> Iterator[int]:
-    """Yield a ROS domain whose lock file this process holds; any domain if all are held."""
-    domains = random.SystemRandom().sample(range(1, 101), 100)
-    with ExitStack() as locks:
-        yield next((domain for domain in domains if _is_locked(domain, locks)), domains[0])
-
-
-def _is_locked(domain: int, locks: ExitStack) -> bool:
-    """Tell whether the lock file of a domain could be locked, until the locks are released."""
-    name = Path(tempfile.gettempdir()) / f'pose_graph_ros_domain_{domain}'
-    try:
-        lock = name.open('a', encoding='utf-8')
-    except OSError:
-        return False
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.close()
-        return False
-    locks.callback(lock.close)
-    return True
 
 
 def _stop(node: 'subprocess.Popen[bytes]') -> int:

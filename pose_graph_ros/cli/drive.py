@@ -21,7 +21,7 @@ from scipy.special import gammaincinv
 
 from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.message_reader import MessageReader
+from pose_graph_ros.adapters.sources import MessageReader
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin

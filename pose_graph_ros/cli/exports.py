@@ -18,14 +18,13 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagMessage, MessageError, Span
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.output_cdr import (
     odometry_cdr,
     path_cdr,
     transform_cdr,
     UNKNOWN_VARIANCE,
 )
-from pose_graph_ros.adapters.sources import KINDS
+from pose_graph_ros.adapters.sources import KINDS, MessageReader
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.run.recorder import Run

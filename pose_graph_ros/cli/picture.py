@@ -31,8 +31,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import Points
 from pose_graph_ros.core.quantities import StampNs
-from pose_graph_ros.offline.simulation.graph import SimulatedGraph
-from pose_graph_ros.offline.simulation.recording import Recording
+from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 
 # After Okabe and Ito, so that people with any kind of colour vision can distinguish them.

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import Bag, BagError, open_bags
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.sources import (
     backend_config,
     CLOSURES,
     Kind,
     LOOP_CLOSURE,
+    MessageReader,
     ODOMETRY,
     source_list,
 )
@@ -33,7 +33,7 @@ from pose_graph_ros.cli.exports import (
     write_lines,
 )
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
-from pose_graph_ros.cli.results import write_results
+from pose_graph_ros.cli.run.document import write_results
 from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status

@@ -29,11 +29,16 @@ from pose_graph_ros.core.io.g2o import g2o_text
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.quantities import Metres, StampsNs
 from pose_graph_ros.offline.simulation import settings
-from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
-from pose_graph_ros.offline.simulation.motion import PERIOD_S
-from pose_graph_ros.offline.simulation.recording import Course, course, record, Recording
+from pose_graph_ros.offline.simulation.recording import (
+    Course,
+    course,
+    graph_of,
+    record,
+    Recording,
+    SimulatedGraph,
+)
 from pose_graph_ros.offline.simulation.sensors import velocities
-from pose_graph_ros.offline.simulation.worlds import WORLDS
+from pose_graph_ros.offline.simulation.worlds import PERIOD_S, WORLDS
 
 GRAPH_SUFFIX = '.g2o'
 ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)  # constant, as many drivers set them

@@ -1,19 +1,38 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The values of /diagnostics by their keys."""
+"""
+What /diagnostics reports: values by their keys, and what concerns the node now, with what to do.
 
-from collections.abc import Sequence
+The most urgent concern is the message of the diagnostics; some are in the log, too. What is around
+the node and probably not as it was meant, such as topics that nobody publishes, or others as well,
+and frames that are not those of the parameters, is in doubt: rclpy and the middleware say nothing
+of it.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 import math
 import os
 from pathlib import Path
 import time
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from pose_graph_ros.adapters.conversions import frame
+from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
+from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
+from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
+from pose_graph_ros.core.odometry.gyro import CONTRADICTORY, MOST_BIAS
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.settings import SOURCES
+from pose_graph_ros.ros.input import EXPECTED
+from pose_graph_ros.ros.topics import moved
+from pose_graph_ros.ros.transforms import other_publishers
 from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
@@ -145,3 +164,202 @@ def _fits(session: 'Session') -> dict[str, object]:
                 + (f'; treated as white: set {name}.correlation_time'
                    if report.wrongly_white else ''))
     return found
+
+
+# --- what concerns the node
+
+class Concern(NamedTuple):
+    """What applies to the node now: a sentence with what to do, without its full stop."""
+
+    level: bytes
+    text: str
+    logged: bool = False  # whether the log has it, too, when it begins and when it is over
+
+    @property
+    def sentence(self) -> str:
+        """The text as a sentence."""
+        return f'{self.text[0].upper()}{self.text[1:]}.'
+
+
+ERROR, WARN, GOOD = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
+
+
+def concerns(session: 'Session') -> Iterator[Concern]:
+    """Yield all that applies to the node, the most urgent first."""
+    worker, received = session.worker, session.input
+    estimate, report = worker.estimate, worker.status.report
+    if not worker.alive:
+        yield Concern(ERROR, 'the worker thread has ended: restart the node')
+    if report is not None and report.status is Status.FAILED:
+        names = ', '.join(worker.status.set_aside) or 'the newest measurements'
+        yield Concern(ERROR, f'the solver failed with {names}: set aside until ~/optimize; the '
+                      'estimate is without them. See the log for the reason')
+    if not session.active:
+        yield Concern(GOOD, 'inactive: activate the node (ros2 lifecycle set)')
+    if received.paused:
+        yield Concern(WARN, 'paused: call ~/pause with false to resume')
+    if not worker.prepared:
+        doing = ('compiling kernels, as at every first start' if session.compiling
+                 else 'loading compiled kernels')
+        yield Concern(WARN, f'{doing}: {received.posted} measurements wait until then')
+    yield from _missing_input(session)
+    if session.out.transforms is not None and session.out.transforms.other != '':
+        yield Concern(WARN, session.out.transforms.other, logged=True)
+    if len(received.silent) > 0:
+        yield Concern(WARN, f'nothing comes from {" and ".join(received.silent)}, while other '
+                      'sources go on: check the drivers', logged=True)
+    if session.active:
+        yield from (Concern(WARN, text, logged=True) for text in doubts(session))
+    yield from (Concern(WARN, text, logged=True) for text in (
+        each.wrong for each in received.arrivals.values()) if text != '')
+    if estimate is not None and estimate.alignment is AlignmentState.UNALIGNED:
+        yield Concern(WARN, 'unaligned: the angle between odometry and map is not known yet. '
+                      'Drive some metres while fixes come in')
+    yield from _disagreements(session)
+    yield from _doubted(session)
+    if estimate is not None and estimate.alignment is AlignmentState.LOCAL:
+        yield Concern(GOOD, 'running without measurements in the map: its frame is that of the '
+                      'first odometry')
+    yield Concern(GOOD, 'running')
+
+
+def _missing_input(session: 'Session') -> Iterator[Concern]:
+    """Yield what is to be said if odometry, or all messages of a source, do not get in."""
+    estimate, received = session.worker.estimate, session.input
+    odometry, refused = session.odometry_topics, received.refused
+    if estimate is None or (session.is_loaded and not any(
+            session.worker.status.counts[name, 'accepted'] > 0 for name in odometry)):
+        why = '; '.join(refused[name] for name in odometry if name in refused) or (
+            f'check {" or ".join(odometry.values())}')
+        state = 'no odometry yet' if estimate is None else (
+            f'a graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
+        yield Concern(WARN, f'{state}: {why}')
+    if received.quiet > 0.0:
+        yield Concern(WARN, f'nothing has been received for {received.quiet:.0f} s: the drivers '
+                      'have stopped, or a bag has ended'
+                      + ('; the graph has been optimised' if session.worker.is_optimal else ''),
+                      logged=True)
+    if len(refused) > 0:
+        yield Concern(WARN, '; '.join(refused.values()))
+
+
+def _doubted(session: 'Session') -> Iterator[Concern]:
+    """Yield what is to be said of a node that works, but with wrong settings or errors."""
+    status = session.worker.status
+    for name in (name for name, each in status.verdicts.items() if each.doubting):
+        yield Concern(WARN, f'the newest measurements of {name} are doubted and not used, as they '
+                      'contradict the others: see ~/verdicts', logged=True)
+    for name, fit in status.sources.items():
+        if fit.wrongly_white:
+            yield Concern(WARN, f'the errors of {name} are correlated in time but treated as '
+                          f'white, so the covariances are too small: set {name}.correlation_time '
+                          f'to about {short(fit.errors.tau)} s')
+    errors = sum(count for (_, reason), count in status.counts.items()
+                 if reason == 'internal_error')
+    if errors > 0:
+        yield Concern(WARN, f'running, but {errors} internal errors are in the log: please report '
+                      'them')
+
+
+def _disagreements(session: 'Session') -> Iterator[Concern]:
+    """Yield who disagrees with others, and what is probably wrong with them."""
+    status, estimate = session.worker.status, session.worker.estimate
+    found = session.searches.contradiction
+    if found is not None:
+        yield Concern(WARN, found.text, logged=True)
+    for name, source in session.input.reader.sources.items():
+        if source.kind is not GYRO or estimate is None:
+            continue
+        counts, bias = status.counts, status.biases.get(name, 0.0)
+        difference = status.differences.get(name)
+        if counts[name, 'rotations'] == 0 and counts[name, 'accepted'] >= 20 <= estimate.n_hidden:
+            yield Concern(WARN, f'no message of {name} could be used: either their stamps are not '
+                          f'in the time of odometry, or they are farther apart than '
+                          f'{name}.maximum_gap', logged=True)
+        if difference is not None and difference.sigmas > CONTRADICTORY and difference.reason:
+            yield Concern(WARN, f'of {name} and odometry one is wrong: {difference.reason}',
+                          logged=True)
+        elif abs(bias) > MOST_BIAS * session.values[f'{name}.sigma_bias']:
+            yield Concern(WARN, f'the bias of {name} is {short(bias)} rad/s, more than five times '
+                          'its sigma_bias: check its mounting and its unit, rad/s', logged=True)
+
+
+# --- what around the node is probably not as it was meant
+
+def doubts(session: 'Session') -> Iterator[str]:
+    """Yield what is to be said now; of the topics, once there was time to start all drivers."""
+    topics: defaultdict[str, list[Source]] = defaultdict(list)
+    for source in session.input.reader.sources.values():
+        topics[session.node.resolve_topic_name(source.topic)].append(source)
+    for topic, users in topics.items():
+        yield from _shared(topic, users)
+        if time.monotonic() - session.activated_at > EXPECTED.quiet:
+            for source in users:
+                yield from _unpublished(session, topic, source)
+    for source in session.input.reader.sources.values():
+        yield from _frames(session, source)
+    for name, (default, *_) in OUTPUTS.items():
+        yield from _published_by_others(session, name, default)
+
+
+def _shared(topic: str, users: list[Source]) -> Iterator[str]:
+    """Yield a doubt, but for sources that use other parts of the same messages."""
+    parts = {source.kind.part for source in users}
+    if len(users) > 1 and (len(parts) < len(users) or '' in parts):
+        names = ' and '.join(source.name for source in users)
+        yield (f'{names} listen to the same topic, {topic}, so that its messages count '
+               f'{len(users)} times: set {users[-1].name}.topic')
+
+
+def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str]:
+    """Of the default inputs but odometry, robots may have some alone."""
+    node, name, wanted = session.node, source.name, source.kind.message_type
+    usual = node.resolve_topic_name(KNOWN_SOURCES[name][1]) if name in KNOWN_SOURCES else ''
+    expected = source.kind.is_odometry or topic != usual or (
+        name not in DEFAULT_SOURCES and not source.kind.is_rare)
+    if session.input.arrivals[name].count > 0 or not expected:
+        return
+    types = {info.topic_type for info in node.get_publishers_info_by_topic(source.topic)}
+    if wanted in types:
+        return
+    found = 'nobody publishes it' if len(types) == 0 else (
+        f'its messages are {", ".join(sorted(types))}')
+    own = {publisher.topic_name for publisher in node.publishers}
+    others = [each for each, kinds in node.get_topic_names_and_types()
+              if wanted in kinds and each not in own and node.count_publishers(each) > 0]
+    there = f'; there is {", ".join(sorted(others)[:3])}' if len(others) > 0 else ''
+    yield f'{name} listens to {topic} for {wanted}, but {found}{there}'
+
+
+def _frames(session: 'Session', source: Source) -> Iterator[str]:
+    name, out, estimate = source.name, session.out, session.worker.estimate
+    frames = session.input.arrivals[name].frames
+    if frames is None:
+        return
+    parent, child = map(frame, frames)
+    if source.kind.names_frames:
+        is_primary = estimate is not None and estimate.primary == name
+        for what, found, parameter, expected, consequence in (
+                ('frame_id', parent if is_primary else out.odom_frame, 'odom_frame',
+                 out.odom_frame, 'no transform to it is published'),
+                ('child_frame_id', child, 'base_link_frame', out.base_frame,
+                 'its motion is taken for that of the robot')):
+            if found == '':
+                yield f'{name} has no {what}: it is taken for {expected}, the {parameter}'
+            elif found != expected:
+                yield (f'{name} has the {what} {found!r}, but the parameter {parameter} is '
+                       f'{expected!r}: set it, else {consequence}')
+    elif parent == '' and source.needs_frame and source.kind.without_frame != '':
+        yield f'{name} has no frame_id: ' + source.kind.without_frame.format(
+            base=out.base_frame, map=out.map_frame, name=name)
+
+
+def _published_by_others(session: 'Session', name: str, default: str) -> Iterator[str]:
+    node, topic = session.node, session.values[f'outputs.{name}']
+    if default.startswith('/') or node.count_publishers(topic) < 2:  # /diagnostics is for all
+        return
+    others = other_publishers(node, topic)
+    if len(others) > 0:
+        resolved = node.resolve_topic_name(topic)
+        yield (f'{resolved} is published by {" and ".join(others)} as well: give one of them '
+               f'another topic, of this node {moved(node, name)}')

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.adapters.conversions import frame, global_pose, Message
+from pose_graph_ros.adapters.conversions import frame, Message, pose_in
 from pose_graph_ros.adapters.sources import JUDGE, SET_POSE
 from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -51,7 +51,7 @@ class SetPoseInput:
 
     def receive(self, message: Message, *, early: bool = False) -> Answer | None:
         """Return why a message cannot be used; None if it can and is kept for `pop`."""
-        given = global_pose(message, self._frames)
+        given = pose_in(message, self._frames)
         if isinstance(given, Answer):
             return given
         if (broken := value_defect(given.pose)) is not None:

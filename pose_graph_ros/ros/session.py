@@ -37,7 +37,7 @@ from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros import diagnostics
-from pose_graph_ros.ros.concerns import concerns
+from pose_graph_ros.ros.diagnostics import concerns
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
 from pose_graph_ros.ros.publishers import Publishers

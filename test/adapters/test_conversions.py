@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages in: what is read, and how what cannot be used is answered."""
 
+from dataclasses import replace
 import math
 
 from harness import fix, imu, odometry, pose, transform
@@ -10,8 +11,9 @@ from sensor_msgs.msg import Range as RangeMessage
 from tf2_msgs.msg import TFMessage
 
 from pose_graph_ros.adapters import conversions
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.parameters import checked, require_together
+from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY, Source
+from pose_graph_ros.adapters.surroundings import Datum, StaticFrames, Surroundings
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import (
     Answer,
@@ -21,19 +23,22 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
 )
 
+SOURCE = Source('any', ODOMETRY, 'any')
+BY = Surroundings('map', 'base_link', Datum(), StaticFrames())
+
 
 def test_odometry_is_read_whatever_the_length_of_its_quaternion() -> None:
     message = odometry(12.5, 1.0, -2.0, 2.5)
     message.pose.pose.orientation.z *= 3.0
     message.pose.pose.orientation.w *= 3.0
-    sample = conversions.odometry_sample(message)
+    sample = conversions.odometry_sample(message, SOURCE, BY)
     assert sample.stamp_ns == 12_500_000_000
     assert sample.pose == pytest.approx([1.0, -2.0, 2.5])
 
 
 @pytest.mark.parametrize('frame', ['map', '/map', ''])
 def test_a_global_pose_in_the_map_is_taken(frame: str) -> None:
-    given = conversions.global_pose(pose(1.0, 0.0, 0.0, 0.0, frame), ('map',))
+    given = conversions.global_pose(pose(1.0, 0.0, 0.0, 0.0, frame), SOURCE, BY)
     assert isinstance(given, GlobalPose)
 
 
@@ -42,7 +47,7 @@ def test_a_global_pose_in_the_map_is_taken(frame: str) -> None:
     ('@1695', None, 1_695_000_000_000), ('@1695.25', None, 1_695_250_000_000),
     ('@1700000000.123456789', None, 1_700_000_000_123_456_789)])
 def test_the_reference_of_a_loop_closure(frame: str, node: int | None, time: int | None) -> None:
-    closure = conversions.loop_closure(pose(2000.0, 1.0, 0.0, 0.0, frame))
+    closure = conversions.loop_closure(pose(2000.0, 1.0, 0.0, 0.0, frame), SOURCE, BY)
     assert isinstance(closure, LoopClosure)
     assert (closure.reference_node, closure.reference_ns) == (node, time)
 
@@ -50,7 +55,7 @@ def test_the_reference_of_a_loop_closure(frame: str, node: int | None, time: int
 @pytest.mark.parametrize('frame', [
     '', 'x', '@', 'x-1', '@-1.0', '@1.0e3', 'base_link', 'x1x', ' x1', '@1.1234567890', 'x1\n'])
 def test_any_other_frame_of_a_loop_closure_is_refused(frame: str) -> None:
-    answer = conversions.loop_closure(pose(2000.0, 1.0, 0.0, 0.0, frame))
+    answer = conversions.loop_closure(pose(2000.0, 1.0, 0.0, 0.0, frame), SOURCE, BY)
     assert isinstance(answer, Answer)
     assert answer.reason == 'wrong_frame'
 
@@ -58,25 +63,27 @@ def test_any_other_frame_of_a_loop_closure_is_refused(frame: str) -> None:
 def test_the_twist_of_odometry_tells_speed_and_noise() -> None:
     message = odometry(1.0, 0.0, 0.0, 0.0, speed=-3.0)
     message.twist.twist.linear.y = 4.0
-    assert conversions.odometry_sample(message).speed == pytest.approx(5.0)
-    assert conversions.odometry_sample(message).twist_variance is None
+    assert conversions.odometry_sample(message, SOURCE, BY).speed == pytest.approx(5.0)
+    assert conversions.odometry_sample(message, SOURCE, BY).twist_variance is None
     message.twist.covariance[0], message.twist.covariance[35] = 0.01, 0.02
-    assert conversions.odometry_sample(message).twist_variance.tolist() == [0.01, 0.0, 0.02]
+    sample = conversions.odometry_sample(message, SOURCE, BY)
+    assert sample.twist_variance.tolist() == [0.01, 0.0, 0.02]
 
 
 @pytest.mark.parametrize('number', [math.nan, math.inf, -1.0, 1.7e308])
 def test_a_twist_that_says_nothing_is_left_out(number: float) -> None:
     message = odometry(1.0, 0.0, 0.0, 0.0, speed=number)
     message.twist.covariance[0], message.twist.covariance[7] = 1.0, number
-    sample = conversions.odometry_sample(message)
+    sample = conversions.odometry_sample(message, SOURCE, BY)
     assert isinstance(sample, OdometrySample)
     assert math.isfinite(sample.speed)
     assert sample.twist_variance is None
 
 
 def test_an_imu_tells_the_heading_from_east() -> None:
-    measurement = conversions.heading(imu(2.5, 1.0, variance=0.04), 0.25, yaw_offset=3.0,
-                                      offset_ns=-500_000_000)
+    source = replace(SOURCE, yaw_offset=3.0, time_offset_ns=-500_000_000)
+    measurement = conversions.heading(imu(2.5, 1.0, variance=0.04), source, replace(
+        BY, datum=Datum((50.0, 7.0, 0.25))))
     assert isinstance(measurement, HeadingOnly)
     assert measurement.stamp_ns == 2_000_000_000
     assert measurement.heading == pytest.approx(3.75 - 2.0 * math.pi)
@@ -86,10 +93,10 @@ def test_an_imu_tells_the_heading_from_east() -> None:
 def test_an_imu_without_an_orientation_is_refused() -> None:
     message = imu(1.0, 0.0)
     message.orientation_covariance[0] = -1.0
-    assert conversions.heading(message).reason == 'no_orientation'
+    assert conversions.heading(message, SOURCE, BY).reason == 'no_orientation'
     message = imu(1.0, 0.0)
     message.orientation.w = message.orientation.z = 0.0
-    assert conversions.heading(message).reason == 'not_finite'
+    assert conversions.heading(message, SOURCE, BY).reason == 'not_finite'
 
 
 def range_message(beacon: str, distance: float, variance: float = 0.0) -> RangeMessage:

@@ -10,8 +10,8 @@ import pyproj
 import pytest
 from sensor_msgs.msg import NavSatFix
 
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import MessageReader
 from pose_graph_ros.adapters.surroundings import Datum, StaticFrames
 from pose_graph_ros.core.measurements import Answer, Fix, Position
 

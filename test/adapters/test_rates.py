@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
 
-from pose_graph_ros.adapters.message_reader import MessageReader
 from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import MessageReader
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.measurements import Answer, OdometrySample, YawRate
 

@@ -80,6 +80,7 @@ def test_a_bag_is_replayed_first(bag, tmp_path, capsys) -> None:
     assert data['fixes'][0]['state'].count(held_out) == len(data['errors']['t'])
     assert 0.0 < max(data['errors']['position']) < 0.5
 
+
 def test_page_summary_and_messages_count_measurements_alike(tmp_path) -> None:
     """Duplicates, and what came before odometry, are refused: they are in no other count."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'

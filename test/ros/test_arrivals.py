@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from pose_graph_ros.ros.arrivals import Arrivals, EXPECTED, quiet, silent
+from pose_graph_ros.ros.input import Arrivals, EXPECTED, quiet, silent
 
 
 class Sources(dict[str, Arrivals]):

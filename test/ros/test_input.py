@@ -13,8 +13,7 @@ import pytest
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.ros import input as input_module
-from pose_graph_ros.ros.arrivals import Arrivals
-from pose_graph_ros.ros.input import Decision, Input, LONGEST_DOUBT
+from pose_graph_ros.ros.input import Arrivals, Decision, Input, LONGEST_DOUBT
 
 SECOND = 1_000_000_000
 

@@ -33,7 +33,7 @@ from pose_graph_ros.adapters.parameter_table import Change
 from pose_graph_ros.adapters.parameters import all_parameters, checked, constraints
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros import diagnostics, requests, services
-from pose_graph_ros.ros.concerns import concerns
+from pose_graph_ros.ros.diagnostics import concerns
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED
 from pose_graph_ros.ros.session import Session

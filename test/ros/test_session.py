@@ -38,7 +38,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State
 from pose_graph_ros.ros import diagnostics, input as input_module
-from pose_graph_ros.ros.concerns import concerns
+from pose_graph_ros.ros.diagnostics import concerns
 from pose_graph_ros.ros.session import Session
 
 pytestmark = pytest.mark.timeout(PREPARE_PATIENCE)

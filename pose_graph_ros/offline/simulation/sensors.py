@@ -22,7 +22,6 @@ from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.simulation.motion import gauss_markov, Motion, PERIOD_S
 from pose_graph_ros.offline.simulation.settings import (
     Closures,
     Fixes,
@@ -37,6 +36,7 @@ from pose_graph_ros.offline.simulation.settings import (
     START_NS,
     Wheels,
 )
+from pose_graph_ros.offline.simulation.worlds import gauss_markov, Motion, PERIOD_S
 
 ODOMETRY_PERIOD_S = 0.05
 TRIES, TRIED = 10_000, 8

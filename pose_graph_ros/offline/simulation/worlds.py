@@ -3,6 +3,10 @@
 """
 Worlds: where a vehicle moves, how, and what sensors it usually has there.
 
+A vehicle follows ways through streets and aisles with limits of speed, lateral and longitudinal
+acceleration; it wanders and stops. Curvatures of paths begin and end at zero, because `ramp`, by
+which headings turn, has a derivative that does.
+
 - `drive`: a car laps some city blocks twice, with fixes that fail at the beginning of the second
   lap and are reflected for a while, loop closures, and false ones. It keeps to the right lane of
   the streets, which are slightly curved, and stops at traffic lights.
@@ -14,22 +18,15 @@ Worlds: where a vehicle moves, how, and what sensors it usually has there.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.offline.simulation.motion import (
-    aisle_corners,
-    follow,
-    Limits,
-    MARGIN_S,
-    Motion,
-    ramp,
-    rounded,
-    street_corners,
-    wandering,
-)
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation.settings import (
     Closures,
     FalseClosures,
@@ -38,8 +35,208 @@ from pose_graph_ros.offline.simulation.settings import (
     Jump,
     Outage,
     Setup,
+    START_NS,
     Wheels,
 )
+
+PERIOD_S = 0.01  # sample period of the motion [s]
+MARGIN_S = 5.0  # by which paths last longer than the motion, whose end is smoothed [s]
+# Four directions of a crossing's streets, counter-clockwise.
+DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+TURN_POINTS = 1000  # at which a turn is tabulated
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """True poses of a vehicle in the frame of the world, and how far it has driven."""
+
+    truth: Trajectory  # headings need not be wrapped
+    distance: FloatArray  # driven up to each pose, shape (N,) [m]
+    lap_time: float = np.inf  # when the second lap begins [s]; never if there are no laps
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the vehicle can do."""
+
+    speed: float  # [m/s]
+    acceleration: float  # along the path [m/s^2]
+    lateral_acceleration: float  # and across it [m/s^2]
+
+
+def follow(
+    path: FloatArray, stops: IntArray, waits: FloatArray, limits: Limits, duration_s: float,
+) -> tuple[Motion, FloatArray]:
+    """
+    Return the motion along a path every 10 ms, and when each point is reached, shape (P,) [s].
+
+    The path, shape (P, 3), has poses that are close to each other, with headings that are not
+    wrapped; it is `MARGIN_S` longer than the motion. The vehicle waits at the first pose, where it
+    starts at rest, and at the stops, which are indices of poses.
+    """
+    length = path_length(path)
+    curvature = np.gradient(path[:, 2], length)
+    speed_limit = np.minimum(limits.speed, np.sqrt(
+        limits.lateral_acceleration / np.maximum(np.abs(curvature), 1e-6)))
+    speed_limit[[0, *stops]] = 0.0
+    # v^2 changes by at most 2 a per metre: take the lower envelope of cones over the limits
+    slope = 2.0 * limits.acceleration * length
+    forward = slope + np.minimum.accumulate(speed_limit**2 - slope)
+    backward = np.minimum.accumulate((speed_limit**2 + slope)[::-1])[::-1] - slope
+    speed = np.sqrt(np.maximum(np.minimum(forward, backward), 0.0))
+
+    wait = np.zeros(len(length))
+    wait[[0, *stops]] = waits
+    travel = 2.0 * np.diff(length) / (speed[1:] + speed[:-1])
+    arrival = np.concatenate(([0.0], np.cumsum(travel + wait[:-1])))
+    knots = np.column_stack((arrival, arrival + wait)).ravel()
+    time = np.arange(0.0, duration_s + MARGIN_S, PERIOD_S)
+    # smoothing over half a second removes jumps of the acceleration, but distorts the last samples
+    distance = gaussian_filter1d(np.interp(time, knots, np.repeat(length, 2)), 0.25 / PERIOD_S)
+    time, distance = time[time <= duration_s], distance[time <= duration_s]
+    poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
+    stamps: IntArray = START_NS + np.round(time * 1e9).astype(np.int64)
+    return Motion(Trajectory(stamps, poses), distance), arrival
+
+
+def path_length(path: FloatArray) -> FloatArray:
+    """Return the length of a path up to each of its points, shape (P,) [m]."""
+    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
+
+
+def wandering(
+    generator: np.random.Generator, points: Points, step: Metres, sigma: Metres,
+) -> FloatArray:
+    """Return poses along a line, which wander slowly to its sides, shape (P, 3), not wrapped."""
+    direction = np.gradient(points, axis=0) / step
+    normal = np.column_stack((-direction[:, 1], direction[:, 0]))
+    aside = gaussian_filter1d(gauss_markov(generator, len(points), sigma, step / 60.0), 8.0 / step)
+    path = points + aside[:, None] * normal
+    direction = np.gradient(path, axis=0)
+    return np.column_stack((path, np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))))
+
+
+def ramp(u: FloatArray) -> FloatArray:
+    """Return a ramp from 0 to 1 on [0, 1] whose derivative begins and ends at 0."""
+    u = np.clip(u, 0.0, 1.0)
+    return u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
+
+
+def gauss_markov(
+    generator: np.random.Generator, count: int, sigma: float, step: float,
+) -> FloatArray:
+    """
+    Return samples of a stationary first-order Gauss-Markov process, shape (count,).
+
+    Sigma is that of each sample, the step a part of the time constant.
+    """
+    decay = np.exp(-step)
+    noise = generator.normal(0.0, sigma * np.sqrt(1.0 - decay**2), count)
+    noise[:1] = generator.normal(0.0, sigma)
+    return np.array(list(accumulate(noise.tolist(), lambda last, new: new + decay * last)))
+
+
+def street_corners(
+    rng: np.random.Generator, length: float, spacing: FloatArray, *, fresh: float,
+) -> FloatArray:
+    """
+    Return the crossings of a random drive through a grid of streets, shape (K, 2) [m].
+
+    It begins in the middle, eastwards. It goes straight on with a probability of 3/5 where it can,
+    turns otherwise, and practically never goes back at once. Distances of the streets are those of
+    both axes, of the second in reverse; a `fresh` street is so much likelier than one driven
+    before.
+    """
+    streets = np.concatenate(([0.0], np.cumsum(spacing)))
+    avenues = np.concatenate(([0.0], np.cumsum(spacing[::-1])))
+    cell, facing = np.array([len(streets) // 2, len(avenues) // 2]), 0
+    corners, visited = [cell], set[tuple[int, int, int]]()
+    driven = 0.0
+    while driven <= length:
+        weights = np.zeros(4)
+        for turn, likely in ((0, 3.0), (1, 1.0), (3, 1.0), (2, 1e-9)):
+            way = (facing + turn) % 4
+            end = cell + DIRECTIONS[way]
+            if np.all(end >= 0) and end[0] < len(streets) and end[1] < len(avenues):
+                seen = (*_middle(cell, end), way % 2) in visited
+                weights[way] = likely * (1.0 if seen else fresh)
+        facing = int(rng.choice(4, p=weights / weights.sum()))
+        end = cell + DIRECTIONS[facing]
+        visited.add((*_middle(cell, end), facing % 2))
+        driven += abs(streets[end[0]] - streets[cell[0]]) + abs(avenues[end[1]] - avenues[cell[1]])
+        cell = end
+        corners.append(cell)
+    nodes = np.array(corners)
+    return np.column_stack((streets[nodes[:, 0]], avenues[nodes[:, 1]]))
+
+
+def _middle(a: IntArray, b: IntArray) -> tuple[int, int]:
+    """Return what names the street between two crossings, in either direction."""
+    return int(a[0] + b[0]), int(a[1] + b[1])
+
+
+def aisle_corners(
+    rng: np.random.Generator, length: Metres, aisles: int, spacing: Metres, depth: Metres,
+) -> FloatArray:
+    """
+    Return the corners of a way through the aisles of a hall in random order, shape (K, 2) [m].
+
+    Aisle k leads from (k spacing, 0) to (k spacing, depth). At both ends a lane joins all aisles.
+    The robot drives each aisle from end to end and then changes to any other.
+    """
+    aisle, y, driven = int(rng.integers(aisles)), 0.0, 0.0
+    corners = [(aisle * spacing, y)]
+    while driven <= length:
+        y = depth - y
+        corners.append((aisle * spacing, y))
+        other = (aisle + int(rng.integers(1, aisles))) % aisles
+        driven += depth + spacing * abs(other - aisle)
+        aisle = other
+        corners.append((aisle * spacing, y))
+    return np.array(corners)
+
+
+def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, FloatArray]:
+    """
+    Return points along straight lines with right-angled turns, and where the corners are on it.
+
+    Given are the ends of the lines, which run along the axes and are longer than a turn; the way
+    begins and ends in the middle of the first and the last one. `turn` is the arc length of a turn
+    and `step` the distance of the points [m]. The middle of each line is given by its distance
+    along the path, shape (L,) [m].
+    """
+    ways = np.diff(corners, axis=0)
+    turns = np.any(np.sign(ways[1:]) != np.sign(ways[:-1]), axis=1)
+    corners = corners[np.concatenate(([True], turns, [True]))]    # where lines go on straight
+    ways = np.diff(corners, axis=0)
+    lengths = np.hypot(*ways.T)
+    ways /= lengths[:, None]
+
+    # a turn to the left, from the origin eastwards; it ends at (reach, reach)
+    u = (np.arange(TURN_POINTS) + 0.5) / TURN_POINTS
+    heading = 0.5 * np.pi * ramp(u)
+    along = turn * np.concatenate(([0.0], u + 0.5 / TURN_POINTS))
+    ahead, left = (turn / TURN_POINTS * np.concatenate(([0.0], np.cumsum(each)))
+                   for each in (np.cos(heading), np.sin(heading)))
+    reach = float(ahead[-1])
+    assert np.all(lengths > 2.0 * reach)
+
+    # pieces: half of a line, a turn, the straight part of the next line, a turn, and so on
+    half = 0.5 * lengths
+    begins = np.cumsum(np.concatenate(([0.0], half[:-1] + half[1:] - 2.0 * reach + turn)))
+    s = np.arange(0.0, begins[-1], step)
+    line = np.searchsorted(begins, s, side='right') - 1
+    # from the middle of line k to that of line k + 1
+    rest = s - begins[line]
+    start, after = half[line] - reach, np.minimum(line + 1, len(ways) - 1)
+    bend = np.clip(rest - start, 0.0, turn)
+    straight = np.minimum(rest, start)
+    beyond = np.maximum(rest - start - turn, 0.0)
+    forward = (straight + np.interp(bend, along, ahead))[:, None]
+    sideways = (np.interp(bend, along, left) + beyond)[:, None]
+    middle = 0.5 * (corners[:-1] + corners[1:])
+    return middle[line] + forward * ways[line] + sideways * ways[after], begins
+
 
 PATH_STEP = 0.05  # distance of the points of paths [m]
 AISLES, AISLE_SPACING, AISLE_DEPTH = 8, 4.0, 30.0  # of the hall; distances [m]

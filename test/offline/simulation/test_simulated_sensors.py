@@ -11,7 +11,6 @@ import pytest
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.offline.simulation import sensors
-from pose_graph_ros.offline.simulation.motion import PERIOD_S
 from pose_graph_ros.offline.simulation.recording import course, record, Recording
 from pose_graph_ros.offline.simulation.settings import (
     ClaimedSigma,
@@ -34,7 +33,7 @@ from pose_graph_ros.offline.simulation.settings import (
     START_NS,
     Wheels,
 )
-from pose_graph_ros.offline.simulation.worlds import WORLDS
+from pose_graph_ros.offline.simulation.worlds import PERIOD_S, WORLDS
 
 FIELDS = {
     'odometry': lambda drive: (drive.odometry.stamps_ns, drive.odometry.poses),

@@ -10,8 +10,7 @@ from scipy.stats import chi2
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind
-from pose_graph_ros.offline.simulation.graph import graph_of, SimulatedGraph
-from pose_graph_ros.offline.simulation.recording import course
+from pose_graph_ros.offline.simulation.recording import course, graph_of, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import (
     Fixes,
     GlobalPoses,
