@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 from itertools import islice
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, IMU
+from pose_graph_ros.cli.drive import distances
 from pose_graph_ros.cli.replay import measurements_of, run_measurements
 from pose_graph_ros.cli.tuned_parameters import (
     changed,
@@ -52,7 +53,7 @@ from pose_graph_ros.core.sources.validation import Validated
 from pose_graph_ros.offline.residuals.source_residuals import RowFit, ScaleFit
 from pose_graph_ros.offline.residuals.variance_components import analyse
 from pose_graph_ros.offline.tuning import held_out, noise
-from pose_graph_ros.offline.tuning.held_out import Errors, NO_ERRORS, Summary
+from pose_graph_ros.offline.tuning.held_out import Errors, Summary
 from pose_graph_ros.offline.tuning.noise import Found, Noise
 
 Key = tuple[str, StampNs]  # source and stamp of a measurement
@@ -60,14 +61,6 @@ LEAST = 20  # measurements of a source whose noise is estimated
 IN_MEMORY = 1_000_000  # measurements, of 700 bytes each
 OF_CLOSURES = Claims(is_constant=False, is_scalable=True, sigma=0.0, sigma_heading=0.0)
 NOT_SHOWN = Found(1.0, 0.0, math.inf, kept=True)
-
-
-class Run(NamedTuple):
-    """Result of a run of the engine."""
-
-    backend: PoseGraphBackend
-    path: Trajectory
-    covariances: Covariances  # of the path, in map axes
 
 
 class Verdict(Enum):
@@ -91,13 +84,6 @@ class Outcome:
     stretch: Seconds  # length of those that were held out
     measured: str  # how much was
     n_doubted: int
-
-
-class _Tried(NamedTuple):
-    """What a path with some settings shows of what was held out."""
-
-    errors: list[Errors]
-    to_truth: Metres
 
 
 class Tuning:
@@ -149,7 +135,7 @@ class Tuning:
         after = self._run(self._with(tuned), 'all, with the settings after')
         doubted = frozenset(
             (source, stamp) for (source, stamp, reference), state
-            in states_by_stamps(after.backend.verdicts()).items()
+            in states_by_stamps(after.verdicts()).items()
             if state is State.DOUBTED and reference is None)
         if len(doubted) > 0:
             tuned, tau = self._estimate(runs, doubted)
@@ -157,13 +143,16 @@ class Tuning:
                       for some in self._sources.values()), default=1.0)
         stretch = held_out.stretch_length(self._duration, period, tau, folds)
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
-        one, other = self._common(tried, doubted)
+        one, other = (held_out.joined(errors) for errors in zip(*(
+            pair for errors, _ in tried for pair in errors), strict=True))
+        right = ~held_out.wrong([one, other])
+        one, other = one.rows(right), other.rows(right)
         verdict = Verdict.SAME
         if len(changed(tuned)) > 0:
             verdict = Verdict.BETTER if held_out.is_better(
                 one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [] if truth is None else np.sqrt(np.mean(np.square(
-            [[each.to_truth for each in pair] for pair in tried]), axis=0)).tolist()
+            [to_truth for _, to_truth in tried]), axis=0)).tolist()
         return Outcome(tuned, verdict, held_out.summary(one), held_out.summary(other), errors,
                        folds, stretch, self._measured(), len(doubted))
 
@@ -183,7 +172,7 @@ class Tuning:
     def _run(
         self, values: Mapping[str, Any], text: str, without: Collection[Key] = (),
         odometry: str = '',
-    ) -> Run:
+    ) -> PoseGraphBackend:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
         self._step += 1
         self._show(f'step {self._step} of {self._steps}: {text}')
@@ -191,12 +180,11 @@ class Tuning:
             (name, each) for name, each in self._measurements
             if odometry in ('', name) or not isinstance(each, OdometrySample)
             if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
-        estimate = backend.estimate()
-        if estimate is None:
-            raise BagError(f'{self._path}: the odometry makes no path')
-        return Run(backend, estimate.path, backend.path_covariances(estimate))
+        return backend
 
-    def _runs(self, text: str, left_out: Collection[Key] = ()) -> tuple[Run, list[Run]]:
+    def _runs(
+        self, text: str, left_out: Collection[Key] = (),
+    ) -> tuple[PoseGraphBackend, list[PoseGraphBackend]]:
         """Return a run with the settings before, and those that show the noise of odometries."""
         before = self._run(self._values, f'{text}, with the settings before', left_out)
         return before, [before] if self._is_shown_before else [
@@ -208,12 +196,12 @@ class Tuning:
         return checked({**self._values, **changed(tuned)})
 
     def _estimate(
-        self, runs: Sequence[Run], without: Collection[Key],
+        self, runs: Sequence[PoseGraphBackend], without: Collection[Key],
     ) -> tuple[list[Tuned], Seconds]:
         """Return what runs show, but for some measurements, and the longest time constant."""
         tuned, longest = list[Tuned](), 0.0
         for name, run in zip(self._odometries, runs, strict=True):
-            parts, by_residuals = run.backend.parts, dict[str, ScaleFit]()
+            parts, by_residuals = run.parts, dict[str, ScaleFit]()
             if len(self._closures) > 0 or any(
                     len(_heading_variances(some)) > 0 for some in self._sources.values()):
                 by_residuals |= analyse(parts).fits
@@ -264,10 +252,14 @@ class Tuning:
               for each in (positions, headings)))
 
     def _fold(
-        self, k: int, folds: int, stretch: Seconds, doubted: Collection[Key],
+        self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
         truth: Trajectory | None,
-    ) -> tuple[_Tried, _Tried]:
-        """Return what a part that is held out shows of the settings before and after."""
+    ) -> tuple[list[tuple[Errors, Errors]], list[Metres]]:
+        """
+        Return errors of the paths before and after at a part that is held out, and to the truth.
+
+        The former are at the same positions, which are not doubted.
+        """
         every = [(name, each.stamp_ns) for name, some in self._sources.items() for each in some
                  if not isinstance(each, HeadingOnly)]
         every += [(name, each.stamp_ns) for name, each in self._closures]
@@ -276,55 +268,50 @@ class Tuning:
         left_out = {key for key, of in zip(every, folds_of.tolist(), strict=True) if of == k}
         text = f'part {k + 1} of {folds} held out'
         before, runs = self._runs(text, left_out)
-        tuned, _ = self._estimate(runs, doubted)
-        after = self._run(self._with(tuned), f'{text}, with the settings after', left_out)
-        return (self._tried(self._values, before, left_out, truth),
-                self._tried(self._with(tuned), after, left_out, truth))
+        values = self._with(self._estimate(runs, doubted)[0])
+        after = self._run(values, f'{text}, with the settings after', left_out)
+        tried = (self._values, before), (values, after)
+        pairs = []
+        for errors in zip(*(self._errors(*each, left_out - doubted) for each in tried),
+                          strict=True):
+            common = np.intersect1d(*(each.stamps_ns for each in errors))
+            one, other = (each.rows(np.isin(each.stamps_ns, common)) for each in errors)
+            pairs.append((one, other))
+        return pairs, [] if truth is None else [
+            float(np.sqrt(np.mean(np.square(distances(
+                self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
+            for _, backend in tried]
 
-    def _tried(
-        self, values: Mapping[str, Any], run: Run, left_out: Collection[Key],
-        truth: Trajectory | None,
-    ) -> _Tried:
-        reports, valid = run.backend.reports(), self._valid(values)
-        errors = [self._closure_errors(run, left_out)] if len(self._closures) > 0 else []
+    def _path_of(self, backend: PoseGraphBackend) -> tuple[Trajectory, Covariances]:
+        estimate = backend.estimate()
+        if estimate is None:
+            raise BagError(f'{self._path}: the odometry makes no path')
+        return estimate.path, backend.path_covariances(estimate)
+
+    def _errors(
+        self, values: Mapping[str, Any], backend: PoseGraphBackend, held: Collection[Key],
+    ) -> list[Errors]:
+        """Return the errors of a path at what was held out of each source, and at closures."""
+        reports, valid, (path, covariances) = (
+            backend.reports(), self._valid(values), self._path_of(backend))
+        found = []
         for name in self._sources:
             in_use = reports[name].in_use if name in reports else None
-            errors.append(held_out.errors_at(
-                run.path, run.covariances,
-                [each for each in valid[name] if (name, each.stamp_ns) in left_out
+            found.append(held_out.errors_at(
+                path, covariances,
+                [each for each in valid[name] if (name, each.stamp_ns) in held
                  and not isinstance(each, HeadingOnly)],
                 1.0 if in_use is None else in_use.correlated + in_use.white))
-        if truth is None or not np.any(inside := run.path.covers(truth.stamps_ns)):
-            return _Tried(errors, np.nan)
-        apart = run.path.at(truth.stamps_ns[inside])[:, :2] - truth.poses[inside, :2]
-        return _Tried(errors, float(np.sqrt(np.mean(np.sum(apart**2, axis=1)))))
-
-    def _closure_errors(self, run: Run, left_out: Collection[Key]) -> Errors:
-        """Return the errors of a path at loop closures; their covariances are not known."""
-        chosen = [each for name, each in self._closures
-                  if (name, each.stamp_ns) in left_out and each.reference_ns is not None]
-        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in chosen],
+        closures = [each for name, each in self._closures
+                    if (name, each.stamp_ns) in held and each.reference_ns is not None]
+        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in closures],
                           dtype=np.int64).reshape(-1, 2)
-        inside = np.all(run.path.covers(stamps), axis=1)
-        ends = run.path.at(stamps[inside])
-        measured_poses = np.array([each.pose for each in chosen]).reshape(-1, 3)[inside]
-        errors = measured_poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
-        return Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))
-
-    def _common(
-        self, tried: Sequence[tuple[_Tried, _Tried]], doubted: Collection[Key],
-    ) -> tuple[Errors, Errors]:
-        """Return the errors before and after at the same positions, which are not wrong."""
-        stamps = np.array([stamp for _, stamp in doubted], dtype=np.int64)
-        ones, others = [NO_ERRORS], [NO_ERRORS]
-        for before, after in tried:
-            for one, other in zip(before.errors, after.errors, strict=True):
-                common = np.isin(one.stamps_ns, other.stamps_ns) & ~np.isin(one.stamps_ns, stamps)
-                ones.append(one.rows(common))
-                others.append(other.rows(np.isin(other.stamps_ns, one.stamps_ns[common])))
-        first, second = held_out.joined(ones), held_out.joined(others)
-        right = ~held_out.wrong([first, second])
-        return first.rows(right), second.rows(right)
+        inside = np.all(path.covers(stamps), axis=1)
+        ends = path.at(stamps[inside])
+        poses = np.array([each.pose for each in closures]).reshape(-1, 3)[inside]
+        errors = poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
+        # the covariances of these are not known
+        return [*found, Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))]
 
     def _measured(self) -> str:
         """Return how much was measured, in words."""
