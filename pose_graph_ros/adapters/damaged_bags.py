@@ -8,7 +8,7 @@ sense, the next one that does is looked for. The rows of an sqlite3 file are rea
 those on damaged pages are left out. The copy is a whole bag, which is read like any other.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
 import logging
@@ -19,7 +19,7 @@ import shutil
 import sqlite3
 import struct
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
 from rosbags.interfaces import Connection, Qos
@@ -36,26 +36,19 @@ _CHUNK_HEAD = struct.Struct('<QQQII')   # first and last stamp, size, checksum, 
 _MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, number, when recorded, when published
 # Kind and length of a record that may have content: no message has 16 MB, and no chunk 4 GB.
 _RECORD = re.compile(rb'[\x03-\x05].{3}\0{5}|\x06.{4}\0{4}', re.DOTALL)
-
-
-class _Topic(NamedTuple):
-    name: str
-    type: str
-    serialization: str
-    definition: str
-    qualities: list[Qos]
-
-
-_Message = tuple[_Topic, int, bytes]    # and when it was recorded [ns]
+_DECOMPRESSORS = {'zstd': storage_mcap.zstd.ZstdDecompressor, 'lz4': LZ4FrameDecompressor}
+Connect = Callable[..., Connection]
+"""Return the connection of the copy, by its topic, type, encoding, definition and quality."""
+_Message = tuple[Connection, int, bytes]    # and when it was recorded [ns]
 
 
 class _Mcap:
     """An mcap file, cut short or with damaged bytes."""
 
-    def __init__(self, path: Path) -> None:
-        self.complete, self.n_damaged = False, 0
+    def __init__(self, path: Path, connect: Connect) -> None:
+        self.complete, self.n_damaged, self._connect = False, 0, connect
         self._types: dict[int, tuple[str, str]] = {}    # names and definitions
-        self.topics: dict[int, _Topic] = {}
+        self._topics: dict[int, Connection] = {}
         with path.open('rb') as file:
             self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.close = self._file.close
@@ -96,10 +89,10 @@ class _Mcap:
         try:
             first, last, size, checksum, n = _CHUNK_HEAD.unpack_from(chunk)
             name, data = chunk[32:32 + n].decode(), chunk[40 + n:]
-            if len(data) < int.from_bytes(chunk[32 + n:40 + n], 'little'):
-                content = _begin_of(name, data)
-            else:
+            if len(data) >= int.from_bytes(chunk[32 + n:40 + n], 'little'):
                 content = storage_mcap.decompress(data, name, size, checksum)
+            else:   # its begin
+                content = bytes(_DECOMPRESSORS[name]().decompress(data)) if name else data
         except Exception:   # decompression can raise anything
             self.n_damaged += 1
             return
@@ -117,33 +110,26 @@ class _Mcap:
             if kind == _SCHEMA:
                 name, _, text = (storage_mcap.read_string(stream) for _ in range(3))
                 self._types.setdefault(number, (name, text))
-            elif kind == _CHANNEL:
+            elif kind == _CHANNEL and number not in self._topics:
                 of_type, text = self._types[int.from_bytes(stream.read(2), 'little')]
                 name, form = (storage_mcap.read_string(stream) for _ in range(2))
-                self.topics.setdefault(number, _Topic(
+                self._topics[number] = self._connect(
                     name, of_type, form, text,
-                    storage_mcap.get_qos(storage_mcap.read_bytes(stream))))
+                    storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
 
     def _message(self, data: bytes) -> Iterator[_Message]:
         """Yield the message in a record, if it is of a known topic."""
         if len(data) >= _MESSAGE_HEAD.size:
             channel, _, recorded_ns, _ = _MESSAGE_HEAD.unpack_from(data)
-            if channel in self.topics:
-                yield self.topics[channel], recorded_ns, data[_MESSAGE_HEAD.size:]
-
-
-def _begin_of(name: str, data: bytes) -> bytes:
-    """Return what a part of compressed data holds."""
-    if name == 'zstd':
-        return bytes(storage_mcap.zstd.ZstdDecompressor().decompress(data))
-    return bytes(LZ4FrameDecompressor().decompress(data)) if name == 'lz4' else data
+            if channel in self._topics:
+                yield self._topics[channel], recorded_ns, data[_MESSAGE_HEAD.size:]
 
 
 class _Sqlite:
     """An sqlite3 file, cut short, with damaged bytes, or with a journal that was not applied."""
 
-    def __init__(self, path: Path) -> None:
-        self.complete, self.n_damaged = False, 0
+    def __init__(self, path: Path, connect: Connect) -> None:
+        self.complete, self.n_damaged, self._connect = False, 0, connect
         self._folder = TemporaryDirectory()
         copy = Path(self._folder.name, path.name)
         # SQLite writes to the file where it applies what a recorder has left beside it
@@ -153,7 +139,6 @@ class _Sqlite:
         _pad(copy)
         self._database = sqlite3.connect(copy)
         self._database.text_factory = lambda text: text.decode(errors='replace')
-        self.topics: dict[int, _Topic] = {}
 
     def close(self) -> None:
         """Close the file, and remove the copy."""
@@ -162,7 +147,7 @@ class _Sqlite:
 
     def messages(self) -> Iterator[_Message]:
         """Yield all messages; where rows cannot be read, the next ones are looked for."""
-        self._read_topics()
+        topics = self._topics()
         last, step = 0, 1
         while step < 2**40:
             try:
@@ -176,9 +161,9 @@ class _Sqlite:
                         if number <= last:
                             raise sqlite3.DatabaseError('rows are not in their order')
                         n, step, last = n + 1, 1, number
-                        if topic in self.topics and isinstance(recorded_ns, int) and (
+                        if topic in topics and isinstance(recorded_ns, int) and (
                                 isinstance(data, bytes)):
-                            yield self.topics[topic], recorded_ns, data
+                            yield topics[topic], recorded_ns, data
                     if n == 0:
                         break
             except (sqlite3.Error, OverflowError):
@@ -186,8 +171,8 @@ class _Sqlite:
                 last, step = last + step, 2 * step
         self.complete = self.n_damaged == 0
 
-    def _read_topics(self) -> None:
-        definitions: dict[str, str] = {}
+    def _topics(self) -> dict[int, Connection]:
+        definitions, found = dict[str, str](), dict[int, Connection]()
         with suppress(sqlite3.Error):   # older ones have none
             definitions = dict(self._database.execute(
                 'SELECT topic_type, encoded_message_definition FROM message_definitions'))
@@ -196,8 +181,9 @@ class _Sqlite:
             qualities: list[Qos] = []
             with suppress(Exception):   # the parser can raise anything
                 qualities = metadata.parse_qos(profiles)
-            self.topics[number] = _Topic(
+            found[number] = self._connect(
                 name, of_type, form, definitions.get(of_type, ''), qualities)
+        return found
 
 
 def _pad(path: Path) -> None:
@@ -232,23 +218,23 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
     found: list[_Mcap | _Sqlite] = []
     connections: dict[tuple[str, str], Connection] = {}
 
-    def connection(topic: _Topic) -> Connection:
-        if (key := topic[:2]) not in connections:
-            connections[key] = writer.add_connection(
-                *key, msgdef=topic.definition, rihs01=NO_HASH,
-                serialization_format=topic.serialization, offered_qos_profiles=topic.qualities)
-        return connections[key]
+    def connect(
+        topic: str, of_type: str, encoding: str, definition: str, qualities: list[Qos],
+    ) -> Connection:
+        if (topic, of_type) not in connections:
+            connections[topic, of_type] = writer.add_connection(
+                topic, of_type, msgdef=definition, rihs01=NO_HASH,
+                serialization_format=encoding, offered_qos_profiles=qualities)
+        return connections[topic, of_type]
 
     with Writer(copy, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for file in files:
             with suppress(sqlite3.Error, ValueError), closing(
-                    (_Sqlite if file.suffix == '.db3' else _Mcap)(file)) as damaged:
+                    (_Sqlite if file.suffix == '.db3' else _Mcap)(file, connect)) as damaged:
                 found.append(damaged)
-                for topic, recorded_ns, data in damaged.messages():
+                for connection, recorded_ns, data in damaged.messages():
                     if 0 <= recorded_ns < 2**63:
-                        writer.write(connection(topic), recorded_ns, data)
-                for topic in damaged.topics.values():   # also those without messages
-                    connection(topic)
+                        writer.write(connection, recorded_ns, data)
     n, end_ns = sum(writer.counts.values()), writer.max_timestamp + 1
     if n == 0:
         return False
