@@ -308,22 +308,18 @@ def _entry(
 
 
 def as_markdown() -> str:
-    """Return the table in docs/parameters.md of the parameters of the node."""
-    lines = ['| parameter | default | unit | range | changes | description |',
-             '|---|---|---|---|---|---|']
-    lines += (f'| `{parameter.name}` | {_facts(parameter)}' for parameter in PARAMETERS)
-    return '\n'.join(lines) + '\n'
-
-
-def sources_as_markdown() -> str:
-    """Return the table in docs/parameters.md of the parameters of a source."""
-    lines = ['| parameter | types | default | unit | range | changes | description |',
-             '|---|---|---|---|---|---|---|']
+    """Return the tables in docs/parameters.md: of the node's parameters, and of a source's."""
     every = [TYPE, *OF_ALL]
     for kind in KINDS.values():
         every += [each for each in kind.parameters if each not in every]
-    lines += (f'| `<source>.{parameter.name}` | {_kinds(parameter)} | {_facts(parameter)}'
-              for parameter in every)
+    lines = ['| parameter | default | unit | range | changes | description |',
+             '|---|---|---|---|---|---|',
+             *(f'| `{each.name}` | {_facts(each)}' for each in PARAMETERS), '',
+             '| parameter | types | default | unit | range | changes | description |',
+             '|---|---|---|---|---|---|---|']
+    for each in every:
+        kinds = [kind.name for kind in KINDS.values() if each in kind.parameters]
+        lines.append(f'| `<source>.{each.name}` | {", ".join(kinds) or "all"} | {_facts(each)}')
     return '\n'.join(lines) + '\n'
 
 
@@ -333,12 +329,6 @@ def _facts(parameter: Parameter) -> str:
         'unset' if parameter.default == [] else _yaml(parameter.default))
     return (f'{value} | {parameter.unit} | {_range(parameter)} | {parameter.change.value} | '
             f'{parameter.description} |')
-
-
-def _kinds(parameter: Parameter) -> str:
-    """Return the names of the kinds of sources that have a parameter."""
-    names = [kind.name for kind in KINDS.values() if parameter in kind.parameters]
-    return ', '.join(names) or 'all'
 
 
 def _range(parameter: Parameter) -> str:

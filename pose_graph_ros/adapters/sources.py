@@ -185,7 +185,11 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         try:
             match source.kind.settings:
                 case OdometrySource() as settings:
-                    odometry[source.name] = _odometry_source(own, settings)
+                    odometry[source.name] = OdometrySource(
+                        noise=config.OdometryNoise(**_same(own, config.OdometryNoise)),
+                        noise_from=config.NoiseFrom(own['noise']),
+                        integrate=Integrate(own.get('integrate', settings.integrate)),
+                        **_same(own, OdometrySource, but=('noise', 'integrate')))
                 case GyroSource():
                     gyros[source.name] = GyroSource(
                         config.RateNoise(own['noise']), **_same(own, GyroSource))
@@ -206,14 +210,6 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
             nodes=math.ceil(values['window.nodes']),
             prior=config.WindowPrior(values['window.prior'])),
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
-
-
-def _odometry_source(own: Mapping[str, Any], default: OdometrySource) -> OdometrySource:
-    return OdometrySource(
-        noise=config.OdometryNoise(**_same(own, config.OdometryNoise)),
-        noise_from=config.NoiseFrom(own['noise']),
-        integrate=Integrate(own.get('integrate', default.integrate)),
-        **_same(own, OdometrySource, but=('noise', 'integrate')))
 
 
 def _same(

@@ -327,7 +327,9 @@ def _add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> No
                        'gyro'),
             ('--truth', 'Odometry, PoseStamped or PoseWithCovarianceStamped in the map, only used '
                         'for comparison')):
-        group.add_argument(option, metavar='TOPIC', type=_topic, help=text)
+        # with the slash that recorders of ROS 1 may leave out
+        group.add_argument(option, metavar='TOPIC', help=text,
+                           type=lambda topic: '/' + topic.removeprefix('/'))
     if hold_out:
         parser.add_argument('--hold-out', metavar='N', type=int, default=0,
                             help='keep every N-th fix out of the graph and use it for comparison')
@@ -370,11 +372,6 @@ def _exports(text: str) -> Exports:
             raise argparse.ArgumentTypeError(
                 f'{name!r} is no format; expected all or some of {", ".join(FORMATS)}')
     return Exports(names)
-
-
-def _topic(text: str) -> str:
-    """Return a topic with the slash that recorders of ROS 1 may leave out."""
-    return '/' + text.removeprefix('/')
 
 
 def _picture(text: str) -> Path:

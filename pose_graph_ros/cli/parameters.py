@@ -4,10 +4,10 @@
 
 import argparse
 
-from pose_graph_ros.adapters.parameters import as_markdown, as_yaml, sources_as_markdown
+from pose_graph_ros.adapters.parameters import as_markdown, as_yaml
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    print(as_yaml() if options.yaml else f'{as_markdown()}\n{sources_as_markdown()}', end='')
+    print(as_yaml() if options.yaml else as_markdown(), end='')
     return 0

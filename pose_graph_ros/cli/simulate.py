@@ -172,8 +172,9 @@ def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
         topics[fixes] = fix_messages(
             fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
     if setup.poses is not None:
-        topics[poses] = pose_messages(
-            poses, *drive.measured[poses][:2], covariance(poses))
+        stamps_ns, values, _ = drive.measured[poses]
+        topics[poses] = _poses(
+            poses, stamps_ns, ['map'] * len(values), values, covariance(poses))
     if setup.closures is not None:
         topics[closures] = loop_closure_messages(
             closures, *drive.measured[closures][:2], covariance(closures))
@@ -310,16 +311,10 @@ def loop_closure_messages(
     return _poses(topic, stamps_ns[:, 1], frames, poses, covariance)
 
 
-def pose_messages(
-    topic: str, stamps_ns: StampsNs, poses: Poses, covariance: Covariance,
-) -> Iterator[Message]:
-    """Return poses in the map with one covariance, as PoseWithCovarianceStamped messages."""
-    return _poses(topic, stamps_ns, ['map'] * len(poses), poses, covariance)
-
-
 def _poses(
     topic: str, stamps_ns: StampsNs, frames: Sequence[str], poses: Poses, covariance: Covariance,
 ) -> Iterator[Message]:
+    """Return poses in frames with one covariance, as PoseWithCovarianceStamped messages."""
     spatial = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
     spatial[PLANAR] = covariance
     for stamp, frame, pose in zip(stamps_ns.tolist(), frames, poses.tolist(), strict=True):

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from pose_graph_ros import __version__
-from pose_graph_ros.adapters.parameters import as_markdown, as_yaml, sources_as_markdown
+from pose_graph_ros.adapters.parameters import as_markdown, as_yaml
 from pose_graph_ros.cli.main import main, SUMMARIES
 
 TOOLS = tuple(SUMMARIES)
@@ -82,7 +82,7 @@ def test_wrong_words_are_refused(words, capsys) -> None:
 
 def test_parameters_are_printed_as_tables_and_as_a_file(capsys) -> None:
     assert main(['parameters']) == 0
-    assert capsys.readouterr().out == f'{as_markdown()}\n{sources_as_markdown()}'
+    assert capsys.readouterr().out == as_markdown()
     assert main(['parameters', '--yaml']) == 0
     assert capsys.readouterr().out == as_yaml()
 

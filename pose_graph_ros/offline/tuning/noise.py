@@ -141,7 +141,10 @@ def noise_of(
 def fitted(path: MeasuredPath) -> Noise:
     """Return the noise that makes positions on a path the most likely."""
     # claims may be wrong by more than the search goes: it begins with the best of some multiples
-    multiple = _multiple(path)
+    evaluate = Evaluation(path)
+    to_the_end(evaluate.find_heading())
+    multiple = min(MULTIPLES, key=lambda exponent: to_the_end(
+        evaluate.value((0.0, 0.0, exponent))))
     evaluate = Evaluation(
         path._replace(variance=2.0**multiple * path.variance), CLAIM_SPREAD, CLAIM_SPREAD, FINEST)
     likely = best = to_the_end(most_likely(evaluate))
@@ -180,13 +183,6 @@ def _at(
     return to_the_end(descend(evaluate, [tuple(moved)], fixed))
 
 
-def _multiple(path: MeasuredPath) -> float:
-    evaluate = Evaluation(path)
-    to_the_end(evaluate.find_heading())
-    return min(MULTIPLES, key=lambda exponent: to_the_end(
-        evaluate.value((0.0, 0.0, exponent))))
-
-
 def _interval(
     evaluate: Evaluation, best: Minimum, axis: int, kept: Collection[int], unit: float,
 ) -> Found:
@@ -217,16 +213,11 @@ def _shown(path: MeasuredPath) -> float:
     turn = np.angle(np.sum(np.conj(here) * there))
     errors = np.abs(there - here * np.exp(1j * turn))**2
     # two coordinates, without the three numbers by which odometry was laid there
-    pieces = float(path.seconds[-1]) / SLOW
-    return largest_ratio(float(np.mean(errors / (2.0 * path.variance))), 2.0 * pieces - 3.0)
-
-
-def largest_ratio(squares: float, degrees: float) -> float:
-    """Return the upper end of the interval of a variance from a mean of squared errors."""
-    if degrees <= 0.0:
-        return math.inf
-    quantile = 2.0 * float(gammaincinv(0.5 * degrees, TAIL))
-    return squares * degrees / quantile if quantile > 0.0 else math.inf
+    degrees = 2.0 * float(path.seconds[-1]) / SLOW - 3.0
+    quantile = 2.0 * float(gammaincinv(0.5 * max(degrees, 0.0), TAIL))
+    # the upper end of the interval of a variance from a mean of squared errors
+    return math.inf if not quantile > 0.0 else degrees / quantile * float(
+        np.mean(errors / (2.0 * path.variance)))
 
 
 def proven_odometry(found: Collection[Noise]) -> tuple[Found, Found]:
