@@ -51,7 +51,7 @@ OFFLINE = {
         'core.geometry', 'core.graph', 'core.odometry', 'core.smoother', 'core.sources',
         'core.disagreement', 'core.parts'},
     'offline.simulation': {'core.geometry', 'core.graph'},
-    'offline.tuning': {'core.batch', 'core.geometry', 'core.sources', 'core.parts'},
+    'offline.noise': {'core.batch', 'core.geometry', 'core.sources', 'core.parts'},
 }
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.backend', 'core.disagreement', 'core.error_tuner', 'core.estimate',

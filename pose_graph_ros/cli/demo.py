@@ -32,8 +32,8 @@ from pose_graph_ros.adapters.conversions import stamp_ns
 from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import drive_in
+from pose_graph_ros.cli.run import Recorder, Run, Update
 from pose_graph_ros.cli.run.document import write_results
-from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.cli.simulate import write_drive
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status

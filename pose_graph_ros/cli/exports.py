@@ -27,7 +27,7 @@ from pose_graph_ros.adapters.output_cdr import (
 from pose_graph_ros.adapters.sources import KINDS, MessageReader
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli.arguments import Exports
-from pose_graph_ros.cli.run.recorder import Run
+from pose_graph_ros.cli.run import Run
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction

@@ -33,8 +33,8 @@ from pose_graph_ros.cli.exports import (
     write_lines,
 )
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
+from pose_graph_ros.cli.run import Recorder, Run, Update
 from pose_graph_ros.cli.run.document import write_results
-from pose_graph_ros.cli.run.recorder import Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport

@@ -8,7 +8,7 @@ import math
 from typing import Any, NamedTuple
 
 from pose_graph_ros.core.quantities import Metres, Radians
-from pose_graph_ros.offline.tuning.noise import Found
+from pose_graph_ros.offline.noise import Found
 
 # Sigmas of odometry, and whether they are of its turns.
 ODOMETRY = {'sigma_distance': False, 'sigma_lateral': False, 'sigma_heading_distance': True,

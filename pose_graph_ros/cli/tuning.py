@@ -50,11 +50,10 @@ from pose_graph_ros.core.measurements import (
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
 from pose_graph_ros.core.sources.kinds import validate
 from pose_graph_ros.core.sources.validation import Validated
+from pose_graph_ros.offline import noise
+from pose_graph_ros.offline.noise import Errors, Found, Noise, Summary
 from pose_graph_ros.offline.residuals.source_residuals import RowFit, ScaleFit
 from pose_graph_ros.offline.residuals.variance_components import analyse
-from pose_graph_ros.offline.tuning import held_out, noise
-from pose_graph_ros.offline.tuning.held_out import Errors, Summary
-from pose_graph_ros.offline.tuning.noise import Found, Noise
 
 Key = tuple[str, StampNs]  # source and stamp of a measurement
 LEAST = 20  # measurements of a source whose noise is estimated
@@ -141,20 +140,20 @@ class Tuning:
             tuned, tau = self._estimate(runs, doubted)
         period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
                       for some in self._sources.values()), default=1.0)
-        stretch = held_out.stretch_length(self._duration, period, tau, folds)
+        stretch = noise.stretch_length(self._duration, period, tau, folds)
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
-        one, other = (held_out.joined(errors) for errors in zip(*(
+        one, other = (noise.joined_errors(errors) for errors in zip(*(
             pair for errors, _ in tried for pair in errors), strict=True))
-        right = ~held_out.wrong([one, other])
+        right = ~noise.far_from_all([one, other])
         one, other = one.rows(right), other.rows(right)
         verdict = Verdict.SAME
         if len(changed(tuned)) > 0:
-            verdict = Verdict.BETTER if held_out.is_better(
+            verdict = Verdict.BETTER if noise.is_better(
                 one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [] if truth is None else np.sqrt(np.mean(np.square(
             [to_truth for _, to_truth in tried]), axis=0)).tolist()
-        return Outcome(tuned, verdict, held_out.summary(one), held_out.summary(other), errors,
-                       folds, stretch, self._measured(), len(doubted))
+        return Outcome(tuned, verdict, noise.error_summary(one), noise.error_summary(other),
+                       errors, folds, stretch, self._measured(), len(doubted))
 
     def _valid(self, values: Mapping[str, Any]) -> dict[str, list[Absolute]]:
         """Return the valid measurements in the map of each source by stamp, by some parameters."""
@@ -263,7 +262,7 @@ class Tuning:
         every = [(name, each.stamp_ns) for name, some in self._sources.items() for each in some
                  if not isinstance(each, HeadingOnly)]
         every += [(name, each.stamp_ns) for name, each in self._closures]
-        folds_of = held_out.fold_of(
+        folds_of = noise.fold_of(
             np.array([stamp for _, stamp in every]), self._start_ns, stretch, folds)
         left_out = {key for key, of in zip(every, folds_of.tolist(), strict=True) if of == k}
         text = f'part {k + 1} of {folds} held out'
@@ -297,7 +296,7 @@ class Tuning:
         found = []
         for name in self._sources:
             in_use = reports[name].in_use if name in reports else None
-            found.append(held_out.errors_at(
+            found.append(noise.errors_at(
                 path, covariances,
                 [each for each in valid[name] if (name, each.stamp_ns) in held
                  and not isinstance(each, HeadingOnly)],

@@ -16,10 +16,9 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, GYRO, LOOP_CLOSURE, ODOMETRY
 from pose_graph_ros.cli.drive import collect_drive, place_truth
 from pose_graph_ros.cli.replay import run_measurements
-from pose_graph_ros.cli.run import places
+from pose_graph_ros.cli.run import MOST_UPDATES, places, Recorder, Run, thinned, Update
 from pose_graph_ros.cli.run.document import document
 from pose_graph_ros.cli.run.findings import MOST_SILENCES, silences, silent
-from pose_graph_ros.cli.run.recorder import MOST_UPDATES, Recorder, Run, thinned, Update
 
 WHITE = ('global_pose.correlation_time', 0.0)
 SECOND = 10**9

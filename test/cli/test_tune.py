@@ -21,7 +21,7 @@ from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_b
 from pose_graph_ros.cli.tuned_parameters import changed, odometry_parameters
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.tuning.noise import Found
+from pose_graph_ros.offline.noise import Found
 
 
 @pytest.fixture(scope='module')

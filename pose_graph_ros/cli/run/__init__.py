@@ -8,3 +8,107 @@ compared with and what was recorded on the way. The object has paths, measuremen
 believed of them, residuals by source, the constraints under most tension, the updates, the pattern
 of H, and sentences on what a person must know. Read first `document`, then `findings`.
 """
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from pose_graph_ros.adapters.sources import Kind
+from pose_graph_ros.cli.drive import Drive
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.exceptions import PoseGraphError
+from pose_graph_ros.core.geometry.se2 import Covariances
+from pose_graph_ros.core.judgement.texts import Key
+from pose_graph_ros.core.judgement.verdicts import Verdict
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, Measurement
+from pose_graph_ros.core.quantities import Seconds, StampNs
+
+MOST_UPDATES = 2000  # in run.json
+
+
+class NoCovariancesError(PoseGraphError):
+    """The solver failed, so that the path has no covariances."""
+
+
+class Update(NamedTuple):
+    """An update, or the worst of several."""
+
+    stamp_ns: StampNs
+    nodes: int
+    milliseconds: float
+    chi2: float
+
+
+def thinned(updates: Sequence[Update]) -> list[Update]:
+    """Return at most `MOST_UPDATES`: neighbours become the last one with their longest time."""
+    stride = 1
+    while len(updates) // stride >= MOST_UPDATES:
+        stride *= 2
+    groups = [updates[k:k + stride] for k in range(0, len(updates), stride)]
+    return [group[-1]._replace(milliseconds=max(each.milliseconds for each in group))
+            for group in groups]
+
+
+@dataclass(slots=True)
+class Recorder:
+    """What is recorded of a run as it goes on."""
+
+    updates: list[Update] = field(default_factory=list)
+    n_updates: int = 0  # with those that were not recorded one by one
+    refused: dict[Key, str] = field(default_factory=dict)  # why, of loop closures
+
+    def add_update(self, update: Update, count: int = 1) -> None:
+        """Add the last of some updates, later than all others; the first loads the solver."""
+        if self.n_updates > 0:
+            self.updates.append(update)
+        self.n_updates += count
+
+    def add_answer(self, source: str, measurement: Measurement, answer: Answer) -> None:
+        """Add what was answered to a measurement at once."""
+        if (answer.status is AnswerStatus.REJECTED and isinstance(measurement, LoopClosure)
+                and isinstance(measurement.reference_ns, int)):
+            self.refused[source, measurement.stamp_ns, measurement.reference_ns] = (
+                f'Refused ({answer.reason}): {answer.detail}.')
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run at its end."""
+
+    title: str
+    subtitle: str
+    drive: Drive  # whose corrected path is that of the engine
+    backend: PoseGraphBackend
+    recorder: Recorder
+    values: Mapping[str, Any]  # all parameters of the node
+    kinds: Mapping[str, Kind]  # of the sources that have a topic
+    counts: Mapping[tuple[str, str], int]  # messages by source and answer
+    report: UpdateReport  # of the final optimisation
+    seconds: Seconds  # that the run took
+
+    @property
+    def start_ns(self) -> StampNs:
+        """Stamp of the first pose of the path."""
+        return int(self.drive.corrected.stamps_ns[0])
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """The estimate at the end."""
+        estimate = self.backend.estimate()
+        assert estimate is not None, 'a run has a hidden node'
+        return estimate
+
+    @cached_property
+    def verdicts(self) -> list[Verdict]:
+        """What is believed at the end."""
+        return self.backend.verdicts()
+
+    @cached_property
+    def covariances(self) -> Covariances:
+        """Those of the path; raises `NoCovariancesError` if the solver failed."""
+        try:
+            return self.backend.path_covariances(self.estimate)
+        except ValueError as error:
+            raise NoCovariancesError(f'there are no covariances: {error}') from error

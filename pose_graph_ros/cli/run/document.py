@@ -23,10 +23,9 @@ from pose_graph_ros.cli.drive import (
     STATES,
     summary,
 )
-from pose_graph_ros.cli.run import places
+from pose_graph_ros.cli.run import places, Run, thinned
 from pose_graph_ros.cli.run.findings import findings
 from pose_graph_ros.cli.run.places import number, rounded
-from pose_graph_ros.cli.run.recorder import Run, thinned
 from pose_graph_ros.cli.run.sources import analyse, source_entry, springs
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError

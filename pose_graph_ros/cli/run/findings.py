@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.sources import Kind
-from pose_graph_ros.cli.run.recorder import Run
+from pose_graph_ros.cli.run import Run
 from pose_graph_ros.cli.run.sources import SourceAnalysis, verdict
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status

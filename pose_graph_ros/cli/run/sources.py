@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, GYRO, Kind, LOOP_CLOSURE, ODOMETRY
+from pose_graph_ros.cli.run import Run
 from pose_graph_ros.cli.run.places import Frame, number, rounded
-from pose_graph_ros.cli.run.recorder import Run
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs

@@ -12,7 +12,7 @@ import pytest
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, POSITIONS, Robust
 from pose_graph_ros.core.measurements import OdometrySample, Position
-from pose_graph_ros.offline.tuning.noise import Noise, noise_of, proven_odometry
+from pose_graph_ros.offline.noise import Noise, noise_of, proven_odometry
 
 GOOD = 0.002, 0.001, 2e-5, 2e-5
 # of the engine, by way and by turn
