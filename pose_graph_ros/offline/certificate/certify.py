@@ -48,7 +48,8 @@ from pose_graph_ros.core.sparse import BlockFactors
 from pose_graph_ros.offline.certificate.objective import Formulation, QuadraticForm
 
 Operator = Callable[[ComplexArray], ComplexArray]
-Inverse = Callable[[FloatArray], FloatArray]
+Preconditioner = Callable[[ComplexArray, ComplexArray], ComplexArray]
+"""From headings, and derivatives by them, to a change that is nearly a step of Newton."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +129,11 @@ class NearHessian(NamedTuple):
         places[1:] = self.places
         return places
 
-    def inverse(self, formulation: Formulation) -> Inverse:
-        """Return the preconditioner for `minimized`."""
-        def inverse(derivative: FloatArray) -> FloatArray:
-            change = np.zeros(formulation.n_unknowns)
-            change[1:] = self.solve(derivative[1:])
-            return change
-        return inverse
+    def precondition(self, y: ComplexArray, v: ComplexArray) -> ComplexArray:
+        """Return a change of headings that are angles, given the derivatives by them."""
+        change = np.zeros_like(v)
+        change[1:, 0] = self.solve((y.conj() * v).imag[1:, 0])
+        return 1j * y * change  # it turns a heading at a right angle
 
 
 def certify(
@@ -151,7 +150,7 @@ def certify(
         cost = form.cost(np.ones((1, 1), dtype=np.complex128))
         return Certificate(Verdict.CERTIFIED, cost, cost, 0.0, None, 1, poses.copy())
     z = minimized(form, formulation.headings(poses)[:, None],
-                  None if hessian is None else hessian.inverse(formulation))
+                  None if hessian is None else hessian.precondition)
     cost = near = form.cost(z)
     if cost <= TUNING.gap * 1.0:
         # a sum of squares is nowhere below 0, whatever rounding leaves of the matrix
@@ -302,40 +301,23 @@ def multipliers(y: ComplexArray, product: ComplexArray) -> FloatArray:
 
 
 def minimized(
-    form: QuadraticForm, y: ComplexArray, inverse: Inverse | None = None,
+    form: QuadraticForm, y: ComplexArray, precondition: Preconditioner | None = None,
 ) -> ComplexArray:
     """
     Return headings at a minimum of f near the given ones, or where steps no longer lower it.
-
-    `inverse` goes from derivatives by headings that are angles, (n,), to changes of them near the
-    minimum.
     """
     cost, radius = form.cost(y), np.inf
     product = form.product(y)
-    solve = None if inverse is not None else _preconditioner(form, multipliers(y, product))
+    precondition = precondition or _preconditioner(form, multipliers(y, product))
     for _ in range(300):
         diagonal = multipliers(y, product)[:, None]
         tangent = _projection(y)
         gradient = tangent(product - diagonal * y)
-
-        def hessian(v: ComplexArray, diagonal: FloatArray = diagonal,
-                    tangent: Operator = tangent) -> ComplexArray:
-            return tangent(form.product(v) - diagonal * v)
-
-        def precondition(
-            v: ComplexArray, tangent: Operator = tangent, y: ComplexArray = y,
-        ) -> ComplexArray:
-            if solve is not None:
-                return tangent(solve(v))
-            assert inverse is not None
-            # a change of the angle turns a heading at a right angle
-            return tangent(1j * y * inverse((y.conj() * v).imag[:, 0])[:, None])
-
-        decrease = inner(gradient, precondition(gradient))
+        decrease = inner(gradient, tangent(precondition(y, gradient)))
         if not decrease > 1e-11 * cost:
             break
         radius = min(radius, 100.0 * np.sqrt(decrease))
-        step, predicted, at_limit = _step(hessian, precondition, gradient, radius)
+        step, predicted, at_limit = _step(form, precondition, (y, diagonal), gradient, radius)
         candidate = unit_rows(y + step)
         after = form.cost(candidate)
         slack = 1e-14 * cost   # may be rounding
@@ -361,14 +343,14 @@ def _projection(y: ComplexArray) -> Operator:
     return tangent
 
 
-def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Operator:
+def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Preconditioner:
     """Return v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite."""
     damping = 1e-12 * form.diagonal   # makes it definite
     factors = form.factors(damping - diagonal, turned=False)
     if not factors.is_positive:
         factors = form.factors(damping, turned=False)
 
-    def solve(v: ComplexArray) -> ComplexArray:
+    def solve(_: ComplexArray, v: ComplexArray) -> ComplexArray:
         out = form.inverse(factors, v)
         out[0] = 0.0
         return out
@@ -376,22 +358,26 @@ def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Operator:
 
 
 def _step(
-    hessian: Operator, precondition: Operator, gradient: ComplexArray, radius: float,
+    form: QuadraticForm, precondition: Preconditioner, at: tuple[ComplexArray, FloatArray],
+    gradient: ComplexArray, radius: float,
 ) -> tuple[ComplexArray, float, bool]:
     """
     Return a step, the decrease of f that it should bring, and whether the radius limits it.
 
-    Conjugate gradients of Steihaug and Toint, with lengths as the preconditioner measures them.
+    Conjugate gradients of Steihaug and Toint, with lengths as the preconditioner measures them, at
+    Y with the diagonal L.
     """
+    y, diagonal = at
+    tangent = _projection(y)
     step, residual = np.zeros_like(gradient), gradient.copy()
     applied = np.zeros_like(gradient)  # the Hessian times the step
-    scaled = precondition(residual)
+    scaled = tangent(precondition(y, residual))
     square = first = inner(residual, scaled)
     direction = -scaled
     length, cross, own = 0.0, 0.0, square
     at_limit = False
     for _ in range(300):
-        image = hessian(direction)
+        image = tangent(form.product(direction) - diagonal * direction)
         curvature = inner(direction, image)
         alpha = square / curvature if curvature > 0.0 else np.inf
         if not length + 2.0 * alpha * cross + alpha**2 * own < radius**2:
@@ -403,7 +389,7 @@ def _step(
             break
         residual += alpha * image
         length += 2.0 * alpha * cross + alpha**2 * own
-        scaled = precondition(residual)
+        scaled = tangent(precondition(y, residual))
         before, square = square, inner(residual, scaled)
         if square <= 1e-6 * first:
             break
