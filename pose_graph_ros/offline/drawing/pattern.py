@@ -138,21 +138,13 @@ def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
 
 def _children_first(cliques: npt.NDArray[Any]) -> list[int]:
     """Return the rows of all cliques with frontal nodes, each after those below it."""
-    parents, siblings, children = (
-        cliques[field].tolist() for field in ('parent', 'sibling', 'child'))
-    frontal = cliques['n_frontal']
-    stack = np.flatnonzero((frontal > 0) & (cliques['parent'] < 0)).tolist()
-    found: list[int] = []
-    while len(stack) > 0:
-        c = stack.pop()
-        found.append(c)
-        child = children[c]
-        while child >= 0:
-            if frontal[child] > 0:
-                stack.append(child)
-            child = siblings[child]
-    assert all(parents[c] < 0 or frontal[parents[c]] > 0 for c in found)
-    return found[::-1]
+    rows = np.flatnonzero(cliques['n_frontal'] > 0).tolist()
+    tree = nx.DiGraph()
+    tree.add_nodes_from(rows)
+    tree.add_edges_from((parent, row) for row, parent in zip(
+        rows, cliques['parent'][rows].tolist(), strict=True) if parent >= 0)
+    roots = [row for row in rows if tree.in_degree(row) == 0]
+    return [row for root in roots[::-1] for row in nx.dfs_preorder_nodes(tree, root)][::-1]
 
 
 def _binned(blocks: Iterable[IntArray], size: int, most_bins: int) -> BinnedPattern:
