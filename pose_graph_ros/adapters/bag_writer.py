@@ -37,6 +37,8 @@ BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
 FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
+Convert = Callable[[bytes], bytes | memoryview]
+"""From a message of ROS 1 to CDR."""
 
 
 class BagWriter:
@@ -60,8 +62,8 @@ class BagWriter:
         self._latched = {STATIC_TRANSFORMS, *latched}
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[tuple[str, str], Connection] = {}
-        # by type, of ROS 1: new name of the type, and how its messages are converted
-        self._converters: dict[str, tuple[str, Callable[[bytes], bytes | memoryview]]] = {}
+        # by type, of ROS 1: name and types in ROS 2, and how its messages are converted
+        self._converters: dict[str, tuple[str, Typestore, Convert]] = {}
         # under its final name in a scratch folder: rosbags names the files after their folder
         try:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
@@ -116,7 +118,7 @@ class BagWriter:
         if isinstance(source.ext, ConnectionExtRosbag1):
             if type_name not in self._converters:
                 self._converters[type_name] = _from_ros1(source, self._types)
-            type_name, convert = self._converters[type_name]
+            type_name, types, convert = self._converters[type_name]
             try:
                 data = bytes(convert(data))
             except Exception as error:  # generated code can raise anything on invalid bytes
@@ -126,7 +128,7 @@ class BagWriter:
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
-                self._connect(key, _ros2_types(source, self._types), _qos(
+                self._connect(key, types, _qos(
                     latched=message.topic in self._latched or bool(source.ext.latching)))
             else:
                 self._connect(key, own_types(source) or self._types,
@@ -151,33 +153,23 @@ def _qos(*, latched: bool) -> Qos:
         QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
 
 
-def _from_ros1(
-    source: Connection, jazzy: Typestore,
-) -> tuple[str, Callable[[bytes], bytes | memoryview]]:
-    """Return the ROS 2 name of a type of a ROS 1 bag, and what converts its messages to CDR."""
+def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Convert]:
+    """
+    Return the ROS 2 name of a type of a ROS 1 bag, its types, and what converts messages to CDR.
+
+    A type that Jazzy does not have is that of the bag, with the header of ROS 2.
+    """
     from rosbags.convert import converter  # noqa: PLC0415  (needed for few bags)
 
-    types = own_types(source) or get_typestore(Stores.ROS1_NOETIC)
-    name = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype)
-    target = _ros2_types(source, jazzy)
-    if converter.is_same_wireformat(types, target, source.msgtype, name):
-        return name, partial(target.ros1_to_cdr, typename=name)
-    return name, partial(
-        converter.migrate_bytes, types, target, source.msgtype, name, {}, src_is2=False,
-        dst_is2=True)
-
-
-def _ros2_types(source: Connection, jazzy: Typestore) -> Typestore:
-    """Return ROS 2 types with that of a ROS 1 bag: the own ones, with the header of ROS 2."""
-    from rosbags.convert import converter  # noqa: PLC0415  (needed for few bags)
-
-    name = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype)
-    if name in jazzy.fielddefs:
-        return jazzy
-    types = get_typestore(Stores.EMPTY)
-    types.register({**(own_types(source) or get_typestore(Stores.ROS1_NOETIC)).fielddefs,
-                    HEADER: jazzy.fielddefs[HEADER]})
-    return types
+    own = own_types(source) or get_typestore(Stores.ROS1_NOETIC)
+    name, types = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype), jazzy
+    if name not in jazzy.fielddefs:
+        types = get_typestore(Stores.EMPTY)
+        types.register({**own.fielddefs, HEADER: jazzy.fielddefs[HEADER]})
+    if converter.is_same_wireformat(own, types, source.msgtype, name):
+        return name, types, partial(types.ros1_to_cdr, typename=name)
+    return name, types, partial(
+        converter.migrate_bytes, own, types, source.msgtype, name, {}, src_is2=False, dst_is2=True)
 
 
 def message_types() -> dict[str, Any]:

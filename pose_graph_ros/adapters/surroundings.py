@@ -68,8 +68,12 @@ class Datum:
         with self._lock:
             self.plane, self._waits, self._to_lift = None, False, False
 
-    def plane_for(self, latitude: float, longitude: float, altitude: float) -> TangentPlane:
-        """Return the plane for a fix that is used, which becomes the datum if there is none."""
+    def place(self, latitude: float, longitude: float, altitude: float) -> FloatArray:
+        """
+        Return the position in the map of a fix that is used, shape (2,) [m].
+
+        It becomes the datum if there is none.
+        """
         with self._lock:
             if math.isfinite(altitude):
                 self.altitude = altitude
@@ -82,11 +86,7 @@ class Datum:
                 self.plane = TangentPlane(
                     self.plane.latitude, self.plane.longitude, self.altitude, self.yaw)
                 self._to_lift = False
-            return self.plane
-
-    def place(self, latitude: float, longitude: float, altitude: float) -> FloatArray:
-        """Return the position in the map of a fix that is used, shape (2,) [m]."""
-        plane = self.plane_for(latitude, longitude, altitude)
+            plane = self.plane
         return plane.to_map(
             latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
 

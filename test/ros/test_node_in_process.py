@@ -267,7 +267,7 @@ def test_the_datum_can_be_set_until_the_graph_refers_to_it(managed: Managed) -> 
     managed.drive(2.0, fixes=False)
     datum = managed.session.input.reader.datum
     # placed, but not in the graph: nothing refers to it
-    datum.plane_for(48.0, 11.0, 0.0)
+    datum.place(48.0, 11.0, 0.0)
     assert managed.call('set_datum').success
     assert datum.plane is None
     managed.drive(4.0, 2.0)

@@ -203,7 +203,7 @@ def test_the_fix_needs_a_datum_and_a_measurement_in_the_map() -> None:
     given = Given()
     given.publish(1.0)
     given.datum = Datum([48.1, 11.6])
-    given.datum.plane_for(48.1, 11.6, 500.0)
+    given.datum.place(48.1, 11.6, 500.0)
     given.publish(2.0, alignment=AlignmentState.LOCAL)
     given.publish(3.0)
     (fix,) = given.node['gps/filtered'].sent
