@@ -3,15 +3,15 @@
 """
 Draw a drive: a map of all paths, and below it (or beside a tall one) their errors over time.
 
-A simulated one is a map alone: the true path, and what was measured there.
+A simulated one has the truth in place of a corrected path.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
@@ -27,9 +27,9 @@ from pose_graph_ros.cli.drive import (
     WAITING,
     WEAKLY_BELIEVED,
 )
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import Points
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
@@ -58,8 +58,19 @@ STYLE: Any = {
     'agg.path.chunksize': 1000}
 
 
-def draw_drive(drive: Drive, file: Path, title: str) -> None:
-    """Draw a drive as a picture with a width of 1600 pixels, and write it to a file."""
+SIMULATED = {'doubted fixes, not used': 'fixes moved by a jump',
+             'doubted or refused\nloop closures, not used': 'false loop closures'}
+"""Names in the legend of what was simulated, by those of a drive."""
+
+
+def draw_drive(
+    drive: Drive, file: Path, title: str, names: Mapping[str, str] | None = None,
+) -> None:
+    """
+    Draw a drive as a picture with a width of 1600 pixels, and write it to a file.
+
+    In the legend some names may be other ones.
+    """
     paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
     low, high = _limits(np.concatenate([path.poses[:, :2] for path in paths]), np.concatenate(
         (drive.placed_odometry.poses[:, :2], drive.fix_positions)))
@@ -75,9 +86,13 @@ def draw_drive(drive: Drive, file: Path, title: str) -> None:
         _draw_map(plan, drive)
         plan.set_aspect('equal', anchor='NW')
         plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        plan.set_title(_facts(drive), loc='left', fontsize=12, color=GREY)
-        figure.legend(*plan.get_legend_handles_labels(), loc='outside right upper',
-                      labelspacing=0.9, alignment='left', title=_compared(drive)[1])
+        if names is None:
+            plan.set_title(_facts(drive), loc='left', fontsize=12, color=GREY)
+        handles, labels = plan.get_legend_handles_labels()
+        for name, other in (names or {}).items():
+            labels = [label.replace(name, other) for label in labels]
+        figure.legend(handles, labels, loc='outside right upper', labelspacing=0.9,
+                      alignment='left', title=_compared(drive)[1])
         _draw_errors(errors, drive)
         figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold',
                         parse_math=False)
@@ -115,10 +130,10 @@ def _facts(drive: Drive) -> str:
 
 
 def _compared(drive: Drive) -> tuple[str, str | None]:
-    """Return what the path is compared with in the legend, and the title of that."""
+    """Return what paths are compared with in the legend, and the title of that."""
     names = {row.name for row in drive.rows}
     for name in ('truth', 'fixes held out', 'fixes used'):
-        if f'corrected path to {name}' in names:
+        if f'odometry alone to {name}' in names or f'corrected path to {name}' in names:
             return name, f'distance to {name}'
     return '', None
 
@@ -134,9 +149,10 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
         digits = 2 if row.rms < 10.0 else 1
         return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'
 
-    path = drive.corrected
-    axes.plot(*thinned(path.poses[:, :2]).T, color=BLUE, linewidth=3.4, solid_capstyle='round',
-              zorder=3, label=label('corrected path'))
+    path = drive.corrected if drive.truth is None or len(drive.corrected) > 0 else drive.truth
+    if len(drive.corrected) > 0:
+        axes.plot(*thinned(path.poses[:, :2]).T, color=BLUE, linewidth=3.4,
+                  solid_capstyle='round', zorder=3, label=label('corrected path'))
     if drive.truth is not None:
         axes.plot(*thinned(drive.truth.poses[:, :2]).T, color=INK, linewidth=0.8,
                   linestyle=(0, (6, 4)), zorder=4, label='truth')
@@ -230,54 +246,26 @@ def _outages(drive: Drive, begin: StampNs, end: StampNs) -> list[tuple[float, fl
 
 
 def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:
-    """Write a map of what was simulated: odometry starts at the true pose."""
+    """Draw what was simulated: what is false or moved looks as if it were doubted."""
     truth = simulated.truth
     if isinstance(simulated, SimulatedGraph):
-        group, odometry = simulated.group, simulated.start
-        ends = truth.poses[np.column_stack((simulated.loops.i, simulated.loops.j)), :2]
+        odometry = Trajectory(truth.stamps_ns, simulated.start)
+        ends = truth.stamps_ns[np.column_stack((simulated.loops.i, simulated.loops.j))]
+        group, stamps = simulated.group, truth.stamps_ns[simulated.observed.i]
         measured = simulated.observed.mean[:, :2]
-        wrong = np.zeros(len(measured), dtype=bool)
-        wrong[simulated.wrong] = True
+        wrong = np.isin(np.arange(len(measured)), simulated.wrong)
     else:
-        begin = max(truth.stamps_ns[0], simulated.odometry.stamps_ns[0])
-        moved = se2.compose(truth.at(begin), se2.inverse(simulated.odometry.at(begin)))
+        odometry = simulated.odometry
         fixes, poses, closures = (
             simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
-        group, odometry = closures.wrong, se2.compose(moved, simulated.odometry.poses)
-        ends = truth.at(np.clip(closures.stamps_ns, *truth.stamps_ns[[0, -1]]))[..., :2]
-        measured = poses.values[:, :2]
+        ends, group, measured = closures.stamps_ns, closures.wrong, poses.values[:, :2]
         if len(fixes.values) > 0:
             plane = TangentPlane(*fixes.values[0].tolist())
             measured = np.concatenate((plane.to_map(*fixes.values.T), measured))
+        stamps = np.append(fixes.stamps_ns, poses.stamps_ns)
         wrong = np.append(fixes.wrong, poses.wrong) >= 0
-    true, odometry = truth.poses[:, :2], odometry[:, :2]
-    low, high = _limits(true, np.concatenate((odometry, measured)))
-    width, height = np.clip(8.0 * (high - low) / np.max(high - low), 4.0, 8.0)
-    with rc_context(STYLE | {'font.size': 11}):
-        figure = Figure(figsize=(width, height + 0.9), dpi=100, layout='constrained')
-        axes = figure.add_subplot(xlabel='x [m]', ylabel='y [m]', aspect='equal',
-                                  xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        is_false = group >= 0
-        for points, line, name in (
-                (odometry, {'color': ORANGE, 'linewidth': 1.0}, 'odometry'),
-                (measured[~wrong], {'color': GREY, 'marker': '.', 'markersize': 3,
-                                    'linestyle': 'none', 'alpha': 0.6}, 'fixes, global poses'),
-                (measured[wrong], {'color': GREY, 'marker': 'x', 'markersize': 5,
-                                   'linestyle': 'none'}, 'those moved by a jump'),
-                (true, {'color': BLUE, 'linewidth': 1.6}, 'truth'),
-                (ends[~is_false, 1], {'color': GREEN, 'marker': '.', 'linestyle': 'none'},
-                 'true closures')):
-            if len(points) > 0:
-                axes.plot(*thinned(points).T, zorder=3, label=name, **line)
-        numbers, sizes = np.unique(group[is_false], return_counts=True)
-        in_group = np.isin(group, numbers[sizes > 1])
-        for chosen, style, name in ((is_false & ~in_group, '--', 'false closures'),
-                                    (in_group, '-', 'false closures in groups')):
-            if np.any(chosen):
-                axes.add_collection(LineCollection(
-                    list(ends[chosen]), colors=INK, linestyles=style, linewidths=0.9, zorder=6,
-                    label=name))
-        figure.suptitle(title, x=0.02, ha='left', fontweight='bold')
-        figure.legend(*axes.get_legend_handles_labels(), loc='outside lower left', ncols=3,
-                      fontsize=10)
-        figure.savefig(file)
+    nothing = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    draw_drive(Drive(
+        odometry, nothing, truth, stamps, measured, np.where(wrong, DOUBTED, BELIEVED),
+        [''] * len(stamps), ends, np.where(group >= 0, DOUBTED, BELIEVED), [''] * len(ends)),
+        file, title, SIMULATED)

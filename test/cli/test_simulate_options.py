@@ -152,7 +152,7 @@ def test_a_map_is_drawn(out, tmp_path, capsys) -> None:
              '--closures', '1', '--false-rate', '0.5')
     simulate(tmp_path / out, *words, '--plot', tmp_path / 'map.svg')
     text = (tmp_path / 'map.svg').read_text(encoding='utf-8')
-    for name in ('odometry', 'truth', 'true closures', 'false closures', 'moved by a jump',
+    for name in ('odometry alone', 'truth', 'false loop closures', 'fixes moved by a jump',
                  'grid, seed 1'):
         assert name in text
     capsys.readouterr()
