@@ -177,11 +177,9 @@ def read_static_frames(reader: Bag) -> list[BagMessage]:
         return []
     good = []
     for message in reader.messages([topic]):
-        try:
+        with suppress(MessageError):
             message.decode()
-        except MessageError:
-            continue
-        good.append(message)
+            good.append(message)
     return good
 
 
