@@ -164,7 +164,7 @@ def test_the_base_of_core_imports_no_engine() -> None:
 
 
 def test_only_the_node_imports_ros() -> None:
-    # the player of `cli` is started as a process of its own
+    # the demo of `cli` imports the player of `ros` by its name when it runs
     logic = [Path('ros', f'{name}.py') for name in LOGIC]
     assert not [(path, name) for path in (*modules('adapters'), *modules('cli'), *logic)
                 for name in imports(path) if is_ros(name)]
