@@ -13,11 +13,12 @@ from pose_graph_ros.core.graph.error_functions import errors
 
 
 class EdgeLinearization(NamedTuple):
-    """Errors, shape (M, 3), and Jacobians A = de/dx_i and B = de/dx_j, shape (M, 3, 3)."""
+    """Errors, shape (M, 3), and their Jacobians by x_i, x_j and x_k, shape (M, 3, 3)."""
 
     error: FloatArray
     jacobian_i: FloatArray
     jacobian_j: FloatArray
+    jacobian_k: FloatArray
 
 
 class ObservedLinearization(NamedTuple):
@@ -53,7 +54,12 @@ def linearize_edges(poses: FloatArray, edges: Factors) -> EdgeLinearization:
         jacobian_i[rows, 0, 2], jacobian_i[rows, 1, 2] = arm[:, 1], -arm[:, 0]
         for k in range(3):
             jacobian_j[rows, k, k] = edges.constants[rows[:, None], [2, 2, 3]][:, k]
-    return EdgeLinearization(error, jacobian_i, jacobian_j)
+    own, jacobian_k = _unrotate(edges.mean[:, 2], edges.mean[:, :2]), np.zeros_like(jacobian_i)
+    half = 0.5 * edges.constants[:, 3]
+    jacobian_k[:, :, 0] = np.column_stack((-half * own[:, 1], half * own[:, 0], 2.0 * half))
+    jacobian_k[:, :2, 1] = -own
+    jacobian_k[edges.k < 0] = 0.0
+    return EdgeLinearization(error, jacobian_i, jacobian_j, jacobian_k)
 
 
 def linearize_observed(poses: FloatArray, observed: Factors) -> ObservedLinearization:

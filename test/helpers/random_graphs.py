@@ -54,7 +54,8 @@ def random_graph(  # noqa: PLR0917
     """
     Return a connected graph with duplicate and reversed edges and large errors.
 
-    The biases are the last nodes: a chain whose first bias is observed, with edges from poses.
+    The biases are the last nodes: a chain whose first bias is observed, with edges from poses, and
+    third nodes of odometry.
     """
     rng = np.random.default_rng(seed)
     i, j = list(range(n_nodes - 1)), list(range(1, n_nodes))
@@ -69,11 +70,15 @@ def random_graph(  # noqa: PLR0917
             random_observed(rng, rng.integers(0, n_nodes, n_observed).tolist())])))
     if n_biases > 0:
         biases = np.arange(n_nodes, n_nodes + n_biases)
+        calibrated = random_edges(rng, i[:n_nodes], j[:n_nodes])
         graph.apply(GraphUpdate(
             biases=random_poses(rng, n_biases), factors=Factors.joined([
                 random_edges_to_biases(rng, biases[1:], biases[:-1]),
                 random_edges_to_biases(rng, rng.integers(0, n_nodes, 3 * n_biases),
                                        rng.choice(biases, 3 * n_biases)),
+                calibrated.replaced(
+                    kind=np.full(n_nodes, FactorKind.ODOMETRY), k=rng.choice(biases, n_nodes),
+                    constants=rng.normal(size=(n_nodes, 4)) * (0.0, 0.0, 0.0, 1.0)),
                 random_observed(rng, [0, n_nodes]).rows(slice(1, 2))])))
     return graph
 
@@ -159,6 +164,13 @@ def slow_to_bias(
     return error, A, F
 
 
+def slow_third(z: FloatArray, duration: float) -> FloatArray:
+    """Return the Jacobian of the error of one edge by bias of the yaw rate and error of scale."""
+    own = np.linalg.inv(matrix(z))[:2, :2] @ z[:2]
+    return np.array([[-0.5 * duration * own[1], -own[0], 0.0],
+                     [0.5 * duration * own[0], -own[1], 0.0], [duration, 0.0, 0.0]])
+
+
 def slow_observed(
     x: FloatArray, offset: FloatArray, z: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -179,12 +191,17 @@ def dense_system(graph: Graph) -> tuple[FloatArray, FloatArray]:
     edges, observed = graph.factors.edges, graph.factors.observed
     of_edges, of_observed = edges.weighted_information, observed.weighted_information
     for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
-        ends = graph.poses[i], graph.poses[j], edges.mean[k]
-        e, A, B = (slow_to_bias(*ends, edges.constants[k]) if edges.kind[k] == FactorKind.BIAS
-                   else slow_edge(*ends))
-        for row, J_row in ((i, A), (j, B)):
+        given = graph.poses[i], graph.poses[j], edges.mean[k]
+        e, A, B = (slow_to_bias(*given, edges.constants[k]) if edges.kind[k] == FactorKind.BIAS
+                   else slow_edge(*given))
+        ends = [(i, A), (j, B)]
+        if edges.k[k] >= 0:
+            ends.append((edges.k[k], slow_third(edges.mean[k], edges.constants[k, 3])))
+            e = e + ends[2][1] @ graph.poses[edges.k[k]]
+            e[2] = np.arctan2(np.sin(e[2]), np.cos(e[2]))
+        for row, J_row in ends:
             b[3 * row:3 * row + 3] += J_row.T @ of_edges[k] @ e
-            for column, J_column in ((i, A), (j, B)):
+            for column, J_column in ends:
                 H[3 * row:3 * row + 3, 3 * column:3 * column + 3] += (
                     J_row.T @ of_edges[k] @ J_column)
     for k, i in enumerate(observed.i):

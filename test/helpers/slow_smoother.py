@@ -53,6 +53,7 @@ class SlowGraph:
         """Return the factors that have not left."""
         return np.flatnonzero(
             self.present[self.factors.i] & (self.present[self.factors.j] | (self.factors.j < 0))
+            & (self.present[self.factors.k] | (self.factors.k < 0))
             & ~np.isin(np.arange(len(self.factors)), list(self.dropped)))
 
     def edited(self, update: GraphUpdate) -> 'SlowGraph':
@@ -62,7 +63,8 @@ class SlowGraph:
         fixed[list(update.free)] = False
         gone = list(self.gone.union(update.remove_nodes))
         factors = Factors.joined([self.factors, update.factors])
-        without = np.flatnonzero(np.isin(factors.i, gone) | np.isin(factors.j, gone))
+        without = np.flatnonzero(np.any(
+            np.isin((factors.i, factors.j, factors.k), gone), axis=0))
         return SlowGraph(
             poses, fixed,
             _weighed(_weighed(factors, update.remove, update.weigh), [*update.drop, *without], {}),
@@ -86,7 +88,8 @@ class SlowGraph:
         unary = jacobians.linearize_observed(self.poses, observed)
         return _normal_equations(len(self.poses), (
             (edges.weighted_information, edge.error,
-             ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j))),
+             ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j),
+              (edges.k, edge.jacobian_k))),
             (observed.weighted_information, unary.error, ((observed.i, unary.jacobian),))))
 
     @property
@@ -172,13 +175,14 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     edges, observed = graph.factors_by_row.edges, graph.factors_by_row.observed
     if nodes is not None:
         edges = edges.replaced(weight=edges.weight * (
-            np.isin(edges.i, nodes) | np.isin(edges.j, nodes)))
+            np.isin(edges.i, nodes) | np.isin(edges.j, nodes) | np.isin(edges.k, nodes)))
         observed = observed.replaced(weight=observed.weight * np.isin(observed.i, nodes))
     m, k = len(edges), len(observed)
     is_edge = graph.factors_by_row.j >= 0
     table, headings = graph.factor_records, graph.node_records['reference'][:, 2]
     rows, unary = table[is_edge], table[~is_edge]
-    ends, hidden = np.zeros((2 * m, 3)), np.zeros((k, 3))
+    # without an error by third nodes, of which the Jacobian is constant
+    ends, hidden = np.zeros((2 * m + 1, 3)), np.zeros((k, 3))
     # the constraints of a clique turn with its frame
     turn = np.array([frame_turn(graph, c) for c in rows['owner']])
     ends[:m, 2] = np.arctan2(rows['lin_sin'], rows['lin_cos']) - edges.mean[:, 2] + turn
@@ -187,16 +191,17 @@ def information(graph: Graph, nodes: list[int] | None = None) -> FloatArray:
     assert np.all(turn[to_bias & (edges.weight > 0.0)] == 0.0)
     ends[:m][to_bias, 2] = (headings[edges.i] + rows['lin_th'])[to_bias]
     difference = rows['lin_arm']
-    ends[m:, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
+    ends[m:2 * m, :2] = np.einsum('mij,mj->mi', se2.rotation(turn), difference)
     hidden[:, 2] = headings[observed.i] + unary['lin_th']
     edge = jacobians.linearize_edges(ends, Factors(
         np.arange(m), m + np.arange(m), edges.mean, edges.information, edges.kind,
-        constants=edges.constants))
+        constants=edges.constants, k=np.where(edges.k < 0, -1, 2 * m)))
     single = jacobians.linearize_observed(hidden, Factors.on(
         np.arange(k), observed.offset, observed.mean, observed.information, observed.kind))
     return _normal_equations(graph.n_nodes, (
         (edges.weighted_information, edge.error,
-         ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j))),
+         ((edges.i, edge.jacobian_i), (edges.j, edge.jacobian_j),
+          (edges.k, edge.jacobian_k))),
         (observed.weighted_information, single.error, ((observed.i, single.jacobian),))))[0]
 
 
@@ -254,12 +259,27 @@ class World:
         return se2.wrapped(pose + self.rng.normal(size=3) * sigma)
 
     def edges(self, pairs: list[tuple[int, int]]) -> Factors:
-        return Factors(
+        table = Factors(
             [i for i, _ in pairs], [j for _, j in pairs],
             np.reshape([self.disturbed(se2.between(self.truth[i], self.truth[j]), self.noise)
                         for i, j in pairs], (-1, 3)),
             np.reshape([self.informative() for _ in pairs], (-1, 3, 3)),
             [FactorKind.LOOP_CLOSURE] * len(pairs))
+        biases = [bias for bias in sorted(self.biases - self.gone) if bias < len(self.truth)]
+        for record in table.records if len(biases) > 0 else ():
+            self._calibrate(record, int(self.rng.choice(biases)))
+        return table
+
+    def _calibrate(self, record: Any, bias: int) -> None:
+        """Let some edges be of odometry with a third node, by which the truth is disturbed."""
+        duration, (rate, scale, _) = self.rng.uniform(-1.0, 1.0), self.truth[bias]
+        by_state = complex(1.0 + scale, -0.5 * duration * rate)
+        if abs(by_state) > 0.5 and self.rng.random() < 0.5:
+            x, y, heading = record['mean']
+            moved = complex(x, y) / by_state
+            record['mean'] = moved.real, moved.imag, heading + duration * rate
+            record['kind'], record['k'] = FactorKind.ODOMETRY, bias
+            record['constants'][3] = duration
 
     def observed(
         self, nodes: list[int], *, position: bool = False, offset: bool = False,

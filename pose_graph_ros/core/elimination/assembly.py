@@ -143,7 +143,7 @@ def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped
             transaction_log.log_factor(head, e)
             factors.linearize(head, e)
         f.owner = c
-        anchored |= anchors(f.kind)
+        anchored |= anchors(f)
         normal_equations.add(head, e, (at_i, at_j, at_k), front, ld)
     return anchored
 

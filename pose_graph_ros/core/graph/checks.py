@@ -107,6 +107,9 @@ def check(
     missing = ~rows[table.kind]
     _refuse_rows(missing & (table.mean != 0.0),
                  'Factors.mean: expected 0 in rows that the error has not', table.mean)
+    _refuse_rows((table.kind == FactorKind.ODOMETRY) & (table.k >= 0) & (
+        dimension[ids.rows(table.k)] < 2), 'Factors.k: expected a bias of two coordinates for an '
+        'edge of odometry', table.k)
     # of one on a bias, or on a single node, the rows that the node has
     of_i = dimension[ids.rows(table.i)]
     of_j = np.where(table.j >= 0, dimension[ids.rows(table.j)], of_i)

@@ -10,9 +10,10 @@ heading and whose mean heading are zero, so its error lies in map axes. A headin
 information on the position is zero.
 
 A *bias* is a hidden node that is not a pose but the time-correlated error of a source of
-measurements, in units of its sigma. Edges of the kind `BIAS` lead to it. `factors` has the errors
-of all kinds. Nothing in here is compiled, so that programs which read a file and work on arrays
-need not load Numba.
+measurements, in units of its sigma. Edges of the kind `BIAS` lead to it. That of a gyroscope, and
+what an odometry is calibrated by, bias of the yaw rate and error of the scale, is the third node
+of its edges. `factors` has the errors of all kinds. Nothing in here is compiled, so that programs
+which read a file and work on arrays need not load Numba.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,7 +44,7 @@ class FactorKind(IntEnum):
     # leads to a bias j, from the pose i that was measured with it or from the next bias i; the
     # error is `F x_j + mean - x_i * offset` in map axes, F = diag(f_t, f_t, f_th)
     BIAS = 2
-    TURN = 3    # change of the heading, as from a gyro, whose bias, if any, is the third node
+    TURN = 3    # change of the heading, as from a gyro
     POINT = 4   # position of landmark j in the frame of i
     PRIOR = 5   # what marginalisation leaves of edges between poses; the error is that of odometry
     RANGE = 6   # distance of landmark j from a point of the robot i
@@ -56,7 +57,6 @@ class FactorKind(IntEnum):
 class FactorType(NamedTuple):
     """What checks, files and pictures need to know of a kind of factors."""
 
-    name: str
     i: tuple[NodeKind, ...]         # kinds of nodes that it may start from
     j: tuple[NodeKind, ...] = ()    # none where it has one end
     k: tuple[NodeKind, ...] = ()    # of the third node, which may be missing
@@ -75,17 +75,19 @@ class FactorType(NamedTuple):
 
 _POSE, _BIAS, _LANDMARK = (NodeKind.POSE,), (NodeKind.BIAS,), (NodeKind.LANDMARK,)
 FACTORS = {
-    FactorKind.ODOMETRY: FactorType('odometry', _POSE, _POSE, tag='EDGE_SE2'),
-    FactorKind.LOOP_CLOSURE: FactorType('loop closure', _POSE, _POSE, tag='EDGE_SE2'),
-    FactorKind.BIAS: FactorType('bias', (*_POSE, *_BIAS), _BIAS, constants=(0, 1, 2, 3)),
-    FactorKind.TURN: FactorType('turn', _POSE, _POSE, _BIAS, rows=(2,), constants=(3,)),
-    FactorKind.POINT: FactorType('point', _POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
-    FactorKind.PRIOR: FactorType('prior', _POSE, _POSE, tag='EDGE_SE2'),
+    FactorKind.ODOMETRY: FactorType(_POSE, _POSE, _BIAS, constants=(3,), tag='EDGE_SE2'),
+    FactorKind.LOOP_CLOSURE: FactorType(_POSE, _POSE, tag='EDGE_SE2'),
+    FactorKind.BIAS: FactorType((*_POSE, *_BIAS), _BIAS, constants=(0, 1, 2, 3)),
+    FactorKind.TURN: FactorType(_POSE, _POSE, _BIAS, rows=(2,), constants=(3,)),
+    FactorKind.POINT: FactorType(_POSE, _LANDMARK, rows=(0, 1), tag='EDGE_SE2_XY'),
+    FactorKind.PRIOR: FactorType(_POSE, _POSE, tag='EDGE_SE2'),
     FactorKind.RANGE: FactorType(
-        'range', _POSE, _LANDMARK, rows=(0,), constants=(0, 1), tag='EDGE_RANGE_SE2_XY'),
-    **{kind: FactorType(kind.name.lower().replace('_', ' '), tuple(NodeKind), constants=(0, 1, 2))
+        _POSE, _LANDMARK, rows=(0,), constants=(0, 1), tag='EDGE_RANGE_SE2_XY'),
+    **{kind: FactorType(tuple(NodeKind), constants=(0, 1, 2))
        for kind in FactorKind if kind >= FactorKind.GLOBAL_POSE},
 }
+# tables by kind are in this order, as a kind is its number
+assert list(FACTORS) == list(FactorKind)
 
 _NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
 FactorKinds = Annotated[IntArray, Choices(FactorKind)]
@@ -139,9 +141,10 @@ class Factors:
     # what else the error depends on, shape (M, 4): with one end the offset (o_x, o_y, o_th, 0)
     # [m, m, rad], that is, motion by odometry since the node, then the lever arm; of edges to a
     # bias the offset in i and the factors of the bias, (o_x, o_y, f_t, f_th) [m, m, m, rad]; of a
-    # range (o_x, o_y), of a turn f_th, the duration [s]
+    # range (o_x, o_y); of edges with a third node for how long its bias acts, negative for one
+    # that the motion lacks, (0, 0, 0, f) [s]
     constants = _Column()
-    k = _Column()       # third nodes: of turns the bias; -1, the default, for none
+    k = _Column()       # third nodes; -1, the default, for none
 
     def __init__(
         self, i: npt.ArrayLike = (), j: npt.ArrayLike = (), mean: npt.ArrayLike = _NO_ROWS,

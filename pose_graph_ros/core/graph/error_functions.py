@@ -16,7 +16,7 @@ from pose_graph_ros.core.compiled.jit import kernel, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.graph.factors import model, prepare
+from pose_graph_ros.core.graph.factors import by_state, model, NO_THIRD, prepare
 from pose_graph_ros.core.graph.tables import FACTOR, RECORDS
 
 
@@ -57,7 +57,9 @@ def _write_errors(poses, records, error):  # type: ignore[no-untyped-def]
         f = record[0]   # in here, as Numba frees the array after its last use
         new = records[e]
         write_data(f, new)
-        third = new.constants[3] * poses[new.k, 0] if new.k >= 0 else 0.0
+        third, _ = NO_THIRD
+        if new.k >= 0:
+            third = by_state(f, poses[new.k, 0], poses[new.k, 1])
         error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
             f, new.kind, poses[new.i], poses[new.j if new.j >= 0 else new.i], third)
 

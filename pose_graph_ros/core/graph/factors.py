@@ -12,15 +12,24 @@ F = diag(f_t, f_t, f_th) and `d = f_t t_j - t_i` the errors are
 
     odometry, loop closure (3.48)    e = (R_z^T (R_i^T d - t_z), wrap(th_j - th_i - th_z)), F = 1
     bias j of a measurement at i     e = (d + t_z - R_i o, wrap(f_th th_j - th_i + th_z))
-    turn (integrated yaw rate)       e_th = wrap(th_j - th_i - th_z + f_th b), b the bias k [rad/s]
+    turn (integrated yaw rate)       e_th = wrap(th_j - th_i - th_z)
     point (landmark j seen from i)   e_t = R_i^T d - t_z
     range (landmark j, antenna o)    e_x = |d - R_i o| - r
     observed node (3.52), F = 0      e = -(R_z^T (t_i + R_i o - t_z), wrap(th_i + th_o - th_z))
 
+Odometry and turns may have a third node k, the bias b of a yaw rate [rad/s] and the error s of a
+scale. With f the duration for which the bias acts [s], negative where the motion is to be turned
+by b, and with o here for R_z^T t_z, it adds to the error
+
+    (-s o + f b S o / 2, f b)
+
+so that the way is longer by the part s, and its chord turned by half of what the end is. That is
+linear in k, in axes that do not depend on k.
+
 A row that a type has not is given no information: a point is an edge without a heading, a turn one
 without a position. All of them are, turned into map axes by the rotation R of their *frame*,
 
-    R e_t' = d - S a dth_i + constant,    e_th' = f_th dth_j - dth_i + f_th b + constant
+    R e_t' = d - S a dth_i + constant,    e_th' = f_th dth_j - dth_i + constant
 
 for small changes, S = ((0, -1), (1, 0)). Frame and *arm* a are all that a type says of its
 Jacobians; with them `R e_t = d + constant`. Of the heading of i only the rotation by th_i enters,
@@ -34,8 +43,8 @@ point of its own; a bar marks values there. In map axes an error is
     e' = h + F delta_j - T delta_i,    T = ((1, 0, -a_y), (0, 1, a_x), (0, 0, 1)) at a_bar
     h_t = f_t x_ref_j - x_ref_i + constant + S a_bar delta_bar_th,   h_th constant
 
-(and delta_k enters e_th' by f_th if there is a third node), and its information is turned by
-R_bar likewise. The residual of the linear model,
+(and what a third node adds, turned by R_bar), and its information is turned by R_bar likewise.
+The residual of the linear model,
 
     r = e - R_bar^T e',
 
@@ -66,6 +75,8 @@ LEAST_FRACTION = 0.01
 MUCH_LONGER = 1e-4
 # Angle of a clique's frame, with its cosine and sine.
 NO_TURN = (0.0, 1.0, 0.0)
+# What a third node adds to an error, and its solution to the heading's, where there is none.
+NO_THIRD = ((0.0, 0.0, 0.0), 0.0)
 
 
 @kernel(forceinline=True)
@@ -81,9 +92,9 @@ def frame_moves(kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def anchors(kind):  # type: ignore[no-untyped-def]
+def anchors(f):  # type: ignore[no-untyped-def]
     """Tell whether axes of a factor's errors or unknowns do not turn with its clique."""
-    return kind >= BIAS and kind != PRIOR
+    return (f.kind >= BIAS and f.kind != PRIOR) or f.ends[2] >= 0
 
 
 @kernel
@@ -155,6 +166,30 @@ def relative_error(f, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
+def by_state(f, b, s):  # type: ignore[no-untyped-def]
+    """Return what a state (b, s) of the third node adds to the error; it is linear in it."""
+    turn, ox, oy = f.constants[3] * b, f.constants[0], f.constants[1]
+    return -s * ox - 0.5 * turn * oy, 0.5 * turn * ox - s * oy, turn
+
+
+@kernel(forceinline=True)
+def third(nodes, f, k):  # type: ignore[no-untyped-def]
+    """Return what the third node k adds to the error, and its solution to the heading's."""
+    if k < 0:
+        return NO_THIRD
+    pose, delta = nodes[k].pose, nodes[k].delta
+    return by_state(f, pose[0], pose[1]), f.constants[3] * delta[0]
+
+
+@kernel
+def motion(nodes, f):  # type: ignore[no-untyped-def]
+    """Return the pose of j in i that a relative error has measured, as the third node says."""
+    (x, y, th), _ = third(nodes, f, f.ends[2])
+    c, s = math.cos(f.mean[2]), math.sin(f.mean[2])
+    return f.mean[0] - c * x + s * y, f.mean[1] - s * x - c * y, f.mean[2] - th
+
+
+@kernel(forceinline=True)
 def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     """Return the error e_t, cosine and sine of its frame, and its arm, for d and `rotation`."""
     if is_relative(kind):
@@ -195,20 +230,24 @@ def refer_to_pose(f):  # type: ignore[no-untyped-def]
 
 @kernel(forceinline=True)
 def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
-    """Return the error of a factor at poses, cosine and sine of its frame, and its arm."""
+    """
+    Return the error of a factor at poses, cosine and sine of its frame, and its arm.
+
+    `third` is what its third node adds.
+    """
     ft, fth = factors_of_end(f, kind)
     c, s = rotation(f, kind, start[2])
     ex, ey, c, s, ax, ay = error(
         f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
-    eth = fth * end[2] - start[2] + heading_offset(f, kind) + third
-    return ex, ey, wrap(eth), c, s, ax, ay
+    eth = fth * end[2] - start[2] + heading_offset(f, kind) + third[2]
+    return ex + third[0], ey + third[1], wrap(eth), c, s, ax, ay
 
 
 @kernel(forceinline=True)
 def _linearize(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     """Linearize a factor, given its nodes i and j, and what the third one adds."""
-    pose_k, delta_k = third
-    _, _, eth, c, s, ax, ay = model(f, kind, start.pose, end.pose, pose_k)
+    by_pose, delta_k = third
+    _, _, eth, c, s, ax, ay = model(f, kind, start.pose, end.pose, by_pose)
     _, fth = factors_of_end(f, kind)
     if frame_moves(kind):
         f.lin_cos, f.lin_sin = c, s
@@ -233,7 +272,7 @@ def _versine_and_sine(turn):  # type: ignore[no-untyped-def]
 @kernel(forceinline=True)
 def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-def]
     """Set the squared linearization error and the energy, as `check`."""
-    (phi, cos, sin), (_, delta_k) = clique_turn, third
+    (phi, cos, sin), ((by_x, by_y, _), delta_k) = clique_turn, third
     ft, fth = factors_of_end(f, kind)
     dx, dy = ft * end.pose[0] - start.pose[0], ft * end.pose[1] - start.pose[1]
     if phi != 0.0:
@@ -250,7 +289,9 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
         qx, qy = c_bar * dx + s_bar * dy, c_bar * dy - s_bar * dx
         versine, sine = _versine_and_sine(turn)
         px, py = versine * qx + sine * qy, versine * qy - sine * qx
-        ex, ey = relative_error(f, qx + px, qy + py)
+        ax, ay = qx + px, qy + py
+        ex, ey = relative_error(f, ax, ay)
+        ex, ey = ex + by_x, ey + by_y
         rx, ry = px - gy * turn, py + gx * turn
     else:   # its clique is anchored, so phi is zero
         c, s = rotation(f, kind, start.pose[2])
@@ -259,7 +300,7 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
         ly = c_bar * (dy + ky) - s_bar * (dx + kx)
         if bx == 0.0 and by == 0.0:
             turned = 0.0
-        ex, ey, c, s, _, _ = error(f, kind, dx, dy, c, s)
+        ex, ey, c, s, ax, ay = error(f, kind, dx, dy, c, s)
         rx, ry = ex - lx - gy * turn, ey - ly + gx * turn
         turned += (c - c_bar) ** 2 + (s - s_bar) ** 2
     linear = f.lin_k + fth * end.delta[2] - th + delta_k
@@ -278,30 +319,22 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
     # the arm has changed, too; a large change would falsify the covariances even where the energy
     # is zero
     iso = 0.5 * (f.information[0] + f.information[3])
-    longer = (ex + f.constants[0] - gx) ** 2 + (ey + f.constants[1] - gy) ** 2
+    longer = (ax - gx) ** 2 + (ay - gy) ** 2
     longer *= iso / (f.information[5] + iso * (gx * gx + gy * gy) + 1e-300)
     f.error2 = w * _form(f, rx, ry, rth) + (turned + longer) * energy + (
         longer if longer > MUCH_LONGER else 0.0)
 
 
-@kernel(forceinline=True)
-def third(nodes, f, k):  # type: ignore[no-untyped-def]
-    """Return what pose and solution of the third node k add to the heading's error."""
-    if k < 0:
-        return 0.0, 0.0
-    return f.constants[3] * nodes[k].pose[0], f.constants[3] * nodes[k].delta[0]
-
-
-# Nearly all constraints have the error of odometry. What is derived from errors is compiled into
-# its callers, once for the constant ODOMETRY and once for all kinds: this takes a fifth less time.
+# Nearly all constraints have the error of odometry, and no third node. What is derived from errors
+# is compiled into its callers, once for these and once for all: this takes a fifth less time.
 
 @kernel
 def linearize(head, e):  # type: ignore[no-untyped-def]
     """Linearize a factor at the present estimate; the caller has logged its row."""
     nodes, f = tb.nodes(head), tb.factors(head)[e]
     kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS:
-        _linearize(f, ODOMETRY, nodes[i], nodes[j], (0.0, 0.0))
+    if kind < BIAS and k < 0:
+        _linearize(f, ODOMETRY, nodes[i], nodes[j], NO_THIRD)
     else:
         _linearize(f, kind, nodes[i], nodes[j], third(nodes, f, k))
 
@@ -317,8 +350,8 @@ def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
     """
     nodes, f = tb.nodes(head), tb.factors(head)[e]
     kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS:
-        _check(f, ODOMETRY, nodes[i], nodes[j], (0.0, 0.0), clique_turn)
+    if kind < BIAS and k < 0:
+        _check(f, ODOMETRY, nodes[i], nodes[j], NO_THIRD, clique_turn)
     else:
         _check(f, kind, nodes[i], nodes[j], third(nodes, f, k), clique_turn)
 
@@ -338,6 +371,6 @@ def energies(head, out):  # type: ignore[no-untyped-def]
     for e in range(head[tb.N_FACTORS]):
         f = tb.factors(head)[e]
         kind, i, j, k = kind_and_ends(f)
-        pose_k, _ = third(nodes, f, k)
-        ex, ey, eth, _, _, _, _ = model(f, kind, nodes[i].pose, nodes[j].pose, pose_k)
+        by_pose, _ = third(nodes, f, k)
+        ex, ey, eth, _, _, _, _ = model(f, kind, nodes[i].pose, nodes[j].pose, by_pose)
         out[e] = _form(f, ex, ey, eth)

@@ -3,8 +3,8 @@
 """
 What factors add to the normal equations: to the front of a clique, or to a gradient.
 
-Symbols are those of `factors`. With G = (0, 0, f_th) the column of a third node, a factor adds the
-blocks of `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
+Symbols are those of `factors`. With G the two columns of a third node, a factor adds the blocks of
+`J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 """
 
 import math
@@ -13,11 +13,13 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.factors import (
     BIAS,
+    by_state,
     constant,
     factors_of_end,
     frame,
     kind_and_ends,
     model,
+    NO_THIRD,
     OBSERVED,
     ODOMETRY,
     third,
@@ -66,8 +68,12 @@ def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _add(f, kind, start, end, at, front, ld):  # type: ignore[no-untyped-def]
-    """Add a factor to a front; `start` and `end` are its nodes i and j, others as for `add`."""
+def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add a factor to a front; `start` and `end` are its nodes i and j, others as for `add`.
+
+    `third` is what the reference of the third node adds to the error.
+    """
     a, b, k = at
     c, s = frame(f, kind)
     xx, xy, xt, yy, yt, tt = _turned(f, c, s)
@@ -76,6 +82,7 @@ def _add(f, kind, start, end, at, front, ld):  # type: ignore[no-untyped-def]
     kx, ky = constant(f, kind, c, s, py, -px)
     hx = ft * end.reference[0] - start.reference[0] + kx + px * f.lin_th
     hy = ft * end.reference[1] - start.reference[1] + ky + py * f.lin_th
+    hx, hy = hx + c * third[0] - s * third[1], hy + s * third[0] + c * third[1]
     hth = f.lin_k
     # W T: the third column is W (S a, 1)
     wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
@@ -98,7 +105,7 @@ def _add(f, kind, start, end, at, front, ld):  # type: ignore[no-untyped-def]
     front[(b + 1) * ld + right] -= ft * gy
     front[(b + 2) * ld + right] -= fth * gth
     if k >= 0:
-        _add_third(front, ld, (a, b, k), f.constants[3], (xt, yt, wt), (xt, yt, tt), gth)
+        _add_third(f, (c, s, px, py), (xx, xy, xt, yy, yt, tt), (gx, gy, gth), at, front, ld)
     # from here on with the columns of j multiplied by F
     xx, xy, xt, yy, yt = ft * xx, ft * xy, fth * xt, ft * yy, fth * yt
     wx, wy, wt = ft * wx, ft * wy, fth * wt
@@ -121,14 +128,35 @@ def _add(f, kind, start, end, at, front, ld):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_third(front, ld, at, factor, of_i, of_j, gth):  # type: ignore[no-untyped-def]
-    """Add the blocks of a third node, whose first coordinate enters the heading's error."""
+def _column(f, c, s, m):  # type: ignore[no-untyped-def]
+    """Return a column of G, in the map axes that the frame's cosine and sine are of."""
+    x, y, th = by_state(f, 1.0 - m, float(m))
+    return c * x - s * y, s * x + c * y, th
+
+
+@kernel
+def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add the blocks of a third node to a front.
+
+    `turned` has cosine and sine of the frame, and S a; `information` is W, and `gradient` W h.
+    """
+    c, s, px, py = turned
+    xx, xy, xt, yy, yt, tt = information
     a, b, k = at
-    front[k * ld + k] += factor * factor * of_j[2]
-    front[(k + 1) * ld - 1] -= factor * gth
-    for m in range(3):
-        for row, value in ((a + m, -of_i[m]), (b + m, of_j[m])):
-            front[min(row, k) * ld + max(row, k)] += factor * value
+    for m in range(2):
+        x, y, th = _column(f, c, s, m)
+        front[(k + m + 1) * ld - 1] -= x * gradient[0] + y * gradient[1] + th * gradient[2]
+        wx, wy, wth = xx * x + xy * y + xt * th, xy * x + yy * y + yt * th, (
+            xt * x + yt * y + tt * th)
+        for n in range(m, 2):
+            x, y, th = _column(f, c, s, n)
+            front[(k + m) * ld + k + n] += x * wx + y * wy + th * wth
+        of_i = -wx, -wy, -(px * wx + py * wy + wth)
+        of_j = wx, wy, wth
+        for n in range(3):
+            for row, value in ((a + n, of_i[n]), (b + n, of_j[n])):
+                front[min(row, k + m) * ld + max(row, k + m)] += value
 
 
 @kernel
@@ -140,11 +168,14 @@ def add(head, e, at, front, ld):  # type: ignore[no-untyped-def]
     right-hand side.
     """
     nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, _ = kind_and_ends(f)
-    if kind < BIAS:
-        _add(f, ODOMETRY, nodes[i], nodes[j], (at[0], at[1], -1), front, ld)
-    else:
-        _add(f, kind, nodes[i], nodes[j], at, front, ld)
+    kind, i, j, k = kind_and_ends(f)
+    if kind < BIAS and k < 0:
+        _add(f, ODOMETRY, nodes[i], nodes[j], NO_THIRD[0], (at[0], at[1], -1), front, ld)
+        return
+    reference = NO_THIRD[0]
+    if k >= 0:
+        reference = by_state(f, nodes[k].reference[0], nodes[k].reference[1])
+    _add(f, kind, nodes[i], nodes[j], reference, at, front, ld)
 
 
 @kernel
@@ -194,21 +225,26 @@ def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-
 
 
 @kernel(forceinline=True)
-def _gradient(f, kind, ends, nodes, third, right):  # type: ignore[no-untyped-def]
+def _gradient(f, kind, ends, nodes, right):  # type: ignore[no-untyped-def]
     """
     Add -b of a factor to `right`, shape (N, 3); return its energy and two sums of magnitudes.
 
     These are of the gradient's coordinates of a position, and of the diagonal terms of the
     energy, which cancel each other where W is nearly singular.
     """
-    v, j = ends
-    ex, ey, eth, c, s, ax, ay = model(f, kind, nodes[v].pose, nodes[j].pose, third)
+    v, j, k = ends
+    by_pose, _ = third(nodes, f, k)
+    ex, ey, eth, c, s, ax, ay = model(f, kind, nodes[v].pose, nodes[j].pose, by_pose)
     i, w = f.information, f.weight
     gx = w * (i[0] * ex + i[1] * ey + i[2] * eth)
     gy = w * (i[1] * ex + i[3] * ey + i[4] * eth)
     gth = w * (i[2] * ex + i[4] * ey + i[5] * eth)
     energy = ex * gx + ey * gy + eth * gth
     terms = w * (i[0] * ex * ex + i[3] * ey * ey + i[5] * eth * eth)
+    if k >= 0:
+        for m in range(2):
+            x, y, th = by_state(f, 1.0 - m, float(m))
+            right[k, m] -= x * gx + y * gy + th * gth
     gx, gy = c * gx - s * gy, s * gx + c * gy
     right[v, 0] += gx
     right[v, 1] += gy
@@ -218,7 +254,7 @@ def _gradient(f, kind, ends, nodes, third, right):  # type: ignore[no-untyped-de
         right[j, 0] -= ft * gx
         right[j, 1] -= ft * gy
         right[j, 2] -= fth * gth
-    return energy, abs(gx) + abs(gy), terms, gth
+    return energy, abs(gx) + abs(gy), terms
 
 
 @kernel(forceinline=True)
@@ -228,11 +264,6 @@ def gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
     nodes, f = tb.nodes(head), tb.factors(head)[e]
     kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS:
-        energy, total, terms, _ = _gradient(f, ODOMETRY, (i, j), nodes, 0.0, right)
-        return energy, total, terms
-    pose_k, _ = third(nodes, f, k)
-    energy, total, terms, gth = _gradient(f, kind, (i, j), nodes, pose_k, right)
-    if k >= 0:
-        right[k, 0] -= f.constants[3] * gth
-    return energy, total, terms
+    if kind < BIAS and k < 0:
+        return _gradient(f, ODOMETRY, (i, j, -1), nodes, right)
+    return _gradient(f, kind, (i, j, k), nodes, right)

@@ -91,7 +91,8 @@ def scale_by(head, e, weight):  # type: ignore[no-untyped-def]
         ft, fth = factors.factors_of_end(f, f.kind)
         add_to_scale(head, f.ends[1], ft * ft * position, fth * fth * heading)
     if f.ends[2] >= 0:
-        third = heading * (f.constants[3] * f.constants[3])
+        turn2 = f.constants[3] * f.constants[3]
+        third = heading * turn2 + position * arm2 * (1.0 + 0.25 * turn2)
         add_to_scale(head, f.ends[2], third, 0.0)
 
 
@@ -231,7 +232,9 @@ def write_rows(head, n_nodes, first_other, types, records):  # type: ignore[no-u
                     _node(head, c, first_other, types))
             for m in range(3):
                 valid = valid and (_ENDS[kind, m] >> ends[m][0]) & 1 == 1
-            if kind == factors.BIAS:     # of the rows that both nodes have
+            if kind < factors.BIAS and c >= 0:  # bias and error of the scale
+                valid = valid and ends[2][1] > 1
+            elif kind == factors.BIAS:     # of the rows that both nodes have
                 valid = valid and _has_rows_only(
                     f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
             elif kind >= factors.OBSERVED:

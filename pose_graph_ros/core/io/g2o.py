@@ -75,6 +75,7 @@ from pose_graph_ros.core.io.g2o_text import (
     read_lines,
     TAGS,
 )
+from pose_graph_ros.core.odometry.motion import bent
 
 if TYPE_CHECKING:
     from pose_graph_ros.core.graph.graph import Graph
@@ -88,8 +89,8 @@ _TO_LANDMARKS = [kind for kind, factor in FACTORS.items() if factor.j == (NodeKi
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
 NOT_USED = '# not used '
 """Begin of the line of a constraint with weight 0."""
-STANDING_FOR_PRIORS = '# instead of dense priors, which g2o does not have, '
-"""Begin of the line behind which there is nothing but edges and observed nodes for priors."""
+STANDING_FOR = '# instead of '
+"""Begin of lines behind which is nothing but what stands for that which g2o does not have."""
 
 
 @dataclass
@@ -352,8 +353,8 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     """
     Return the text of a g2o file: vertices, FIX, edges and observed nodes, each in their order.
 
-    Edges and observed nodes that tell about the same as dense priors are the last lines. `ids` are
-    numbers of the hidden nodes, by default their ids.
+    Edges and observed nodes that tell about the same as calibrated odometry and dense priors are
+    the last lines. `ids` are numbers of the hidden nodes, by default their ids.
     """
     ids = rows.node_ids if ids is None else ids
     factors = rows.factors.renumbered(rows.rows_of)
@@ -361,11 +362,12 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     is_edge, n_biases = factors.j >= 0, int(np.sum(rows.is_bias))
     written = np.where(
         is_edge, np.isin(factors.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
-        & ~np.any(factors.constants, axis=1), ~rows.is_bias[factors.i])
-    n_edges, n_observed = np.sum(is_edge & ~written), np.sum(~is_edge & ~written)
+        & ~np.any(factors.constants, axis=1) & (factors.k < 0), ~rows.is_bias[factors.i])
+    calibrated = (factors.kind == FactorKind.ODOMETRY) & (factors.k >= 0)
+    n_edges = np.sum(is_edge & ~written & ~calibrated)
     if n_edges > 0 or n_biases > 0:
-        lines.append(f'# left out: {n_biases} biases, {n_edges} edges to them and {n_observed} '
-                     f'observed ones')
+        lines.append(f'# left out: {n_biases} biases, {n_edges} edges that g2o does not have and '
+                     f'{np.sum(~is_edge & ~written)} observed biases')
     is_landmark = ~rows.is_pose & ~rows.is_bias
     for tag, chosen in (('VERTEX_SE2', rows.is_pose), ('VERTEX_XY', is_landmark)):
         numbers = _texts(rows.poses[chosen, :TAGS[tag].rows])
@@ -373,11 +375,23 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
             ids[chosen].tolist(), numbers, strict=True)]
     lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
     lines += _factor_lines(factors.rows(written), ids, used[written])
+    if np.any(calibrated):
+        instead = _corrected(factors.rows(calibrated), rows.poses)
+        lines += [f'{STANDING_FOR}odometry with a bias and an error of the scale: {len(instead)} '
+                  f'lines', *_factor_lines(instead, ids, used[calibrated])]
     if len(rows.priors) > 0:
         instead = standing_for(rows).renumbered(rows.rows_of)
-        lines += [f'{STANDING_FOR_PRIORS}of which there are {len(rows.priors)}: {len(instead)} '
-                  f'lines', *_factor_lines(instead, ids, np.ones(len(instead), dtype=bool))]
+        lines += [f'{STANDING_FOR}dense priors, which g2o does not have, of which there are '
+                  f'{len(rows.priors)}: {len(instead)} lines',
+                  *_factor_lines(instead, ids, np.ones(len(instead), dtype=bool))]
     return '\n'.join(lines) + '\n'
+
+
+def _corrected(factors: Factors, poses: FloatArray) -> Factors:
+    """Return calibrated edges of odometry as what they measure at the present poses."""
+    rate, scale, _ = poses[factors.k].T
+    return factors.replaced(constants=0.0, k=-1, mean=bent(
+        factors.mean, -factors.constants[:, 3] * rate, 1.0 + scale))
 
 
 def _is_used(factors: Factors) -> BoolArray:

@@ -34,7 +34,7 @@ from pose_graph_ros.core.graph.constraints import (
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import factors_of, g2o_text, NOT_USED, STANDING_FOR_PRIORS
+from pose_graph_ros.core.io.g2o import factors_of, g2o_text, NOT_USED, STANDING_FOR
 from pose_graph_ros.core.io.g2o_text import GraphText, lines_of, MEASURED, TAGS
 from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
@@ -84,8 +84,8 @@ class SavedRows:
     bias_values: Rows3
     factor_kind: FactorKinds  # of all factors
     factor_weight: Numbers
-    # rows of the factors that are given here; edges of `IN_G2O` and observed nodes on no bias
-    # are in the g2o file
+    # rows of the factors that are given here; edges of `IN_G2O` without a third node, and observed
+    # nodes on no bias, are in the g2o file
     others: Integers
     other_i: Integers
     other_j: Integers
@@ -147,7 +147,7 @@ def read_graph(path: Path) -> SavedGraph:
         rest = {name: decoded(hints[name], members[name]) for name in _members()
                 if name in members}
         rows: SavedRows = decoded(SavedRows, members['graph'])
-        text = g2o.decode('ascii').partition(STANDING_FOR_PRIORS)[0].replace(NOT_USED, '')
+        text = g2o.decode('ascii').partition(STANDING_FOR)[0].replace(NOT_USED, '')
         return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, text)), **rest)
     except MISMATCHES as error:
         raise FileFormatError(f'{path}, with {g2o_path.name}: {error!r}') from error
@@ -234,7 +234,7 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
     factors, others = rows.factors, ~rows.is_pose
     in_json = np.flatnonzero(np.where(
         factors.j < 0, np.isin(factors.i, rows.node_ids[rows.is_bias]),
-        ~np.isin(factors.kind, IN_G2O)))
+        ~np.isin(factors.kind, IN_G2O) | (factors.k >= 0)))
     given = factors.rows(in_json)
     node_ids, factor_ids = (
         None if len(ids) == end else ids for ids, end in zip(

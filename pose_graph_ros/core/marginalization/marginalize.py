@@ -29,7 +29,7 @@ from pose_graph_ros.core.graph.priors import model, Prior
 from pose_graph_ros.core.marginalization.sparsification import edges_between, turned
 from pose_graph_ros.core.sparse import components
 
-# Kinds of edges that turn with their poses.
+# Kinds of edges that turn with their poses, but for a third node that remains.
 _RELATIVE = (FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE, FactorKind.PRIOR)
 # Those to landmarks turn with poses and landmarks; a prior does with poses alone.
 _TO_LANDMARKS = (FactorKind.POINT, FactorKind.RANGE)
@@ -176,11 +176,13 @@ def _ends(factors: Factors) -> IntArray:
 
 def _is_anchored(graph: Graph, kept: IntArray) -> bool:
     """Tell whether a constraint knows where its nodes are in the map, of which some remain."""
-    relative = list(_RELATIVE)
+    factors, relative, turns = graph.factors, list(_RELATIVE), True
     if np.all(graph.is_pose[graph.node_rows(kept)]):
         relative += _TO_LANDMARKS
-    return bool(not np.all(np.isin(graph.factors.kind, relative))
-                or any(prior.anchored for prior in graph.priors))
+    else:
+        turns = bool(np.all(factors.k < 0))
+    return not turns or bool(not np.all(np.isin(factors.kind, relative))
+                             or any(prior.anchored for prior in graph.priors))
 
 
 def _part(

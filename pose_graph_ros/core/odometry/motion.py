@@ -122,11 +122,11 @@ class OdometryErrors(NamedTuple):
 
     def motions(self, means: FloatArray, seconds: FloatArray) -> FloatArray:
         """Return motions, as odometry says them, without their constant errors."""
-        return _bent(means, self.rate * seconds, 1.0 + self.scale)
+        return bent(means, self.rate * seconds, 1.0 + self.scale)
 
     def as_odometry_says(self, means: FloatArray, seconds: FloatArray) -> FloatArray:
         """Undo `motions`."""
-        return _bent(means, -self.rate * seconds, 1.0 / (1.0 + self.scale))
+        return bent(means, -self.rate * seconds, 1.0 / (1.0 + self.scale))
 
     def covariances(self, claimed: FloatArray) -> FloatArray:
         """Return covariances of motions, shape (M, 3, 3), from those that odometry claims."""
@@ -163,7 +163,7 @@ class OdometryErrors(NamedTuple):
 AS_CLAIMED = OdometryErrors()
 
 
-def _bent(means: FloatArray, turn: FloatArray, length: float) -> FloatArray:
+def bent(means: FloatArray, turn: FloatArray, length: FloatArray | float) -> FloatArray:
     """Return motions that turn by more at a constant rate, and are longer by a factor."""
     # the chord turns by half of what the end turns by
     c, s = np.cos(0.5 * turn), np.sin(0.5 * turn)

@@ -106,6 +106,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     head[tb.UPDATE] += 1    # rows are stamped, but not logged: nothing has to be rolled back
     _write_node(head, v, last, mean)
     f = tb.factors(head)[e]
+    f.constants[2] = f.constants[3] = 0.0
     factors.prepare(f, 0)
     tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
     f.checked = f.waits = 0

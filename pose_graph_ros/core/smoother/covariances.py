@@ -104,7 +104,8 @@ def _write_innovations(head, records, error, out):  # type: ignore[no-untyped-de
 @kernel
 def _edge_jacobians(f, kind, start, end, error, start_j, end_j):  # type: ignore[no-untyped-def]
     """Write the error of an edge between two poses, and its Jacobians, in map axes."""
-    error[0], error[1], error[2], c, s, ax, ay = factors.model(f, kind, start, end, 0.0)
+    error[0], error[1], error[2], c, s, ax, ay = factors.model(
+        f, kind, start, end, factors.NO_THIRD[0])
     ft, fth = factors.factors_of_end(f, kind)
     start_j[:] = 0.0
     end_j[:] = 0.0

@@ -87,8 +87,9 @@ def test_the_graph_is_the_one_that_what_is_left_would_make(seed: int) -> None:
         graph.apply(update)
         stays = ~np.isin(before.node_ids, update.remove_nodes)
         nodes = before.node_ids[stays]
-        factors = (np.isin(before.factors.i, nodes) & np.isin(before.factors.j, (*nodes, -1))
-                   & ~np.isin(before.factor_ids, update.drop))
+        ends = before.factors.i, before.factors.j, before.factors.k
+        factors = np.all(np.isin(ends, (*nodes, -1)), axis=0) & ~np.isin(
+            before.factor_ids, update.drop)
         assert graph.node_ids.tolist() == nodes.tolist()
         assert graph.factor_ids.tolist() == before.factor_ids[factors].tolist()
         assert graph.next_ids == before.next_ids

@@ -9,7 +9,14 @@ The formulas are written again here, one constraint at a time; derivatives are f
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from random_graphs import matrix, random_information, slow_edge, slow_observed, slow_to_bias
+from random_graphs import (
+    matrix,
+    random_information,
+    slow_edge,
+    slow_observed,
+    slow_third,
+    slow_to_bias,
+)
 from slow_smoother import EXACT
 
 from pose_graph_ros.core.batch import gauss_newton, optimizer
@@ -46,7 +53,11 @@ def slow_error(poses: FloatArray, edges: Factors, e: int) -> FloatArray:
         return np.array([*(point - mean[:2]), 0.0])
     if kind == FactorKind.RANGE:
         return np.array([np.hypot(*(point - bias[:2])) - mean[0], 0.0, 0.0])
-    return slow_edge(start, end, mean)[0]
+    error = slow_edge(start, end, mean)[0]
+    if edges.k[e] >= 0:
+        error += slow_third(mean, bias[3]) @ poses[edges.k[e]]
+        error[2] = np.arctan2(np.sin(error[2]), np.cos(error[2]))
+    return error
 
 
 def whitened(graph: Graph, values: FloatArray) -> FloatArray:
@@ -78,7 +89,7 @@ def drive(rng: np.random.Generator, noise: float) -> list[GraphUpdate]:
     Return a drive as updates: odometry, turns with a bias that walks, points and ranges.
 
     Nodes are 8 poses; the bias of dimension 1 and the landmarks come with the second, a second
-    bias with the fifth.
+    bias with the fifth. With the sixth one comes what odometry is calibrated by from there on.
     """
     truth = np.cumsum(np.column_stack((
         np.ones(N_POSES), rng.normal(0.0, 0.3, (N_POSES, 2)))), axis=0)
@@ -86,7 +97,7 @@ def drive(rng: np.random.Generator, noise: float) -> list[GraphUpdate]:
     sigmas, updates = np.array([0.1, 0.1, 0.05]), []
     bias, first_point = 2, 3
     for k in range(N_POSES):
-        node = k if k < 2 else k + 4 if k < 4 else k + 4 + (k > 4)
+        node = k if k < 2 else k + 4 + (k > 4) + (k > 5)
         update = GraphUpdate(hidden=se2.wrapped(truth[k:k + 1] + noise * rng.normal(size=3)))
         if k == 0:
             updates.append(update._replace(
@@ -95,8 +106,17 @@ def drive(rng: np.random.Generator, noise: float) -> list[GraphUpdate]:
             continue
         parts = []
         motion = se2.between(truth[k - 1], truth[k]) + noise * sigmas * rng.normal(size=3)
+        calibrated = -1
+        if k >= 5:
+            calibrated = 11
+            motion = motion * (0.9, 0.9, 1.0) + (0.0, 0.0, 0.1 * dt)
         parts.append(Factors([names[-1]], [node], [motion], [np.diag(sigmas**-2)],
-                           [FactorKind.ODOMETRY]))
+                           [FactorKind.ODOMETRY], k=[calibrated],
+                           constants=[[0.0, 0.0, 0.0, dt * (k >= 5)]]))
+        if k == 5:
+            update = update._replace(biases=np.array([[0.0, 0.01, 0.0]]), dimensions=[2])
+            parts.append(Factors.on([calibrated], mean=np.zeros((1, 3)), kind=[
+                FactorKind.POSITION], information=[np.diag((1e2, 1e2, 0.0))]))
         if k == 1:
             update = update._replace(biases=np.array([[0.01, 0.0, 0.0]]), dimensions=[1],
                                      landmarks=POINTS + noise * rng.normal(size=POINTS.shape))
@@ -214,7 +234,8 @@ def test_a_rollback_restores_and_nodes_leave_with_edges_of_three_ends(
     (FactorKind.POINT, {'j': [1]}, r'kind POINT to have landmark'),
     (FactorKind.RANGE, {'j': [1]}, r'kind RANGE to have landmark'),
     (FactorKind.TURN, {'k': [1]}, r'Factors\.k: .*kind TURN to have bias'),
-    (FactorKind.ODOMETRY, {'j': [1], 'k': [2]}, r'Factors\.k: .*to have none'),
+    (FactorKind.LOOP_CLOSURE, {'j': [1], 'k': [2]}, r'Factors\.k: .*to have none'),
+    (FactorKind.ODOMETRY, {'j': [1], 'k': [2]}, r'Factors\.k: .*two coordinates'),
     (FactorKind.POINT, {'mean': [[1.0, 0.0, 1.0]]}, 'mean: expected 0 in rows'),
     (FactorKind.RANGE, {'information': [np.eye(3)]}, 'information: expected 0 in rows'),
     (FactorKind.TURN, {'k': [99]}, r'expected a hidden node in 0\.\.5'),

@@ -17,7 +17,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.io.g2o import read_g2o, STANDING_FOR_PRIORS
+from pose_graph_ros.core.io.g2o import read_g2o, STANDING_FOR
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
@@ -79,7 +79,9 @@ def test_other_programs_get_the_whole_path_and_edges_instead_of_priors(tmp_path:
     backend = run(drive(1500)[0], WINDOW)
     saved, estimate = backend.saved(), backend.estimate()
     g2o, _, tum = write_graph(saved, tmp_path / 'map')
-    assert f'{STANDING_FOR_PRIORS}of which there are 1: ' in g2o.read_text()
+    text = g2o.read_text()
+    assert f'{STANDING_FOR}dense priors, ' in text
+    assert 'of which there are 1: ' in text
     path = read_tum(tum)
     np.testing.assert_array_equal(path.stamps_ns, saved.nodes.stamps_ns)
     np.testing.assert_allclose(path.poses, estimate.path.poses[:len(path)], atol=1e-12)
