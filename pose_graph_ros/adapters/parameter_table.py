@@ -152,7 +152,17 @@ OF_WHEELS = (
     Parameter('sigma_scale', _ODOMETRY.sigma_scale, '', 'Factor on the standard deviations of the '
               'primary odometry. If 0, it is 1, but more or less where global poses or fixes '
               'with a `correlation_time` of -1 show that odometry drifts more or less than it '
-              'claims.', 0.0, 1e3))
+              'claims.', 0.0, 1e3),
+    Parameter('calibrate', _ODOMETRY.calibrate, '', 'Whether a bias of the yaw rate and an error '
+              'of the scale of the distance are estimated all the time, while this is the primary '
+              'odometry. Fixes or global poses show them; they matter where these are missing.',
+              change=Change.UNCONFIGURED),
+    Parameter('calibration_sigma', [*_ODOMETRY.calibration_sigma], 'rad/s, 1', 'Standard '
+              'deviations of the bias and of the error of the scale, before anything shows them.',
+              1e-9, 10.0, sizes=(2,), change=Change.UNCONFIGURED),
+    Parameter('calibration_walk', [*_ODOMETRY.calibration_walk], 'rad/s/sqrt(h), 1/sqrt(h)',
+              'Random walk of both, per square root of an hour.', 1e-9, 10.0, sizes=(2,),
+              change=Change.UNCONFIGURED))
 
 INTEGRATE = Parameter(
     'integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` in the '

@@ -142,8 +142,6 @@ def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 def _source(name: str, own: Mapping[str, Any]) -> Source:
     given = _same(own, Source)
-    if 'lever_arm' in given:
-        given['lever_arm'] = tuple(given['lever_arm'])
     if 'beacons' in given:
         given['beacons'] = dict(_beacon(name, text) for text in given['beacons'])
     return Source(name, KINDS[own['type']],
@@ -216,8 +214,10 @@ def _same(
     own: Mapping[str, Any], settings: type, but: Collection[str] = (),
 ) -> dict[str, Any]:
     """Return the parameters that are named as the settings that they are."""
-    return {each.name: own[each.name] for each in fields(settings)
-            if each.name in own and each.name not in but}
+    given = {each.name: own[each.name] for each in fields(settings)
+             if each.name in own and each.name not in but}
+    return {name: tuple(value) if isinstance(value, list) else value
+            for name, value in given.items()}
 
 
 def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:

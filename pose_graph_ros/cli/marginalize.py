@@ -14,8 +14,8 @@ from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import GraphFile, standing_for, write_g2o
-from pose_graph_ros.core.marginalization.marginalize import marginalize
+from pose_graph_ros.core.io.g2o import GraphFile, write_g2o
+from pose_graph_ros.core.marginalization.marginalize import marginalize, standing_for
 
 
 def execute(options: argparse.Namespace) -> int:

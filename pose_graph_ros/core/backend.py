@@ -33,7 +33,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     rejected,
 )
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
 from pose_graph_ros.core.parts import capture, Parts, restore
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, Refinement
@@ -86,6 +86,8 @@ class PoseGraphBackend:
         self.verdict_changes = self._judge.changes
         self._factors = FactorBuilder(self._config, self._reweighting)
         self.gyro_biases = self._factors.gyro_rates
+        self.calibrations = partial(
+            self._factors.calibrations, self.graph, self._smoother.covariance)
         self.disagreement = lambda: disagreement.find(self._smoother, self._nodes, self._factors)
         self._tuner = ErrorTuner(
             self._smoother, self._nodes, self._factors, self._reweighting, self._judge)
@@ -188,20 +190,26 @@ class PoseGraphBackend:
         self.counts['solver', 'failed'] += result.status is Status.FAILED
         return result.status is not Status.FAILED
 
-    def _make_node(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
+    def _make_node(self, made: NewNode) -> int:
         """Append a hidden node to the graph; return its id, or -1 if the solver failed."""
-        if information is None:
+        if made.information is None:
             first = self.graph.next_ids.node
-            self._smoother.update(GraphUpdate(hidden=mean[None], fix=(first,)))
+            self._smoother.update(GraphUpdate(hidden=made.mean[None], fix=(first,)))
             return first
-        result = self._smoother.extend(mean, information)
+        if made.moving > 0.0:
+            change, chain = self._factors.next_node(made, self.graph)
+            result = self._smoother.update(change)
+        else:
+            result = self._smoother.extend(made.mean, made.information)
         if result.status is Status.FAILED:
             # the next sample tries again, with a longer motion
             self.counts['solver', 'failed'] += 1
             return -1
+        if made.moving > 0.0:
+            self._factors.keep(made.source, chain)
         self._settled = self._settled and result.status is Status.CONVERGED
         self._newest_node_covariance = self._smoother.newest_covariance()
-        settings = self._config.odometry_source(source)
+        settings = self._config.odometry_source(made.source)
         edge = self.graph.next_ids.factor - 1
         self._reweighting.add(edge, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
@@ -299,7 +307,8 @@ class PoseGraphBackend:
             freed: list[int] = []
             if T_map_graph is not None:
                 transaction.callback(graph.set_poses, graph.poses.copy())
-                graph.set_poses(se2.compose(T_map_graph, graph.poses))
+                moved = se2.compose(T_map_graph, graph.poses)
+                graph.set_poses(np.where(graph.is_bias[:, None], graph.poses, moved))
                 # measurements fix the gauge from now on, and the first node is no longer fixed
                 freed = graph.node_ids[graph.fixed].tolist()
             change = self._factors.build(queue, graph)._replace(free=freed)

@@ -147,6 +147,11 @@ class OdometrySource:
     covariance_scale: float = 1.0  # factor on the covariance of every increment
     # factor on the sigmas of the primary odometry; 0 for one that fixes and poses show
     sigma_scale: float = 0.0
+    # whether bias of the yaw rate and error of the scale are estimated while it is the primary one
+    calibrate: bool = False
+    # sigmas of these two in the beginning [rad/s, 1], and of their random walks in sqrt(h)
+    calibration_sigma: tuple[float, float] = (0.005, 0.02)
+    calibration_walk: tuple[float, float] = (0.0005, 0.002)
     # a sample that is older by stamp than the newest one by up to this is still used [s]
     reorder_window: float = 0.25
     maximum_speed: float = 60.0  # a faster motion counts as a jump of the odometry [m/s]
@@ -155,6 +160,9 @@ class OdometrySource:
 
     def __post_init__(self) -> None:
         check(self, 'covariance_scale', 'maximum_speed', 'rejection_threshold')
+        for name in ('calibration_sigma', 'calibration_walk'):
+            if not all(0.0 < each < math.inf for each in getattr(self, name)):
+                raise ConfigError(f'{name}: expected positive ones, got {getattr(self, name)}')
 
 
 class RateNoise(Enum):
@@ -259,10 +267,9 @@ POSITIONS = MeasurementSource(
 HEADINGS = MeasurementSource(minimum_period=0.5)
 # settings of poses that a user sets: neither judged nor with a loss, as the user is believed
 SET_POSES = MeasurementSource(robust=Robust.NONE)
-# defaults of a source of loop closures; those with an invalid covariance are rejected
+# of loop closures; those with an invalid covariance are rejected
 LOOP_CLOSURES = MeasurementSource(
     covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
-
 # defaults of a source of ranges to beacons; most messages do not say how accurate they are
 RANGES = MeasurementSource(
     covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
@@ -425,14 +432,14 @@ class BackendConfig:
         Return the wanted settings if a back end with these settings can change to them.
 
         Settings of stored data cannot change: `noise_from` and `integrate`, as noise and twists
-        are summed up sample by sample, the correlation of errors and the bias of a gyroscope, as
-        the graph contains states for them, and the smoother.
-        Raises ConfigError if one of these differs; the message names it with both values.
+        are summed up sample by sample, those of errors that the graph contains states for, and the
+        smoother. Raises ConfigError if one of these differs; it names it with both values.
         """
         require_same(type(self).__name__, self, wanted, 'smoother')
         for name in sorted({*self.odometry, *wanted.odometry}):
             require_same(f'{name}: OdometrySource', self.odometry_source(name),
-                         wanted.odometry_source(name), 'noise_from', 'integrate')
+                         wanted.odometry_source(name), 'noise_from', 'integrate', 'calibrate',
+                         'calibration_sigma', 'calibration_walk')
         for name in sorted({*self.gyros, *wanted.gyros}):
             require_same(f'{name}: GyroSource', self.gyro(name), wanted.gyro(name),
                          'sigma_bias', 'sigma_bias_walk', 'bias_period')

@@ -177,7 +177,7 @@ class ErrorTuner:
                 past=constraints.past, node=first)
         change = self._change
         others = {} if change is None else {change.source: change.bias}
-        return self._factors.leaving_biases(factors, others), past
+        return self._factors.leaving_biases(factors, others, graph), past
 
     @property
     def needed(self) -> list[int]:
@@ -232,7 +232,9 @@ class ErrorTuner:
         found = max(sources, key=lambda one: one.n_ever, default=None)
         if found is None:
             return AS_CLAIMED
-        if self._nodes.n_primaries > 1:     # constant errors are those of one odometry
+        # constant errors are those of one odometry; states of the graph are what calibrates it
+        calibrated = self._factors.config.odometry_source(self._nodes.primary).calibrate
+        if self._nodes.n_primaries > 1 or calibrated:
             return found.odometry._replace(rate=0.0, scale=0.0)
         return found.odometry
 

@@ -106,7 +106,7 @@ def predict(estimate: Estimate, sample: OdometrySample) -> Prediction:
     since = (sample.stamp_ns - estimate.stamp_ns) * 1e-9
     step, elapsed = (math.hypot(x, y), abs(theta)), abs(since)
     if step[0] < JITTER_DISTANCE and step[1] < JITTER_HEADING:
-        elapsed = 0.0   # at rest the twist adds nothing
+        since = elapsed = 0.0   # at rest the twist adds nothing, and the robot does not turn
     along, across, heading = step_variance(
         odometry, None if twist is None else tuple(twist.tolist()), step, elapsed)
     factor = odometry.covariance_scale

@@ -23,6 +23,7 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.kinds import KINDS, observed
@@ -38,7 +39,8 @@ def estimate(
     node = Corrected(graph.poses_of(nodes.ids[-1]), newest_covariance)
     if state is AlignmentState.ALIGNED:
         node = corrected(parts, node)
-    motion, motion_noise, odometry = nodes.newest()
+    errors = factors.calibration(nodes.primary, graph)
+    motion, motion_noise, odometry = nodes.newest(errors)
     motion, motion_noise = _turned(parts, motion, motion_noise)
     newest = se2.compose(node.pose, motion)
     cov = covariance.propagated(*node, motion, motion_noise)
@@ -62,7 +64,9 @@ def estimate(
         n_priors=graph.n_priors,
         n_edges=graph.n_edges,
         n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
-        primary=nodes.primary, odometry=source, odometry_errors=nodes.errors,
+        primary=nodes.primary, odometry=source,
+        odometry_errors=nodes.errors if errors == AS_CLAIMED else nodes.errors._replace(
+            rate=errors.rate, scale=errors.scale),
         trajectory=None if not with_path else Trajectory(
             nodes.stamps_ns, nodes.poses(graph) + shift).continued(stamp_ns, newest))
 

@@ -64,6 +64,9 @@ def _state(session: 'Session') -> dict[str, object]:
     found |= {f'{source}.{answer}': count
               for (source, answer), count in sorted((status.counts + rejected).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
+    found |= {f'{source}.calibrated_{name}': f'{value:.6f}'
+              for source, each in status.calibrations.items()
+              for name, value in each._asdict().items()}
     found |= {f'{source}.odometry_difference': ': '.join(filter(None, (
         f'{short(each.sigmas)} sigmas', each.reason)))
         for source, each in status.differences.items()}

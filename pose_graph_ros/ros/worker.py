@@ -24,6 +24,7 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
 from pose_graph_ros.core.measurements import Measurement, OdometrySample
 from pose_graph_ros.core.odometry.gyro import Difference
+from pose_graph_ros.core.sources.bias import Calibration
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.log import verdict_lines
 
@@ -57,6 +58,7 @@ class WorkerStatus:
     # what is believed of each
     verdicts: Mapping[str, SourceVerdicts] = field(default_factory=dict)
     biases: Mapping[str, float] = field(default_factory=dict)  # of gyroscopes [rad/s]
+    calibrations: Mapping[str, Calibration] = field(default_factory=dict)  # of odometries
     # of the rotations of each gyroscope from those of odometry
     differences: Mapping[str, Difference] = field(default_factory=dict)
     n_changes: int = 0  # number of changes of verdicts
@@ -292,7 +294,7 @@ class Worker:
             solve_max=longest,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
-            biases=backend.gyro_biases(backend.graph),
+            biases=backend.gyro_biases(backend.graph), calibrations=backend.calibrations(),
             differences=backend.gyro_differences(),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
         return len(changes)

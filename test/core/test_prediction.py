@@ -109,12 +109,11 @@ def test_plain_numbers_say_what_matrices_say(  # noqa: PLR0917
     increment = se2.between(T_odom_base, now)
     step, turn = float(np.hypot(*increment[:2])), abs(float(increment[2]))
     by_twist = source.noise_from is NoiseFrom.TWIST and has_twist
-    motion = Motion(increment, step, turn)
+    motion, rests = Motion(increment, step, turn), step < 0.01 and turn < 0.01
     if by_twist:
-        rests = step < 0.01 and turn < 0.01
         motion = Motion(increment, 0.0, 0.0, twist * (0.0 if rests else 0.1))
     claimed = source.covariance_scale * odometry_covariance(source.noise, motion, floor=False)
-    seconds = np.array((0.1,))
+    seconds = np.array((0.0 if rests else 0.1,))
     increment = errors.motions(increment[None], seconds)[0]
     expected = covariance.propagated(
         T_map_base, estimate.covariance, increment, errors.covariances(claimed[None])[0])

@@ -191,10 +191,12 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
     draw_drive(drive, folder / 'drive.png', run.title)
     totals = backend.verdict_totals()
     counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
+    calibrations = {source: each._asdict() for source, each in backend.calibrations().items()}
     nees = {} if drive.truth is None or report.status is Status.FAILED else consistency(
         drive, run.covariances)
     text = json.dumps(summary(drive, {
         **facts, **{f'nees_{name}': each for name, each in nees.items()},
+        **({'calibrations': calibrations} if len(calibrations) > 0 else {}),
         'alignment': estimate.alignment.value,
         'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,

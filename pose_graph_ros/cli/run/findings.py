@@ -68,6 +68,11 @@ def _whole(run: Run) -> Iterator[Finding]:
         yield Finding(
             'notice', 'nothing was measured in the map, so the path begins at its origin, and '
             f'nothing but loop closures{others} bounds its drift', 'map')
+    for source, each in run.backend.calibrations().items():
+        yield Finding(
+            'good', f'{source}: its yaw rate is corrected by {short(each.rate, 3)} rad/s (sigma '
+            f'{short(each.rate_sigma)}), its way by {short(100.0 * each.scale, 3)} % (sigma '
+            f'{short(100.0 * each.scale_sigma)}), as calibrated at the end', f'source-{source}')
     if run.backend.n_quarantined > 0:
         names = ', '.join(run.backend.set_aside(3))
         yield Finding('warning', f'{run.backend.n_quarantined} constraints are set aside because '

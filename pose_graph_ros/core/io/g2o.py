@@ -66,7 +66,6 @@ from pose_graph_ros.core.graph.constraints import (
     upper,
 )
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
-from pose_graph_ros.core.graph.priors import model
 from pose_graph_ros.core.io.g2o_text import (
     AMBIGUOUS,
     GraphText,
@@ -75,7 +74,7 @@ from pose_graph_ros.core.io.g2o_text import (
     read_lines,
     TAGS,
 )
-from pose_graph_ros.core.odometry.motion import bent
+from pose_graph_ros.core.odometry.motion import as_calibrated
 
 if TYPE_CHECKING:
     from pose_graph_ros.core.graph.graph import Graph
@@ -376,22 +375,17 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
     lines += _factor_lines(factors.rows(written), ids, used[written])
     if np.any(calibrated):
-        instead = _corrected(factors.rows(calibrated), rows.poses)
+        instead = as_calibrated(factors.rows(calibrated), rows.poses)
         lines += [f'{STANDING_FOR}odometry with a bias and an error of the scale: {len(instead)} '
                   f'lines', *_factor_lines(instead, ids, used[calibrated])]
     if len(rows.priors) > 0:
+        # takes long to load, and most graphs have none
+        from pose_graph_ros.core.marginalization.marginalize import standing_for  # noqa: PLC0415
         instead = standing_for(rows).renumbered(rows.rows_of)
         lines += [f'{STANDING_FOR}dense priors, which g2o does not have, of which there are '
                   f'{len(rows.priors)}: {len(instead)} lines',
                   *_factor_lines(instead, ids, np.ones(len(instead), dtype=bool))]
     return '\n'.join(lines) + '\n'
-
-
-def _corrected(factors: Factors, poses: FloatArray) -> Factors:
-    """Return calibrated edges of odometry as what they measure at the present poses."""
-    rate, scale, _ = poses[factors.k].T
-    return factors.replaced(constants=0.0, k=-1, mean=bent(
-        factors.mean, -factors.constants[:, 3] * rate, 1.0 + scale))
 
 
 def _is_used(factors: Factors) -> BoolArray:
@@ -435,29 +429,3 @@ def _texts(rows: FloatArray) -> list[str]:
     """Return the numbers of each row with the digits needed to read them back bit for bit."""
     # the text of a list is made at once
     return [repr(row)[1:-1].replace(',', '') for row in rows.tolist()]
-
-
-def standing_for(rows: GraphRows) -> Factors:
-    """
-    Return edges and observed nodes that tell no more of the poses than the priors of a graph.
-
-    They have the minimum of the priors, linear at the present poses, and their ends are ids.
-    Biases and landmarks in priors are marginalised out.
-    """
-    # takes long to load, and most graphs have none
-    from pose_graph_ros.core.marginalization.marginalize import schur_complement  # noqa: PLC0415
-    from pose_graph_ros.core.marginalization.sparsification import sparsify  # noqa: PLC0415
-
-    factors = []
-    for prior in rows.priors:
-        at = rows.rows_of(prior.nodes)
-        is_pose = rows.is_pose[at]
-        linear = model(prior, rows.poses[at], is_pose)
-        if not np.any(is_pose):
-            continue
-        U, u = schur_complement(
-            linear.information, -linear.gradient, np.flatnonzero(~is_pose))
-        sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
-                          anchored=prior.anchored)
-        factors.append(sparse.factors)
-    return Factors.joined(factors)

@@ -17,8 +17,9 @@ from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, INTEGERS, kernel, NU
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph import factors, tables as tb
+from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, full, NodeKind, upper
+from pose_graph_ros.core.graph.factors import motion, wrap
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 
@@ -236,6 +237,8 @@ def _extend(  # type: ignore[no-untyped-def]
         if edge >= 0:
             f = factors[edge]
             step = f.mean[0], f.mean[1], f.mean[2]
+            if f.ends[2] >= 0:
+                step = motion(nodes, f)
             noise[:] = _inverse(f.information)
             if weighted:
                 noise /= max(f.weight, _LEAST_WEIGHT)
@@ -299,4 +302,4 @@ def _inverse(m):  # type: ignore[no-untyped-def]
 def composed(a, b):  # type: ignore[no-untyped-def]
     """Return the composition of two poses, as tuples of numbers."""
     c, s = math.cos(a[2]), math.sin(a[2])
-    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], factors.wrap(a[2] + b[2])
+    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])

@@ -26,7 +26,7 @@ from pose_graph_ros.core.graph import normal_equations, tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
-from pose_graph_ros.core.marginalization.sparsification import edges_between, turned
+from pose_graph_ros.core.marginalization.sparsification import edges_between, sparsify, turned
 from pose_graph_ros.core.sparse import components
 
 # Kinds of edges that turn with their poses, but for a third node that remains.
@@ -121,6 +121,28 @@ def schur_complement(
     eliminate(H, b, rows, np.diagonal(H).copy())
     columns = columns_of(np.delete(np.arange(len(b) // 3), rows))
     return _symmetric(H[np.ix_(columns, columns)]), b[columns]
+
+
+def standing_for(rows: GraphRows) -> Factors:
+    """
+    Return edges and observed nodes that tell no more of the poses than the priors of a graph.
+
+    They have the minimum of the priors, linear at the present poses, and their ends are ids.
+    Biases and landmarks in priors are marginalised out.
+    """
+    factors = []
+    for prior in rows.priors:
+        at = rows.rows_of(prior.nodes)
+        is_pose = rows.is_pose[at]
+        linear = model(prior, rows.poses[at], is_pose)
+        if not np.any(is_pose):
+            continue
+        U, u = schur_complement(
+            linear.information, -linear.gradient, np.flatnonzero(~is_pose))
+        sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
+                          anchored=prior.anchored)
+        factors.append(sparse.factors)
+    return Factors.joined(factors)
 
 
 def as_edge(prior: Prior) -> Factors:

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Iterable
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +28,16 @@ from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline, Ro
 from pose_graph_ros.core.saved_columns import as_matrix, as_pose
 
 
+class NewNode(NamedTuple):
+    """A hidden node that odometry makes, as the motion from the one before."""
+
+    mean: FloatArray  # the motion, or the pose of the first node, shape (3,)
+    information: FloatArray | None  # shape (3, 3); None for the first one
+    source: str
+    stamp_ns: int = -1  # of the node [ns]
+    moving: float = 0.0  # for how long the calibration of the source acts on it [s]; 0 without
+
+
 class HiddenNodes(NodeTable):
     """
     The hidden nodes by stamp, and the odometry that makes them.
@@ -34,15 +45,11 @@ class HiddenNodes(NodeTable):
     A settled sample of the primary source (`several_sources`) makes a node if one is due by the
     node policy, with an edge from the node before. The other sources add edges between them.
 
-    `make_node` takes the mean of the edge to a new node, its information, and the name of the
-    source; for the first node its pose and None. It returns the id of the node in the graph, or -1
-    if there is none: it is then tried again at the next sample.
+    `make_node` returns the id of a new node in the graph, or -1 if there is none: it is then tried
+    again at the next sample.
     """
 
-    def __init__(
-        self, config: BackendConfig,
-        make_node: Callable[[FloatArray, FloatArray | None, str], int],
-    ) -> None:
+    def __init__(self, config: BackendConfig, make_node: Callable[[NewNode], int]) -> None:
         super().__init__()
         self._config = config
         self._make_node = make_node
@@ -153,7 +160,8 @@ class HiddenNodes(NodeTable):
         self._set_primary(-1, source)
         self.covered_ns = self._base_ns = first_ns
         self._append(
-            first_ns, self._make_node(pose.copy(), None, source), as_pose(pose), pose.copy())
+            first_ns, self._make_node(NewNode(pose.copy(), None, source)), as_pose(pose),
+            pose.copy())
         self._catch_up()
 
     def _set_primary(self, after_ns: int, source: str) -> None:
@@ -203,7 +211,7 @@ class HiddenNodes(NodeTable):
         """
         timeline = self.streams[self.primary].timeline
         moved = self._motion_since_node(self.streams[self.primary], self.covered_ns)[0]
-        node = self._make_node(mean, covariance.information(noise), self.primary)
+        node = self._make_node(NewNode(mean, covariance.information(noise), self.primary))
         if node < 0:
             return node
         stamp_ns = max(self.covered_ns, int(self.stamps_ns[-1])) + 1
@@ -243,11 +251,27 @@ class HiddenNodes(NodeTable):
                 math.hypot(pose[0] - base[0], pose[1] - base[1]),
                 abs(wrap_one(pose[2] - base[2])), (stamp_ns - self._base_ns) * 1e-9):
             return
-        mean, noise = self._motion_since_node(self.streams[self.primary], stamp_ns)
+        stream = self.streams[self.primary]
+        motion = stream.timeline.motion(self._base_ns, stamp_ns)
+        mean, noise = self._after_span(motion.increment, stream.covariance(motion))
         known, noise = self._corrected(mean, noise, stamp_ns)
-        node = self._make_node(known, covariance.information(noise), self.primary)
+        node = self._make_node(NewNode(
+            known, covariance.information(noise), self.primary, stamp_ns,
+            self._moving(motion, stamp_ns)))
         if node >= 0:
             self._append(stamp_ns, node, pose, se2.compose(self.odometry[-1], mean))
+
+    def _moving(self, motion: Motion, stamp_ns: int) -> float:
+        """
+        Return for how long its calibration acts on the motion from `_base_ns` to a stamp [s].
+
+        It does not while the robot stands, nor where the motion since the newest node is not that
+        of the primary source alone; 0 without one.
+        """
+        if (self._span is not None or motion.distance == motion.turn == 0.0
+                or not self._config.odometry_source(self.primary).calibrate):
+            return 0.0
+        return self.streams[self.primary].timeline.moving(self._base_ns, stamp_ns)
 
     def _corrected(
         self, mean: FloatArray, noise: FloatArray, stamp_ns: int,
@@ -354,17 +378,24 @@ class HiddenNodes(NodeTable):
         n_old = sum(after_ns < last_ns for after_ns, _ in self._primaries) - 1
         del self._primaries[:max(n_old, 0)]
 
-    def newest(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def newest(
+        self, calibration: OdometryErrors = AS_CLAIMED,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
         Return the motion from the newest node to the newest sample, and its covariance at its end.
 
         Third comes the newest pose of the primary source as received, shape (3,) [m, m, rad].
+        `calibration` has the constant errors that the graph knows of beside `errors`.
         """
-        stream = self.streams[self.primary]
+        stream, newest_ns = self.streams[self.primary], max(
+            self.newest_ns, int(self.stamps_ns[-1]))
         motion, raw = stream.newest(self._base_ns)
-        mean, noise = self._after_span(
-            motion.increment, stream.covariance(motion, floor=False))
-        return *self._corrected(mean, noise, max(self.newest_ns, int(self.stamps_ns[-1]))), raw
+        mean, noise = self._corrected(*self._after_span(
+            motion.increment, stream.covariance(motion, floor=False)), newest_ns)
+        moving = self._moving(motion, newest_ns)
+        if moving > 0.0:
+            mean = calibration.motions(mean[None], np.array([moving]))[0]
+        return mean, noise, raw
 
     def saved(self) -> SavedNodes:
         """Return the state, with the odometry samples that are needed; there must be a node."""

@@ -19,6 +19,7 @@ import numpy as np
 from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import exp_one, FloatArray, Pose
+from pose_graph_ros.core.graph.constraints import Factors
 
 Variances = tuple[float, float, float]  # of (x, y, theta) [m^2, m^2, rad^2], or of a twist
 NO_VARIANCE: FloatArray = np.zeros(3)
@@ -170,6 +171,13 @@ def bent(means: FloatArray, turn: FloatArray, length: FloatArray | float) -> Flo
     x, y = means[:, 0], means[:, 1]
     return np.column_stack((
         length * (c * x - s * y), length * (s * x + c * y), means[:, 2] + turn))
+
+
+def as_calibrated(edges: Factors, nodes: FloatArray) -> Factors:
+    """Return edges of odometry as what they measure with the values of their third nodes."""
+    rate, scale, _ = nodes[edges.k].T
+    return edges.replaced(constants=0.0, k=-1, mean=bent(
+        edges.mean, -edges.constants[:, 3] * rate, 1.0 + scale))
 
 
 def changed(

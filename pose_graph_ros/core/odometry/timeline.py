@@ -240,6 +240,11 @@ class OdometryTimeline:
         ends = np.flatnonzero(np.diff(np.concatenate(([False], still, [False]))))
         return [(int(times[begin]), int(times[end])) for begin, end in ends.reshape(-1, 2)]
 
+    def moving(self, start_ns: StampNs, end_ns: StampNs) -> float:
+        """Return for how long the robot did not stand between two stamps [s]."""
+        rests = (last_ns - first_ns for first_ns, last_ns in self.rests(start_ns, end_ns))
+        return (end_ns - start_ns - sum(rest for rest in rests if rest >= STANDING_NS)) * 1e-9
+
     def pose(self, stamp_ns: int) -> FloatArray:
         """
         Return the interpolated pose in the odometry frame at an instant, shape (3,) [m, m, rad].

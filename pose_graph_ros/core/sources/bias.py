@@ -25,11 +25,13 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from pose_graph_ros.core.config import GyroSource
+from pose_graph_ros.core.config import GyroSource, OdometrySource
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.graph import GraphUpdate, NextIds
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
+from pose_graph_ros.core.odometry.hidden_nodes import NewNode
+from pose_graph_ros.core.odometry.motion import as_calibrated
 from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -58,6 +60,15 @@ class CorrelatedErrors(NamedTuple):
 WHITE = CorrelatedErrors(0.0, 0.0, 1.0)
 
 
+class Calibration(NamedTuple):
+    """What an odometry is calibrated by at present, with sigmas."""
+
+    rate: float  # what the yaw rate is larger than odometry says [rad/s]
+    rate_sigma: float
+    scale: float  # by which part the way is longer than odometry says
+    scale_sigma: float
+
+
 class Process(NamedTuple):
     """How a bias goes on in time, in each of its coordinates."""
 
@@ -80,6 +91,13 @@ class Process(NamedTuple):
         """Return the process of the bias of a gyroscope [rad/s]."""
         return cls(round(source.bias_period * 1e9), (source.sigma_bias**2,),
                    (source.sigma_bias_walk**2,), longest_gap=SOURCES.switched_off)
+
+    @classmethod
+    def of_odometry(cls, source: OdometrySource) -> Self:
+        """Return the process of bias of the yaw rate [rad/s] and error of the scale."""
+        return cls(round(SOURCES.calibration_period * 1e9),
+                   tuple(sigma**2 for sigma in source.calibration_sigma),
+                   tuple(walk**2 / 3600.0 for walk in source.calibration_walk))
 
     def transitions(self, later: IntArray, earlier: IntArray, seconds: FloatArray) -> Factors:
         """Return the edges from states to those some seconds before, or behind."""
@@ -212,6 +230,26 @@ class BiasChain:
         ties[:1] = -1
         anchor = self.anchor if self.anchor in left else int(left[0]) if len(left) > 0 else -1
         return BiasChain(self.begins_ns[kept], left, ties, anchor, self.bin_ns)
+
+
+def next_node(
+    made: NewNode, chain: BiasChain, process: Process, graph: Graph,
+) -> tuple[GraphUpdate, BiasChain]:
+    """
+    Return an update with a node behind the newest one by calibrated odometry, and the chain then.
+
+    The edge to the node is its last factor.
+    """
+    assert made.information is not None, 'it is not the first one'
+    first, last = graph.next_ids, graph.newest_pose
+    additions = Additions(first._replace(node=first.node + 1))  # the pose is before them
+    value = graph.poses_of(chain.nodes[-1]) if len(chain) > 0 else np.zeros(3)
+    chain = chain.with_bins(np.array([made.stamp_ns]), process, additions, value)
+    edge = Factors([last], [first.node], made.mean[None], made.information[None],
+                   [FactorKind.ODOMETRY], constants=[(0.0, 0.0, 0.0, -made.moving)], k=[0])
+    motion = as_calibrated(edge, value[None]).mean
+    additions.add(edge.replaced(k=[chain.state(made.stamp_ns)]))
+    return additions.update()._replace(hidden=se2.compose(graph.poses_of(last), motion)), chain
 
 
 def biased_constraint(

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From queued constraints to one update of the graph, and what is kept of each source."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple
@@ -11,19 +11,22 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, Covariance, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, PoseMeasurement
+from pose_graph_ros.core.odometry.hidden_nodes import NewNode
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.saved_columns import Records
 from pose_graph_ros.core.sources import source_report
 from pose_graph_ros.core.sources.bias import (
     Additions,
     BiasChain,
+    Calibration,
     CorrelatedErrors,
     held_by_bias,
+    next_node,
     Process,
 )
 from pose_graph_ros.core.sources.error_likelihood import PastPath
@@ -52,7 +55,8 @@ class SourceState:
         default_factory=lambda: GrowingArray((), MEASURED))
     edges: Annotated[GrowingArray, Records(EDGE)] = field(
         default_factory=lambda: GrowingArray((), EDGE))  # but those of primary odometry
-    bias: BiasChain | None = None  # of errors that are correlated, or of a gyroscope
+    # of errors that are correlated, of a gyroscope, or of what an odometry is calibrated by
+    bias: BiasChain | None = None
     errors: CorrelatedErrors | None = None  # found ones in use; None for white or given ones
     n_otherwise: int = 0  # constraints of a loaded graph that were added under other settings
     n_gone: int = 0  # number of measurements that have left the graph
@@ -78,13 +82,6 @@ class SourceState:
 
     def leaving(self, factors: IntArray) -> BoolArray:
         return np.isin(self.measured['id'], factors)
-
-    def oldest_ns(self, factors: IntArray) -> int | None:
-        """Return the stamp of the oldest constraint that stays once others leave; None without."""
-        stamps_ns = np.concatenate([
-            table['stamp_ns'][~np.isin(table['id'], factors)]
-            for table in (self.measured, self.edges)])
-        return int(np.min(stamps_ns)) if len(stamps_ns) > 0 else None
 
     def forget(self, nodes: IntArray, factors: IntArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
@@ -210,6 +207,16 @@ class FactorBuilder:
             chains[source] = chain.with_bins(stamps_ns, process, additions, value)
         return chains
 
+    def next_node(self, made: NewNode, graph: Graph) -> tuple[GraphUpdate, BiasChain]:
+        """Return an update with a node by calibrated odometry, and the chain, for `keep`."""
+        known = self._state(made.source).bias
+        return next_node(made, BiasChain() if known is None else known, Process.of_odometry(
+            self.config.odometry_source(made.source)), graph)
+
+    def keep(self, source: str, chain: BiasChain) -> None:
+        """Keep the chain of an update that the graph has taken."""
+        self.sources.setdefault(source, SourceState()).bias = chain
+
     def commit(self) -> None:
         for queued, new in zip(self._queued, self.new, strict=True):
             self.sources.setdefault(new.source, SourceState()).append(
@@ -226,7 +233,7 @@ class FactorBuilder:
                 self._reweighting.add(new.held_by, loss, threshold)
                 self._reweighting.set_base_weight(new.number, 0.0)
         for source, chain in self._chains.items():
-            self.sources.setdefault(source, SourceState()).bias = chain
+            self.keep(source, chain)
 
     def _settings(
         self, source: str, kind: type[PoseMeasurement] = GlobalPose,
@@ -271,12 +278,38 @@ class FactorBuilder:
         """Let the states of a bias that holds no measurement leave with the next nodes."""
         self._abandoned += [] if bias is None else bias.nodes.tolist()
 
+    def _newest_states(self, graph: Graph, dimension: int) -> dict[str, int]:
+        """Return the id of the newest state of each chain with states of so many coordinates."""
+        newest = {source: int(state.bias.nodes[-1]) for source, state in self.sources.items()
+                  if state.bias is not None and len(state.bias) > 0}
+        return {source: node for source, node in newest.items()
+                if graph.dimension[graph.node_rows(node)] == dimension}
+
     def gyro_rates(self, graph: Graph) -> dict[str, float]:
         """Return the newest estimate of the bias of each gyroscope [rad/s]."""
-        chains = {source: state.bias for source, state in self.sources.items()
-                  if not self.has(source)}
-        return {source: float(graph.poses_of(chain.nodes[-1])[0])
-                for source, chain in chains.items() if chain is not None and len(chain) > 0}
+        return {source: float(graph.poses_of(node)[0])
+                for source, node in self._newest_states(graph, 1).items()}
+
+    def calibrations(
+        self, graph: Graph, covariance: Callable[[int], Covariance],
+    ) -> dict[str, Calibration]:
+        """Return what each odometry is calibrated by, given covariances of nodes."""
+        found = dict[str, Calibration]()
+        if graph.has_touched:
+            return found    # until an update that failed is followed by one that does not
+        for source, node in self._newest_states(graph, 2).items():
+            rate, scale, _ = graph.poses_of(node).tolist()
+            sigmas = np.sqrt(np.diagonal(covariance(node)))
+            found[source] = Calibration(rate, float(sigmas[0]), scale, float(sigmas[1]))
+        return found
+
+    def calibration(self, source: str, graph: Graph) -> OdometryErrors:
+        """Return the constant errors that an odometry is calibrated by, if it is."""
+        node = self._newest_states(graph, 2).get(source, -1)
+        if node < 0 or not self.config.odometry_source(source).calibrate:
+            return AS_CLAIMED
+        rate, scale, _ = graph.poses_of(node).tolist()
+        return OdometryErrors(rate=rate, scale=scale)
 
     def finding(self) -> list[str]:
         """Return the sources whose errors are estimated and that have measurements."""
@@ -300,12 +333,18 @@ class FactorBuilder:
                 for source, state in self.sources.items() if self.has(source)}
 
     def leaving_biases(
-        self, factors: IntArray, others: Mapping[str, BiasChain],
+        self, factors: IntArray, others: Mapping[str, BiasChain], graph: Graph,
     ) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned]
+        ends = graph.factor_records['ends'][~np.isin(graph.factor_ids, factors), 2]
+        thirds = np.unique(graph.node_ids[ends[ends >= 0]])
         for source, state in self.sources.items():
-            oldest_ns = state.oldest_ns(factors)
+            measured = state.measured.values
+            stamps_ns = measured['stamp_ns'][~np.isin(measured['id'], factors)]
+            if state.bias is not None and not self.has(source):
+                stamps_ns = state.bias.begins_ns[np.isin(state.bias.nodes, thirds)]
+            oldest_ns = int(np.min(stamps_ns)) if len(stamps_ns) > 0 else None
             for chain in (state.bias, others.get(source)):
                 biases += [] if chain is None else chain.leaving(oldest_ns)
         return biases

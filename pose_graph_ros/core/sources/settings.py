@@ -20,6 +20,7 @@ class SourceSettings:
     least_own: float = 0.01  # of a variance that is not of the motion since the node, as a share
     # time without rotations after which a gyroscope may have been switched off and on again [s]
     switched_off: float = 60.0
+    calibration_period: float = 10.0  # the calibration of odometry has a new state this often [s]
 
     # --- reports
     more_residuals: float = 0.05  # measurements after which one is renewed, as a share

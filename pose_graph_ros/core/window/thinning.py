@@ -44,9 +44,9 @@ def carriers(graph: Graph) -> IntArray:
     measures = is_pose[graph.node_rows(factors.i)] & (
         (factors.kind == FactorKind.BIAS)
         | ((factors.j < 0) & (factors.kind != FactorKind.NODE_PRIOR)))
-    # a rotation is held by the later one of its poses
+    # a rotation, and odometry that is calibrated, is held by the later one of its poses
     return np.where(measures, factors.i, np.where(
-        factors.kind == FactorKind.TURN, np.maximum(factors.i, factors.j), -1))
+        factors.k >= 0, np.maximum(factors.i, factors.j), -1))
 
 
 def first_of(holder: IntArray) -> int:
@@ -80,7 +80,7 @@ def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
     """Return after how many of some poses no bias has measurements on both sides, at least one."""
     factors = graph.factors
     measured = (holder >= 0) & (factors.j >= 0)
-    bias = np.where(factors.kind == FactorKind.TURN, factors.k, factors.j)[measured]
+    bias = np.where(factors.k >= 0, factors.k, factors.j)[measured]
     biases, which = np.unique(bias, return_inverse=True)
     at = np.searchsorted(poses, holder[measured])
     # a bias is in use between its first and its last pose

@@ -16,7 +16,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
 
 SECOND = 1_000_000_000
 EPOCH = 1_767_225_600 * SECOND
@@ -62,13 +62,13 @@ class Made:
     refuse: int = 0
     """Number of nodes that are refused next."""
 
-    def __call__(self, mean: FloatArray, information: FloatArray | None, source: str) -> int:
-        if self.refuse > 0 and information is not None:
+    def __call__(self, new: NewNode) -> int:
+        if self.refuse > 0 and new.information is not None:
             self.refuse -= 1
             return -1
-        self.means.append(mean)
-        self.information.append(information)
-        self.sources.append(source)
+        self.means.append(new.mean)
+        self.information.append(new.information)
+        self.sources.append(new.source)
         return len(self.means) - 1
 
     @property

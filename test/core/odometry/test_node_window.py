@@ -13,7 +13,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import propagated
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Answer, OdometrySample
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
 from pose_graph_ros.core.odometry.node_table import ThinnedNodes
 from pose_graph_ros.core.sources.kinds import attach
 
@@ -45,8 +45,8 @@ def arrivals(silences: list[tuple[str, float, float]]) -> list[tuple[str, Odomet
 def empty_nodes() -> tuple[HiddenNodes, list[tuple[bytes, str]]]:
     made: list[tuple[bytes, str]] = []
 
-    def make(mean: np.ndarray, information: np.ndarray | None, source: str) -> int:
-        made.append((mean.tobytes(), source))
+    def make(new: NewNode) -> int:
+        made.append((new.mean.tobytes(), new.source))
         return len(made) - 1
 
     return HiddenNodes(CONFIG, make), made
