@@ -15,6 +15,7 @@ from pose_graph_ros.core.config import (
     BackendConfig,
     FOUND,
     LOOP_CLOSURES,
+    OdometrySource,
     POSITIONS,
     Robust,
     ThinningConfig,
@@ -36,6 +37,7 @@ def configs(draw: st.DrawFn) -> BackendConfig:
     fixes = replace(
         POSITIONS, robust=draw(robust), correlation_time=draw(st.sampled_from((0.0, FOUND, 10.0))))
     return BackendConfig(
+        odometry={'odom': OdometrySource(calibrate=fixes.robust is not Robust.JUDGED)},
         window=WindowConfig(
             **draw(st.sampled_from(LIMITS)), prior=draw(st.sampled_from(WindowPrior))),
         thinning=ThinningConfig(

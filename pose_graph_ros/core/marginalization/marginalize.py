@@ -139,6 +139,8 @@ def standing_for(rows: GraphRows) -> Factors:
             continue
         U, u = schur_complement(
             linear.information, -linear.gradient, np.flatnonzero(~is_pose))
+        if not np.any(np.diagonal(U) > 1e-12):
+            continue    # it tells of biases alone, but for rounding
         sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
                           anchored=prior.anchored)
         factors.append(sparse.factors)

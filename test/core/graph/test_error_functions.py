@@ -7,8 +7,6 @@ import jacobians
 import numpy as np
 import pytest
 from random_graphs import (
-    dense_system,
-    free_part,
     random_edges,
     random_observed,
     random_poses,
@@ -20,12 +18,9 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import error_functions
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 # Tolerance for coordinates of about 10 m after three or four rotations, each rounded to 2e-15.
 ROUNDING = 1e-13
-# Tolerance for sums of them weighted by information of about 100.
-WEIGHTED_ROUNDING = 1e-10
 
 N = 40
 seeds = st.integers(0, 2**32 - 1)
@@ -62,23 +57,3 @@ def test_angles_are_wrapped_once_and_at_the_end() -> None:
                              [FactorKind.GLOBAL_POSE])
     assert error_functions.errors(poses, observed)[0, 2] == pytest.approx(
         -0.1, abs=ROUNDING)
-
-
-@given(seeds)
-def test_an_observed_node_is_an_edge_with_zero_mean_from_a_node_fixed_there(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    poses = random_poses(rng, N)
-    observed = random_observed(rng, list(range(N)), offset=False)
-    with_observed, with_edges = Graph(), Graph()
-    chain = random_edges(rng, list(range(N - 1)), list(range(1, N)))
-    with_observed.apply(GraphUpdate(hidden=poses, factors=Factors.joined([chain, observed])))
-    with_edges.apply(GraphUpdate(hidden=poses, factors=chain))
-    with_edges.apply(GraphUpdate(
-        hidden=observed.mean, fix=range(N, 2 * N),
-        factors=Factors(np.arange(N, 2 * N), observed.i, np.zeros((N, 3)), observed.information,
-                    [FactorKind.LOOP_CLOSURE] * N)))
-    H, b = dense_system(with_observed)
-    H_edges, b_edges = free_part(with_edges, *dense_system(with_edges))
-    np.testing.assert_allclose(H_edges, H, atol=WEIGHTED_ROUNDING)
-    np.testing.assert_allclose(b_edges, b, atol=WEIGHTED_ROUNDING)
-    assert with_edges.energies().chi2 == pytest.approx(with_observed.energies().chi2, rel=1e-12)

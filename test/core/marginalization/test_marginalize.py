@@ -4,8 +4,9 @@
 
 import numpy as np
 
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import Prior
-from pose_graph_ros.core.marginalization.marginalize import as_edge, as_observed
+from pose_graph_ros.core.marginalization.marginalize import as_edge, as_observed, standing_for
 
 # what nodes that told nothing of a pose leave there: not positive semidefinite
 NOTHING = np.array([[8.7e-13, 6.1e-13, -1.12e-11], [6.1e-13, 1.6e-13, -5.3e-12],
@@ -26,3 +27,11 @@ def test_an_edge_is_valid() -> None:
     edge = as_edge(Prior(
         np.array([3, 4]), np.zeros((2, 3)), information, np.zeros(6), 0.0, anchored=False))
     assert np.linalg.eigvalsh(edge.information[0])[0] > -1e-16
+
+
+def test_nothing_stands_for_a_prior_that_tells_of_a_bias_alone_but_for_rounding() -> None:
+    graph, J = Graph(), np.array([[1e-23, -2.3e-23, 1.7e-24, 1.0, 0.0, 0.0]])
+    graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), biases=np.zeros((1, 3)), dimensions=[1]))
+    graph.apply(GraphUpdate(priors=[Prior(
+        np.arange(2), np.zeros((2, 3)), 1.37e4 * J.T @ J, np.zeros(6), 0.0, True)]))
+    assert len(standing_for(graph.rows())) == 0
