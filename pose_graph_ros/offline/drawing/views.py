@@ -198,8 +198,9 @@ def bayesian_network(graph: Any) -> Any:
     view = _begun(graph)
     for term in _used(graph, view):
         if term.sort in {Sort.ODOMETRY, Sort.BIAS}:
-            before, after = sorted(term.nodes)
-            _join(view, before, after, term)
+            before, after = sorted(term.nodes[:2])
+            for parent in (before, *term.nodes[2:]):
+                _join(view, parent, after, term)
             if term.sort is Sort.ODOMETRY:
                 _add(view, 'u', Role.CONTROL, term, ends=(after,))
         else:
