@@ -65,12 +65,17 @@ def disturbed(rng: np.random.Generator, delay: float) -> Sequence[Event]:
 
 def through_files(backend: PoseGraphBackend, config: BackendConfig, path: Path) -> (
         PoseGraphBackend):
-    """Return what goes on from a file; its estimate is the same once the graph is in the map."""
-    write_graph(backend.saved(), path)
+    """
+    Return what goes on from a file; its estimate is the same once the graph is in the map.
+
+    But what waits for odometry is not saved, and corrects the newest pose already.
+    """
+    saved = backend.saved()
+    write_graph(saved, path)
     again = PoseGraphBackend.restored(config, read_graph(path))
     before, after = backend.estimate(), again.estimate()
     assert before.n_hidden == after.n_hidden
-    if before.alignment.value != 'unaligned':
+    if before.alignment.value != 'unaligned' and saved.n_left_out == 0:
         np.testing.assert_allclose(after.T_map_base, before.T_map_base, atol=1e-6)
     return again
 

@@ -269,7 +269,7 @@ def eliminate(H: FloatArray, b: FloatArray, nodes: IntArray, scale: FloatArray) 
     The scale, shape (3N,), is what the constraints have added to the diagonal.
     """
     left, decrease = set(nodes.tolist()), 0.0
-    linked = np.any(H.reshape(len(H) // 3, 3, -1, 3) != 0.0, axis=(1, 3))
+    linked = np.any(H.reshape(len(H) // 3, 3, len(H) // 3, 3) != 0.0, axis=(1, 3))
     while left:
         v = min(left, key=lambda node: (int(np.count_nonzero(linked[node])), node))
         left.remove(v)

@@ -6,7 +6,12 @@ import numpy as np
 
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import Prior
-from pose_graph_ros.core.marginalization.marginalize import as_edge, as_observed, standing_for
+from pose_graph_ros.core.marginalization.marginalize import (
+    as_edge,
+    as_observed,
+    eliminate,
+    standing_for,
+)
 
 # what nodes that told nothing of a pose leave there: not positive semidefinite
 NOTHING = np.array([[8.7e-13, 6.1e-13, -1.12e-11], [6.1e-13, 1.6e-13, -5.3e-12],
@@ -35,3 +40,8 @@ def test_nothing_stands_for_a_prior_that_tells_of_a_bias_alone_but_for_rounding(
     graph.apply(GraphUpdate(priors=[Prior(
         np.arange(2), np.zeros((2, 3)), 1.37e4 * J.T @ J, np.zeros(6), 0.0, True)]))
     assert len(standing_for(graph.rows())) == 0
+
+
+def test_nothing_is_eliminated_where_constraints_have_no_other_ends() -> None:
+    none = np.zeros(0)
+    assert eliminate(np.zeros((0, 0)), none, none.astype(np.int64), none) == 0.0
