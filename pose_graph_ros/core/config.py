@@ -267,7 +267,7 @@ POSITIONS = MeasurementSource(
 HEADINGS = MeasurementSource(minimum_period=0.5)
 # settings of poses that a user sets: neither judged nor with a loss, as the user is believed
 SET_POSES = MeasurementSource(robust=Robust.NONE)
-# of loop closures; those with an invalid covariance are rejected
+# defaults of loop closures; those with an invalid covariance are rejected
 LOOP_CLOSURES = MeasurementSource(
     covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
 # defaults of a source of ranges to beacons; most messages do not say how accurate they are

@@ -200,13 +200,11 @@ def _ends(factors: Factors) -> IntArray:
 
 def _is_anchored(graph: Graph, kept: IntArray) -> bool:
     """Tell whether a constraint knows where its nodes are in the map, of which some remain."""
-    factors, relative, turns = graph.factors, list(_RELATIVE), True
-    if np.all(graph.is_pose[graph.node_rows(kept)]):
-        relative += _TO_LANDMARKS
-    else:
-        turns = bool(np.all(factors.k < 0))
-    return not turns or bool(not np.all(np.isin(factors.kind, relative))
-                             or any(prior.anchored for prior in graph.priors))
+    factors = graph.factors
+    only_poses = bool(np.all(graph.is_pose[graph.node_rows(kept)]))
+    relative = [*_RELATIVE, *(_TO_LANDMARKS if only_poses else ())]
+    turn = np.isin(factors.kind, relative) & (only_poses | (factors.k < 0))
+    return not np.all(turn) or any(prior.anchored for prior in graph.priors)
 
 
 def _part(
