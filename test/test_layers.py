@@ -35,8 +35,10 @@ CORE = {
     'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},
     'core.sources': {'core.compiled', 'core.geometry', 'core.graph', 'core.odometry'},
     'core.alignment': {'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
+    'core.belief': {
+        'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
     'core.judgement': {
-        'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch',
+        'core.belief', 'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch',
         'core.smoother', 'core.odometry', 'core.sources'},
     'core.window': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',

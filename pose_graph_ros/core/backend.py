@@ -81,10 +81,11 @@ class PoseGraphBackend:
         self.odometry = self._nodes.streams  # by source, to be read only
         self._newest_node_covariance = np.zeros((3, 3))  # in map axes
         self._reweighting = Reweighting()
-        self._judge = Judge(self._smoother, self._reweighting, self._config, self._nodes)
+        self._factors = FactorBuilder(self._config, self._reweighting)
+        self._judge = Judge(
+            self._smoother, self._reweighting, self._config, self._nodes, self._factors)
         self.verdicts, self.verdict_totals = self._judge.verdicts, self._judge.totals
         self.verdict_changes = self._judge.changes
-        self._factors = FactorBuilder(self._config, self._reweighting)
         self.gyro_biases = self._factors.gyro_rates
         self.calibrations = partial(
             self._factors.calibrations, self.graph, self._smoother.covariance)

@@ -23,7 +23,7 @@ from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.graph_update import Gone, GraphUpdate
-from pose_graph_ros.core.judgement.judge import Leaving
+from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
@@ -88,7 +88,7 @@ class _Asked(NamedTuple):
     """What is to leave the graph, and what is known of it only until then."""
 
     nodes: IntArray  # with the biases that nothing needs without them; ids, ascending
-    judged: Leaving
+    judged: list[Verdict]
     past: Mapping[str, PastPath]
 
 

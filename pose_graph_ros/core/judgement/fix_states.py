@@ -21,8 +21,8 @@ from pose_graph_ros.core.judgement.verdicts import (
     Verdict,
 )
 
-# Run of a measurement that is in none.
-LONE = -1
+# Run of a measurement that is wrong by itself, and of all that are good.
+LONE, GOOD = -1, 0
 # Members of a run follow one another: so many records before and after one are looked at.
 ALIKE_WITHIN = 50
 
@@ -31,7 +31,7 @@ class FixStates(Judgements):
     run = Column()
 
     def __init__(self) -> None:
-        super().__init__(Judged.FIX, run=LONE)  # number of the run that it belongs to
+        super().__init__(Judged.FIX, run=LONE)  # id of the first one of its fault, `LONE` or `GOOD`
 
     @property
     def believed(self) -> BoolArray:

@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +28,6 @@ from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_states import OdometryStates
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import (
     Change,
     Decision,
@@ -41,7 +39,7 @@ from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.saved_columns import Integers, Numbers
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder, NewConstraint
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,24 +52,16 @@ class SavedJudgement:
     odometry_left: Mapping[str, int]
 
 
-class Leaving(NamedTuple):
-    """What is decided on constraints that are about to leave the graph."""
-
-    unused: list[Verdict]  # on those that are not believed
-    # stamp [ns] of the newest believed measurement in the map, and where the robot was
-    last: tuple[int, Track] | None
-
-
 class Judge:
     """Judges the constraints of a graph; it knows no clock, and nothing of how they arrived."""
 
     def __init__(
         self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
-        nodes: HiddenNodes,
+        nodes: HiddenNodes, factors: FactorBuilder,
     ) -> None:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._nodes = nodes
-        self._fixes = FixJudge(smoother, reweighting, config)
+        self._fixes = FixJudge(smoother, reweighting, config, nodes, factors)
         self._odometry = OdometryStates(nodes)
         self._closures = ClosureJudge(smoother, reweighting)
         # the judged closures of the last `before`, by their numbers among its factors
@@ -225,26 +215,25 @@ class Judge:
         judge = self._fixes if is_fix else self._closures
         return judge.decide(name, decision)
 
-    def decide_leaving(self, factors: IntArray) -> Leaving:
+    def decide_leaving(self, factors: IntArray) -> list[Verdict]:
         """
-        Return what is decided on constraints that are about to leave the graph, for `forget`.
+        Return the verdicts on constraints that are about to leave the graph unused, for `forget`.
         """
         graph = self._smoother.graph
         closures = self._closures.decide_leaving(factors)
-        fixes, last = self._fixes.decide_leaving(factors)
+        fixes = self._fixes.decide_leaving(factors)
         unused = [*closures, *fixes,
                   *self._odometry.decide_leaving(
                       graph, factors, self._fixes.states.believed_after)]
-        return Leaving([replace(each, left=True, since_ns=self._nodes.newest_ns)
-                        for each in unused], last)
+        return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
     def forget(
-        self, nodes: IntArray, factors: IntArray, leaving: Leaving,
+        self, nodes: IntArray, factors: IntArray, leaving: Sequence[Verdict],
     ) -> None:
         self._closures.forget(nodes, factors)
-        self._fixes.forget(nodes, factors, leaving.last)
+        self._fixes.forget(nodes, factors)
         self._odometry.forget(self._smoother.graph, factors, self._fixes.loosened)
-        self._left.extend(leaving.unused)
+        self._left.extend(leaving)
 
     def saved(self) -> SavedJudgement:
         loosened = self._fixes.loosened

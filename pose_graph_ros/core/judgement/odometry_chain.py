@@ -61,7 +61,6 @@ class OdometryChain:
         self._next_edge = 0  # id of the first edge that was not looked at
         # number of nodes that were forgotten since the poses were made relative to the first
         self._n_gone = 0
-        self.noise_factor = 1.0  # on the covariances of odometry
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -182,7 +181,7 @@ class OdometryChain:
         adjoint = se2.adjoint(se2.inverse(self._poses.values[at_j]))
         total = full(ahead * (self._sums.values[at_j] - self._sums.values[at_i]))
         return (se2.between(self._poses.values[at_i], self._poses.values[at_j]),
-                self.noise_factor * adjoint @ total @ np.swapaxes(adjoint, 1, 2))
+                adjoint @ total @ np.swapaxes(adjoint, 1, 2))
 
     def places(self, nodes: IntArray) -> IntArray:
         """Return the places of nodes in the chain, -1 for those that are not in it."""

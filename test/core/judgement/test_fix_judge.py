@@ -149,16 +149,17 @@ def grow(drive: Drive) -> None:
 
 @pytest.mark.parametrize(('seconds', 'change', 'wrong', 'most', 'settled', 'rms'), [
     (120, lambda drive: None, (0.0, 0.0), 1, 100, 0.4),
-    (120, slip_in_an_outage, (0.0, 0.0), 1, 90, 3.0),
+    (120, slip_in_an_outage, (0.0, 0.0), 1, 110, 3.0),
     # a receiver that is initialised wrongly for a minute
     (150, lambda drive: drive.move(60.0, 120.0, (-60.0, 80.0)), (60.0, 120.0), 1, 130, 1.5),
     # or at the beginning
     (100, lambda drive: drive.move(0.0, 20.0, (30.0, 20.0)), (0.0, 20.0), 3, 99, 1.0),
-    (200, lambda drive: drive.slip(60.0, 12.0), (0.0, 0.0), 60, 105, 1.0),
+    (200, lambda drive: drive.slip(60.0, 12.0), (0.0, 0.0), 65, 105, 1.0),
     (150, turn, (0.0, 0.0), 2, 125, 1.0),
     # odometry that is worse than it claims
     (200, noisier(2.0), (0.0, 0.0), 2, 190, 1.0), (200, noisier(4.0), (0.0, 0.0), 2, 190, 1.0),
-    (250, grow, (105.0, 130.0), 60, 249, 10.0)])
+    # which has drawn the path aside before it shows, so that what is right later does not fit
+    (250, grow, (105.0, 130.0), 160, 249, 10.0)])
 def test_what_is_wrong_is_doubted_and_the_path_finds_back(
     seconds: int, change: Callable[[Drive], None], wrong: tuple[float, float], *, most: int,
     settled: int, rms: float,
@@ -177,7 +178,8 @@ def test_single_wrong_fixes_are_doubted() -> None:
     drive = Drive(120)
     wrong = drive.rng.random(120) < 0.2
     angle = drive.rng.uniform(0.0, 6.28, 120)
-    drive.fixes[wrong] += 30.0 * np.column_stack((np.cos(angle), np.sin(angle)))[wrong]
+    far = drive.rng.uniform(20.0, 50.0, (120, 1))
+    drive.fixes[wrong] += (far * np.column_stack((np.cos(angle), np.sin(angle))))[wrong]
     driven = Driven(drive)
     bad = {f'fix/{number}' for number in np.flatnonzero(wrong)}
     assert bad <= driven.doubted

@@ -173,7 +173,7 @@ def everything(backend: PoseGraphBackend) -> list[object]:
     judge = backend._judge._fixes
     return [judge.states.records.tobytes(), judge._loosened,
             [base.tolist() for base in backend._reweighting.base_weights()],
-            [(run.number, run.n, run.seconds, run.believed) for run in judge._runs]]
+            judge._bank.rows['id'].tolist(), judge._slips]
 
 
 def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:

@@ -11,9 +11,6 @@ from test_consistency import Drive
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.residual_scale import ScaleLeft, together
-from pose_graph_ros.core.judgement.run_set import best_runs, without_old
-from pose_graph_ros.core.judgement.runs import Run, Transition
-from pose_graph_ros.core.judgement.tracks import Track
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED, State, WAITING
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
@@ -47,47 +44,6 @@ def test_the_motion_between_nodes_that_stay_is_known_as_before(seed: int) -> Non
     ends = chain.nodes[[0]], chain.nodes[[-1]]
     for one, other in zip(chain.between(*ends), whole.between(*ends), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
-
-
-def track(node: int) -> Track:
-    return Track(node, np.zeros(3), np.eye(3))
-
-
-def some_runs(rng: np.random.Generator) -> list[Run]:
-    """Return runs of some seconds each, with the prices to believe one after another."""
-    runs = []
-    for number in range(7):
-        begin = int(rng.integers(0, 60))
-        run = Run(number, begin * SECOND, track(begin), believed=False)
-        end = begin + int(rng.integers(1, 20))
-        run.end_ns, run.track, run.seconds = end * SECOND, track(end), float(end - begin)
-        runs.append(run)
-    for run in runs:
-        run.prices = {other.number: [Transition(
-            float(rng.uniform(0.0, 25.0)), float(rng.choice([1.0, 9.0])))] for other in runs}
-    return runs
-
-
-@given(seeds)
-def test_the_best_runs_stay_the_best_when_old_ones_are_forgotten(seed: int) -> None:
-    rng, chain = np.random.default_rng(seed), OdometryChain()
-    runs = some_runs(rng)
-    newest = max(runs, key=lambda run: run.end_ns)
-    expected = best_runs(runs, chain)
-    for node in (20, 35, 50):
-        runs = without_old(runs, node, newest, chain)
-        assert all(run.track.node >= node or run is newest for run in runs)
-        chosen = best_runs(runs, chain)
-        if not any(run in runs for run, _ in expected):
-            break   # what is the best at present has left as a whole
-        assert [run.number for run, _ in chosen] == [
-            run.number for run, _ in expected if run in runs]
-        # with what was jumped over up to there
-        jumps = [way.scale for (_, way), (run, _) in zip(expected[1:], expected[1:], strict=True)
-                 if way.scale > 1.0]
-        found = [scale for _, _, scale in chosen[0][0].jumps_before] + [
-            way.scale for _, way in chosen[1:] if way.scale > 1.0]
-        assert found == jumps
 
 
 def added(states: ClosureStates, edges: range) -> None:

@@ -1,0 +1,225 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measurements in the map in the order of their stamps, and what the best hypothesis says of each.
+
+A late one takes its place among the others, and the filters run again from there: what is decided
+does not depend on the order of arrival.
+"""
+
+from copy import copy
+from typing import NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.belief.filter import ERROR, NOISE, RATE, SCALE
+from pose_graph_ros.core.belief.hypotheses import (
+    advance,
+    BRANCH,
+    GOOD,
+    HYPOTHESIS,
+    SLIPPED,
+)
+from pose_graph_ros.core.belief.rows import count, join_motions, MEASURED, Records
+from pose_graph_ros.core.belief.settings import BANK
+from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.odometry.motion import OdometryErrors
+
+
+class Odometry(NamedTuple):
+    """The chain of odometry that measurements lie on, with the errors that it knows of."""
+
+    nodes: IntArray  # ids, ascending, shape (N,)
+    poses: FloatArray  # in the first one, shape (N, 3)
+    sums: FloatArray  # upper triangles of the summed covariances up to them, shape (N, 6)
+    stamps_ns: IntArray  # shape (N,)
+    errors: OdometryErrors
+
+
+class Prior(NamedTuple):
+    """Where the robot is at a node by what is not in the bank."""
+
+    node: int
+    pose: FloatArray  # in the map, shape (3,) [m, m, rad]
+    covariance: FloatArray  # in map axes, shape (3, 3)
+
+
+class Decided(NamedTuple):
+    """What is decided on the rows from the first one whose decision has changed."""
+
+    first: int
+    choice: IntArray
+    far: FloatArray  # from where they were expected [m]
+    d2: FloatArray  # the same as squared Mahalanobis distances
+
+
+class Bank:
+    def __init__(self) -> None:
+        self._rows = GrowingArray((), MEASURED)
+        self._begin_at({0: np.zeros(0, HYPOTHESIS)})
+        self._first_node = -1  # node that the motion to the first row begins at, if it is known
+        self.n_sources = 0
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def rows(self) -> Records:
+        """Rows of measurements, by stamp, read-only."""
+        return self._rows.read_only
+
+    def begin_with(self, prior: Prior, noise: Records) -> None:
+        """Begin an empty bank with where the robot is known to be."""
+        one = np.zeros(1, HYPOTHESIS)
+        one['state'][0, :3] = prior.pose
+        one['covariance'][0, :3, :3] = prior.covariance
+        for k, sigma in ((RATE, BANK.rate), (SCALE, BANK.scale)):
+            one['covariance'][0, k, k] = sigma**2
+        for source in range(BANK.sources):
+            for k in (ERROR + 2 * source, ERROR + 2 * source + 1):
+                one['covariance'][0, k, k] = noise['slow'][0, source]
+        self._kept[0], self._first_node = one, prior.node
+
+    def insert(self, new: Records, odometry: Odometry) -> None:
+        """Insert rows, but for their motions, into the order of stamps."""
+        oldest = int(np.min(new['stamp_ns']))
+        first = len(self)
+        if first > 0 and int(self._rows.values[-1]['stamp_ns']) >= oldest:
+            first = int(np.searchsorted(self._rows['stamp_ns'], oldest))
+        later = np.concatenate((self._rows.values[first:], new))
+        # those of one stamp by their source, then by their values: not by the order of arrival
+        order = np.lexsort(
+            (later['mean'][:, 1], later['mean'][:, 0], later['source'], later['stamp_ns']))
+        is_new = order >= len(self) - first
+        self._rows.truncate(first)
+        self._rows.append(later[order])
+        self.n_sources = max(self.n_sources, int(np.max(new['source'])) + 1)
+        self._begin_from(first + int(np.argmax(is_new)))
+        after_new = np.append(False, is_new[:-1])
+        for row in (first + np.flatnonzero(is_new | after_new)).tolist():
+            self._place(row, odometry)
+        count(self._rows.values, first, BANK.period_ns)
+
+    def _place(self, row: int, odometry: Odometry) -> None:
+        rows = self._rows.values
+        begin = int(rows['node'][row - 1]) if row > 0 else self._first_node
+        end = int(rows['node'][row])
+        nodes = odometry.nodes
+        places = [int(np.searchsorted(nodes, node)) for node in (begin, end)]
+        if begin < 0 or places[1] >= len(nodes):
+            places[0] = places[1] = min(places[1], len(nodes) - 1)
+        if places[0] < places[1]:
+            join_motions(odometry.poses, odometry.sums, odometry.stamps_ns,
+                         np.array(odometry.errors), rows, row, *places)
+        else:
+            for name in ('motion', 'turn', 'way', 'lever', 'travel'):
+                rows[name][row] = 0.0
+        if row > 0:     # slow errors change also while no node is passed
+            rows['lever'][row, 2] = 1e-9 * (rows['stamp_ns'][row] - rows['stamp_ns'][row - 1])
+
+    def remove(self, ids: IntArray) -> None:
+        """Remove rows whose factors were not added after all, all of them the newest to come."""
+        gone = np.isin(self._rows['id'], ids)
+        if not np.any(gone):
+            return
+        first = int(np.argmax(gone))
+        self._begin_from(first)
+        self._rows.select(np.flatnonzero(~gone))
+
+    def _begin_from(self, row: int) -> None:
+        """Take the bank back to before a row."""
+        if row >= self._done:
+            return
+        for at in [at for at in self._kept if at > row]:
+            del self._kept[at]
+        self._done = max(self._kept)
+        kept = self._kept[self._done]
+        self._n = len(kept)
+        self._bank[:self._n] = kept
+        self._tree.truncate(self._done)
+
+    def decide(self, noise: Records) -> Decided:
+        """Take the bank along all rows that it has not seen; return what is decided anew."""
+        begin, n = self._done, len(self)
+        self._tree.append(np.zeros((n - begin, BANK.hypotheses), BRANCH))
+        while self._done < n:
+            end = min(n, (self._done // BANK.checkpoint + 1) * BANK.checkpoint)
+            self._n = advance(self._bank, self._n, self._rows.values, self._done, end,
+                              self.n_sources, noise, self._tree.values)
+            self._done = end
+            if end % BANK.checkpoint == 0:
+                self._kept[end] = self._bank[:self._n].copy()
+        if len(self._kept) > BANK.checkpoints:
+            old = sorted(self._kept)[1:len(self._kept) // 2]
+            for at in old[::2]:
+                del self._kept[at]
+        return self._trace(begin)
+
+    def _trace(self, begin: int) -> Decided:
+        """Follow the best hypothesis back to where it meets the one that was the best before."""
+        n, branches, first = len(self), self._tree.values, 0
+        self._path.truncate(n)
+        self._path.append(np.zeros(n - len(self._path), dtype=np.int64))
+        path = self._path.values
+        at = int(np.argmax(self._bank['weight'][:self._n])) if self._n > 0 else 0
+        for row in range(n - 1, -1, -1):
+            if row < begin and path[row] == at:
+                first = row + 1
+                break
+            path[row] = at
+            at = int(branches['before'][row, at])
+        return self.told(first)
+
+    def told(self, first: int) -> Decided:
+        """Return what the best hypothesis says of the rows from one on."""
+        leaves = self._tree.values[np.arange(first, len(self)), self._path.values[first:]]
+        return Decided(first, leaves['choice'].astype(np.int64), leaves['far'].astype(np.float64),
+                       leaves['d2'].astype(np.float64))
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the probability density of all measurements."""
+        return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
+
+    def again(self) -> Self:
+        """Return a bank with the same rows that is at the first of them."""
+        other = copy(self)
+        other._begin_at({0: self._kept[0]})  # noqa: SLF001
+        return other
+
+    def _begin_at(self, kept: dict[int, Records]) -> None:
+        # hypotheses before some rows; those before the first one are never dropped
+        self._kept = kept
+        self._tree = GrowingArray((BANK.hypotheses,), BRANCH)
+        self._path = GrowingArray((), np.int64)  # the best hypothesis after each row, by number
+        # rows that the bank was taken along, and hypotheses that it has
+        self._done, self._n = 0, len(kept[0])
+        self._bank = np.zeros(BANK.hypotheses, HYPOTHESIS)
+        self._bank[:self._n] = kept[0]
+
+    def forget(self, left: IntArray) -> None:
+        """Forget the oldest rows up to a kept state, if all have left the graph; by ids."""
+        gone = ~np.isin(self._rows['id'], left)
+        n_gone = int(np.argmin(gone)) if not np.all(gone) else len(gone)
+        begin = max((at for at in self._kept if at <= min(n_gone, self._done)), default=0)
+        if begin == 0:
+            return
+        self._first_node = int(self._rows['node'][begin - 1])
+        for column in (self._rows, self._tree, self._path):
+            column.drop_first(begin)
+        self._done -= begin
+        self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
+
+
+def is_believed(choice: IntArray) -> npt.NDArray[np.bool_]:
+    return np.asarray((choice == GOOD) | (choice == SLIPPED))
+
+
+def as_claimed() -> Records:
+    """Return the noise of odometry and of sources that are as good as they claim."""
+    noise = np.zeros(1, NOISE)
+    for name in ('way', 'turn', 'white', 'tau'):
+        noise[name] = 1.0
+    return noise

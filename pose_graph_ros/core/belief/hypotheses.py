@@ -1,0 +1,351 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The hypotheses of the bank, and how each measurement lets them fork, join and go.
+
+At a measurement, every hypothesis forks: the measurement is good; it alone is wrong; a fault of
+its source begins, or its offset jumps; the fault goes on; or odometry has slipped, and it is good.
+The weight of a hypothesis is the logarithm of its probability, up to a constant for all.
+"""
+
+import math
+
+from numba import from_dtype, types
+import numpy as np
+
+from pose_graph_ros.core.belief.filter import (
+    correct,
+    density,
+    ERROR,
+    fade,
+    forget_error,
+    heading_density,
+    innovation,
+    LOG_2PI,
+    N_STATES,
+    NOISES,
+    predict,
+    RATE,
+    SCALE,
+)
+from pose_graph_ros.core.belief.rows import TABLE
+from pose_graph_ros.core.belief.settings import BANK
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel
+from pose_graph_ros.core.graph import factors
+
+MOST, N_SOURCES = BANK.hypotheses, BANK.sources
+
+HYPOTHESIS = np.dtype([
+    ('weight', 'f8'),
+    ('in_fault', 'i8', (N_SOURCES,)),  # whether a source is in a fault
+    ('state', 'f8', (N_STATES,)),
+    ('covariance', 'f8', (N_STATES, N_STATES))])
+
+# What a hypothesis says of a measurement. The second and the third are one run of wrong ones.
+GOOD, ALONE, BEGINS, GOES_ON, SLIPPED = range(5)
+N_CHOICES = 5
+
+# A hypothesis after a measurement, as a member of the tree of all.
+BRANCH = np.dtype([
+    ('before', 'i2'),  # number of the hypothesis that it has come from
+    ('choice', 'i2'),
+    ('far', 'f4'),  # distance of the measurement from where it was expected [m]
+    ('d2', 'f4')])  # the same as a squared Mahalanobis distance
+
+HYPOTHESES = types.Array(from_dtype(HYPOTHESIS), 1, 'C')
+TREE = types.Array(from_dtype(BRANCH), 2, 'C')
+
+# Copies of the settings that kernels use.
+BETWEEN_FAULTS, FAULT, BETWEEN_SLIPS = BANK.between_faults, BANK.fault, BANK.between_slips
+LN_OUTLIER, LN_NO_OUTLIER = math.log(BANK.outliers), math.log(1.0 - BANK.outliers)
+FAULT_SIZE2, SLIP_SIZE2 = BANK.fault_size**2, BANK.slip_size**2
+SLIP_HEADING2, WANDER2 = BANK.slip_heading**2, BANK.wander**2
+UNMOVED_WAY, UNMOVED = BANK.unmoved_way, BANK.unmoved
+HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
+NEAR2, FAR2 = BANK.near_fault**2, BANK.far_fault**2
+RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
+LOST, HOPELESS, ALIKE = BANK.lost, BANK.hopeless, BANK.alike
+SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
+EQUAL2, EQUAL = BANK.equal**2, BANK.equal
+LEAST = -1e300
+
+
+@kernel
+def _cauchy(square, scale2):  # type: ignore[no-untyped-def]
+    """Return the logarithm of the Cauchy density in the plane at a squared distance."""
+    return 0.5 * math.log(scale2) - LOG_2PI - 1.5 * math.log(square + scale2)
+
+
+@kernel
+def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
+    """Write the hypotheses on a first measurement: any heading, good or in a fault."""
+    seen, noise = table[row], noises[0]
+    r = seen.source
+    in_fault = FAULT / (FAULT + BETWEEN_FAULTS)
+    n = 0
+    for fault in range(3):
+        # in a fault the heading of a pose is wrong as well
+        n_headings = 1 if fault == 0 and seen.heading_variance > 0.0 else HEADINGS
+        for k in range(n_headings):
+            one = bank[n]
+            x, p = one.state, one.covariance
+            x[:], p[:, :], one.in_fault[:] = 0.0, 0.0, 0
+            heading, variance = 2.0 * math.pi * k / n_headings, HEADING2
+            if n_headings == 1:
+                heading, variance = seen.mean[2] - seen.offset[2], seen.heading_variance
+            c, s = math.cos(heading), math.sin(heading)
+            x[0] = seen.mean[0] - c * seen.offset[0] + s * seen.offset[1]
+            x[1] = seen.mean[1] - s * seen.offset[0] - c * seen.offset[1]
+            x[2] = heading
+            p[2, 2] = variance
+            p[RATE, RATE], p[SCALE, SCALE] = RATE2, SCALE2
+            for other in range(n_sources):
+                for i in range(ERROR + 2 * other, ERROR + 2 * other + 2):
+                    p[i, i] = noise.slow[other] * seen.slow
+            slow = noise.slow[r] * seen.slow
+            if fault > 0:
+                slow = NEAR2 if fault == 1 else FAR2
+                one.in_fault[r] = 1
+            p[0, 0] = noise.white[r] * seen.noise[0] + slow
+            p[0, 1] = noise.white[r] * seen.noise[1]
+            p[1, 0] = p[0, 1]
+            p[1, 1] = noise.white[r] * seen.noise[2] + slow
+            for i in range(2):
+                j = ERROR + 2 * r + i
+                p[j, j] = slow
+                p[i, j] = -slow
+                p[j, i] = -slow
+            share = 1.0 - in_fault if fault == 0 else 0.5 * in_fault
+            one.weight = math.log(share / n_headings)
+            n += 1
+    return n
+
+
+@kernel
+def _begin_again(  # type: ignore[no-untyped-def]
+    bank, n, table, row, n_sources, noises, leaves,
+):
+    """Begin anew, as if nothing were known of where the robot is, after the best hypothesis."""
+    best = 0
+    for k in range(1, n):
+        if bank[k].weight > bank[best].weight:
+            best = k
+    weight = bank[best].weight if n > 0 else 0.0
+    n = _begin(bank, table, row, n_sources, noises)
+    for k in range(n):
+        bank[k].weight += weight
+        leaf = leaves[k]
+        leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
+        leaf.choice = GOOD if bank[k].in_fault[table[row].source] == 0 else BEGINS
+    return n
+
+
+@kernel
+def _prepare(one, row, noise, n_sources):  # type: ignore[no-untyped-def]
+    """Move a hypothesis to a measurement."""
+    n = ERROR + 2 * n_sources
+    x, p = one.state, one.covariance
+    predict(x, p, n, row, noise)
+    seconds = row.lever[2]
+    for r in range(n_sources):
+        part = math.exp(-seconds / noise.tau[r])
+        more = (1.0 - part * part) * noise.slow[r] * row.slow
+        if one.in_fault[r] != 0:
+            fade(x, p, n, ERROR + 2 * r, 1.0, more + WANDER2 * seconds)
+        else:
+            fade(x, p, n, ERROR + 2 * r, part, more)
+
+
+@kernel
+def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
+    """Write the weights of the choices of a hypothesis, and how far the measurement is off."""
+    x, p, r = one.state, one.covariance, row.source
+    white, slow = noise.white[r], noise.slow[r] * row.slow
+    first, in_fault = ERROR + 2 * r, one.in_fault[r] != 0
+    ex, ey, xx, xy, yy, _, _ = innovation(x, p, row, first, white, 0.0)
+    with_error, d2 = density(ex, ey, xx, xy, yy)
+    square, spread = ex * ex + ey * ey, 0.5 * (xx + yy)
+    gx, gy, gxx, gxy, gyy, fresh = ex, ey, xx, xy, yy, with_error
+    if in_fault:
+        gx, gy, gxx, gxy, gyy, _, _ = innovation(x, p, row, -1, white, slow)
+        fresh, d2 = density(gx, gy, gxx, gxy, gyy)
+    fresh_square, fresh_spread = gx * gx + gy * gy, 0.5 * (gxx + gyy)
+    heading = heading_density(x, p, row)
+    any_heading = -LOG_2PI if row.heading_variance > 0.0 else 0.0
+    begins = 1.0 - math.exp(-row.gap / BETWEEN_FAULTS)
+    ends = 1.0 - math.exp(-row.gap / FAULT)
+    slips = 1.0 - math.exp(-row.lever[2] / BETWEEN_SLIPS)
+    changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
+    weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
+    weights[ALONE] = LN_OUTLIER + _cauchy(square, FAULT_SIZE2 + spread) + any_heading
+    weights[BEGINS] = (math.log(max(begins, 1e-12)) + LN_NO_OUTLIER
+                       + _cauchy(square, FAULT_SIZE2 + spread) + any_heading)
+    weights[GOES_ON] = LEAST
+    if in_fault:
+        weights[GOES_ON] = (math.log(max(1.0 - ends, 1e-12)) + LN_NO_OUTLIER + with_error
+                            + any_heading)
+    weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + LN_NO_OUTLIER
+                        + _cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
+    if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
+        weights[SLIPPED] -= UNMOVED
+    for choice in range(N_CHOICES):
+        weights[choice] += one.weight
+        if not weights[choice] > LEAST:
+            weights[choice] = LEAST
+        branch = branches[choice]
+        branch.choice = choice
+        branch.far = math.sqrt(fresh_square)
+        branch.d2 = d2
+
+
+@kernel(allocates=True)
+def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
+    """Let a hypothesis have made a choice."""
+    n, r = ERROR + 2 * n_sources, row.source
+    x, p = one.state, one.covariance
+    first, choice = ERROR + 2 * r, branch.choice
+    if choice == ALONE:
+        return
+    if choice == BEGINS:
+        ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
+        more = (FAULT_SIZE2 + ex * ex + ey * ey) / 3.0
+        p[first, first] += more
+        p[first + 1, first + 1] += more
+        one.in_fault[r] = 1
+    elif choice != GOES_ON:
+        if one.in_fault[r] != 0:
+            forget_error(x, p, n, first, noise.slow[r] * row.slow)
+        one.in_fault[r] = 0
+        if choice == SLIPPED:
+            more = (SLIP_SIZE2 + branch.far * branch.far) / 3.0
+            p[0, 0] += more
+            p[1, 1] += more
+            p[2, 2] += SLIP_HEADING2
+    correct(x, p, n, row, first, noise.white[r], one.in_fault[r] == 0)
+
+
+@kernel
+def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
+    """
+    Tell whether hypothesis n joins one before it, and which, or -1: it stays, or -2: it goes.
+
+    It goes if enough are in its place with the same faults already.
+    """
+    one, n_alike = bank[n], 0
+    x, p = one.state, one.covariance
+    for m in range(n):
+        other = bank[m]
+        same = True
+        for r in range(n_sources):
+            same = same and one.in_fault[r] == other.in_fault[r]
+        if not same:
+            continue
+        y, q = other.state, other.covariance
+        one_spread, other_spread = p[0, 0] + p[1, 1], q[0, 0] + q[1, 1]
+        spread = min(one_spread, other_spread)
+        far2 = (x[0] - y[0])**2 + (x[1] - y[1])**2
+        turn = abs(factors.wrap(x[2] - y[2])) / math.sqrt(min(p[2, 2], q[2, 2]))
+        if not (far2 < SAME_PLACE2 * spread and turn < SAME_HEADING):
+            continue
+        equal = (far2 < EQUAL2 * spread and turn < EQUAL
+                 and max(one_spread, other_spread) < 2.0 * spread)
+        for r in range(n_sources):
+            i = ERROR + 2 * r
+            if one.in_fault[r] != 0:
+                far2 = (x[i] - y[i])**2 + (x[i + 1] - y[i + 1])**2
+                equal = equal and far2 < EQUAL2 * (p[i, i] + p[i + 1, i + 1])
+        if equal:
+            return m
+        n_alike += 1
+    return -1 if n_alike < ALIKE else -2
+
+
+@kernel
+def _copy(bank, n, other, m, n_states):  # type: ignore[no-untyped-def]
+    one, from_one = bank[n], other[m]
+    one.weight = from_one.weight
+    for r in range(N_SOURCES):
+        one.in_fault[r] = from_one.in_fault[r]
+    for i in range(n_states):
+        one.state[i] = from_one.state[i]
+        for j in range(n_states):
+            one.covariance[i, j] = from_one.covariance[i, j]
+
+
+@kernel
+def _best(weights):  # type: ignore[no-untyped-def]
+    """Return the number of the largest weight, which is taken away."""
+    best = 0
+    for k in range(1, len(weights)):
+        if weights[k] > weights[best]:
+            best = k
+    weight = weights[best]
+    weights[best] = LEAST
+    return best, weight
+
+
+@kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, NOISES, TREE),
+        allocates=True)
+def advance(  # type: ignore[no-untyped-def]
+    bank, n, table, first, end, n_sources, noises, tree,
+):
+    """
+    Take the n hypotheses of a bank along rows of measurements; return how many there are then.
+
+    The branches of all hypotheses after each row are written to the tree.
+    """
+    noise, n_states = noises[0], ERROR + 2 * n_sources
+    before, branches = np.empty_like(bank), np.empty((MOST, N_CHOICES), tree.dtype)
+    weights = np.empty((MOST, N_CHOICES))
+    for at in range(first, end):
+        row = table[at]
+        if n == 0 or row.turn[5] * noise.turn > LOST:
+            n = _begin_again(bank, n, table, at, n_sources, noises, tree[at])
+            continue
+        for k in range(n):
+            _prepare(bank[k], row, noise, n_sources)
+            _weigh(bank[k], row, noise, weights[k], branches[k])
+        if row.decides == 0:
+            _stay(bank, n, row, weights, branches, tree[at], noises, n_sources)
+            continue
+        for k in range(n):
+            _copy(before, k, bank, k, n_states)
+        flat, n, most = weights[:n].copy().reshape(-1), 0, LEAST
+        while n < MOST:
+            place, weight = _best(flat)
+            most = max(most, weight)
+            if weight < most - HOPELESS or weight <= LEAST:
+                break
+            k, choice = place // N_CHOICES, place % N_CHOICES
+            _copy(bank, n, before, k, n_states)
+            bank[n].weight = weight
+            _follow(bank[n], row, branches[k, choice], noise, n_sources)
+            other = _joins(bank, n, n_sources)
+            if other >= 0:
+                bank[other].weight += math.log1p(math.exp(weight - bank[other].weight))
+            if other == -1:
+                _note(tree[at], n, branches[k, choice], k)
+                n += 1
+    return n
+
+
+@kernel(allocates=True)
+def _stay(  # type: ignore[no-untyped-def]
+    bank, n, row, weights, branches, leaves, noises, n_sources,
+):
+    """Let each hypothesis make the best choice by which nothing begins and nothing ends."""
+    for k in range(n):
+        one = bank[k]
+        choice = GOES_ON if one.in_fault[row.source] != 0 else GOOD
+        if weights[k, ALONE] > weights[k, choice]:
+            choice = ALONE
+        one.weight = weights[k, choice]
+        _follow(one, row, branches[k, choice], noises[0], n_sources)
+        _note(leaves, k, branches[k, choice], k)
+
+
+@kernel
+def _note(leaves, n, branch, before):  # type: ignore[no-untyped-def]
+    leaf = leaves[n]
+    leaf.before, leaf.choice = before, branch.choice
+    leaf.far, leaf.d2 = branch.far, branch.d2

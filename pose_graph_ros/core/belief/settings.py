@@ -1,0 +1,55 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is assumed of receivers and of odometry: each number is a sentence about the world."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class BankSettings:
+    """Meaning and unit of each number stand beside it."""
+
+    # --- how often something goes wrong, and how far
+    between_faults: float = 300.0  # mean time from one fault of a receiver to the next [s]
+    fault: float = 30.0  # mean time that a fault lasts [s]
+    between_slips: float = 3600.0  # mean time between slips of odometry [s]
+    outliers: float = 0.01  # share of measurements that are wrong by themselves
+    # scale of the Cauchy density of what is wrong: hardly anything is known of its size [m]
+    fault_size: float = 20.0
+    slip_size: float = 1.0
+    slip_heading: float = 0.3  # sigma of the heading after a slip [rad]
+    # the offset in a fault is as mobile as the error of a good receiver, and wanders [m/sqrt(s)]
+    wander: float = 0.1
+    # wheels that spin make the way too long, so a robot that must have moved farther than its
+    # odometry says by so much has hardly slipped: that is less likely by so many nats
+    unmoved_way: float = 5.0
+    unmoved: float = 7.0
+
+    # --- what is known at the beginning
+    headings: int = 16  # headings that are tried, with
+    heading: float = 0.15  # such a sigma [rad]
+    near_fault: float = 40.0  # how far a receiver is off that begins in a fault [m]: as mostly,
+    far_fault: float = 1000.0  # or as after a cold start
+    rate: float = 0.005  # sigma of the constant error of the yaw rate [rad/s]
+    scale: float = 0.01  # sigma of that of the scale of the way
+    lost: float = 0.3  # variance of a turn by odometry after which the heading is not known [rad^2]
+    # least sigmas of a measurement to decide by, as maps and mountings are not exact [m], [rad]
+    least_position: float = 0.3
+    least_heading: float = 0.05
+
+    # evidence that is needed for slow errors of a source [nats]
+    occam: float = 10.0
+
+    # --- the bank
+    hypotheses: int = 48
+    sources: int = 4  # sources with an error of their own; further ones share that of the last
+    hopeless: float = 30.0  # a hypothesis is dropped that is less likely by so many nats
+    alike: int = 4  # most hypotheses with the same faults in the same place
+    same_place: float = 2.0  # that is within so many sigmas
+    equal: float = 0.3  # within so many sigmas two become one
+    period_ns: int = 1_000_000_000  # of each source one measurement in such a time decides [ns]
+    checkpoint: int = 16  # rows from one state that is kept to the next
+    checkpoints: int = 64  # states that are kept; of older ones, every second is dropped
+
+
+BANK = BankSettings()
