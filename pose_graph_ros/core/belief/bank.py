@@ -56,7 +56,8 @@ class Decided(NamedTuple):
 
 
 class Bank:
-    def __init__(self) -> None:
+    def __init__(self, noise: Records | None = None) -> None:
+        self.noise = as_claimed() if noise is None else noise
         self._rows = GrowingArray((), MEASURED)
         self._begin_at({0: np.zeros(0, HYPOTHESIS)})
         self._first_node = -1  # node that the motion to the first row begins at, if it is known
@@ -70,7 +71,7 @@ class Bank:
         """Rows of measurements, by stamp, read-only."""
         return self._rows.read_only
 
-    def begin_with(self, prior: Prior, noise: Records) -> None:
+    def begin_with(self, prior: Prior) -> None:
         """Begin an empty bank with where the robot is known to be."""
         one = np.zeros(1, HYPOTHESIS)
         one['state'][0, :3] = prior.pose
@@ -79,7 +80,7 @@ class Bank:
             one['covariance'][0, k, k] = sigma**2
         for source in range(BANK.sources):
             for k in (ERROR + 2 * source, ERROR + 2 * source + 1):
-                one['covariance'][0, k, k] = noise['slow'][0, source]
+                one['covariance'][0, k, k] = self.noise['slow'][0, source]
         self._kept[0], self._first_node = one, prior.node
 
     def insert(self, new: Records, odometry: Odometry) -> None:
@@ -139,15 +140,16 @@ class Bank:
         self._n = len(kept)
         self._bank[:self._n] = kept
         self._tree.truncate(self._done)
+        self._traced = min(self._traced, self._done)
 
-    def decide(self, noise: Records) -> Decided:
-        """Take the bank along all rows that it has not seen; return what is decided anew."""
-        begin, n = self._done, len(self)
-        self._tree.append(np.zeros((n - begin, BANK.hypotheses), BRANCH))
+    def advance(self, most: int) -> bool:
+        """Take the bank along at most so many rows; return whether some are left."""
+        n = min(self._done + most, len(self))
+        self._tree.append(np.zeros((n - self._done, BANK.hypotheses), BRANCH))
         while self._done < n:
             end = min(n, (self._done // BANK.checkpoint + 1) * BANK.checkpoint)
             self._n = advance(self._bank, self._n, self._rows.values, self._done, end,
-                              self.n_sources, noise, self._tree.values)
+                              self.n_sources, self.noise, self._tree.values)
             self._done = end
             if end % BANK.checkpoint == 0:
                 self._kept[end] = self._bank[:self._n].copy()
@@ -155,9 +157,14 @@ class Bank:
             old = sorted(self._kept)[1:len(self._kept) // 2]
             for at in old[::2]:
                 del self._kept[at]
-        return self._trace(begin)
+        return n < len(self)
 
-    def _trace(self, begin: int) -> Decided:
+    def decide(self) -> Decided:
+        """Take the bank along all rows that it has not seen; return what is decided anew."""
+        self.advance(len(self))
+        return self._trace()
+
+    def _trace(self) -> Decided:
         """Follow the best hypothesis back to where it meets the one that was the best before."""
         n, branches, first = len(self), self._tree.values, 0
         self._path.truncate(n)
@@ -165,11 +172,12 @@ class Bank:
         path = self._path.values
         at = int(np.argmax(self._bank['weight'][:self._n])) if self._n > 0 else 0
         for row in range(n - 1, -1, -1):
-            if row < begin and path[row] == at:
+            if row < self._traced and path[row] == at:
                 first = row + 1
                 break
             path[row] = at
             at = int(branches['before'][row, at])
+        self._traced = n
         return self.told(first)
 
     def told(self, first: int) -> Decided:
@@ -183,33 +191,59 @@ class Bank:
         """Logarithm of the probability density of all measurements."""
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
 
-    def again(self) -> Self:
-        """Return a bank with the same rows that is at the first of them."""
+    def again(self, noise: Records, newest: int | None = None) -> Self:
+        """
+        Return a bank with the same rows and another noise, before the first of them.
+
+        Or before about so many of the newest ones; what is decided on those before these stays.
+        """
+        begin = 0 if newest is None else max(
+            (at for at in self._kept if at <= len(self) - newest), default=0)
         other = copy(self)
-        other._begin_at({0: self._kept[0]})  # noqa: SLF001
+        other._take(self, begin, noise)  # noqa: SLF001
         return other
 
-    def _begin_at(self, kept: dict[int, Records]) -> None:
+    def _take(self, other: Self, begin: int, noise: Records) -> None:
+        """Take over the rows of another bank, and what it says of those before one."""
+        self.noise, self._rows = noise, GrowingArray.of(other._rows.values)  # noqa: SLF001
+        tree, path = other._tree.values, other._path.values  # noqa: SLF001
+        self._begin_at({at: kept for at, kept in other._kept.items()  # noqa: SLF001
+                        if at <= begin}, begin)
+        self._tree.append(tree[:begin])
+        self._path.append(path[:begin])
+
+    def _begin_at(self, kept: dict[int, Records], begin: int = 0) -> None:
         # hypotheses before some rows; those before the first one are never dropped
         self._kept = kept
         self._tree = GrowingArray((BANK.hypotheses,), BRANCH)
-        self._path = GrowingArray((), np.int64)  # the best hypothesis after each row, by number
+        # the best hypothesis after each row, by number, and up to which row it is known
+        self._path, self._traced = GrowingArray((), np.int64), begin
         # rows that the bank was taken along, and hypotheses that it has
-        self._done, self._n = 0, len(kept[0])
+        self._done, self._n = begin, len(kept[begin])
         self._bank = np.zeros(BANK.hypotheses, HYPOTHESIS)
-        self._bank[:self._n] = kept[0]
+        self._bank[:self._n] = kept[begin]
 
-    def forget(self, left: IntArray) -> None:
-        """Forget the oldest rows up to a kept state, if all have left the graph; by ids."""
+    @property
+    def begin(self) -> int:
+        """The first row that the bank has not been taken along."""
+        return self._done
+
+    def forget(self, left: IntArray, least: int) -> None:
+        """
+        Forget the oldest rows up to a kept state, if their factors are not among those left.
+
+        At least so many rows stay.
+        """
         gone = ~np.isin(self._rows['id'], left)
         n_gone = int(np.argmin(gone)) if not np.all(gone) else len(gone)
-        begin = max((at for at in self._kept if at <= min(n_gone, self._done)), default=0)
+        most = min(n_gone, self._done, len(self) - least)
+        begin = max((at for at in self._kept if at <= most), default=0)
         if begin == 0:
             return
         self._first_node = int(self._rows['node'][begin - 1])
         for column in (self._rows, self._tree, self._path):
             column.drop_first(begin)
-        self._done -= begin
+        self._done, self._traced = self._done - begin, self._traced - begin
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
 
 

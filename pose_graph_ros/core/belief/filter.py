@@ -18,8 +18,9 @@ import math
 from numba import from_dtype, types
 import numpy as np
 
+from pose_graph_ros.core.belief.rows import TABLE
 from pose_graph_ros.core.belief.settings import BANK
-from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel, NUMBER, NUMBERS
 from pose_graph_ros.core.graph import factors
 
 LOG_2PI = math.log(2.0 * math.pi)
@@ -34,6 +35,13 @@ NOISE = np.dtype([
     ('slow', 'f8', (BANK.sources,)), ('tau', 'f8', (BANK.sources,))])
 
 NOISES = types.Array(from_dtype(NOISE), 1, 'C')
+
+# Copies of the settings that kernels use.
+LN_OUTLIER, LN_NO_OUTLIER = math.log(BANK.outliers), math.log(1.0 - BANK.outliers)
+FAULT_SIZE2, SLIP_HEADING2, WANDER2 = BANK.fault_size**2, BANK.slip_heading**2, BANK.wander**2
+LOST, ASTRAY = BANK.lost, BANK.astray
+# Variance of the heading and of a position where the filter begins, and of the heading again.
+BEGIN_HEADING, BEGIN_POSITION, NEW_HEADING = 0.1, 1e4, 1.0
 
 
 @kernel
@@ -170,3 +178,78 @@ def correct(x, p, n, row, first, white, with_heading):  # type: ignore[no-untype
             for j in range(i, n):
                 p[i, j] -= gain_x[i] * gain_x[j] / variance
                 p[j, i] = p[i, j]
+
+
+@kernel
+def cauchy(square, scale2):  # type: ignore[no-untyped-def]
+    """Return the logarithm of the Cauchy density in the plane at a squared distance."""
+    return 0.5 * math.log(scale2) - LOG_2PI - 1.5 * math.log(square + scale2)
+
+
+@kernel
+def _begin(x, p, n, row, heading, variance):  # type: ignore[no-untyped-def]
+    """Begin at a measured position, with what is known of constant and slow errors."""
+    if row.heading_variance > 0.0:
+        heading, variance = row.mean[2] - row.offset[2], row.heading_variance
+    c, s = math.cos(heading), math.sin(heading)
+    x[0] = row.mean[0] - c * row.offset[0] + s * row.offset[1]
+    x[1] = row.mean[1] - s * row.offset[0] - c * row.offset[1]
+    x[2] = heading
+    for i in range(3):
+        for j in range(n):
+            p[i, j] = 0.0
+            p[j, i] = 0.0
+    p[0, 0] = BEGIN_POSITION * row.slow
+    p[1, 1] = p[0, 0]
+    p[2, 2] = variance
+
+
+@kernel(signature=(TABLE, NUMBERS, INTEGER, NOISES, NUMBER, NUMBERS), allocates=True)
+def log_density(rows, slips, n_sources, noises, heading, constants):  # type: ignore[no-untyped-def]
+    """
+    Return the logarithm of the density of positions by one filter, each at least an outlier's.
+
+    Those with a negative entry in `slips` are left out; before the others odometry has slipped
+    with such a variance. The constants are rate and scale of odometry with their variances: in,
+    before the first position; out, after the last one.
+    """
+    noise, n = noises[0], ERROR + 2 * n_sources
+    x, p = np.zeros(N_STATES), np.zeros((N_STATES, N_STATES))
+    x[RATE], x[SCALE], p[RATE, RATE], p[SCALE, SCALE] = constants
+    total, n_wrong, has_begun = 0.0, 0, False
+    for k in range(len(rows)):
+        row = rows[k]
+        if has_begun:
+            predict(x, p, n, row, noise)
+            for r in range(n_sources):
+                part = math.exp(-row.lever[2] / noise.tau[r])
+                fade(x, p, n, ERROR + 2 * r, part,
+                     (1.0 - part * part) * noise.slow[r] * row.slow)
+            if row.turn[5] * noise.turn > LOST:
+                n_wrong = ASTRAY
+        if slips[k] < 0.0:
+            continue
+        if not has_begun:
+            for r in range(n_sources):
+                forget_error(x, p, n, ERROR + 2 * r, noise.slow[r] * row.slow)
+        if not has_begun or n_wrong >= ASTRAY:
+            _begin(x, p, n, row, heading if not has_begun else x[2],
+                   NEW_HEADING if has_begun else BEGIN_HEADING)
+            has_begun, n_wrong = True, 0
+        if slips[k] > 0.0:
+            p[0, 0] += slips[k]
+            p[1, 1] += slips[k]
+            p[2, 2] += SLIP_HEADING2
+        r = row.source
+        ex, ey, xx, xy, yy, _, _ = innovation(x, p, row, ERROR + 2 * r, noise.white[r], 0.0)
+        good, _ = density(ex, ey, xx, xy, yy)
+        good += LN_NO_OUTLIER + heading_density(x, p, row)
+        wrong = LN_OUTLIER + cauchy(ex * ex + ey * ey, FAULT_SIZE2 + 0.5 * (xx + yy)) - (
+            LOG_2PI if row.heading_variance > 0.0 else 0.0)
+        total += max(good, wrong)
+        n_wrong = n_wrong + 1 if wrong > good else 0
+        if n_wrong == 0:
+            correct(x, p, n, row, ERROR + 2 * r, noise.white[r], True)
+    constants[0], constants[1], constants[2], constants[3] = (
+        x[RATE], x[SCALE], p[RATE, RATE], p[SCALE, SCALE])
+    return total

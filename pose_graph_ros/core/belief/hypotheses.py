@@ -14,19 +14,26 @@ from numba import from_dtype, types
 import numpy as np
 
 from pose_graph_ros.core.belief.filter import (
+    cauchy,
     correct,
     density,
     ERROR,
     fade,
+    FAULT_SIZE2,
     forget_error,
     heading_density,
     innovation,
+    LN_NO_OUTLIER,
+    LN_OUTLIER,
     LOG_2PI,
+    LOST,
     N_STATES,
     NOISES,
     predict,
     RATE,
     SCALE,
+    SLIP_HEADING2,
+    WANDER2,
 )
 from pose_graph_ros.core.belief.rows import TABLE
 from pose_graph_ros.core.belief.settings import BANK
@@ -57,23 +64,15 @@ TREE = types.Array(from_dtype(BRANCH), 2, 'C')
 
 # Copies of the settings that kernels use.
 BETWEEN_FAULTS, FAULT, BETWEEN_SLIPS = BANK.between_faults, BANK.fault, BANK.between_slips
-LN_OUTLIER, LN_NO_OUTLIER = math.log(BANK.outliers), math.log(1.0 - BANK.outliers)
-FAULT_SIZE2, SLIP_SIZE2 = BANK.fault_size**2, BANK.slip_size**2
-SLIP_HEADING2, WANDER2 = BANK.slip_heading**2, BANK.wander**2
+SLIP_SIZE2 = BANK.slip_size**2
 UNMOVED_WAY, UNMOVED = BANK.unmoved_way, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
 NEAR2, FAR2 = BANK.near_fault**2, BANK.far_fault**2
 RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
-LOST, HOPELESS, ALIKE = BANK.lost, BANK.hopeless, BANK.alike
+HOPELESS, ALIKE = BANK.hopeless, BANK.alike
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
 EQUAL2, EQUAL = BANK.equal**2, BANK.equal
 LEAST = -1e300
-
-
-@kernel
-def _cauchy(square, scale2):  # type: ignore[no-untyped-def]
-    """Return the logarithm of the Cauchy density in the plane at a squared distance."""
-    return 0.5 * math.log(scale2) - LOG_2PI - 1.5 * math.log(square + scale2)
 
 
 @kernel
@@ -177,15 +176,15 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     slips = 1.0 - math.exp(-row.lever[2] / BETWEEN_SLIPS)
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
     weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
-    weights[ALONE] = LN_OUTLIER + _cauchy(square, FAULT_SIZE2 + spread) + any_heading
+    weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
     weights[BEGINS] = (math.log(max(begins, 1e-12)) + LN_NO_OUTLIER
-                       + _cauchy(square, FAULT_SIZE2 + spread) + any_heading)
+                       + cauchy(square, FAULT_SIZE2 + spread) + any_heading)
     weights[GOES_ON] = LEAST
     if in_fault:
         weights[GOES_ON] = (math.log(max(1.0 - ends, 1e-12)) + LN_NO_OUTLIER + with_error
                             + any_heading)
     weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + LN_NO_OUTLIER
-                        + _cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
+                        + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
         weights[SLIPPED] -= UNMOVED
     for choice in range(N_CHOICES):
@@ -305,7 +304,7 @@ def advance(  # type: ignore[no-untyped-def]
         for k in range(n):
             _prepare(bank[k], row, noise, n_sources)
             _weigh(bank[k], row, noise, weights[k], branches[k])
-        if row.decides == 0:
+        if row.decides == 0 or row.judged == 0:
             _stay(bank, n, row, weights, branches, tree[at], noises, n_sources)
             continue
         for k in range(n):

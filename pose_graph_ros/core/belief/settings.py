@@ -37,8 +37,26 @@ class BankSettings:
     least_position: float = 0.3
     least_heading: float = 0.05
 
-    # evidence that is needed for slow errors of a source [nats]
-    occam: float = 10.0
+    # --- how noisy all is
+    # evidence that is needed for slow errors of a source, and for odometry that is not as it
+    # claims [nats]
+    slow_evidence: float = 10.0
+    odometry_evidence: float = 3.0
+    # medians of variances in units of what is claimed, and sigmas of their logarithms: nobody
+    # knows how noisy turns are; what receivers claim of slow errors may be a small part of them
+    way: tuple[float, float] = (1.0, 2.0)
+    turn: tuple[float, float] = (1.0, 3.0)
+    white: tuple[float, float] = (1.0, 1.4)
+    slow: tuple[float, float] = (0.25, 2.0)
+    tau: tuple[float, float] = (40.0, 1.0)  # of the time constant of slow errors [s]
+    least_white: float = 0.1  # least white part of what a source claims, as a variance
+    astray: int = 8  # successive measurements that are wrong after which a filter begins again
+    # at which numbers of measurements noise is learnt: the first, the ratio of the next one, and
+    # the most between
+    first_learnt: int = 20
+    next_learnt: float = 1.5
+    most_between: int = 500
+    most_learnt: int = 3000  # newest ones that it is learnt from while measurements come
 
     # --- the bank
     hypotheses: int = 48

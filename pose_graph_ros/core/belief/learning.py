@@ -1,0 +1,289 @@
+# Copyright 2026 The pose_graph_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How noisy odometry and sources are, by all that they show of one another.
+
+The noise with the largest posterior density of the innovations of one filter is searched on a
+lattice of exponents of 2. What to believe depends on it, and it on what is believed: the search
+begins with all, and with noise that nobody has learnt, and takes what explains all measurements
+best, by the evidence of the bank. So wrong measurements are not explained by noise, nor noise by
+faults. The result depends on the measurements alone, not on the order of arrival.
+
+Searches are generators: each step takes a bounded time.
+"""
+
+from collections.abc import Collection, Generator, Sequence
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from pose_graph_ros.core.belief.bank import Bank, Decided, is_believed
+from pose_graph_ros.core.belief.filter import log_density, NOISE
+from pose_graph_ros.core.belief.hypotheses import SLIPPED
+from pose_graph_ros.core.belief.rows import Records
+from pose_graph_ros.core.belief.settings import BANK
+from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.odometry.motion import OdometryErrors
+from pose_graph_ros.core.sources.bias import CorrelatedErrors
+
+# Exponents of 2 of the variances by way and by turn, and of each source of those of its white and
+# slow errors, with the time constant.
+Point = tuple[float, ...]
+WAY, TURN = 0, 1
+ODOMETRY = WAY, TURN
+NO_SLOW = -math.inf  # exponent of a source without slow errors
+LN_2 = math.log(2.0)
+# Steps on the lattice, and bounds.
+COARSEST, FINEST, LEAST, MOST = 2.0, 0.25, -12.0, 16.0
+# What searches begin with: way and turn; slow variance, time constant [s] and white variance.
+ODOMETRY_BEGINS = (0.0, 0.0), (-4.0, -4.0), (0.0, 4.0), (4.0, 4.0)
+SLOW_BEGINS = tuple(
+    (slow, math.log2(tau), white) for slow in (-2.0, 0.0, 2.0) for tau in (10.0, 40.0)
+    for white in (-3.0, -1.0))
+UNLEARNT_SLOW = (-1.0, math.log2(40.0), -1.0)
+MOST_ROUNDS = 2  # of learning from what is believed
+ROWS_IN_STEP = 5000  # measurements that are filtered in a step, of about a microsecond each
+BANK_ROWS_IN_STEP = 50  # the same of a bank, of about 0.1 ms each
+
+Search = Generator[None, None, 'Learnt']
+
+
+def axes_of(source: int) -> tuple[int, int, int]:
+    """Return the axes of a source: white, slow, time constant."""
+    return 2 + 3 * source, 3 + 3 * source, 4 + 3 * source
+
+
+class Known(NamedTuple):
+    """The noise that is given, and of what it is to be found."""
+
+    point: Point  # what is given; what is to be found is as claimed here
+    odometry: bool
+    sources: tuple[int, ...]
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Axes of white noise that is to be found."""
+        return (*(ODOMETRY if self.odometry else ()),
+                *(axes_of(source)[0] for source in self.sources))
+
+
+class Learnt(NamedTuple):
+    point: Point
+    evidence: float  # of all measurements, with the prior of the noise [nats]
+    constants: FloatArray  # rate and scale of odometry, and their variances, shape (4,)
+
+    def odometry(self) -> OdometryErrors:
+        rate, scale, _, _ = self.constants.tolist()
+        return OdometryErrors(2.0**self.point[WAY], 2.0**self.point[TURN], rate, scale)
+
+    def errors(self, source: int) -> CorrelatedErrors | None:
+        """Return the slow and white errors of a source; None without slow ones."""
+        white, slow, tau = (2.0**self.point[axis] for axis in axes_of(source))
+        return CorrelatedErrors(tau, slow, white) if slow > 0.0 else None
+
+
+def claimed(n_sources: int) -> Point:
+    """Return the noise by which all is as good as it claims."""
+    return (0.0, 0.0, *(n_sources * (0.0, NO_SLOW, 0.0)))
+
+
+def noise_at(point: Point) -> Records:
+    """Return the noise at a point, as the filters take it."""
+    noise = np.zeros(1, NOISE)
+    noise['way'], noise['turn'] = 2.0**point[WAY], 2.0**point[TURN]
+    noise['white'] = noise['tau'] = 1.0
+    for source in range((len(point) - 2) // 3):
+        for name, axis in zip(('white', 'slow', 'tau'), axes_of(source), strict=True):
+            noise[name][0, source] = 2.0**point[axis]
+    return noise
+
+
+def log_prior(point: Point, known: Known, white_spread: float = BANK.white[1]) -> float:
+    """Return the logarithm of the prior of what is to be found, with its Occam factor."""
+    total = 0.0
+
+    def add(axis: int, median: float, spread: float) -> None:
+        nonlocal total
+        total -= 0.5 * ((LN_2 * point[axis] - math.log(median)) / spread)**2
+    if known.odometry:
+        add(WAY, *BANK.way)
+        add(TURN, *BANK.turn)
+    for source in known.sources:
+        white, slow, tau = axes_of(source)
+        add(white, BANK.white[0], white_spread)
+        if point[slow] > NO_SLOW:
+            add(slow, *BANK.slow)
+            add(tau, *BANK.tau)
+            total -= BANK.slow_evidence
+    return total
+
+
+class Minimum(NamedTuple):
+    value: float
+    point: Point
+
+
+class Posterior:
+    """The negative logarithm of the posterior density of noise, at most once at each point."""
+
+    def __init__(
+        self, rows: Records, slips: FloatArray, known: Known, *,
+        white_spread: float = BANK.white[1], finest: float = FINEST, constant: bool = True,
+    ) -> None:
+        """Take slips as `log_density` does, and whether odometry may have constant errors."""
+        self.rows, self._slips, self.known = np.ascontiguousarray(rows), slips, known
+        self._white_spread, self.finest = white_spread, finest
+        self._begin = np.zeros(4)
+        if constant:
+            self._begin[2:] = BANK.rate**2, BANK.scale**2
+        self.heading = 0.0
+        self._values: dict[Point, float] = {}
+        self.constants: dict[Point, FloatArray] = {}  # at the end, see `Learnt`
+        self._left = ROWS_IN_STEP
+
+    def density(self, point: Point, heading: float) -> tuple[float, FloatArray]:
+        constants = self._begin.copy()
+        n_sources = (len(point) - 2) // 3
+        return float(log_density(self.rows, self._slips, n_sources, noise_at(point), heading,
+                                 constants)), constants
+
+    def find_heading(self) -> Generator[None, None, None]:
+        """Find the heading at the first position that makes all as claimed the most likely."""
+        angles = 2.0 * math.pi / BANK.headings * np.arange(BANK.headings)
+        most = -math.inf
+        for angle in angles.tolist():
+            value, _ = self.density(self.known.point, angle)
+            if value > most:
+                most, self.heading = value, angle
+            yield from self._pause()
+
+    def value(self, point: Point) -> Generator[None, None, float]:
+        if point not in self._values:
+            density, self.constants[point] = self.density(point, self.heading)
+            self._values[point] = -density - log_prior(point, self.known, self._white_spread)
+            yield from self._pause()
+        return self._values[point]
+
+    def _pause(self) -> Generator[None, None, None]:
+        self._left -= len(self.rows)
+        if self._left < 0:
+            self._left = ROWS_IN_STEP
+            yield
+
+
+def descend(
+    posterior: Posterior, begins: Sequence[Point], axes: Collection[int],
+) -> Generator[None, None, Minimum]:
+    """Return the minimum along some axes near the best of some points, by halved steps."""
+    values: list[Minimum] = []
+    for point in begins:
+        values.append(Minimum((yield from posterior.value(point)), point))
+    best, step = min(values), COARSEST
+    while step >= posterior.finest:
+        before = best
+        for axis in axes:
+            for move in (step, -step):
+                point = moved(best.point, {axis: min(max(best.point[axis] + move, LEAST), MOST)})
+                value = yield from posterior.value(point)
+                if value < best.value:
+                    best = Minimum(value, point)
+                    break
+        if best.value == before.value:
+            step /= 2.0
+    return best
+
+
+def moved(point: Point, to: dict[int, float]) -> Point:
+    """Return a point with other exponents on some axes."""
+    return tuple(to.get(axis, exponent) for axis, exponent in enumerate(point))
+
+
+def most_likely(posterior: Posterior) -> Generator[None, None, Minimum]:
+    """Return the best point; slow errors and other odometry only where much shows them."""
+    known = posterior.known
+    yield from posterior.find_heading()
+    axes, white = known.free, known.free[2 if known.odometry else 0:]
+    begins = [known.point]
+    if known.odometry:
+        begins = [moved(known.point, {WAY: way, TURN: turn}) for way, turn in ODOMETRY_BEGINS]
+    begins += [moved(known.point, dict.fromkeys(white, at)) for at in (-3.0, 3.0)]
+    best = yield from descend(posterior, begins, axes)
+    for source in known.sources:
+        own = axes_of(source)
+        wider = (*axes, *own[1:])
+        found = Minimum(math.inf, best.point)
+        for point in {best.point, known.point}:
+            found = min(found, (yield from descend(posterior, [
+                moved(point, {own[0]: part, own[1]: slow, own[2]: tau})
+                for slow, tau, part in SLOW_BEGINS], wider)))
+        if found.value < best.value:
+            best, axes = found, wider
+    if known.odometry:
+        as_given = yield from descend(
+            posterior, [moved(best.point, {WAY: known.point[WAY], TURN: known.point[TURN]})],
+            [axis for axis in axes if axis not in ODOMETRY])
+        if as_given.value - best.value < BANK.odometry_evidence:
+            return as_given
+    return best
+
+
+def search(
+    bank: Bank, known: Known, *, begins: Collection[Point] = (), newest: int | None = None,
+) -> Search:
+    """
+    Return the noise that explains the measurements of a bank best, or the newest ones.
+
+    It begins also with some points. The bank stays as it is.
+    """
+    same = bank.again(bank.noise, newest)
+    first, rows, found = same.begin, same.rows[same.begin:].copy(), dict[Point, Learnt]()
+    learnt = dict[bytes, Point]()  # by what is believed
+
+    def learn(slips: FloatArray) -> Generator[None, None, Point]:
+        if slips.tobytes() not in learnt:
+            posterior = Posterior(rows, slips, known)
+            learnt[slips.tobytes()] = (yield from most_likely(posterior)).point
+        return learnt[slips.tobytes()]
+
+    unlearnt = moved(known.point, {
+        axis: value for source in known.sources
+        for axis, value in zip(axes_of(source), (
+            UNLEARNT_SLOW[2], *UNLEARNT_SLOW[:2]), strict=True)})
+    as_all = yield from learn(np.where(rows['decides'] == 1, 0.0, -1.0))
+    for begin in dict.fromkeys((as_all, known.point, unlearnt, *begins)):
+        point = begin
+        for _ in range(1 + MOST_ROUNDS):
+            if point in found:
+                break
+            trial = same.again(noise_at(point), len(rows))
+            while trial.advance(BANK_ROWS_IN_STEP):
+                yield
+            trial.decide()
+            slips = _slips(rows, trial.told(first))
+            found[point] = Learnt(
+                point, trial.evidence + log_prior(point, known),
+                (yield from _constants(rows, slips, known, point)))
+            point = yield from learn(slips)
+    return max(found.values(), key=lambda each: each.evidence)
+
+
+def _slips(rows: Records, decided: Decided) -> FloatArray:
+    """Return what is believed and decides, and the slips before it, for `log_density`."""
+    far = np.where(decided.choice == SLIPPED, decided.far, 0.0)
+    slips = np.where(decided.choice == SLIPPED, (BANK.slip_size**2 + far**2) / 3.0, 0.0)
+    return np.where(is_believed(decided.choice) & (rows['decides'] == 1), slips, -1.0)
+
+
+def _constants(
+    rows: Records, slips: FloatArray, known: Known, point: Point,
+) -> Generator[None, None, FloatArray]:
+    """Return the constant errors of odometry, 0 unless there is evidence for them."""
+    without = Posterior(rows, slips, known, constant=False)
+    yield from without.find_heading()
+    with_them = Posterior(rows, slips, known)
+    with_them.heading = without.heading
+    none = yield from without.value(point)
+    some = yield from with_them.value(point)
+    shown = known.odometry and none - some > BANK.odometry_evidence
+    return with_them.constants[point] if shown else np.zeros(4)
