@@ -1,24 +1,26 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Estimates of the errors of sources, and the change of the graph to new ones.
+What is learnt of the noise of odometry and of sources, and the change of the graph to it.
 
-When a source with `correlation_time` of -1 has sent enough measurements, the statistics of its
-errors are estimated (`sources.error_estimate`), and again whenever there are some more. If they
-differ much from those in use, the source gets a new bias, and all its measurements get edges to
-it, the newest first. Where odometry drifts more than it claims, its edges get a lower weight, all
-in one step, outside the timer if the graph is large. All else is done in bounded steps.
-At the end of a stream the statistics are those that all measurements show, whatever was in use.
+When there are enough new measurements in the map, the noise of all is learnt (`belief.learning`).
+If other noise than that in use explains the measurements better, the judge decides anew with it,
+and the graph follows: where the errors of a source are slow it gets a new bias, and all its
+measurements get edges to it, the newest first; edges of odometry get other weights and are without
+constant errors, all in one step, outside the timer if the graph is large. All else is done in
+bounded steps. At the end of a stream the noise is that which all measurements show, whatever was
+in use.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 import math
 
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.belief import learning
+from pose_graph_ros.core.belief.settings import BANK
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Measured
@@ -31,7 +33,6 @@ from pose_graph_ros.core.odometry.motion import (
     OdometryErrors,
 )
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources import error_estimate
 from pose_graph_ros.core.sources.bias import (
     Additions,
     BiasChain,
@@ -39,15 +40,16 @@ from pose_graph_ros.core.sources.bias import (
     held_by_bias,
     Process,
 )
-from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, SourceState
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.transaction import succeeds
 
 # Number of measurements that a step moves, online and at the end of a stream.
 PART, WHOLE = 100, 5000
-# Estimates that differ by less than this factor from what is in use change nothing online.
-SIMILAR = 1.9
+# Slow errors that differ by less than this factor are not changed online in the graph.
+ALIKE = 1.9
+# Noise that explains the measurements better by less than this changes nothing online [nats].
+SIMILAR = 3.0
 
 
 @dataclass(slots=True)
@@ -62,17 +64,8 @@ class _Change:
     undoing: bool = False
 
 
-@dataclass(slots=True)
-class _Search:
-    """An estimate that is under way."""
-
-    source: str
-    steps: error_estimate.Search
-    next_estimate: int  # number of measurements at which the next one is due
-
-
 class ErrorTuner:
-    """Finds out whether the errors of sources are correlated, and has the graph treat them so."""
+    """Learns how noisy odometry and sources are, and has the graph treat them so."""
 
     def __init__(
         self, smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
@@ -80,7 +73,12 @@ class ErrorTuner:
     ) -> None:
         self._smoother, self._factors, self._reweighting = smoother, factors, reweighting
         self._nodes, self._judge = nodes, judge
-        self._search: _Search | None = None
+        self._search: learning.Search | None = None
+        self._in_use: learning.Point | None = None  # noise that the judge decides with
+        self._odometry = AS_CLAIMED  # errors of odometry that were learnt
+        self._next = BANK.first_learnt  # number of measurements at which it is learnt next
+        # sources whose errors are to change, one after the other
+        self._waiting: dict[str, CorrelatedErrors | None] = {}
         self._change: _Change | None = None
         self.n_failures = 0  # number of changes that were undone because the solver failed
         self._failed: OdometryErrors | None = None  # of odometry, with which the solver failed
@@ -104,94 +102,93 @@ class ErrorTuner:
                 self._correct_odometry(self._wanted())
             moved = np.abs(graph.poses[:len(before)] - before)[graph.is_pose[:len(before)], :2]
             return float(np.max(moved, initial=0.0))
-        if self._search is None:
-            self._search = self._next_search()
+        if self._begin_next() or self._judge.fixes.step():
+            return 0.0
+        if self._search is None and self._is_due:
+            fixes = self._judge.fixes
+            fixes.prepare()
+            self._search = learning.search(
+                fixes.bank, known := fixes.known(), newest=BANK.most_learnt,
+                begins=() if self._in_use is None else (
+                    learning.widened(self._in_use, known),))
+            self._next = self._n_learnable + max(1, min(
+                int((BANK.next_learnt - 1.0) * self._n_learnable), BANK.most_between))
         if self._search is not None:
             try:
-                next(self._search.steps)
+                next(self._search)
             except StopIteration as end:
-                search, self._search = self._search, None
-                constraints = self._factors.sources[search.source]
-                constraints.next_estimate = search.next_estimate
-                found: error_estimate.Estimate = end.value
-                if _far(constraints.odometry, found):
-                    constraints.odometry = found.odometry
-                if _differ(self._factors.errors_in_use(search.source), found.errors):
-                    self._begin(search.source, found.errors)
+                self._search = None
+                found: learning.Found = end.value
+                if found.is_better_than(self._in_use, SIMILAR):
+                    self._use(found.best, newest=BANK.most_learnt)
         return 0.0
+
+    @property
+    def _n_learnable(self) -> int:
+        """Number of measurements of the sources whose errors are to be found, also gone ones."""
+        return sum(self._factors.sources[source].n_ever for source in self._factors.finding())
+
+    @property
+    def _is_due(self) -> bool:
+        return self._n_learnable >= self._next
 
     @property
     def is_idle(self) -> bool:
         """Whether `step` has nothing to do."""
-        return (self._change is None and self._search is None and not self._odometry_is_due()
-                and len(self._factors.due_for_estimate()) == 0)
+        return (self._change is None and self._search is None and len(self._waiting) == 0
+                and not self._odometry_is_due() and not self._judge.fixes.decides_anew
+                and not self._is_due)
+
+    def _use(self, learnt: learning.Learnt, newest: int | None = None) -> None:
+        """
+        Use noise that was learnt, also for judging the newest measurements, or all.
+
+        If not all, the graph follows only where it differs much.
+        """
+        fixes, self._in_use = self._judge.fixes, learnt.point
+        fixes.adopt(learning.noise_at(learnt.point), newest)
+        if newest is None or learnt.is_far_from(self._odometry):
+            self._odometry = learnt.odometry()
+        for source in self._factors.finding():
+            before, number = self._factors.errors_in_use(source), fixes.source(source)
+            errors = None if number is None else learnt.errors(number)
+            if errors != before and (newest is None or _differ(before, errors)):
+                self._waiting[source] = errors
 
     def finish_change(self) -> None:
-        """Do all that is left of a change that is under way."""
-        while self._change is not None and self._move(WHOLE):
-            pass
+        """Do all that is left of changes that are under way."""
+        while self._change is not None or self._begin_next():
+            if not self._move(WHOLE):
+                break
         if self._odometry_is_due() and not self._smoother.graph.has_touched:
             self._correct_odometry(self._wanted())
 
     def decide(self) -> None:
-        """Give all sources the errors that their measurements show; for the end of a stream."""
+        """Use the noise that all measurements show; for the end of a stream."""
         self.finish_change()
         self._search = None
-        sources = self._factors.finding()
-        if len(sources) == 0:
+        fixes = self._judge.fixes
+        fixes.prepare()
+        if len(self._factors.finding()) == 0 or len(fixes.bank) == 0:
             return
         # what was in use depends on the order of arrival
-        self._correct_odometry(self._given or AS_CLAIMED)
-        # moving the measurements of one source changes none of another one
-        weights = self._judge.final_weights()
-        for source in sources:
-            constraints = self._factors.sources[source]
-            found = to_the_end(self._steps(constraints, weights))
-            if found.odometry.rate != 0.0:
-                found = to_the_end(self._steps(constraints, weights, reference=found.odometry))
-            constraints.next_estimate = max(
-                constraints.next_estimate, _next_estimate(constraints))
-            constraints.odometry = found.odometry
-            if found.errors != self._factors.errors_in_use(source):
-                self._begin(source, found.errors)
-                self.finish_change()
+        found = to_the_end(learning.search(fixes.bank, fixes.known()))
+        self._use(found.best)
         self.finish_change()
 
-    def leaving(
-        self, factors: IntArray, first: int,
-    ) -> tuple[list[int], Mapping[str, PastPath]]:
+    def leaving(self, factors: IntArray) -> list[int]:
         """
         Return the ids of the biases that are to leave the graph with constraints.
 
-        With it comes what the measurements among these show of the errors of their sources, for
-        `forget`; `first` is the pose that is the oldest one then. At least the newest bias of a
-        source stays.
+        At least the newest bias of a source stays.
         """
-        graph, past = self._smoother.graph, dict[str, PastPath]()
-        for source in self._factors.finding():
-            constraints = self._factors.sources[source]
-            used = constraints.measured.values[
-                constraints.leaving(factors) & constraints.are_used(graph)]
-            past[source] = error_estimate.left_behind(
-                graph, self._odometry(AS_CLAIMED), used['stamp_ns'], used['id'],
-                past=constraints.past, node=first)
         change = self._change
         others = {} if change is None else {change.source: change.bias}
-        return self._factors.leaving_biases(factors, others, graph), past
+        return self._factors.leaving_biases(factors, others, self._smoother.graph)
 
-    @property
-    def needed(self) -> list[int]:
-        """Ids of the poses from which odometry leads to the measurements that are left."""
-        every = (self._factors.sources[source].past for source in self._factors.finding())
-        return [past.node for past in every if past is not None]
-
-    def forget(
-        self, nodes: IntArray, factors: IntArray, past: Mapping[str, PastPath],
-    ) -> None:
-        """Forget what has left the graph, by ids; keep what `leaving` has returned of it."""
+    def forget(self, nodes: IntArray, factors: IntArray) -> None:
+        """Forget what has left the graph, by ids."""
         kept, change = self._factors.forget(nodes, factors), self._change
-        for source, path in past.items():
-            self._factors.sources[source].past = path
         if change is None:
             return
         change.bias = change.bias.without(nodes)
@@ -206,6 +203,7 @@ class ErrorTuner:
 
         In files of older versions (not `knows_errors`) weights stand for the noise of odometry.
         """
+        self._odometry = self._nodes.errors
         graph, rows = self._smoother.graph, self._primary_rows()
         # what a loss or the judge has changed has less weight
         weight = float(np.max(graph.weights[rows], initial=0.0))
@@ -216,7 +214,7 @@ class ErrorTuner:
             measure=[Measured(ids, edges.mean, weight * edges.information)],
             weigh=dict(zip(ids.tolist(), (edges.weight / weight).tolist(), strict=True))))
         self._reweighting.scale_base_weights(ids, 1.0 / weight)
-        self._nodes.errors = OdometryErrors.scaled(weight**-0.5)
+        self._nodes.errors = self._odometry = OdometryErrors.scaled(weight**-0.5)
 
     @property
     def _given(self) -> OdometryErrors | None:
@@ -225,18 +223,14 @@ class ErrorTuner:
         return OdometryErrors.scaled(scale) if scale > 0.0 else None
 
     def _wanted(self) -> OdometryErrors:
-        """Return the errors of odometry that are given, or that most measurements show."""
+        """Return the errors of odometry that are given, or that were learnt."""
         if self._given is not None:
             return self._given
-        sources = [self._factors.sources[source] for source in self._factors.finding()]
-        found = max(sources, key=lambda one: one.n_ever, default=None)
-        if found is None:
-            return AS_CLAIMED
         # constant errors are those of one odometry; states of the graph are what calibrates it
         calibrated = self._factors.config.odometry_source(self._nodes.primary).calibrate
         if self._nodes.n_primaries > 1 or calibrated:
-            return found.odometry._replace(rate=0.0, scale=0.0)
-        return found.odometry
+            return self._odometry._replace(rate=0.0, scale=0.0)
+        return self._odometry
 
     def _odometry_is_due(self) -> bool:
         """Tell whether the odometry in the graph is to have other errors."""
@@ -273,30 +267,14 @@ class ErrorTuner:
         primary &= ~np.isin(later, self._nodes.relocated_ids)
         return np.flatnonzero(primary)
 
-    def _next_search(self) -> _Search | None:
-        for source in self._factors.due_for_estimate():
-            constraints = self._factors.sources[source]
-            steps = self._steps(
-                constraints, self._smoother.graph.weights,
-                correlated=self._factors.errors_in_use(source) is not None,
-                reference=self._nodes.errors)
-            return _Search(source, steps, _next_estimate(constraints))
-        return None
-
-    def _steps(
-        self, constraints: SourceState, weights: FloatArray, *,
-        correlated: bool = False, reference: OdometryErrors = AS_CLAIMED,
-    ) -> error_estimate.Search:
-        """Search with the measurements of a source that have a weight, of those given by row."""
-        graph = self._smoother.graph
-        used = constraints.measured.values[constraints.are_used(graph, weights)]
-        path = yield from error_estimate.measured_path(
-            graph, self._odometry(reference), used['stamp_ns'], used['id'], constraints.past)
-        return (yield from error_estimate.search(path, correlated=correlated))
-
-    def _odometry(self, reference: OdometryErrors) -> error_estimate.PathOdometry:
-        return error_estimate.PathOdometry(
-            self._nodes.ids, self._nodes.stamps_ns, self._nodes.errors, reference)
+    def _begin_next(self) -> bool:
+        """Begin the change of a source that waits for it; return whether there was one."""
+        for source in list(self._waiting):
+            errors = self._waiting.pop(source)
+            if errors != self._factors.errors_in_use(source):
+                self._begin(source, errors)
+                return True
+        return False
 
     def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""
@@ -364,22 +342,8 @@ class ErrorTuner:
         return True
 
 
-def _next_estimate(constraints: SourceState) -> int:
-    """Return at how many measurements of a source the estimate after the next one is due."""
-    return constraints.n_gone + math.ceil(1.3 * len(constraints))
-
-
-def _far(known: OdometryErrors, found: error_estimate.Estimate) -> bool:
-    """Tell whether errors of odometry differ by more than what is known of them."""
-    new = found.odometry
-    return (any(max(one, other) > 1.5 * min(one, other)
-                for one, other in zip(known[:2], new[:2], strict=True))
-            or abs(new.rate - known.rate) > found.rate_sigma
-            or abs(new.scale - known.scale) > found.scale_sigma)
-
-
 def _differ(one: CorrelatedErrors | None, other: CorrelatedErrors | None) -> bool:
-    """Tell whether two estimates differ by more than the factor `SIMILAR` in a number."""
+    """Tell whether two sets of errors differ by more than the factor `ALIKE` in a number."""
     if one is None or other is None:
         return one is not other
-    return any(max(a, b) > SIMILAR * min(a, b) for a, b in zip(one, other, strict=True))
+    return any(max(a, b) > ALIKE * min(a, b) for a, b in zip(one, other, strict=True))

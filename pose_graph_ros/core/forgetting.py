@@ -11,7 +11,7 @@ is freed: a prior of poses relative to it says nothing about where they are in t
 By thinning, nodes leave where a place is driven often, as `window.thinning` decides.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 import math
 from typing import NamedTuple
 
@@ -27,7 +27,6 @@ from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
-from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.transaction import succeeds
 from pose_graph_ros.core.window.sparse_removal import (
     crowded_edges,
@@ -89,7 +88,6 @@ class _Asked(NamedTuple):
 
     nodes: IntArray  # with the biases that nothing needs without them; ids, ascending
     judged: list[Verdict]
-    past: Mapping[str, PastPath]
 
 
 class Forgetting:
@@ -134,14 +132,14 @@ class Forgetting:
         factors = np.union1d(graph.factors_on(nodes), factors)
         # the judge may change weights
         judged = self._parts.judge.decide_leaving(factors)
-        biases, past = ([], {}) if after is None else tuner.leaving(factors, after)
-        return _Asked(np.union1d(nodes, biases).astype(np.int64), judged, past)
+        biases = [] if after is None else tuner.leaving(factors)
+        return _Asked(np.union1d(nodes, biases).astype(np.int64), judged)
 
     def _tell(self, asked: _Asked, gone: Gone, places: Places) -> None:
         """Let all owners forget what has left the graph."""
         self._parts.judge.forget(gone.nodes, gone.factors, asked.judged)
         self._parts.reweighting.forget(gone.factors)
-        self._tuner.forget(gone.nodes, gone.factors, asked.past)
+        self._tuner.forget(gone.nodes, gone.factors)
         self._parts.nodes.thin(*places)
 
     def _solve(self, update: GraphUpdate | None) -> Gone | None:
@@ -223,7 +221,7 @@ class Forgetting:
 
     def _held(self) -> IntArray:
         """Return the ids of nodes that do not leave, as something is to be added to them."""
-        parts, found = self._parts, [*self._tuner.needed]
+        parts, found = self._parts, list[int]()
         for queue in (parts.pipeline.queue, parts.quarantine):
             found += [node for each in queue for node in each.nodes]
         return np.array(found, dtype=np.int64)

@@ -5,7 +5,7 @@ How noisy odometry and the sources of positions are, by all that a drive shows o
 
 The factors are those with the largest likelihood that the engine finds as well. A factor of 1 that
 is as likely, by a likelihood ratio, is kept, and all others are found again. The interval of a
-factor is where the likelihood, with all others at their best, falls by half of `RISE`.
+factor is where the likelihood, with all others at their best, falls by `RISE`.
 
 The likelihood knows what changes between measurements. It is blind to errors of a source that
 last longer than the drive, and takes slower ones than it models for motion. So a source claims
@@ -28,28 +28,30 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
+from pose_graph_ros.core.belief.learning import (
+    claimed,
+    descend,
+    Known,
+    Minimum,
+    most_likely,
+    moved,
+    NO_SLOW,
+    Posterior,
+    TURN,
+    WAY,
+)
+from pose_graph_ros.core.belief.rows import Records
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.measurements import GlobalPose, Position
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.quantities import Metres, StampNs
-from pose_graph_ros.core.sources.error_estimate import (
-    descend,
-    Evaluation,
-    measured_path,
-    Minimum,
-    most_likely,
-    PathOdometry,
-    Point,
-)
-from pose_graph_ros.core.sources.error_likelihood import MeasuredPath
-from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_report import estimate
 
-# Rise of twice the negative logarithm of the likelihood at the ends of an interval of 95 %, and
-# that which makes a factor of 1 unlikely enough to be changed (99 %).
-RISE, CHANGE_RISE = 3.84, 6.63
+# Rise of the negative logarithm of the likelihood at the ends of an interval of 95 %, and that
+# which makes a factor of 1 unlikely enough to be changed (99 %).
+RISE, CHANGE_RISE = 1.92, 3.31
 # Sigma of the logarithm of the variance of a source before it is seen: what claims are is found.
 CLAIM_SPREAD = 3.0
 # Smallest step of an exponent of 2.
@@ -62,11 +64,15 @@ SMALLEST = 0.01
 MULTIPLES = -12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0
 # Largest exponent of 2, from the best one, at which the end of an interval is looked for.
 REACH = 6.0
-# Axes of a point, from its end; those of correlated errors, from its beginning.
-WAY, TURN, WHITE = -3, -2, -1
-TAU, CORRELATED = 0, 1
+# Steps in which it is looked for.
+STEP = 0.25
+# Axes of the source in a point.
+WHITE, SLOW, TAU = 2, 3, 4
+# What nothing is known of but odometry and one source.
+ALL_UNKNOWN = Known(claimed(1), odometry=True, sources=(0,))
+LEAST_POSITIONS = 20
 # Time in which slow errors of a receiver change: satellites, ionosphere, reflections [s].
-SLOW = 300.0
+CHANGE = 300.0
 # Probability that a variance is larger than the end of its interval.
 TAIL = 0.025
 # Time constants in a drive from which on these and their variance are known to a factor of `WIDE`.
@@ -131,79 +137,82 @@ def noise_of(
 
     None if there are too few positions.
     """
-    graph, nodes = parts.graph, parts.nodes
-    rows = parts.factors.sources[source].measured.values
-    rows = rows[~np.isin(rows['stamp_ns'], np.array([*without], dtype=np.int64))]
-    rows = rows[np.argsort(rows['stamp_ns'], kind='stable')]
-    path = to_the_end(measured_path(
-        graph, PathOdometry(nodes.ids, nodes.stamps_ns, nodes.errors, nodes.errors),
-        rows['stamp_ns'], rows['id']))
-    if len(path.seconds) < 2 * SOURCES.least_positions:
+    rows = parts.judge.fixes.path(source, without).copy()
+    if len(rows) < LEAST_POSITIONS:
         return None
     # a factor on what is claimed is none on what the motion since the node adds
-    stamps_ns = rows['stamp_ns'][0] + np.rint(1e9 * path.seconds).astype(np.int64)
-    added = rows['noise'][np.searchsorted(rows['stamp_ns'], stamps_ns), 0]
-    return fitted(path._replace(variance=np.maximum(
-        path.variance - added, SMALLEST * path.variance)))
+    known = parts.factors.sources[source].measured.values
+    added = known['noise'][np.searchsorted(known['id'], rows['id']), 0]
+    rows['slow'] = np.maximum(rows['slow'] - added, SMALLEST * rows['slow'])
+    rows['noise'] = rows['slow'][:, None] * (1.0, 0.0, 1.0)
+    rows['source'] = 0
+    return fitted(rows)
 
 
-def fitted(path: MeasuredPath) -> Noise:
-    """Return the noise that makes positions on a path the most likely."""
+def fitted(rows: Records) -> Noise:
+    """Return the noise that makes measurements of one source the most likely."""
+    used, known = np.zeros(len(rows)), ALL_UNKNOWN
     # claims may be wrong by more than the search goes: it begins with the best of some multiples
-    evaluate = Evaluation(path)
-    to_the_end(evaluate.find_heading())
+    posterior = Posterior(rows, used, known)
+    to_the_end(posterior.find_heading())
     multiple = min(MULTIPLES, key=lambda exponent: to_the_end(
-        evaluate.value((0.0, 0.0, exponent))))
-    evaluate = Evaluation(
-        path._replace(variance=2.0**multiple * path.variance), CLAIM_SPREAD, CLAIM_SPREAD, FINEST)
-    likely = best = to_the_end(most_likely(evaluate))
+        posterior.value(moved(known.point, {WHITE: exponent}))))
+    scaled = rows.copy()
+    scaled['noise'] *= 2.0**multiple
+    scaled['slow'] *= 2.0**multiple
+    posterior = Posterior(
+        scaled, used, known, spread=CLAIM_SPREAD, least_white=SMALLEST, finest=FINEST)
+    likely = best = to_the_end(most_likely(posterior))
+    is_slow = best.point[SLOW] > NO_SLOW
     kept: tuple[int, ...] = ()
-    axes = (WAY, TURN, WHITE) if len(best.point) == 3 else (WAY, TURN)
+    axes = (WAY, TURN) if is_slow else (WAY, TURN, WHITE)
     while len(kept) < len(axes):
         least, axis = min(
-            (_at(evaluate, best.point, axis, -multiple if axis == WHITE else 0.0, (*kept, axis)),
-             axis) for axis in axes if axis not in kept)
+            (_at(posterior, best, axis, -multiple if axis == WHITE else 0.0, (*kept, axis)), axis)
+            for axis in axes if axis not in kept)
         if least.value - likely.value > CHANGE_RISE:
             break
         best, kept = least, (*kept, axis)
 
     def found(axis: int, unit: float = 1.0) -> Found:
         if axis not in kept:
-            return _interval(evaluate, best, axis, kept, unit)
-        each = _interval(evaluate, likely, axis, (), unit)
+            return _interval(posterior, best, axis, kept, unit)
+        each = _interval(posterior, likely, axis, (), unit)
         return Found(1.0, min(each.low, 1.0), max(each.high, 1.0), kept=True)
-    if len(best.point) == 3:
-        size, tau = found(WHITE, 2.0**multiple), None
-    else:
-        axis = CORRELATED - len(best.point)
+    if is_slow:
         # with the white part
-        size = found(axis, 2.0**multiple * (1.0 + 2.0**(best.point[WHITE] - best.point[axis])))
-        tau = found(TAU - len(best.point))
-    return Noise(found(WAY), found(TURN), size, tau, float(np.sqrt(np.median(path.variance))),
-                 _shown(path), float(path.seconds[-1]))
+        size = found(SLOW, 2.0**multiple * (1.0 + 2.0**(best.point[WHITE] - best.point[SLOW])))
+        tau = found(TAU)
+    else:
+        size, tau = found(WHITE, 2.0**multiple), None
+    return Noise(found(WAY), found(TURN), size, tau, float(np.sqrt(np.median(rows['slow']))),
+                 _shown(rows), _seconds(rows))
+
+
+def _seconds(rows: Records) -> float:
+    return 1e-9 * float(rows['stamp_ns'][-1] - rows['stamp_ns'][0])
 
 
 def _at(
-    evaluate: Evaluation, point: Point, axis: int, exponent: float, fixed: Collection[int],
+    posterior: Posterior, best: Minimum, axis: int, exponent: float, fixed: Collection[int],
 ) -> Minimum:
     """Return the minimum near a point with another exponent on an axis."""
-    moved = list(point)
-    moved[axis] = exponent
-    return to_the_end(descend(evaluate, [tuple(moved)], fixed))
+    free = [other for other, at in enumerate(best.point)
+            if other not in fixed and not (other >= SLOW and best.point[SLOW] == NO_SLOW)]
+    return to_the_end(descend(posterior, [moved(best.point, {axis: exponent})], free))
 
 
 def _interval(
-    evaluate: Evaluation, best: Minimum, axis: int, kept: Collection[int], unit: float,
+    posterior: Posterior, best: Minimum, axis: int, kept: Collection[int], unit: float,
 ) -> Found:
     """Return the exponent on an axis with its interval, as a number of units."""
     ends = []
     for sign in (-1.0, 1.0):
-        point, at = best.point, best.point[axis]
-        for far in np.arange(SOURCES.finest, REACH + 0.1, SOURCES.finest).tolist():
-            least = _at(evaluate, point, axis, at + sign * far, (*kept, axis))
-            point = least.point
+        least, at = best, best.point[axis]
+        for far in np.arange(STEP, REACH + 0.1, STEP).tolist():
+            least = _at(posterior, least, axis, at + sign * far, (*kept, axis))
             if least.value - best.value > RISE:
-                ends.append(unit * 2.0**point[axis])
+                ends.append(unit * 2.0**least.point[axis])
                 break
         else:
             ends.append(0.0 if sign < 0.0 else math.inf)
@@ -211,22 +220,22 @@ def _interval(
     return Found(unit * 2.0**best.point[axis], low, high, kept=False)
 
 
-def _shown(path: MeasuredPath) -> float:
+def _shown(rows: Records) -> float:
     """Return how large the variance of positions can be at most, in units of the claimed one."""
-    headings = np.cumsum(path.motion[:, 2])
+    headings = np.cumsum(rows['motion'][:, 2])
     before = np.concatenate(([0.0], headings[:-1]))
-    here = np.cumsum((path.motion[:, 0] + 1j * path.motion[:, 1]) * np.exp(1j * before))
-    here += (path.offset[:, 0] + 1j * path.offset[:, 1]) * np.exp(1j * headings)
-    there = path.position[:, 0] + 1j * path.position[:, 1]
+    here = np.cumsum((rows['motion'][:, 0] + 1j * rows['motion'][:, 1]) * np.exp(1j * before))
+    here += (rows['offset'][:, 0] + 1j * rows['offset'][:, 1]) * np.exp(1j * headings)
+    there = rows['mean'][:, 0] + 1j * rows['mean'][:, 1]
     here, there = here - np.mean(here), there - np.mean(there)
     turn = np.angle(np.sum(np.conj(here) * there))
     errors = np.abs(there - here * np.exp(1j * turn))**2
     # two coordinates, without the three numbers by which odometry was laid there
-    degrees = 2.0 * float(path.seconds[-1]) / SLOW - 3.0
+    degrees = 2.0 * _seconds(rows) / CHANGE - 3.0
     quantile = 2.0 * float(gammaincinv(0.5 * max(degrees, 0.0), TAIL))
     # the upper end of the interval of a variance from a mean of squared errors
     return math.inf if not quantile > 0.0 else degrees / quantile * float(
-        np.mean(errors / (2.0 * path.variance)))
+        np.mean(errors / (2.0 * rows['slow'])))
 
 
 def proven_odometry(found: Collection[Noise]) -> tuple[Found, Found]:

@@ -59,6 +59,8 @@ class Bank:
     def __init__(self, noise: Records | None = None) -> None:
         self.noise = as_claimed() if noise is None else noise
         self._rows = GrowingArray((), MEASURED)
+        self._done, self._traced, self._n = 0, 0, 0
+        self._bank = np.zeros(BANK.hypotheses, HYPOTHESIS)
         self._begin_at({0: np.zeros(0, HYPOTHESIS)})
         self._first_node = -1  # node that the motion to the first row begins at, if it is known
         self.n_sources = 0
@@ -78,10 +80,8 @@ class Bank:
         one['covariance'][0, :3, :3] = prior.covariance
         for k, sigma in ((RATE, BANK.rate), (SCALE, BANK.scale)):
             one['covariance'][0, k, k] = sigma**2
-        for source in range(BANK.sources):
-            for k in (ERROR + 2 * source, ERROR + 2 * source + 1):
-                one['covariance'][0, k, k] = self.noise['slow'][0, source]
-        self._kept[0], self._first_node = one, prior.node
+        self._begin_at({0: one})
+        self._first_node = prior.node
 
     def insert(self, new: Records, odometry: Odometry) -> None:
         """Insert rows, but for their motions, into the order of stamps."""
@@ -96,12 +96,23 @@ class Bank:
         is_new = order >= len(self) - first
         self._rows.truncate(first)
         self._rows.append(later[order])
-        self.n_sources = max(self.n_sources, int(np.max(new['source'])) + 1)
+        self._add_sources(new)
         self._begin_from(first + int(np.argmax(is_new)))
         after_new = np.append(False, is_new[:-1])
         for row in (first + np.flatnonzero(is_new | after_new)).tolist():
             self._place(row, odometry)
         count(self._rows.values, first, BANK.period_ns)
+
+    def _add_sources(self, new: Records) -> None:
+        """Let all hypotheses know that nothing is known of the slow errors of new sources."""
+        before, self.n_sources = self.n_sources, max(
+            self.n_sources, int(np.max(new['source'])) + 1)
+        for source in range(before, self.n_sources):
+            own = new['slow'][new['source'] == source]
+            variance = float(self.noise['slow'][0, source]) * float(np.max(own, initial=0.0))
+            for hypotheses in (self._bank, *self._kept.values()):
+                for k in (ERROR + 2 * source, ERROR + 2 * source + 1):
+                    hypotheses['covariance'][:, k, k] = variance
 
     def _place(self, row: int, odometry: Odometry) -> None:
         rows = self._rows.values
@@ -205,9 +216,9 @@ class Bank:
 
     def _take(self, other: Self, begin: int, noise: Records) -> None:
         """Take over the rows of another bank, and what it says of those before one."""
-        self.noise, self._rows = noise, GrowingArray.of(other._rows.values)  # noqa: SLF001
-        tree, path = other._tree.values, other._path.values  # noqa: SLF001
-        self._begin_at({at: kept for at, kept in other._kept.items()  # noqa: SLF001
+        self.noise, self._rows = noise, GrowingArray.of(other._rows.values)
+        tree, path = other._tree.values, other._path.values
+        self._begin_at({at: kept for at, kept in other._kept.items()
                         if at <= begin}, begin)
         self._tree.append(tree[:begin])
         self._path.append(path[:begin])

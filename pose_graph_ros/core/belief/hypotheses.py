@@ -121,25 +121,6 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _begin_again(  # type: ignore[no-untyped-def]
-    bank, n, table, row, n_sources, noises, leaves,
-):
-    """Begin anew, as if nothing were known of where the robot is, after the best hypothesis."""
-    best = 0
-    for k in range(1, n):
-        if bank[k].weight > bank[best].weight:
-            best = k
-    weight = bank[best].weight if n > 0 else 0.0
-    n = _begin(bank, table, row, n_sources, noises)
-    for k in range(n):
-        bank[k].weight += weight
-        leaf = leaves[k]
-        leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
-        leaf.choice = GOOD if bank[k].in_fault[table[row].source] == 0 else BEGINS
-    return n
-
-
-@kernel
 def _prepare(one, row, noise, n_sources):  # type: ignore[no-untyped-def]
     """Move a hypothesis to a measurement."""
     n = ERROR + 2 * n_sources
@@ -153,6 +134,31 @@ def _prepare(one, row, noise, n_sources):  # type: ignore[no-untyped-def]
             fade(x, p, n, ERROR + 2 * r, 1.0, more + WANDER2 * seconds)
         else:
             fade(x, p, n, ERROR + 2 * r, part, more)
+
+
+@kernel
+def _begin_again(  # type: ignore[no-untyped-def]
+    bank, n, table, row_number, n_sources, noises, leaves,
+):
+    """Begin anew, as if nothing were known of where the robot is, after the best hypothesis."""
+    best, weight = 0, 0.0
+    for k in range(1, n):
+        if bank[k].weight > bank[best].weight:
+            best = k
+    if n > 0:
+        # where it is seen is as likely as a fault makes it, so that to be lost gains nothing
+        row = table[row_number]
+        one = bank[best]
+        _prepare(one, row, noises[0], n_sources)
+        ex, ey, xx, _, yy, _, _ = innovation(one.state, one.covariance, row, -1, 1.0, row.slow)
+        weight = one.weight + cauchy(ex * ex + ey * ey, FAULT_SIZE2 + 0.5 * (xx + yy))
+    n = _begin(bank, table, row_number, n_sources, noises)
+    for k in range(n):
+        bank[k].weight += weight
+        leaf = leaves[k]
+        leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
+        leaf.choice = GOOD if bank[k].in_fault[table[row_number].source] == 0 else BEGINS
+    return n
 
 
 @kernel
@@ -173,7 +179,7 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     any_heading = -LOG_2PI if row.heading_variance > 0.0 else 0.0
     begins = 1.0 - math.exp(-row.gap / BETWEEN_FAULTS)
     ends = 1.0 - math.exp(-row.gap / FAULT)
-    slips = 1.0 - math.exp(-row.lever[2] / BETWEEN_SLIPS)
+    slips = 1.0 - math.exp(-row.gap / BETWEEN_SLIPS)
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
     weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
     weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
@@ -251,8 +257,11 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
         for r in range(n_sources):
             i = ERROR + 2 * r
             if one.in_fault[r] != 0:
-                far2 = (x[i] - y[i])**2 + (x[i + 1] - y[i + 1])**2
-                equal = equal and far2 < EQUAL2 * (p[i, i] + p[i + 1, i + 1])
+                # of pose and offset, what is seen is their sum, which is known much better
+                dx, dy = x[0] + x[i] - y[0] - y[i], x[1] + x[i + 1] - y[1] - y[i + 1]
+                seen = (p[0, 0] + p[i, i] + 2.0 * p[0, i]
+                        + p[1, 1] + p[i + 1, i + 1] + 2.0 * p[1, i + 1])
+                equal = equal and dx * dx + dy * dy < EQUAL2 * seen
         if equal:
             return m
         n_alike += 1
@@ -305,7 +314,7 @@ def advance(  # type: ignore[no-untyped-def]
             _prepare(bank[k], row, noise, n_sources)
             _weigh(bank[k], row, noise, weights[k], branches[k])
         if row.decides == 0 or row.judged == 0:
-            _stay(bank, n, row, weights, branches, tree[at], noises, n_sources)
+            _stay(bank, n, row, weights, branches, tree[at])
             continue
         for k in range(n):
             _copy(before, k, bank, k, n_states)
@@ -328,18 +337,18 @@ def advance(  # type: ignore[no-untyped-def]
     return n
 
 
-@kernel(allocates=True)
-def _stay(  # type: ignore[no-untyped-def]
-    bank, n, row, weights, branches, leaves, noises, n_sources,
-):
-    """Let each hypothesis make the best choice by which nothing begins and nothing ends."""
+@kernel
+def _stay(bank, n, row, weights, branches, leaves):  # type: ignore[no-untyped-def]
+    """
+    Let a measurement be what the one before it of its source is, unless it alone is wrong.
+
+    Errors of measurements that follow one another so closely are mostly the same, so that it
+    tells the hypotheses nothing.
+    """
     for k in range(n):
-        one = bank[k]
-        choice = GOES_ON if one.in_fault[row.source] != 0 else GOOD
+        choice = GOES_ON if bank[k].in_fault[row.source] != 0 else GOOD
         if weights[k, ALONE] > weights[k, choice]:
             choice = ALONE
-        one.weight = weights[k, choice]
-        _follow(one, row, branches[k, choice], noises[0], n_sources)
         _note(leaves, k, branches[k, choice], k)
 
 

@@ -36,17 +36,16 @@ NO_SLOW = -math.inf  # exponent of a source without slow errors
 LN_2 = math.log(2.0)
 # Steps on the lattice, and bounds.
 COARSEST, FINEST, LEAST, MOST = 2.0, 0.25, -12.0, 16.0
-# What searches begin with: way and turn; slow variance, time constant [s] and white variance.
-ODOMETRY_BEGINS = (0.0, 0.0), (-4.0, -4.0), (0.0, 4.0), (4.0, 4.0)
-SLOW_BEGINS = tuple(
-    (slow, math.log2(tau), white) for slow in (-2.0, 0.0, 2.0) for tau in (10.0, 40.0)
-    for white in (-3.0, -1.0))
+# What searches begin with: way and turn; slow and white variance; time constants [s].
+ODOMETRY_BEGINS = (-4.0, -4.0), (0.0, 4.0), (4.0, 0.0), (4.0, 4.0)
+SLOW_BEGINS = (-2.0, -3.0), (0.0, -3.0), (2.0, -3.0), (-1.0, -1.0), (1.0, -1.0)
+SLOW_TAUS = 10.0, 60.0
 UNLEARNT_SLOW = (-1.0, math.log2(40.0), -1.0)
 MOST_ROUNDS = 2  # of learning from what is believed
-ROWS_IN_STEP = 5000  # measurements that are filtered in a step, of about a microsecond each
-BANK_ROWS_IN_STEP = 50  # the same of a bank, of about 0.1 ms each
+ROWS_IN_STEP = 8000  # measurements that are filtered in a step, of about a microsecond each
+BANK_ROWS_IN_STEP = 80  # the same of a bank, of about 0.1 ms each
 
-Search = Generator[None, None, 'Learnt']
+Search = Generator[None, None, 'Found']
 
 
 def axes_of(source: int) -> tuple[int, int, int]:
@@ -77,10 +76,37 @@ class Learnt(NamedTuple):
         rate, scale, _, _ = self.constants.tolist()
         return OdometryErrors(2.0**self.point[WAY], 2.0**self.point[TURN], rate, scale)
 
+    def is_far_from(self, known: OdometryErrors) -> bool:
+        """Tell whether errors of odometry differ by more than what is known of them."""
+        new, (*_, rate_variance, scale_variance) = self.odometry(), self.constants.tolist()
+        return (any(max(one, other) > 1.5 * min(one, other)
+                    for one, other in zip(known[:2], new[:2], strict=True))
+                or (new.rate - known.rate)**2 > rate_variance
+                or (new.scale - known.scale)**2 > scale_variance)
+
     def errors(self, source: int) -> CorrelatedErrors | None:
         """Return the slow and white errors of a source; None without slow ones."""
-        white, slow, tau = (2.0**self.point[axis] for axis in axes_of(source))
+        axes = axes_of(source)
+        if axes[-1] >= len(self.point):
+            return None
+        white, slow, tau = (2.0**self.point[axis] for axis in axes)
         return CorrelatedErrors(tau, slow, white) if slow > 0.0 else None
+
+
+class Found(NamedTuple):
+    best: Learnt
+    every: dict[Point, Learnt]
+
+    def is_better_than(self, point: Point | None, needed: float) -> bool:
+        """Tell whether it explains the measurements better than noise that was tried as well."""
+        other = None if point is None else self.every.get(
+            (*point, *self.best.point[len(point):]))
+        return other is None or self.best.evidence - other.evidence > needed
+
+
+def widened(point: Point, known: Known) -> Point:
+    """Return a point with what is known of sources that have come since."""
+    return (*point, *known.point[len(point):])
 
 
 def claimed(n_sources: int) -> Point:
@@ -99,19 +125,19 @@ def noise_at(point: Point) -> Records:
     return noise
 
 
-def log_prior(point: Point, known: Known, white_spread: float = BANK.white[1]) -> float:
+def log_prior(point: Point, known: Known, spread: float = BANK.spread) -> float:
     """Return the logarithm of the prior of what is to be found, with its Occam factor."""
     total = 0.0
 
-    def add(axis: int, median: float, spread: float) -> None:
+    def add(axis: int, median: float, sigma: float) -> None:
         nonlocal total
-        total -= 0.5 * ((LN_2 * point[axis] - math.log(median)) / spread)**2
+        total -= 0.5 * ((LN_2 * point[axis] - math.log(median)) / sigma)**2
     if known.odometry:
         add(WAY, *BANK.way)
         add(TURN, *BANK.turn)
     for source in known.sources:
         white, slow, tau = axes_of(source)
-        add(white, BANK.white[0], white_spread)
+        total -= 0.5 * (math.log(2.0**point[white] + 2.0**point[slow]) / spread)**2
         if point[slow] > NO_SLOW:
             add(slow, *BANK.slow)
             add(tau, *BANK.tau)
@@ -129,11 +155,14 @@ class Posterior:
 
     def __init__(
         self, rows: Records, slips: FloatArray, known: Known, *,
-        white_spread: float = BANK.white[1], finest: float = FINEST, constant: bool = True,
+        spread: float = BANK.spread, least_white: float = BANK.least_white,
+        finest: float = FINEST, constant: bool = True,
     ) -> None:
         """Take slips as `log_density` does, and whether odometry may have constant errors."""
-        self.rows, self._slips, self.known = np.ascontiguousarray(rows), slips, known
-        self._white_spread, self.finest = white_spread, finest
+        self._least = dict.fromkeys(
+            (axes_of(source)[0] for source in known.sources), math.log2(least_white))
+        self.rows, self.slips, self.known = np.ascontiguousarray(rows), slips, known
+        self._spread, self.finest = spread, finest
         self._begin = np.zeros(4)
         if constant:
             self._begin[2:] = BANK.rate**2, BANK.scale**2
@@ -145,8 +174,11 @@ class Posterior:
     def density(self, point: Point, heading: float) -> tuple[float, FloatArray]:
         constants = self._begin.copy()
         n_sources = (len(point) - 2) // 3
-        return float(log_density(self.rows, self._slips, n_sources, noise_at(point), heading,
+        return float(log_density(self.rows, self.slips, n_sources, noise_at(point), heading,
                                  constants)), constants
+
+    def clipped(self, axis: int, exponent: float) -> float:
+        return min(max(exponent, self._least.get(axis, LEAST)), MOST)
 
     def find_heading(self) -> Generator[None, None, None]:
         """Find the heading at the first position that makes all as claimed the most likely."""
@@ -161,7 +193,7 @@ class Posterior:
     def value(self, point: Point) -> Generator[None, None, float]:
         if point not in self._values:
             density, self.constants[point] = self.density(point, self.heading)
-            self._values[point] = -density - log_prior(point, self.known, self._white_spread)
+            self._values[point] = -density - log_prior(point, self.known, self._spread)
             yield from self._pause()
         return self._values[point]
 
@@ -184,7 +216,8 @@ def descend(
         before = best
         for axis in axes:
             for move in (step, -step):
-                point = moved(best.point, {axis: min(max(best.point[axis] + move, LEAST), MOST)})
+                point = moved(best.point, {
+                    axis: posterior.clipped(axis, best.point[axis] + move)})
                 value = yield from posterior.value(point)
                 if value < best.value:
                     best = Minimum(value, point)
@@ -200,32 +233,39 @@ def moved(point: Point, to: dict[int, float]) -> Point:
 
 
 def most_likely(posterior: Posterior) -> Generator[None, None, Minimum]:
-    """Return the best point; slow errors and other odometry only where much shows them."""
+    """Return the best point; with slow errors only where much shows them."""
     known = posterior.known
     yield from posterior.find_heading()
-    axes, white = known.free, known.free[2 if known.odometry else 0:]
-    begins = [known.point]
+    axes, best = known.free, Minimum(math.inf, known.point)
+    white = axes[2 if known.odometry else 0:]
+    begins = [moved(known.point, dict.fromkeys(white, at)) for at in (-3.0, 3.0)]
     if known.odometry:
-        begins = [moved(known.point, {WAY: way, TURN: turn}) for way, turn in ODOMETRY_BEGINS]
-    begins += [moved(known.point, dict.fromkeys(white, at)) for at in (-3.0, 3.0)]
-    best = yield from descend(posterior, begins, axes)
+        begins += [moved(known.point, {WAY: way, TURN: turn}) for way, turn in ODOMETRY_BEGINS]
+    for some in ([known.point], begins):
+        best = min(best, (yield from descend(posterior, some, axes)))
     for source in known.sources:
         own = axes_of(source)
         wider = (*axes, *own[1:])
         found = Minimum(math.inf, best.point)
-        for point in {best.point, known.point}:
-            found = min(found, (yield from descend(posterior, [
-                moved(point, {own[0]: part, own[1]: slow, own[2]: tau})
-                for slow, tau, part in SLOW_BEGINS], wider)))
+        for point in dict.fromkeys((best.point, known.point)):
+            for tau in SLOW_TAUS:
+                found = min(found, (yield from descend(posterior, [
+                    moved(point, {own[0]: part, own[1]: slow, own[2]: math.log2(tau)})
+                    for slow, part in SLOW_BEGINS], wider)))
         if found.value < best.value:
             best, axes = found, wider
-    if known.odometry:
-        as_given = yield from descend(
-            posterior, [moved(best.point, {WAY: known.point[WAY], TURN: known.point[TURN]})],
-            [axis for axis in axes if axis not in ODOMETRY])
-        if as_given.value - best.value < BANK.odometry_evidence:
-            return as_given
     return best
+
+
+def _without(posterior: Posterior, best: Minimum) -> Generator[None, None, Minimum]:
+    """Return the best point by which odometry is as it is given, without constant errors."""
+    known = posterior.known
+    without = Posterior(posterior.rows, posterior.slips, known, constant=False)
+    without.heading = posterior.heading
+    axes = [axis for source in known.sources for axis in axes_of(source)
+            if best.point[axis] > NO_SLOW]
+    return (yield from descend(without, [moved(
+        best.point, {WAY: known.point[WAY], TURN: known.point[TURN]})], axes))
 
 
 def search(
@@ -243,7 +283,12 @@ def search(
     def learn(slips: FloatArray) -> Generator[None, None, Point]:
         if slips.tobytes() not in learnt:
             posterior = Posterior(rows, slips, known)
-            learnt[slips.tobytes()] = (yield from most_likely(posterior)).point
+            best = yield from most_likely(posterior)
+            if known.odometry:
+                without = yield from _without(posterior, best)
+                if without.value - best.value < BANK.odometry_evidence:
+                    best = without
+            learnt[slips.tobytes()] = best.point
         return learnt[slips.tobytes()]
 
     unlearnt = moved(known.point, {
@@ -265,7 +310,7 @@ def search(
                 point, trial.evidence + log_prior(point, known),
                 (yield from _constants(rows, slips, known, point)))
             point = yield from learn(slips)
-    return max(found.values(), key=lambda each: each.evidence)
+    return Found(max(found.values(), key=lambda each: each.evidence), found)
 
 
 def _slips(rows: Records, decided: Decided) -> FloatArray:
@@ -278,12 +323,12 @@ def _slips(rows: Records, decided: Decided) -> FloatArray:
 def _constants(
     rows: Records, slips: FloatArray, known: Known, point: Point,
 ) -> Generator[None, None, FloatArray]:
-    """Return the constant errors of odometry, 0 unless there is evidence for them."""
-    without = Posterior(rows, slips, known, constant=False)
-    yield from without.find_heading()
-    with_them = Posterior(rows, slips, known)
-    with_them.heading = without.heading
-    none = yield from without.value(point)
-    some = yield from with_them.value(point)
-    shown = known.odometry and none - some > BANK.odometry_evidence
-    return with_them.constants[point] if shown else np.zeros(4)
+    """Return the constant errors of odometry, 0 unless it is not as it is given to be."""
+    posterior = Posterior(rows, slips, known)
+    if known.odometry:
+        yield from posterior.find_heading()
+        best = Minimum((yield from posterior.value(point)), point)
+        without = yield from _without(posterior, best)
+        if without.value - best.value > BANK.odometry_evidence:
+            return posterior.constants[point]
+    return np.zeros(4)

@@ -25,7 +25,7 @@ MEASURED = np.dtype([
     ('node', 'i8'),  # id of the hidden node before it
     ('judged', 'i8'),  # whether it may be in a fault; else others say how much it counts
     ('decides', 'i8'),  # whether it is the first of its source in its period
-    ('gap', 'f8'),  # time since the one of the same source before it [s]
+    ('gap', 'f8'),  # time since the one of its source before it that decides [s]
     ('offset', 'f8', (3,)),  # pose of what was measured in the node [m, m, rad]
     ('mean', 'f8', (3,)),  # what was measured; of a position, the heading is 0 [m, m, rad]
     # claimed covariance of the position in map axes: xx, xy, yy [m^2]
@@ -45,7 +45,10 @@ Records = npt.NDArray[Any]
 TABLE = types.Array(from_dtype(MEASURED), 1, 'C')
 
 
-def measured(given: Factors, stamps_ns: Sequence[int], ids: Sequence[int]) -> Records:
+def measured(
+    given: Factors, stamps_ns: Sequence[int], ids: Sequence[int],
+    least_position: float = BANK.least_position,
+) -> Records:
     """
     Return rows for factors in the map or to biases, but for sources and motions.
 
@@ -58,7 +61,8 @@ def measured(given: Factors, stamps_ns: Sequence[int], ids: Sequence[int]) -> Re
     rows['offset'][biased, 2] = 0.0
     has_heading = np.where(
         biased, information[:, 2, 2] > 0.0, given.kind != FactorKind.POSITION)
-    placed = information[:, 0, 0] > 0.0
+    placed = (information[:, 0, 0] > 0.0) & np.isin(
+        given.kind, (FactorKind.GLOBAL_POSE, FactorKind.POSITION, FactorKind.BIAS))
     for n, which in ((2, placed & ~has_heading), (3, placed & has_heading)):
         noise = _turned(np.linalg.inv(information[which, :n, :n]),
                         np.where(biased[which], 0.0, given.mean[which, 2]))
@@ -68,7 +72,7 @@ def measured(given: Factors, stamps_ns: Sequence[int], ids: Sequence[int]) -> Re
                 noise[:, 2, 2] + np.where(
                     biased[which], given.constants[which, 3] / STRETCH, 0.0)**2,
                 BANK.least_heading**2)
-    rows['noise'][:, [0, 2]] = np.maximum(rows['noise'][:, [0, 2]], BANK.least_position**2)
+    rows['noise'][:, [0, 2]] = np.maximum(rows['noise'][:, [0, 2]], least_position**2)
     rows['slow'] = np.where(biased, given.constants[:, 2]**2, 0.5 * (
         rows['noise'][:, 0] + rows['noise'][:, 2]))
     return np.asarray(rows[placed])
@@ -159,14 +163,13 @@ def join_motions(  # type: ignore[no-untyped-def]
 
 @kernel(signature=(TABLE, INTEGER, INTEGER))
 def count(table, first, period_ns):  # type: ignore[no-untyped-def]
-    """Write from a row on how long ago its source measured before, and which rows decide."""
+    """Write from a row on which rows decide, and how long ago their source decided before."""
     for row in range(first, len(table)):
         one, before = table[row], row - 1
-        while before >= 0 and table[before].source != one.source:
+        while before >= 0 and (table[before].source != one.source or table[before].decides == 0):
             before -= 1
+        since_ns = one.stamp_ns - table[max(before, 0)].stamp_ns
+        one.gap = since_ns * 1e-9
         one.decides = 1
-        one.gap = (one.stamp_ns - table[0].stamp_ns) * 1e-9
-        if before >= 0:
-            one.gap = (one.stamp_ns - table[before].stamp_ns) * 1e-9
-            if one.stamp_ns // period_ns == table[before].stamp_ns // period_ns:
-                one.decides = 0
+        if before >= 0 and one.stamp_ns // period_ns == table[before].stamp_ns // period_ns:
+            one.decides = 0

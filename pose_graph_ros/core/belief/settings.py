@@ -12,7 +12,7 @@ class BankSettings:
     # --- how often something goes wrong, and how far
     between_faults: float = 300.0  # mean time from one fault of a receiver to the next [s]
     fault: float = 30.0  # mean time that a fault lasts [s]
-    between_slips: float = 3600.0  # mean time between slips of odometry [s]
+    between_slips: float = 10000.0  # mean time between slips of odometry [s]
     outliers: float = 0.01  # share of measurements that are wrong by themselves
     # scale of the Cauchy density of what is wrong: hardly anything is known of its size [m]
     fault_size: float = 20.0
@@ -32,7 +32,7 @@ class BankSettings:
     far_fault: float = 1000.0  # or as after a cold start
     rate: float = 0.005  # sigma of the constant error of the yaw rate [rad/s]
     scale: float = 0.01  # sigma of that of the scale of the way
-    lost: float = 0.3  # variance of a turn by odometry after which the heading is not known [rad^2]
+    lost: float = 0.3  # variance of a turn after which the heading is not known [rad^2]
     # least sigmas of a measurement to decide by, as maps and mountings are not exact [m], [rad]
     least_position: float = 0.3
     least_heading: float = 0.05
@@ -46,15 +46,15 @@ class BankSettings:
     # knows how noisy turns are; what receivers claim of slow errors may be a small part of them
     way: tuple[float, float] = (1.0, 2.0)
     turn: tuple[float, float] = (1.0, 3.0)
-    white: tuple[float, float] = (1.0, 1.4)
+    spread: float = 0.5  # of the logarithm of all of what a source claims: that is known best
     slow: tuple[float, float] = (0.25, 2.0)
     tau: tuple[float, float] = (40.0, 1.0)  # of the time constant of slow errors [s]
     least_white: float = 0.1  # least white part of what a source claims, as a variance
     astray: int = 8  # successive measurements that are wrong after which a filter begins again
     # at which numbers of measurements noise is learnt: the first, the ratio of the next one, and
     # the most between
-    first_learnt: int = 20
-    next_learnt: float = 1.5
+    first_learnt: int = 30
+    next_learnt: float = 1.3
     most_between: int = 500
     most_learnt: int = 3000  # newest ones that it is learnt from while measurements come
 

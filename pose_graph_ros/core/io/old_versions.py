@@ -250,9 +250,7 @@ def _state(
     *, rows: list[list[int]], ties: list[int], bins: dict[str, Any] | None, **others: Any,
 ) -> dict[str, Any]:
     """Return the state of a source of measurements or closures."""
-    n, noise, odometry = len(rows), others.get('noise', ()), others.get('odometry', ())
-    variance = others.get('odometry_scale', 1.0)**2
-    past, bias = others.get('past'), None
+    n, noise, bias = len(rows), others.get('noise', ()), None
     if bins is not None:
         # each edge was that of the state behind it, as seen from the one with the prior
         at = bins['ties'].index(-1) if -1 in bins['ties'] else 0
@@ -263,11 +261,7 @@ def _state(
             'held_by': others.get('edges') or n * [-1],
             'noise': noise if len(noise) == n else n * [[0.0, 0.0]]},
         'edges': {'stamp_ns': len(ties) * [-1], 'id': ties}, 'bias': bias,
-        # an older version knew less of odometry
-        'past': past if past is not None and past.get('lever') else None,
-        'odometry': dict(zip(('way', 'turn', 'rate', 'scale'),
-                             odometry or (variance, variance, 0.0, 0.0), strict=True)),
-        **{name: others[name] for name in ('errors', 'n_otherwise', 'n_gone', 'next_estimate')
+        **{name: others[name] for name in ('errors', 'n_otherwise', 'n_gone')
            if name in others}}
 
 

@@ -31,7 +31,8 @@ class FixStates(Judgements):
     run = Column()
 
     def __init__(self) -> None:
-        super().__init__(Judged.FIX, run=LONE)  # id of the first one of its fault, `LONE` or `GOOD`
+        # id of the first one of its fault, `LONE` or `GOOD`
+        super().__init__(Judged.FIX, run=LONE)
 
     @property
     def believed(self) -> BoolArray:

@@ -7,25 +7,25 @@ Judge positions and poses in the map over time, and odometry where it has slippe
 that has slipped a lower one.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief.bank import as_claimed, Bank, Decided, is_believed, Odometry, Prior
+from pose_graph_ros.core.belief.bank import Bank, Decided, is_believed, Odometry, Prior
 from pose_graph_ros.core.belief.hypotheses import ALONE, BEGINS, GOES_ON, GOOD, SLIPPED
+from pose_graph_ros.core.belief.learning import axes_of, claimed, Known, TURN, WAY
 from pose_graph_ros.core.belief.rows import measured, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.config import BackendConfig, Robust
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.fix_states import FixStates, LONE
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.verdicts import (
     AUTO,
@@ -37,21 +37,20 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,
-    HeadingOnly,
-    LoopClosure,
+    GlobalPose,
+    PoseMeasurement,
+    Position,
     rejected,
 )
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, NewConstraint
 
 # Up to so many measurements it is asked whether those that are believed tell where the map is,
 # which at least so many are needed for. If they do not, nothing is doubted yet.
 FEW, LEAST = 100, 3
-# Errors of sources that have slow ones, as long as nothing is known of them.
-SLOW = CorrelatedErrors(40.0, 0.5, 0.25)
+# Rows of measurements that a bank with another noise is taken along in one step.
+ROWS_IN_STEP = 50
 
 
 class _Decided(NamedTuple):
@@ -74,13 +73,15 @@ class FixJudge:
         self.states = self._states = FixStates()
         self.chain = OdometryChain()
         self._bank = Bank()
+        self._next: Bank | None = None  # with noise learnt anew, on its way to the newest row
+        self._is_new = False  # whether all that the bank says is to be applied
+        self._sources: list[str] = []  # whose measurements the bank has, by number
         self._loosened: dict[int, float] = {}
         # where odometry has slipped, by the id of the measurement that shows it: between which
         # nodes, and the factor on the covariance of the odometry between that allows for it
         self._slips: dict[int, tuple[int, int, float]] = {}
         self._before: _Decided | None = None  # during an update, what was decided before it
         self._new_ids: IntArray = np.empty(0, dtype=np.int64)  # rows that came with the update
-        self._final: _Decided | None = None  # what `final_weights` has found
         self._now_ns = -1   # newest stamp of odometry
         self._is_restored = False  # whether the bank does not know the records yet
 
@@ -96,39 +97,78 @@ class FixJudge:
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
     ) -> GraphUpdate:
         """Return an update in which all rows have the weights that the new ones make right."""
-        judged = [one for one in new if one.kind not in (LoopClosure, HeadingOnly)
-                  and self._config.measurement_source(one.source, one.kind).robust
-                  is Robust.JUDGED]
-        if len(judged) == 0:
+        seen = [one for one in new if one.kind in (GlobalPose, Position)
+                and self._sees(one.source, one.kind)]
+        if len(seen) == 0:
             return change
         self._now_ns, before, graph = now_ns, self._begin(), self._smoother.graph
         self.chain.extend(graph)
         if self._is_restored:
             self._add_records()
-        ids = np.array([one.number for one in judged])
+        ids = np.array([one.number for one in seen])
         rows = measured(change.factors.rows(ids - graph.next_ids.factor),
-                        [one.stamp_ns for one in judged], ids.tolist())
+                        [one.stamp_ns for one in seen], ids.tolist())
         if len(rows) == 0:
             return change
-        by_id = {one.number: one for one in judged}
+        by_id = {one.number: one for one in seen}
         self._new_ids = rows['id'].copy()
-        for number in self._new_ids.tolist():
-            self._states.append(by_id[number], now_ns, BELIEVED, run=LONE)
+        for row in rows:
+            one = by_id[int(row['id'])]
+            row['source'] = self._number(one.source)
+            row['judged'] = self._is_judged(one.source, one.kind)
+            if row['judged']:
+                self.states.append(one, now_ns, BELIEVED, run=LONE)
         if len(self._bank) == 0 and not np.any(graph.fixed) and not graph.has_touched:
             self._begin_with_graph(int(rows['node'][np.argmin(rows['stamp_ns'])]))
         self._insert(rows)
-        decided = self._bank.decide(self._noise())
-        self._apply(self._bank, decided)
+        decided = self._bank.decide()
+        self._apply(self._bank.told(0) if self._is_new or len(self._bank) <= FEW else decided)
         self._note_distances(decided)
         return self._with_weights(change, before)
 
+    def _is_judged(self, source: str, kind: type[PoseMeasurement]) -> bool:
+        return self._config.measurement_source(source, kind).robust is Robust.JUDGED
+
+    def _sees(self, source: str, kind: type[PoseMeasurement]) -> bool:
+        """Tell whether the bank has the measurements of a source: to judge them, or to learn."""
+        settings = self._config.measurement_source(source, kind)
+        return settings.robust is Robust.JUDGED or settings.finds_correlation
+
+    def _number(self, source: str) -> int:
+        """Return the number of the errors of a source, which is told to the bank if it is new."""
+        if source not in self._sources:
+            self._sources.append(source)
+            number = self._sources.index(source)
+            if number < BANK.sources:
+                given = self._errors_in_use(source)
+                for bank in self._banks():
+                    bank.noise['white'][0, number], bank.noise['slow'][0, number] = (
+                        given[1:] if given is not None else (1.0, 0.0))
+                    bank.noise['tau'][0, number] = 1.0 if given is None else given[0]
+        return min(self._sources.index(source), BANK.sources - 1)
+
+    def _errors_in_use(self, source: str) -> tuple[float, float, float] | None:
+        """Return time constant, white and slow variance as the filters take them."""
+        found = self._factors.errors_in_use(source)
+        if found is None:
+            return None
+        if source in self._factors.sources and self._factors.sources[source].errors is not None:
+            return found.tau, found.white, found.correlated
+        return found.tau, 1.0, 1.0  # of a given time constant, both variances are in the rows
+
+    def _banks(self) -> list[Bank]:
+        return [self._bank] if self._next is None else [self._bank, self._next]
+
     def _insert(self, rows: Records) -> None:
-        numbers = np.searchsorted(self._states.added, rows['id'])
-        rows['source'] = np.minimum(self._states.source[numbers], BANK.sources - 1)
+        for bank in self._banks():
+            bank.insert(rows, self._odometry())
+
+    def _odometry(self) -> Odometry:
         chain = self.chain
-        stamps_ns = self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, chain.nodes)]
-        self._bank.insert(rows, Odometry(
-            chain.nodes, chain.poses, chain.sums, stamps_ns, self._nodes.errors))
+        return Odometry(
+            chain.nodes, chain.poses, chain.sums,
+            self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, chain.nodes)],
+            self._nodes.errors)
 
     def _begin_with_graph(self, node: int) -> None:
         graph = self._smoother.graph
@@ -136,47 +176,82 @@ class FixJudge:
             node, graph.poses_of(node), np.ascontiguousarray(self._smoother.covariance(node))))
 
     def _add_records(self) -> None:
-        """Let the bank know of records that were loaded."""
-        states, self._is_restored = self._states, False
-        rows = measured(self._smoother.graph.factors_at(states.added),
-                        states.stamps_ns[:, 0].tolist(), states.added.tolist())
+        """Let the bank know of measurements that were loaded."""
+        self._is_restored = False
+        for source in self._factors.sources:
+            rows = self._records(source)
+            if len(rows) > 0 and self._sees(source, GlobalPose):
+                rows['source'] = self._number(source)
+                rows['judged'] = self._is_judged(source, GlobalPose)
+                self._insert(rows)
+
+    def _records(self, source: str, least: float = BANK.least_position) -> Records:
+        some = self._factors.sources[source].measured.values
+        return measured(self._smoother.graph.factors_at(some['id']), some['stamp_ns'].tolist(),
+                        some['id'].tolist(), least)
+
+    def path(self, source: str, without: Collection[int]) -> Records:
+        """Return rows for the measurements in the graph of one source, but for some stamps."""
+        self.chain.extend(self._smoother.graph)
+        rows, bank = self._records(source, 0.0), Bank()
+        rows = rows[~np.isin(rows['stamp_ns'], np.array([*without], dtype=np.int64))]
         if len(rows) > 0:
-            self._insert(rows)
+            bank.insert(rows, self._odometry())
+        return bank.rows
 
-    def _noise(
-        self, errors: OdometryErrors | None = None, unknown_errors: CorrelatedErrors | None = None,
-    ) -> Records:
-        """
-        Return the noise of odometry and sources as it is known, or is assumed to be.
+    @property
+    def bank(self) -> Bank:
+        """The bank with the noise in use, which only this object may change."""
+        return self._bank
 
-        If errors of odometry are given, sources whose errors are to be found have unknown ones.
-        """
-        noise = as_claimed()
-        known = self._nodes.errors if errors is None else errors
-        noise['way'], noise['turn'] = known.way, known.turn
-        finding = self._factors.finding()
-        for number, source in enumerate(self._states.sources[:BANK.sources]):
-            found = self._factors.errors_in_use(source) if source in self._factors.sources else None
-            if found is not None and (errors is None or source not in finding):
-                is_given = self._factors.sources[source].errors is None
-                noise['tau'][0, number] = found.tau
-                noise['white'][0, number] = 1.0 if is_given else found.white
-                noise['slow'][0, number] = 1.0 if is_given else found.correlated
-            elif unknown_errors is not None and source in finding:
-                noise['tau'][0, number], noise['slow'][0, number], noise['white'][0, number] = (
-                    unknown_errors)
-        return noise
+    def prepare(self) -> None:
+        """Let the bank know of all measurements, also after a graph was loaded."""
+        if self._is_restored:
+            self.chain.extend(self._smoother.graph)
+            self._add_records()
 
-    def _apply(self, bank: Bank, decided: Decided) -> None:
+    def known(self) -> Known:
+        """Return which noise is given, and which is to be found."""
+        finding, n = self._factors.finding(), min(len(self._sources), BANK.sources)
+        point, scale = [*claimed(n)], self._config.odometry_scale
+        if scale > 0.0:
+            point[WAY] = point[TURN] = 2.0 * math.log2(scale)
+        for number, source in enumerate(self._sources[:n]):
+            given = None if source in finding else self._errors_in_use(source)
+            if given is not None:
+                tau, white, slow = given
+                for axis, value in zip(axes_of(number), (white, slow, tau), strict=True):
+                    point[axis] = math.log2(value)
+        return Known(tuple(point), scale == 0.0, tuple(
+            number for number, source in enumerate(self._sources[:n]) if source in finding))
+
+    def source(self, name: str) -> int | None:
+        """Return the number of the errors of a source; None if the bank has nothing of it."""
+        return min(self._sources.index(name), BANK.sources - 1) if name in self._sources else None
+
+    def adopt(self, noise: Records, newest: int | None = None) -> None:
+        """Judge the newest measurements, or all, anew with another noise, step by step."""
+        self._next = self._bank.again(noise, newest)
+
+    @property
+    def decides_anew(self) -> bool:
+        return self._next is not None
+
+    def step(self) -> bool:
+        """Do a part of that; return whether something is left."""
+        if self._next is not None and not self._next.advance(ROWS_IN_STEP):
+            self._next.decide()
+            self._bank, self._next, self._is_new = self._next, None, True
+        return self._next is not None
+
+    def _apply(self, decided: Decided) -> None:
         """Believe and doubt measurements, and odometry where it has slipped."""
-        if len(bank) <= FEW:
-            decided = bank.told(0)
+        bank = self._bank
         states, rows = self._states, bank.rows[decided.first:]
         if len(rows) == 0:
             return
-        at = np.searchsorted(states.added, rows['id'])
-        known = (at < len(states)) & (states.added[np.minimum(at, len(states) - 1)] == rows['id'])
-        numbers = at[known]
+        known = np.isin(rows['id'], states.added)
+        numbers = np.searchsorted(states.added, rows['id'][known])
         choice = decided.choice
         if decided.first == 0 and not _determines(rows[is_believed(choice)]):
             choice = np.full(len(rows), GOOD)
@@ -221,7 +296,7 @@ class FixJudge:
     def _note_distances(self, decided: Decided) -> None:
         """Note how far new measurements are from where they were expected."""
         rows = self._bank.rows['id'][decided.first:]
-        new = np.isin(rows, self._new_ids)
+        new = np.isin(rows, self._new_ids) & np.isin(rows, self._states.added)
         numbers = np.searchsorted(self._states.added, rows[new])
         self._states.distance[numbers] = np.sqrt(decided.d2[new])
 
@@ -234,7 +309,7 @@ class FixJudge:
         return change._replace(weigh={**change.weigh, **weights})
 
     def _begin(self) -> _Decided:
-        self._before, self._final = self._decided(), None
+        self._before = self._decided()
         self._new_ids = self._new_ids[:0]
         return self._before
 
@@ -257,12 +332,13 @@ class FixJudge:
             states.announce(number, int(before[number]), self._now_ns)
         for number in range(len(before), len(states)):
             states.announce(number, NEW, self._now_ns)
-        self._before = None
+        self._before, self._is_new = None, False
 
     def rollback(self) -> None:
         if self._before is not None:
             self._decide(self._before)
-            self._bank.remove(self._new_ids)
+            for bank in self._banks():
+                bank.remove(self._new_ids)
             self._before = None
 
     def state(self) -> Callable[[], None]:
@@ -275,53 +351,20 @@ class FixJudge:
         return bring_back
 
     def finish(self) -> None:
-        """Judge all again, unless `final_weights` has just decided it."""
-        final = self._final
-        if not self._can_judge_all():
+        """Give all measurements the weights that the bank says."""
+        self.prepare()
+        if len(self._bank) == 0 or self._smoother.graph.has_touched:
             return
-        before = self._begin()
-        if final is None:
-            self._judge_all()
-        else:
-            self._decide(final)
+        while self.step():
+            pass
+        before, self._slips = self._begin(), {}
+        self._bank.decide()
+        self._apply(self._bank.told(0))
         change = self._with_weights(GraphUpdate(), before)
         if len(change.weigh) > 0 and self._smoother.update(change).reason != '':
             self.rollback()
         else:
             self.commit()
-
-    def final_weights(self) -> FloatArray:
-        """Return the weights that `finish` would give, by row."""
-        graph, states = self._smoother.graph, self._states
-        weights = graph.weights
-        if not self._can_judge_all():
-            return weights
-        self._begin()
-        self._judge_all()
-        weights[graph.factor_rows(states.held)] = states.believed
-        final = self._decided()
-        self.rollback()
-        self._final = final
-        return weights
-
-    def _can_judge_all(self) -> bool:
-        return 0 < len(self._states) <= BELIEF.most_again and not self._smoother.graph.has_touched
-
-    def _judge_all(self) -> None:
-        """Judge all again, with white or slow errors of the sources, whichever is likelier."""
-        self.chain.extend(self._smoother.graph)
-        if self._is_restored:
-            self._add_records()
-        best, most = None, -math.inf
-        for errors in (None, SLOW):
-            bank = self._bank.again()
-            decided = bank.decide(self._noise(AS_CLAIMED, errors))
-            evidence = bank.evidence - (0.0 if errors is None else BANK.occam)
-            if evidence > most:
-                best, most = (bank, decided), evidence
-        assert best is not None
-        self._slips = {}
-        self._apply(*best)
 
     def decide_leaving(self, factors: IntArray) -> list[Verdict]:
         """Return the verdicts on what leaves unused."""
@@ -333,9 +376,9 @@ class FixJudge:
         leaving = self._states.leaving(factors)
         if np.any(leaving):
             self._states.select(np.flatnonzero(~leaving))
-            self._bank.forget(self._states.added)
+        for bank in self._banks():
+            bank.forget(self._smoother.graph.factor_ids, BANK.most_learnt)
         self.chain.forget(nodes)
-        self._final = None
         gone = {*factors.tolist()}
         if not gone.isdisjoint(self._loosened):
             self._loosened = {edge: weight for edge, weight in self._loosened.items()

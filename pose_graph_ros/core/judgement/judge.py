@@ -61,7 +61,7 @@ class Judge:
     ) -> None:
         self._smoother, self._reweighting, self._config = smoother, reweighting, config
         self._nodes = nodes
-        self._fixes = FixJudge(smoother, reweighting, config, nodes, factors)
+        self.fixes = FixJudge(smoother, reweighting, config, nodes, factors)
         self._odometry = OdometryStates(nodes)
         self._closures = ClosureJudge(smoother, reweighting)
         # the judged closures of the last `before`, by their numbers among its factors
@@ -72,14 +72,14 @@ class Judge:
 
     def configure(self, config: BackendConfig) -> None:
         self._config = config
-        self._fixes.configure(config)
+        self.fixes.configure(config)
 
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
     ) -> GraphUpdate:
         """Return an update in which the new rows have the weights that they begin with."""
         self._new = new
-        change = self._fixes.before(new, change, now_ns)
+        change = self.fixes.before(new, change, now_ns)
         first = self._smoother.graph.next_ids.factor
         closures = [one for one in new if self._is_judged_closure(one, change, first)]
         if len(closures) == 0:
@@ -162,16 +162,16 @@ class Judge:
 
     def commit(self) -> None:
         self._closures.commit()
-        self._fixes.commit()
+        self.fixes.commit()
         self._keep_gaps()
 
     def _keep_gaps(self) -> None:
         self._odometry.keep_gaps(
-            self._fixes.loosened, self._smoother.graph, self._nodes.newest_ns)
+            self.fixes.loosened, self._smoother.graph, self._nodes.newest_ns)
 
     def rollback(self) -> None:
         self._closures.rollback()
-        self._fixes.rollback()
+        self.fixes.rollback()
 
     def after(self) -> None:
         self._closures.after()
@@ -184,7 +184,7 @@ class Judge:
 
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
         """Return the verdicts that are listed, see `Judgements`, and on what left unused."""
-        graph, closures, fixes = self._smoother.graph, self._closures, self._fixes.states
+        graph, closures, fixes = self._smoother.graph, self._closures, self.fixes.states
         return [*closures.reports.of(graph, closures.states.listed(most_believed).tolist()),
                 *self._odometry.verdicts(graph, fixes.believed_after),
                 *fixes.verdicts(graph, fixes.listed(most_believed)), *self._left]
@@ -198,21 +198,21 @@ class Judge:
         weak, waiting, doubted = self._closures.states.drawn_ids()
         doubted = np.append(doubted, self._odometry.doubted_edges).astype(np.int64)
         return DrawnRows(*(each.tolist() for each in (
-            weak, waiting, doubted, self._fixes.states.unused)))
+            weak, waiting, doubted, self.fixes.states.unused)))
 
     def changes(self) -> list[Change]:
         return [*self._closures.states.take_changes(), *self._odometry.take_changes(),
-                *self._fixes.states.take_changes()]
+                *self.fixes.states.take_changes()]
 
     def totals(self) -> Mapping[str, SourceVerdicts]:
         return {**self._odometry.totals(), **self._closures.totals(),
-                **self._fixes.states.totals()}
+                **self.fixes.states.totals()}
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """Return the answer to a person's decision on a constraint, which is applied at once."""
-        fixes = self._fixes.states
+        fixes = self.fixes.states
         is_fix = fixes.find(name) >= 0 or fixes.has_left(name)
-        judge = self._fixes if is_fix else self._closures
+        judge = self.fixes if is_fix else self._closures
         return judge.decide(name, decision)
 
     def decide_leaving(self, factors: IntArray) -> list[Verdict]:
@@ -221,38 +221,38 @@ class Judge:
         """
         graph = self._smoother.graph
         closures = self._closures.decide_leaving(factors)
-        fixes = self._fixes.decide_leaving(factors)
+        fixes = self.fixes.decide_leaving(factors)
         unused = [*closures, *fixes,
                   *self._odometry.decide_leaving(
-                      graph, factors, self._fixes.states.believed_after)]
+                      graph, factors, self.fixes.states.believed_after)]
         return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
     def forget(
         self, nodes: IntArray, factors: IntArray, leaving: Sequence[Verdict],
     ) -> None:
         self._closures.forget(nodes, factors)
-        self._fixes.forget(nodes, factors)
-        self._odometry.forget(self._smoother.graph, factors, self._fixes.loosened)
+        self.fixes.forget(nodes, factors)
+        self._odometry.forget(self._smoother.graph, factors, self.fixes.loosened)
         self._left.extend(leaving)
 
     def saved(self) -> SavedJudgement:
-        loosened = self._fixes.loosened
+        loosened = self.fixes.loosened
         return SavedJudgement(
-            self._closures.saved(), self._fixes.states.saved(),
+            self._closures.saved(), self.fixes.states.saved(),
             np.array([*loosened], dtype=np.int64), np.array([*loosened.values()]),
             dict(self._odometry.left))
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
         self._closures.restore(saved.closures, now_ns)
-        self._fixes.restore(saved.fixes, dict(zip(
+        self.fixes.restore(saved.fixes, dict(zip(
             saved.loosened.tolist(), saved.weights.tolist(), strict=True)), now_ns)
         self._odometry.left.update(saved.odometry_left)
-        self._odometry.keep_gaps(self._fixes.loosened, self._smoother.graph, now_ns)
+        self._odometry.keep_gaps(self.fixes.loosened, self._smoother.graph, now_ns)
         self._odometry.take_changes()   # which were told before
 
     def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
         """Follow the edges of odometry, which know of other errors of it now."""
-        for chain in (self._fixes.chain, self._closures.chain):
+        for chain in (self.fixes.chain, self._closures.chain):
             chain.correct(
                 before, after, self._nodes.stamps_ns[
                     np.searchsorted(self._nodes.ids, chain.nodes)],
@@ -260,11 +260,7 @@ class Judge:
 
     def moved(self, before: IntArray, after: IntArray) -> None:
         """Follow measurements that other factors hold now, with the same weights; by ids."""
-        self._fixes.states.moved(before, after)
-
-    def final_weights(self) -> FloatArray:
-        """Return the weights of factors, by row, that the end would give."""
-        return self._fixes.final_weights()
+        self.fixes.states.moved(before, after)
 
     def finish(self, undo: ExitStack[bool]) -> None:
         """
@@ -277,12 +273,12 @@ class Judge:
         undo.callback(graph.set_poses, graph.poses.copy())
         undo.callback(graph.set_weights, graph.weights)
         undo.callback(self._reweighting.set_base_weights, self._reweighting.base_weights())
-        for judge in (self._closures, self._fixes, self._odometry):
+        for judge in (self._closures, self.fixes, self._odometry):
             undo.callback(judge.state())
         # each part believes one more, or leaves fewer to be tested
         while self._closures.test():
             pass
-        self._fixes.finish()
+        self.fixes.finish()
         self._keep_gaps()
         self._closures.decide_finally()
 

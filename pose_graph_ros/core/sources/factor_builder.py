@@ -29,7 +29,6 @@ from pose_graph_ros.core.sources.bias import (
     next_node,
     Process,
 )
-from pose_graph_ros.core.sources.error_likelihood import PastPath
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -60,10 +59,6 @@ class SourceState:
     errors: CorrelatedErrors | None = None  # found ones in use; None for white or given ones
     n_otherwise: int = 0  # constraints of a loaded graph that were added under other settings
     n_gone: int = 0  # number of measurements that have left the graph
-    past: PastPath | None = None  # their positions, where the errors are estimated
-    # number of measurements at which the errors are estimated next
-    next_estimate: int = SOURCES.least_positions
-    odometry: OdometryErrors = AS_CLAIMED  # errors of odometry that the measurements show
 
     def __len__(self) -> int:
         return len(self.measured)
@@ -314,13 +309,7 @@ class FactorBuilder:
     def finding(self) -> list[str]:
         """Return the sources whose errors are estimated and that have measurements."""
         return [source for source, state in self.sources.items()
-                if state.n_ever >= SOURCES.least_positions
-                and self._settings(source).finds_correlation]
-
-    def due_for_estimate(self) -> list[str]:
-        """Return those of `finding` with enough new measurements for another estimate."""
-        return [source for source in self.finding()
-                if self.sources[source].n_ever >= self.sources[source].next_estimate]
+                if state.n_ever > 0 and self._settings(source).finds_correlation]
 
     def edges(self) -> dict[str, IntArray]:
         """Return the ids of the edges between poses, by source, without primary odometry."""

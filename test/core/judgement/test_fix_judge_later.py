@@ -170,22 +170,22 @@ class Flaky(IncrementalSmoother):
 
 
 def everything(backend: PoseGraphBackend) -> list[object]:
-    judge = backend._judge._fixes
+    judge = backend._judge.fixes
     return [judge.states.records.tobytes(), judge._loosened,
             [base.tolist() for base in backend._reweighting.base_weights()],
             judge._bank.rows['id'].tolist(), judge._slips]
 
 
 def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
-    # the first 15 fixes are off by the same vector: 10 s later they are thrown out
-    events, _ = drive(3, n=60, wrong=0.1)
+    # the first 15 fixes are off by the same vector: half a minute later they are thrown out
+    events, _ = drive(3, n=90, wrong=0.1)
     events = [replace(event, position=event.position + np.array((40.0, 0.0)))
               if isinstance(event, Position) and event.stamp_ns <= 15 * SECOND else event
               for event in events]
     config = BackendConfig(measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
     smoother = Flaky(config.smoother)
     backend, n_turned = PoseGraphBackend(config, smoother=smoother), 0
-    judge = backend._judge._fixes
+    judge = backend._judge.fixes
     for k, event in enumerate(events):
         feed(backend, [event])
         if k % 2 == 0:
