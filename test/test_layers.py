@@ -38,8 +38,8 @@ CORE = {
     'core.belief': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
     'core.judgement': {
-        'core.belief', 'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch',
-        'core.smoother', 'core.odometry', 'core.sources'},
+        'core.belief', 'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
+        'core.batch', 'core.smoother', 'core.odometry', 'core.sources'},
     'core.window': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
         'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
@@ -53,7 +53,8 @@ OFFLINE = {
         'core.geometry', 'core.graph', 'core.odometry', 'core.smoother', 'core.sources',
         'core.disagreement', 'core.parts'},
     'offline.simulation': {'core.geometry', 'core.graph'},
-    'offline.noise': {'core.batch', 'core.geometry', 'core.sources', 'core.parts'},
+    'offline.noise': {
+        'core.batch', 'core.belief', 'core.geometry', 'core.sources', 'core.parts'},
 }
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.backend', 'core.disagreement', 'core.error_tuner', 'core.estimate',

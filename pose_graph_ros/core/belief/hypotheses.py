@@ -82,7 +82,7 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
     r = seen.source
     in_fault = FAULT / (FAULT + BETWEEN_FAULTS)
     n = 0
-    for fault in range(3):
+    for fault in range(3 if seen.judged != 0 else 1):
         # in a fault the heading of a pose is wrong as well
         n_headings = 1 if fault == 0 and seen.heading_variance > 0.0 else HEADINGS
         for k in range(n_headings):
@@ -193,6 +193,8 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
                         + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
         weights[SLIPPED] -= UNMOVED
+    if row.judged == 0:
+        weights[BEGINS] = weights[SLIPPED] = LEAST
     for choice in range(N_CHOICES):
         weights[choice] += one.weight
         if not weights[choice] > LEAST:
@@ -313,7 +315,7 @@ def advance(  # type: ignore[no-untyped-def]
         for k in range(n):
             _prepare(bank[k], row, noise, n_sources)
             _weigh(bank[k], row, noise, weights[k], branches[k])
-        if row.decides == 0 or row.judged == 0:
+        if row.decides == 0:
             _stay(bank, n, row, weights, branches, tree[at])
             continue
         for k in range(n):

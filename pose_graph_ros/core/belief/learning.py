@@ -323,12 +323,11 @@ def _slips(rows: Records, decided: Decided) -> FloatArray:
 def _constants(
     rows: Records, slips: FloatArray, known: Known, point: Point,
 ) -> Generator[None, None, FloatArray]:
-    """Return the constant errors of odometry, 0 unless it is not as it is given to be."""
+    """Return the constant errors of odometry, 0 unless much shows them."""
     posterior = Posterior(rows, slips, known)
-    if known.odometry:
-        yield from posterior.find_heading()
-        best = Minimum((yield from posterior.value(point)), point)
-        without = yield from _without(posterior, best)
-        if without.value - best.value > BANK.odometry_evidence:
-            return posterior.constants[point]
-    return np.zeros(4)
+    without = Posterior(rows, slips, known, constant=False)
+    yield from posterior.find_heading()
+    without.heading = posterior.heading
+    none, some = (yield from without.value(point)), (yield from posterior.value(point))
+    is_shown = known.odometry and none - some > BANK.odometry_evidence
+    return posterior.constants[point] if is_shown else np.zeros(4)

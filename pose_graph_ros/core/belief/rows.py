@@ -23,7 +23,7 @@ MEASURED = np.dtype([
     ('id', 'i8'),  # of its factor
     ('source', 'i8'),  # place of its error among those of all sources
     ('node', 'i8'),  # id of the hidden node before it
-    ('judged', 'i8'),  # whether it may be in a fault; else others say how much it counts
+    ('judged', 'i8'),  # whether its source may be in a fault; others only tell of noise
     ('decides', 'i8'),  # whether it is the first of its source in its period
     ('gap', 'f8'),  # time since the one of its source before it that decides [s]
     ('offset', 'f8', (3,)),  # pose of what was measured in the node [m, m, rad]

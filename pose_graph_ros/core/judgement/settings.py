@@ -90,56 +90,11 @@ class BeliefSettings:
     scale_ratio: float = 1.2
 
     # --- measurements in the map
-    stated: float = 2.0  # factor on covariances that are stated, which are often too small
-    # the same on the sigmas of odometry: what sources show of them depends on what is believed
-    odometry_scale: float = 2.0
-    # change of the logarithm of a source's factor by one measurement: it remembers about a
-    # hundred, so that a fault of a minute hardly changes it
-    noise_step: float = 0.03
-    most_noise: float = 4.0  # largest factor of a source
-    more_of_pose: float = 2.5  # squared distance of a pose, beyond a position's: as few in doubt
-    wide_prediction: float = 9.0  # a prediction with so many times the variance begins a new run
-    begin_heading: float = 0.2  # sigma of the heading at the begin of a run [rad]
-    nowhere: float = 1e6  # variance of a position that is not known [m^2]
-    known_before: float = 100.0  # what was in the graph before is a run that lasted so long [s]
-    most_runs: int = 24  # that are remembered
-    short_lived_ns: int = 30_000_000_000  # runs of few members are forgotten then [ns]
-    hopeless_run: float = 50.0  # excess of a believed run's price over that of a hopeless one
     newest: int = 3  # measurements of a source that tell whether it is doubted
     records_near: int = 100  # measurements around one among which one alike is looked for
-    most_again: int = 100_000  # measurements that are all judged again at the end
 
-    # --- prices of what may be wrong, in units of chi2
-    # one run of wrong measurements or one fault of odometry, and the squared distance from which
-    # on a measurement is in doubt: chi2 with 2 degrees of freedom, 99.9 %
+    # squared distance from which on a measurement contradicts others: 99.9 % of chi2
     event: float = 13.8
-    wrong_rate: float = 0.25  # a second of wrong measurements [1/s]
-    longest_wrong: float = 10.0  # time that one of them counts [s]
-    fault: float = 20.0  # how far a receiver in a fault is off, about [m]
-    slip: float = 1.0  # how far a slip of odometry goes [m]
-    slip_heading: float = 0.3  # heading that it leaves unknown [rad]
-    slips_rarer: float = 30.0  # slips come in hours, faults of receivers in minutes
-    # wheels that spin make the way too long: that the robot moved without them is less likely by
-    # so much, once it would be by so far [m]
-    unmoved: float = 14.0
-    unmoved_way: float = 5.0
-    cut_above: float = 6.0  # price above which the run before may have ended with wrong members
-    turn_allowed: float = 9.0  # that the direction of a run is off for nothing [sigma^2]
-    most_of_turn: float = 40.0  # highest price of it
-    turn_after: float = 30.0  # a run must last so long for that, as errors drift as well [s]
     much_less: float = 0.25  # weight of odometry below which it is told as doubted
-
-    # --- runs of measurements
-    least_members: int = 3  # of a run that can show a fault of odometry
-    # members that may tell the heading anew, and their squared deviation, each, from odometry
-    fitted_members: int = 10
-    fitted_d2: float = 2.5
-    fitted_heading: float = 0.4  # largest sigma of a heading that is told so [rad]
-    begin_members: int = 40  # the pose at the begin of a run is estimated from so many, over
-    begin_way: float = 50.0  # such a way [m]
-    noted_every_ns: int = 3_000_000_000  # time between the states that a run notes [ns]
-    noted_ratio: float = 1.4  # ratio of the ages of one's neighbours, below which it is dropped
-    noted: int = 20  # states that are kept, which reach back about 7 minutes
-
 
 BELIEF = BeliefSettings()

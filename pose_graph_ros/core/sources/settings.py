@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers by which measurements are kept, and the errors of their sources estimated."""
+"""The numbers by which measurements are kept, and how well they fit is reported."""
 
 from dataclasses import dataclass
 
@@ -36,47 +36,5 @@ class SourceSettings:
     # correlation of consecutive residuals: in standard deviations of white noise, and the least
     significant_lag: float = 4.0
     least_correlation: float = 0.3
-
-    # --- search of the statistics of the errors of a source, and of odometry
-    newest_positions: int = 2000  # that are used, and
-    older_positions: int = 2000  # as many of all before them
-    least_positions: int = 10
-    kept_positions: int = 1000  # that have left the graph, when some are dropped
-    per_step: int = 5000  # positions that are filtered in one step, of 0.3 us each
-    nodes_per_step: int = 10_000  # nodes that are joined in one, of 0.1 us each
-    # How much more likely something must be, in twice the difference of the logarithms: correlated
-    # errors, which must only be more likely once they are believed, so that it does not flip to
-    # and fro; and these for each time that the filter was lost, as odometry was wrong then.
-    significant: float = 20.0
-    per_lost: float = 100.0
-    # The errors of odometry. The constant ones are states with a prior, which by itself keeps them
-    # from being believed where little shows them. Beside correlated errors, which may be taken for
-    # them, it is `significant`.
-    significant_odometry: float = 6.0
-    # one factor on its noise; and how much less likely larger ones may be
-    significant_scale: float = 4.0
-    # longest time constant, in times from the first to the last measurement: a shorter bound would
-    # make the variance of an error that hardly changes in this time too small
-    longest_time: float = 16.0
-    least_shared: float = 0.2  # least correlation of consecutive measurements that matters
-    # sigmas of logarithms before they are seen: of the total variance in units of the claimed one;
-    # of white errors that are smaller, as the rest of the claim is mostly an error that changes
-    # slowly; of the noise of way and of turn, as settings of turns are hardly ever known
-    spread: float = 0.7
-    smaller_spread: float = 0.5
-    way_spread: float = 2.0
-    turn_spread: float = 3.0
-    # exponents of 2 on the lattice: smallest step, and bounds of the variances
-    finest: float = 0.25
-    least_exponent: float = -10.0
-    most_exponent: float = 8.0
-    # Those that searches begin with: correlated and white part; way and turn, also less than white
-    # errors need; way and turn beside white errors.
-    beginnings: tuple[tuple[float, float], ...] = (
-        (0.0, -5.0), (0.0, -3.0), (-0.5, -2.0), (-1.0, -1.0))
-    odometry_beginnings: tuple[tuple[float, float], ...] = ((0.0, 0.0), (-4.0, -4.0))
-    white_beginnings: tuple[float, ...] = (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0)
-    headings: int = 16  # at which the filter starts; the best one is used
-
 
 SOURCES = SourceSettings()

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from pose_graph_ros.core.belief.bank import as_claimed, Bank, is_believed, Odometry
-from pose_graph_ros.core.belief.filter import N_STATES, RATE, SCALE
+from pose_graph_ros.core.belief.filter import RATE, SCALE
 from pose_graph_ros.core.belief.hypotheses import ALONE, SLIPPED
 from pose_graph_ros.core.belief.rows import MEASURED
 from pose_graph_ros.core.belief.settings import BANK
@@ -112,8 +112,9 @@ def plain(bank: Bank, noise: npt.NDArray[np.void], heading: float) -> tuple[floa
         motion[:2] += x[SCALE] * row['motion'][:2]
         c, s = np.cos(x[2]), np.sin(x[2])
         part = np.exp(-row['lever'][2] / tau)
-        return np.array((x[0] + c * motion[0] - s * motion[1], x[1] + s * motion[0] + c * motion[1],
-                         x[2] + motion[2], x[3], x[4], part * x[5], part * x[6]))
+        return np.array((
+            x[0] + c * motion[0] - s * motion[1], x[1] + s * motion[0] + c * motion[1],
+            x[2] + motion[2], x[3], x[4], part * x[5], part * x[6]))
 
     for row in rows[1:]:
         jacobian = np.column_stack([
@@ -241,4 +242,3 @@ def test_the_oldest_rows_can_be_forgotten() -> None:
             pass
         again.decide()
         assert again.told(0).choice.tolist() == bank.told(0).choice.tolist()
-    assert N_STATES == 5 + 2 * BANK.sources

@@ -47,7 +47,7 @@ def errors(
 
 
 def a_drive(
-    seed: int, *, n: int = 200, period: float = 1.0, tau: float = 0.0, white: float = 0.1,
+    seed: int, *, n: int = 200, period: float = 1.0, tau: float = 0.0, white: float = 0.05,
     sigma: float = 1.0, drift: float = 1.0, wrong: float = 0.0, turns: float = 1.0,
     speed: float = 1.0, longer: float = 0.0, rate: float = 0.0,
 ) -> Bank:
@@ -78,7 +78,7 @@ def a_drive(
     adjoint = se2.adjoint(seen[1:])
     sums = np.cumsum(adjoint @ cov @ np.swapaxes(adjoint, 1, 2), axis=0)
     bank = Bank()
-    bank.insert(rows, Odometry(np.arange(n), seen, np.vstack((np.zeros(6), upper(sums))),
+    bank.insert(rows, Odometry(np.arange(n), seen, np.vstack((np.zeros(6), upper(sums))).copy(),
                                stamps_ns, AS_CLAIMED))
     return bank
 
@@ -97,7 +97,7 @@ def test_the_density_is_that_of_the_full_covariance(*, constant: bool) -> None:
     n, tau, slow, odometry, white = 12, 7.0, 0.8, 1.5, 0.3
     rng = np.random.default_rng(0)
     seconds = np.cumsum(rng.uniform(0.5, 2.0, n))
-    variance = rng.uniform(0.5, 2.0, n)
+    variance = np.full(n, 1.3)
     rows = np.zeros(n, MEASURED)
     rows['mean'][:, 0] = np.arange(n)
     rows['mean'][:, :2] += 0.3 * rng.standard_normal((n, 2))
@@ -127,7 +127,7 @@ def test_the_density_is_that_of_the_full_covariance(*, constant: bool) -> None:
 
 
 @pytest.mark.parametrize(('tau', 'period', 'n'), [
-    (10.0, 5.0, 120), (60.0, 1.0, 400), (60.0, 5.0, 120), (300.0, 1.0, 900)])
+    (10.0, 2.0, 300), (60.0, 1.0, 400), (60.0, 5.0, 120), (300.0, 1.0, 900)])
 def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n: int) -> None:
     every = [errors_in(a_drive(seed, n=n, period=period, tau=tau)) for seed in range(3)]
     known = [each for each in every if each is not None]

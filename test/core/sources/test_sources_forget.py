@@ -2,24 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What sources keep of measurements that have left the graph."""
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 from test_gauss_markov import SECOND, TAU
 
-from pose_graph_ros.core.batch.optimizer import to_the_end
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED
+from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.graph import NextIds
 from pose_graph_ros.core.sources.bias import (
     Additions,
     BiasChain,
     CorrelatedErrors,
     Process,
 )
-from pose_graph_ros.core.sources.error_estimate import left_behind, measured_path, PathOdometry
-from pose_graph_ros.core.sources.error_likelihood import no_past
-from pose_graph_ros.core.sources.settings import SOURCES
 
 PROCESS = Process.correlated(CorrelatedErrors(TAU, 1.0, 0.05))
 
@@ -97,72 +91,3 @@ def test_a_bias_of_which_old_states_have_left_stays_the_same_process(
         assert chain.bias.nodes.tolist() == sorted(chain.bins, key=chain.bins.__getitem__)
     assert chain.bias.nodes[-1] not in chain.bias.leaving(None)
 
-
-def drive(seed: int, n: int) -> tuple[Graph, np.ndarray, np.ndarray]:
-    """Return a drive with positions at some nodes, their stamps and their ids."""
-    rng, graph = np.random.default_rng(seed), Graph()
-    root = rng.normal(size=(n - 1, 3, 3)) * (0.05, 0.03, 0.02)
-    noise = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
-    nodes = np.flatnonzero(rng.random(n) < 0.6)
-    graph.apply(GraphUpdate(hidden=np.zeros((n, 3)), factors=Factors.joined([
-        Factors(np.arange(n - 1), np.arange(1, n), rng.normal(size=(n - 1, 3)),
-                np.linalg.inv(noise), np.full(n - 1, FactorKind.ODOMETRY)),
-        Factors.on(
-            nodes, rng.normal(size=(len(nodes), 3)) * (1.0, 1.0, 0.0),
-            rng.normal(size=(len(nodes), 3)) * (9.0, 9.0, 0.0),
-            np.tile(np.diag((1.0, 1.0, 0.0)), (len(nodes), 1, 1)),
-            np.full(len(nodes), FactorKind.POSITION))])))
-    return graph, nodes * SECOND, n - 1 + np.arange(len(nodes))
-
-
-ODOMETRY = PathOdometry(np.arange(100), SECOND * np.arange(100), AS_CLAIMED, AS_CLAIMED)
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 2**32 - 1))
-def test_the_measured_path_goes_on_before_the_window(seed: int) -> None:
-    n = 30
-    graph, stamps_ns, ids = drive(seed, n)
-    whole, past = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids)), None
-    for first in (0, 4, 5, 17):
-        begin = int(graph.node_ids[0])
-        gone = np.flatnonzero((stamps_ns >= begin * SECOND) & (stamps_ns < first * SECOND))
-        past = left_behind(
-            graph, ODOMETRY, stamps_ns[gone], ids[gone], past=past, node=first)
-        graph.begin()
-        graph.apply(GraphUpdate(remove_nodes=tuple(range(begin, first))))
-        graph.commit()
-        again = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids, past))
-        for each in (whole, again):
-            each.motion[:, 2] = se2.wrap(each.motion[:, 2])
-        for one, other in zip(whole, again, strict=True):
-            np.testing.assert_allclose(one[1:], other[1:], atol=1e-9)
-    assert past is not None
-    # two motions are one, with the noise of both
-    if len(past.stamps_ns) > 0:
-        rough, n_kept = past.thinned(), len(past.stamps_ns) % 2 + len(past.stamps_ns) // 2
-        assert len(rough.stamps_ns) == n_kept == len(rough.motion) - 1
-        ends = []
-        for each in (past, rough):
-            pose = np.zeros(3)
-            for motion in each.motion[1 if each is past else 0:]:
-                pose = se2.compose(pose, motion)
-            ends.append(pose)
-        first_motion = past.motion[0]
-        np.testing.assert_allclose(
-            se2.compose(first_motion, ends[0]), ends[1], atol=1e-9)
-
-
-def test_the_past_is_bounded() -> None:
-    path = no_past(0)
-    graph, stamps_ns, ids = drive(1, 12)
-    part = to_the_end(measured_path(graph, ODOMETRY, stamps_ns, ids))
-    grown = part._replace(motion=np.zeros((len(ids) + 1, 3)),
-                          noise=np.tile(np.eye(3), (len(ids) + 1, 1, 1)),
-                          way=np.tile((1.0, 0.0, 1.0), (len(ids) + 1, 1)),
-                          lever=np.zeros((len(ids) + 1, 3)))
-    for k in range(600):
-        path = path.extended(stamps_ns + k * 100 * SECOND, grown, 0)
-        assert len(path.stamps_ns) <= 2 * SOURCES.kept_positions
-    assert np.all(np.diff(path.stamps_ns) > 0)
-    assert path.stamps_ns[-1] == stamps_ns[-1] + 599 * 100 * SECOND
