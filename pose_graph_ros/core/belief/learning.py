@@ -58,7 +58,7 @@ class Known(NamedTuple):
 
     point: Point  # what is given; what is to be found is as claimed here
     odometry: bool
-    sources: tuple[int, ...]
+    sources: tuple[int, ...]  # numbers of the sources whose errors are to be found
 
     @property
     def free(self) -> tuple[int, ...]:

@@ -219,7 +219,7 @@ def _graph_of(text: GraphText, edge2_order: str | None) -> GraphFile:
     if not np.all(np.isfinite(poses)):
         raise FileFormatError(f'{text.path}: poses composed from edges are not finite')
     fixed = _fixed(text, ids)
-    if not np.any(fixed) and np.all(factors.j >= 0):
+    if len(ids) > 0 and not np.any(fixed) and np.all(factors.j >= 0):
         fixed[np.argmin(is_landmark)] = True
     n = len(ids)
     graph = GraphRows(

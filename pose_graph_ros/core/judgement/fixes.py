@@ -212,18 +212,28 @@ class FixJudge:
 
     def known(self) -> Known:
         """Return which noise is given, and which is to be found."""
-        finding, n = self._factors.finding(), min(len(self._sources), BANK.sources)
+        n, finding = min(len(self._sources), BANK.sources), self._factors.finding()
         point, scale = [*claimed(n)], self._config.odometry_scale
         if scale > 0.0:
             point[WAY] = point[TURN] = 2.0 * math.log2(scale)
+        free = list[int]()
         for number, source in enumerate(self._sources[:n]):
             given = None if source in finding else self._errors_in_use(source)
             if given is not None:
-                tau, white, slow = given
-                for axis, value in zip(axes_of(number), (white, slow, tau), strict=True):
+                tau, white, correlated = given
+                for axis, value in zip(axes_of(number), (white, correlated, tau), strict=True):
                     point[axis] = math.log2(value)
-        return Known(tuple(point), scale == 0.0, tuple(
-            number for number, source in enumerate(self._sources[:n]) if source in finding))
+            else:
+                # slow errors also where the graph does not know of them: what is not white looks
+                # like a fault to filters by which all is
+                free.append(number)
+        return Known(tuple(point), scale == 0.0 and len(finding) > 0, tuple(free))
+
+    @property
+    def n_seen(self) -> int:
+        """Number of measurements that the bank has got, also of those that have left the graph."""
+        sources = self._factors.sources
+        return sum(sources[source].n_ever for source in self._sources if source in sources)
 
     def source(self, name: str) -> int | None:
         """Return the number of the errors of a source; None if the bank has nothing of it."""
