@@ -72,8 +72,11 @@ class Drive:
                         dtype=bool)
         others = tuple((source, one) for source, one in self.others
                        if (source, one.stamp_ns) not in self.wrong)
-        return replace(self, stamps_ns=self.stamps_ns[kept], fixes=self.fixes[kept],
-                       others=others, wrong=frozenset())
+        return replace(self.only(kept), others=others, wrong=frozenset())
+
+    def only(self, chosen: BoolArray) -> 'Drive':
+        """Return the drive with some of its fixes."""
+        return replace(self, stamps_ns=self.stamps_ns[chosen], fixes=self.fixes[chosen])
 
     def moved(self, chosen: BoolArray, by: FloatArray) -> 'Drive':
         """
@@ -98,8 +101,7 @@ class Drive:
 
     def silent(self, begin_s: float, end_s: float) -> 'Drive':
         """Leave out the fixes of a time since the middle [s]."""
-        kept = ~self.within(begin_s, end_s)
-        return replace(self, stamps_ns=self.stamps_ns[kept], fixes=self.fixes[kept],
+        return replace(self.only(~self.within(begin_s, end_s)),
                        good_ns=self.middle_ns + round(end_s * SECOND))
 
     def within(self, begin_s: float, end_s: float) -> BoolArray:
@@ -149,14 +151,24 @@ def simulated(
                  stamps, places, sigma=fixes.sigma, others=others)
 
 
-def plaza(data: Path, seed: int) -> Drive:
+def plaza(data: Path, seed: int, folder: str = PLAZA) -> Drive:
     """Read the drive of a lawn mower, odometry and truth, and make fixes of its truth at 1 Hz."""
-    tables = (np.genfromtxt(data / PLAZA / name, delimiter=',', skip_header=1)
-              for name in ('odom.csv', 'gt.csv'))
     odometry, truth = (
-        Trajectory(stamps[new], rows[new, 1:4]) for rows in tables
-        for stamps in [np.round(rows[:, 0] * 1e9).astype(np.int64)]
-        for new in [np.append(True, np.diff(stamps) > 0)])
+        Trajectory(stamps, rows[:, :3]) for name in ('odom.csv', 'gt.csv')
+        for stamps, rows in [stamped(data / folder / name)])
+    return with_fixes(odometry, truth, seed)
+
+
+def stamped(file: Path) -> tuple[IntArray, FloatArray]:
+    """Read a table with times [s] in its first column: stamps [ns], and the other columns."""
+    rows = np.genfromtxt(file, delimiter=',', skip_header=1)
+    stamps = np.round(rows[:, 0] * 1e9).astype(np.int64)
+    new = np.append(True, np.diff(stamps) > 0)
+    return stamps[new], rows[new, 1:]
+
+
+def with_fixes(odometry: Trajectory, truth: Trajectory, seed: int) -> Drive:
+    """Return a drive with fixes that are made of its truth, at 1 Hz with white errors of 1 m."""
     begin = max(odometry.stamps_ns[0], truth.stamps_ns[0])
     stamps = np.arange(begin + SECOND, min(odometry.stamps_ns[-1], truth.stamps_ns[-1]), SECOND)
     noise = np.random.default_rng(seed).normal(0.0, SIGMA, (len(stamps), 2))

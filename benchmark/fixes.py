@@ -206,17 +206,17 @@ def multipath(drive: Drive, rng: np.random.Generator) -> Drive:
 
 def slip(forward: float) -> Fault:
     """Return a fault: odometry goes on by so much more [m] in 10 s of 60 s without fixes."""
-    return lambda drive, _: replace(drive.silent(0.0, 60.0), odometry=_continued(
+    return lambda drive, _: replace(drive.silent(0.0, 60.0), odometry=continued(
         drive.odometry, drive.middle_ns + 25 * SECOND, np.array((forward, 0.0, 0.0)), 10.0))
 
 
-def two_receivers(far: float, seconds: float) -> Fault:
-    """Return a fault: of two receivers one is wrong by so much [m] for a time [s]."""
+def two_receivers(far: float, seconds: float, begin: float = 0.0) -> Fault:
+    """Return a fault: of two receivers one is wrong by so much [m] from a time until one [s]."""
     def make(drive: Drive, rng: np.random.Generator) -> Drive:
         stamps = np.arange(drive.stamps_ns[0] + SECOND // 3, drive.stamps_ns[-1], SECOND)
         fixes = drive.truth.at(stamps)[:, :2] + rng.normal(0.0, SIGMA, (len(stamps), 2))
         second = replace(drive, stamps_ns=stamps, fixes=fixes).offset(
-            0.0, seconds, aside(rng, far))
+            begin, seconds, aside(rng, far))
         return replace(drive, others=tuple(positions('second', stamps, second.fixes)),
                        fault_ns=second.fault_ns, good_ns=second.good_ns,
                        wrong=frozenset(('second', stamp) for _, stamp in second.wrong))
@@ -241,13 +241,13 @@ def localiser(by: tuple[float, float, float], seconds: float) -> Fault:
 
 def restart(drive: Drive, _: np.random.Generator) -> Drive:
     """Return odometry that begins again 5 m off."""
-    return replace(drive, good_ns=drive.middle_ns, odometry=_continued(
+    return replace(drive, good_ns=drive.middle_ns, odometry=continued(
         drive.odometry, drive.middle_ns, np.array((5.0, 1.0, 0.3))))
 
 
 def kidnapped(drive: Drive, _: np.random.Generator) -> Drive:
     """Return a robot that is carried away; odometry does not notice."""
-    truth = _continued(drive.truth, drive.middle_ns, np.array((30.0, 20.0, 0.7)))
+    truth = continued(drive.truth, drive.middle_ns, np.array((30.0, 20.0, 0.7)))
     late = drive.stamps_ns >= drive.middle_ns
     off = truth.at(drive.stamps_ns)[:, :2] - drive.truth.at(drive.stamps_ns)[:, :2]
     return replace(drive, truth=truth, good_ns=drive.middle_ns,
@@ -258,7 +258,7 @@ def _whole(drive: Drive) -> tuple[int, int]:
     return int(drive.stamps_ns[0]), int(drive.stamps_ns[-1])
 
 
-def _continued(
+def continued(
     path: Trajectory, at_ns: int, by: FloatArray, lasting_s: float = 0.0,
 ) -> Trajectory:
     """Return a path that continues, from a time on, after a motion in the robot's frame."""

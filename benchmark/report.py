@@ -55,7 +55,7 @@ def write(
     for section in sections:
         parts += [f'## {section.title}', '', section.about, '']
         for table in section.tables:
-            parts += _markdown(table)
+            parts += markdown(table)
         parts += [*(f'- {note}' for note in section.notes), '']
     path = folder / 'README.md'
     path.write_text('\n'.join(parts).rstrip() + '\n', encoding='utf-8')
@@ -91,10 +91,11 @@ def _verdicts(sections: list[Section]) -> list[str]:
             if metric.target is not None:
                 table.rows.append((metric.key, f'{metric.value:.4g}{metric.unit}',
                                    metric.status()))
-    return _markdown(table)
+    return markdown(table)
 
 
-def _markdown(table: Table) -> list[str]:
+def markdown(table: Table) -> list[str]:
+    """Return a table as lines of Markdown, none without rows."""
     if len(table.rows) == 0:
         return []
     lines = [f'**{table.caption}**', ''] if table.caption else []

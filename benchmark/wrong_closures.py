@@ -67,7 +67,7 @@ def simulated(
                        closures=replace(usual.closures, false=wrong),
                        claims=(ClaimedSigma(CLOSURES, claimed),))
     graph = graph_of(course(WORLDS[world], seed, duration_s, change), distance)
-    chain = graph.factors.edges.rows(graph.factors.edges.kind == FactorKind.ODOMETRY)
+    chain = graph.edges.rows(graph.edges.kind == FactorKind.ODOMETRY)
     return Recording(world, graph.truth.stamps_ns, chain, graph.truth).closing(graph.loops)
 
 

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from pose_graph_ros.cli.arguments import METHODS
+from pose_graph_ros.cli.closure_scale import give_scale
 from pose_graph_ros.cli.solve_starts import Problem
 from pose_graph_ros.core.batch.optimizer import (
     optimize,
@@ -27,9 +28,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Po
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement import final
+from pose_graph_ros.core.judgement.closure_search import best
 from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward
-from pose_graph_ros.core.judgement.residual_scale import give_scale
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import short
 
@@ -156,7 +156,7 @@ def _from_odometry(graph: Graph, edges: Factors, closures: IntArray) -> Truncate
 
 
 SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
-    'selection': final.best,
+    'selection': best,
     'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED, patient=True),
     'gnc-gm': partial(
         TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE, patient=True)}

@@ -123,6 +123,11 @@ class TruncatedProblem:
     def __len__(self) -> int:
         return len(self.limits)
 
+    def begin_at(self, start: FloatArray) -> None:
+        """Solve for all further sets from other poses."""
+        self.start = start
+        self._choices.clear()
+
     def solve(
         self, weights: FloatArray, config: SolverConfig = ROUGH, *, go_on: bool = False,
     ) -> Solution:

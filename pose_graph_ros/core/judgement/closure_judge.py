@@ -5,26 +5,35 @@ Which loop closures to believe, decided as they come and again when the evidence
 
 A closure passes the *gate* if its error at the estimate is plausible: `e^T (J P J^T + R)^-1 e` is
 below the 99 % quantile, with P the joint covariance of both nodes in the graph of what is believed
-and R the claimed covariance, floored. Then `belief_rule` says whether it is *believed*. One that
-does not fit any more is thrown out: back to weight 0, from where it may come again.
+and R the claimed covariance, floored. It is *believed* if a clique of closures that agree along
+the path supports it, or if a random one of its source would hardly pass: q p is small against
+1 - q, with p the chance to pass and q the share of its source that is doubted. If p is large, only
+the record q of the source speaks for it: it is believed weakly. One that does not fit any more is
+*thrown out*: back to weight 0, from where it may come again. Between the updates `closure_search`
+looks for a set of closures that costs less.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import to_the_end
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.batch.optimizer import Status, to_the_end
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import closures, final
-from pose_graph_ros.core.judgement.beliefs import BeliefRule, Beliefs, Retests, ScaleLeft
-from pose_graph_ros.core.judgement.closure_states import ClosureReports, ClosureStates
-from pose_graph_ros.core.judgement.closure_trial import ClosureTrial, SetSearch
-from pose_graph_ros.core.judgement.closures import chances, claims, ClosureTable, GATE
+from pose_graph_ros.core.judgement.closure_search import decide, Redecision
+from pose_graph_ros.core.judgement.closure_states import ClosureStates, NEVER
+from pose_graph_ros.core.judgement.closures import (
+    as_edges,
+    chances,
+    claims,
+    ClosureTable,
+    GATE,
+    squares,
+)
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.residual_scale import ScaleLearner
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.judgement.verdicts import (
@@ -32,285 +41,332 @@ from pose_graph_ros.core.judgement.verdicts import (
     Decision,
     DECISIONS,
     DOUBTED,
-    SourceVerdicts,
+    OUT,
     State,
     STATES,
-    USED,
     Verdict,
     WAITING,
 )
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+from pose_graph_ros.core.smoother.trial import continued
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 
 class ClosureJudge:
     def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
         self._smoother, self._reweighting = smoother, reweighting
-        self.chain = self._chain = OdometryChain()
-        self._table = ClosureTable(self._chain)
-        self.states = self._states = ClosureStates()
-        self.reports = ClosureReports(self._states, self._table)
-        self._retests = Retests(self._states)
-        self._rule = BeliefRule(self._states, self._table)
+        self.chain = OdometryChain()
+        self._table = ClosureTable(self.chain)
+        self.states = ClosureStates()
+        self.redecision = Redecision(smoother)
+        # increases when more or less is believed, so that those that wait are tested again
+        self._round = 0
+        self._now_ns = 0
         self._final = (0, 0, -1)  # next ids of the graph and round at the last final decision
         self._n_staged = 0
-        self._search = SetSearch(self._states)
-        self._beliefs = Beliefs(smoother, reweighting, self._states, self._table)
-        self._scales = ScaleLearner(smoother, self._states, self._table, self._beliefs)
+
+    # --- new closures ----------------------------------------------------------------------------
 
     def before(
         self, new: Sequence[NewConstraint], edges: Factors, now_ns: int,
     ) -> FloatArray:
         """Return the weights with which closures are to be added, shape (M,)."""
-        begin, n = len(self._states), len(new)
-        self._beliefs.now_ns, self._n_staged = now_ns, n
-        self._chain.extend(self._smoother.graph)
+        begin, n = len(self.states), len(new)
+        self._now_ns, self._n_staged = now_ns, n
+        self.chain.extend(self._smoother.graph)
         self._table.append(claims(edges))
         for one in new:
-            self._states.append(one, now_ns, WAITING)
-        self._scales.add_sources()
+            self.states.append(one, now_ns, WAITING)
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
-            chosen = self._rule.choose(*self._test(numbers[:BELIEF.tests_of_new]))
-            for number, state in chosen.items():
-                self._states.state[number] = STATES.index(state)
-        return self._beliefs.weights(numbers)
+            for number, state in self._tested(numbers[:self._most]).items():
+                self.states.state[number] = STATES.index(state)
+        return self._weights(numbers)
 
     def withhold(self) -> FloatArray | None:
         """Return the weights of the last `before` without belief; None if they had none."""
-        numbers = np.arange(len(self._states) - self._n_staged, len(self._states))
-        if not np.any(self._states.in_graph[numbers]):
+        numbers = np.arange(len(self.states) - self._n_staged, len(self.states))
+        if not np.any(self.states.in_graph[numbers]):
             return None
-        self._states.state[numbers] = WAITING
-        self._retests.again(numbers)
-        self._search.want()
-        return self._beliefs.weights(numbers)
+        self.states.state[numbers], self.states.round[numbers] = WAITING, NEVER
+        return self._weights(numbers)
 
-    @property
-    def trial(self) -> ClosureTrial:
-        return self._beliefs.trial
+    def rollback(self) -> None:
+        size, self._n_staged = len(self.states) - self._n_staged, 0
+        self._table.truncate(size)
+        self.states.truncate(size)
+
+    def commit(self) -> None:
+        begin, self._n_staged = len(self.states) - self._n_staged, 0
+        for number in range(begin, len(self.states)):
+            self.states.announce(number, NEW, self._now_ns)
+        for source in np.unique(self.states.source[begin:]).tolist():
+            self.states.forget(source)
+        if np.any(self.states.in_graph[begin:]):
+            self._round += 1
+            self._set_base_weights(np.arange(begin, len(self.states)))
+
+    # --- tests -----------------------------------------------------------------------------------
 
     @property
     def _is_large(self) -> bool:
         return self._smoother.graph.n_nodes > BELIEF.large
 
-    def rollback(self) -> None:
-        self.reports.forget()
-        self._table.drop(self._n_staged)
-        self._states.truncate(len(self._states) - self._n_staged)
-        self._n_staged = 0
+    @property
+    def _most(self) -> int:
+        """Return how many closures are tested at once: they are as deep as the path is long."""
+        by_size = BELIEF.nodes_in_part // max(self._smoother.graph.n_nodes, 1)
+        return max(min(BELIEF.tests_in_part, by_size), 1)
 
-    def commit(self) -> None:
-        begin, self._n_staged = len(self._states) - self._n_staged, 0
-        if begin < len(self._states):
-            self._retests.begin_turns()
-        for number in range(begin, len(self._states)):
-            self._states.announce(number, NEW, self._beliefs.now_ns)
-        for source in np.unique(self._states.source[begin:]).tolist():
-            self._table.forget(self._states.forget(source).tolist())
-        if np.any(self._states.in_graph[begin:]):
-            self._beliefs.round += 1
-            self._beliefs.set_base_weights(np.arange(begin, len(self._states)))
-
-    def _test(self, numbers: IntArray) -> tuple[IntArray, FloatArray]:
-        """Test closures that are not in the graph; return those that pass, and their chances."""
-        some, n = self._table.rows(numbers), len(numbers)
-        errors, spread = self._smoother.innovations(closures.as_edges(some))
-        total, distance = spread + some.noise, np.empty(n)
-        closures.distances(errors, total, distance)
+    def _tested(self, numbers: IntArray) -> dict[int, State]:
+        """Test closures that are not in the graph; return the states of those to believe."""
+        some, states = self._table.rows(numbers), self.states
+        errors, spread = self._smoother.innovations(as_edges(some))
+        distance = squares(errors, spread + some.noise)
         self._table.spread[numbers] = spread
-        self._states.distance[numbers] = np.sqrt(distance)
-        self._retests.tested(numbers, self._beliefs.round)
-        passes = distance < GATE
-        for number, state in zip(
-                numbers.tolist(), np.where(passes, WAITING, DOUBTED).tolist(), strict=True):
-            before = int(self._states.state[number])
-            self._states.state[number] = state
-            if state == DOUBTED and not self._states.corroborated[number]:
-                self._states.corroborated[number] = self._rule.is_corroborated(
-                    number, ~self._states.in_graph)
-            if number < len(self._states) - self._n_staged:
-                self._states.announce(number, before, self._beliefs.now_ns)
-        return numbers[passes], chances(total[passes], self._smoother.graph.extent)
+        before = states.state[numbers].copy()
+        states.distance[numbers] = np.sqrt(distance)
+        states.round[numbers] = self._round
+        states.state[numbers] = np.where(distance < GATE, WAITING, DOUBTED)
+        chance = chances(spread + some.noise, self._smoother.graph.extent)
+        chosen = dict[int, State]()
+        for k, number in enumerate(numbers.tolist()):
+            if number < len(states) - self._n_staged:
+                states.announce(number, int(before[k]), self._now_ns)
+            if distance[k] < GATE:
+                chosen[number] = self._belief(number, float(chance[k]))
+        return {number: state for number, state in chosen.items() if state.in_graph}
+
+    def _belief(self, number: int, chance: float) -> State:
+        """Return whether to believe a closure that has passed the gate."""
+        states = self.states
+        good, bad = states.record(int(states.source[number]))
+        alone = (bad + 1.0) * chance < BELIEF.wrong_odds * (good + 1.0)
+        usable = (states.decision != OUT) & ~states.forgotten
+        if (alone and chance <= BELIEF.wrong_odds) or self._table.is_supported(number, usable):
+            return State.BELIEVED
+        return State.WEAKLY_BELIEVED if alone else State.WAITING
 
     def after(self) -> None:
         """Judge again, within bounds, after an update of a graph that is not large."""
         if not self._is_large:
-            self._part(BELIEF.tests_in_update)
+            self._part()
 
-    def work(self) -> bool:
-        return not self._smoother.graph.has_touched and (
-            self._part(self._most) or self._try() or self._scales.learn()
-            or self._look_for_another_set())
+    def _part(self) -> bool:
+        """Throw out what does not fit, or test some that wait; tell whether there was any."""
+        if self._smoother.graph.has_touched:
+            return False
+        return self._throw_out(np.flatnonzero(self.states.in_graph)) or self.test()
 
     def test(self) -> bool:
         """Do a bounded part of the tests that are left; tell whether there was any."""
-        return (len(self._states) > 0 and not self._smoother.graph.has_touched
-                and self._test_again(self._most))
+        return (len(self.states) > 0 and not self._smoother.graph.has_touched
+                and self._test_again())
 
-    @property
-    def _most(self) -> int:
-        by_size = BELIEF.nodes_in_part // max(self._smoother.graph.n_nodes, 1)
-        return max(min(BELIEF.tests_in_part, by_size), 1)
-
-    def _try(self) -> bool:
-        before = self._beliefs.round
-        tried = self._beliefs.try_part()
-        if self._beliefs.round > before:
-            self._table.spread[:] = 0.0
-        return tried
-
-    def _part(self, most: int) -> bool:
-        if len(self._states) == 0 or self._smoother.graph.has_touched:
+    def work(self) -> bool:
+        """Do a part on a copy, or of the tests that are left; tell whether there was any."""
+        if self._smoother.graph.has_touched:
             return False
-        return self._throw_out() or self._test_again(most)
+        if self.redecision.work() or self._part():
+            return True
+        if np.any(self.states.judged & ~self.states.in_graph):
+            self.redecision.search(self._searched())
+        return self.redecision.work()
 
-    def _throw_out(self) -> bool:
-        """Take out of the graph what does not fit any more; tell whether there was any."""
-        # where the graph cannot be solved without them, that is not tried for ever
-        resting = self._retests.resting(self._smoother.graph.next_ids.node)
-        inside = np.flatnonzero(self._states.in_graph & self._states.judged & ~resting)
-        return self._throw_out_of(inside)
-
-    def _throw_out_of(self, inside: IntArray) -> bool:
+    def _throw_out(self, inside: IntArray) -> bool:
         """Take those of some closures out of the graph that do not fit; tell if there was any."""
+        graph, states = self._smoother.graph, self.states
+        inside = inside[states.judged[inside] & ~self._rest(inside)]
         # the smoother knows the energies; raised covariances make the residuals only smaller
-        inside = inside[closures.are_above(
-            self._smoother.graph, self._states.held[inside], 0.5 * GATE)]
-        fit = closures.residuals(self._smoother.graph, self._table.rows(inside))
-        bad = inside[fit > GATE]
-        if not self._change(dict.fromkeys(bad.tolist(), State.DOUBTED)):
-            return False
-        self._retests.thrown_out(bad)
-        # without them the graph is less certain
-        self._table.spread[:] = 0.0
-        return True
+        rows, factors = graph.factor_rows(states.held[inside]), graph.factor_records
+        inside = inside[factors['energy'][rows] > 0.5 * GATE * factors['weight'][rows]]
+        some = self._table.rows(inside)
+        bad = inside[squares(graph.errors(as_edges(some)), some.noise) > GATE]
+        thrown_out = self._change(dict.fromkeys(bad.tolist(), State.DOUBTED))
+        # those that contradict one another would take turns in the graph for ever
+        self._let_rest(bad)
+        return thrown_out
 
-    def _test_again(self, most: int) -> bool:
+    def _test_again(self) -> bool:
         """Test some closures that wait; tell whether some are left."""
-        waiting = np.flatnonzero(
-            ~self._states.in_graph & self._states.judged
-            & self._retests.due(self._beliefs.round, self._smoother.graph.next_ids.node))
+        states = self.states
+        waiting = np.flatnonzero(~states.in_graph & states.judged & (states.round < self._round))
+        waiting = waiting[~self._rest(waiting)]
         if len(waiting) == 0:
             return False
         some = self._table.rows(waiting)
-        errors = closures.errors_of(self._smoother.graph, some)
-        # covariances only shrink while more is believed, so this is a lower bound
-        spread, least = self._table.spread[waiting], np.empty(len(waiting))
-        closures.distances(errors, spread + some.noise, least)
-        known = spread[:, 0, 0] > 0.0
-        hopeless = known & ~(least < GATE)
-        self._retests.tested(waiting[hopeless], self._beliefs.round)
-        rest = waiting[~hopeless]
-        rest = rest[np.argsort(np.where(known, least, 0.0)[~hopeless], kind='stable')]
-        passed, chance = self._test(rest[:most])
-        return self._change(self._rule.choose(passed, chance)) or len(rest) > most
+        # covariances shrink while more is believed, so this is about the least that it can be
+        least = squares(self._smoother.graph.errors(as_edges(some)),
+                        self._table.spread[waiting] + some.noise)
+        hopeless = ~(least < GATE)
+        states.round[waiting[hopeless]] = self._round
+        rest = waiting[~hopeless][np.argsort(least[~hopeless], kind='stable')]
+        return self._change(self._tested(rest[:self._most])) or len(rest) > self._most
 
-    def _change(self, states: dict[int, State]) -> bool:
-        """Change states; tell whether there were any, and the update has not diverged."""
-        if len(states) == 0:
+    def _rest(self, numbers: IntArray) -> BoolArray:
+        return np.asarray(self.states.resting[numbers] > self._smoother.graph.next_ids.node)
+
+    def _let_rest(self, numbers: IntArray) -> None:
+        """Let closures wait until the graph has grown by a share, so that a drive ends."""
+        graph = self._smoother.graph
+        self.states.resting[numbers] = graph.next_ids.node + max(
+            int(BELIEF.pause * graph.n_nodes), BELIEF.least_rest)
+
+    # --- changes ---------------------------------------------------------------------------------
+
+    def _weights(self, numbers: IntArray) -> FloatArray:
+        return self.states.in_graph[numbers].astype(np.float64)
+
+    def _set_base_weights(self, numbers: IntArray) -> None:
+        """Tell robust losses the weights of closures, which the graph has already."""
+        for number, weight in zip(numbers.tolist(), self._weights(numbers).tolist(), strict=True):
+            self._reweighting.set_base_weight(int(self.states.held[number]), weight)
+
+    def _change(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
+        """Change states and weights; tell whether there were any, and it has not diverged."""
+        if len(changes) == 0:
             return False
-        done = self._beliefs.apply(states)
-        if not done:
-            self._retests.failed(states, self._smoother.graph)
-            self._search.want()
-        return done
+        weights = {int(self.states.held[number]): float(state.in_graph)
+                   for number, state in changes.items()}
+        result = self._smoother.update(GraphUpdate(weigh=weights), fall_back=at_once)
+        if result.status is Status.FAILED:
+            numbers = np.array([*changes])
+            self.states.round[numbers] = NEVER
+            self._let_rest(numbers)
+            return False
+        self._note(changes)
+        return True
+
+    def _note(self, changes: Mapping[int, State]) -> None:
+        """Change states, of which the graph has the weights already."""
+        for number, state in sorted(changes.items()):
+            before = int(self.states.state[number])
+            self.states.state[number] = STATES.index(state)
+            self.states.announce(number, before, self._now_ns)
+        self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
+        self._round += 1
+        if not all(state.in_graph for state in changes.values()):
+            self._table.forget_spread()     # without them the graph is less certain
+
+    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, State]:
+        """Return the states of closures with a set of believed ones, both by the ids of edges."""
+        states = self.states
+        numbers = states.numbers(decided)
+        now, later = states.in_graph, np.isin(states.held, believed)
+        return {k: (State.DOUBTED if not later[k] else
+                    STATES[states.state[k]] if now[k] else State.BELIEVED)
+                for k in numbers[states.judged[numbers] & (now | later)[numbers]].tolist()}
+
+    # --- all closures together -------------------------------------------------------------------
+
+    def _searched(self) -> Generator[None, None, None]:
+        """Look for a set that costs less, and adopt it, if any that agree are left out."""
+        graph, states = self._smoother.graph, self.states
+        for number in np.flatnonzero(states.judged & ~states.in_graph).tolist():
+            yield
+            # closures may have left or been believed meanwhile
+            outside = states.judged & ~states.in_graph
+            if number < len(states) and self._table.is_supported(number, outside):
+                break
+        else:
+            return
+        judged, nodes = np.flatnonzero(states.judged), graph.node_ids.copy()
+        decided = states.held[judged]
+        choice = yield from decide(
+            graph, decided, states.held[states.in_graph & ~states.judged], states.in_graph[judged])
+        if choice is None or np.all(states.in_graph[states.numbers(decided)] == choice.believed):
+            return
+        believed = decided[choice.believed]
+        changes = self._changes_to(decided, believed)
+        weights = {int(states.held[k]): float(each.in_graph) for k, each in changes.items()}
+        changed = np.array([*weights], dtype=np.int64)
+
+        def is_still_judged() -> bool:
+            return bool(np.all(states.judged[states.numbers(changed)]))
+        if (yield from self.redecision.tried(
+                weights, continued(graph, choice.poses, nodes), is_still_judged)):
+            self._note(self._changes_to(changed, believed))
+
+    def decide_finally(self) -> None:
+        """Decide on all closures anew, by the graph, if anything has changed since."""
+        graph, states = self._smoother.graph, self.states
+        judged, present = np.flatnonzero(states.judged), (*graph.next_ids, self._round)
+        if len(judged) == 0 or present == self._final:
+            return
+        decided, before = states.held[judged], graph.poses.copy()
+        choice = to_the_end(decide(
+            graph, decided, states.held[states.in_graph & ~states.judged],
+            states.in_graph[judged], self._reweighting))
+        if choice is None:
+            return
+        graph.set_poses(continued(graph, choice.poses))
+        changes = self._changes_to(decided, decided[choice.believed])
+        if len(changes) > 0 and not self._change(changes, at_once=True):
+            graph.set_poses(before)
+            self._smoother.update(GraphUpdate())
+            return
+        # nothing is to be tested again until something changes
+        states.round[:] = self._round
+        self._final = *present[:-1], self._round
+
+    def state(self) -> Callable[[], None]:
+        """Return what brings the present state back, as long as no closure is added."""
+        states_back = self.states.snapshot()
+
+        def bring_back() -> None:
+            states_back()
+            self.redecision.drop()
+            self._test_all_again()
+        return bring_back
+
+    def _test_all_again(self) -> None:
+        self.states.round[:], self.states.resting[:] = NEVER, 0
+        self._table.forget_spread()
+
+    # --- what leaves the window ------------------------------------------------------------------
 
     def decide_leaving(self, edges: IntArray) -> list[Verdict]:
         """
         Decide on closures that are about to leave the graph; return the verdicts on those unused.
         """
-        states, graph = self._states, self._smoother.graph
-        self._chain.extend(graph)
+        states, graph = self.states, self._smoother.graph
+        self.chain.extend(graph)
         leaving = states.numbers(edges)
         if len(leaving) == 0:
             return []
-        judged = leaving[states.judged[leaving]]
         if not graph.has_touched:
-            self._throw_out_of(judged[states.in_graph[judged]])
-            for _ in range(BELIEF.leaving_rounds):
-                due = self._retests.due(self._beliefs.round, graph.next_ids.node)
-                waiting = judged[~states.in_graph[judged] & due[judged]]
-                if len(waiting) == 0 or graph.has_touched:
-                    break
-                self._change(self._rule.choose(*self._test(waiting[:BELIEF.tests_in_update])))
-        return self.reports.of(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:].tolist())
+            self._throw_out(leaving[states.in_graph[leaving]])
+            waiting = leaving[~states.in_graph[leaving] & states.judged[leaving]
+                              & ~self._rest(leaving) & (states.round[leaving] < self._round)]
+            self._change(self._tested(waiting[:self._most]))
+        return self.verdicts(leaving[~states.in_graph[leaving]][-MOST_OTHERS:])
 
     def forget(self, nodes: IntArray, edges: IntArray) -> None:
-        states, gone = self._states, self._states.numbers(edges)
+        gone = self.states.numbers(edges)
         if len(gone) > 0:
-            self._beliefs.closures_left(gone)
             # all others get other numbers
-            kept = np.setdiff1d(np.arange(len(states)), gone)
-            for table in (states, self._table):
-                table.select(kept)
-            self.reports.forget()
-        self._chain.forget(nodes)
+            kept = np.setdiff1d(np.arange(len(self.states)), gone)
+            self.states.select(kept)
+            self._table.select(kept)
+        self.chain.forget(nodes)
 
-    def decide_finally(self) -> None:
-        """Decide on all closures anew, by the graph alone, if anything has changed since."""
-        smoother, states = self._smoother, self._states
-        graph, judged = smoother.graph, np.flatnonzero(states.judged)
-        present = *graph.next_ids, self._beliefs.round
-        if len(judged) == 0 or present == self._final:
-            return
-        forced = states.held[states.in_graph & ~states.judged]
-        inside = states.in_graph
-        choice = to_the_end(final.decide(
-            graph, states.held[judged], forced, inside[judged], self._reweighting))
-        if choice is None:
-            return
-        inside[judged] = choice.believed
-        self._scales.begin()
-        if not self._beliefs.change_to(inside, choice.poses):
-            return
-        self._scales.learn_all()
-        # nothing is to be tested again until something changes
-        self._retests.tested(slice(None), self._beliefs.round)
-        self._final = *present[:-1], self._beliefs.round
+    # --- what is told ----------------------------------------------------------------------------
 
-    def state(self) -> Callable[[], None]:
-        """Return what brings the present state back, as long as no closure is added."""
-        states_back, scales = self._states.snapshot(), self._scales.state()
-
-        def bring_back() -> None:
-            states_back()
-            self._scales.set_state(*scales)
-            self._search = SetSearch(self._states)
-            self._beliefs.trial.end()
-            self._retests.again(slice(None))
-            self._table.spread[:] = 0.0
-        return bring_back
-
-    def _look_for_another_set(self) -> bool:
-        """Do a part of the search of another set; tell whether there was anything to do."""
-        more, found = self._search.work(self._smoother.graph)
-        if found is not None:
-            self._beliefs.try_set(found)
-        return more
-
-    def saved(self) -> SavedVerdicts:
-        return self._states.saved(self._beliefs.scales)
+    def verdicts(self, numbers: IntArray) -> list[Verdict]:
+        return self.states.reports(self._smoother.graph, self._table, numbers.tolist())
 
     def restore(self, saved: SavedVerdicts, now_ns: int) -> None:
-        self._beliefs.now_ns = now_ns
-        self._chain.extend(self._smoother.graph)
+        self._now_ns = now_ns
+        self.chain.extend(self._smoother.graph)
         self._table.append(claims(self._smoother.graph.factors_at(saved.held)))
-        self._states.restore(saved)
-        self._scales.set_state(saved.scales.tolist(), [0] * len(saved.scales))
-        self._beliefs.scales_left[:] = map(
-            ScaleLeft, np.sum(saved.left[:, USED], axis=1).tolist(), saved.scales.tolist())
-        self._scales.add_sources()
-
-    def totals(self) -> dict[str, SourceVerdicts]:
-        return self._states.totals(self._beliefs.scales)
+        self.states.restore(saved)
 
     def decide(self, name: str, decision: Decision) -> Answer:
         """
         Apply a decision at once; a closure that had been forced in waits when that is taken back.
         """
-        states = self._states
+        states = self.states
         number = states.find(name)
         if number < 0:
             return unknown(name, has_left=states.has_left(name))
@@ -319,12 +375,10 @@ class ClosureJudge:
                  Decision.AUTO: State.WAITING}[decision]
         forced = decision is not Decision.AUTO or before != AUTO
         states.decision[number] = DECISIONS.index(decision)
-        if states.forgotten[number]:
-            states.forgotten[number] = False
-            self._table.bring_back([number])
-        if forced and not self._beliefs.apply({number: state}, at_once=True):
+        states.forgotten[number] = False
+        if forced and not self._change({number: state}, at_once=True):
             states.decision[number] = before
             return rejected('failed', 'the solver failed with it')
-        self._beliefs.round += 1
-        verdict, = self.reports.of(self._smoother.graph, [number])
+        self._test_all_again()
+        verdict, = self.verdicts(np.array([number]))
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')

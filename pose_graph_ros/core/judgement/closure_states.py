@@ -18,8 +18,6 @@ from pose_graph_ros.core.judgement.verdicts import (
     Judged,
     ODOMETRY,
     SourceVerdicts,
-    State,
-    STATES,
     USED,
     Verdict,
     WAITING,
@@ -30,18 +28,14 @@ NEVER = -1  # round of the last test of one that was not tested
 
 
 class ClosureStates(Judgements):
-    forgotten, corroborated = Column(), Column()
-    round, turns, resting = Column(), Column(), Column()
+    forgotten, round, resting = Column(), Column(), Column()
 
     def __init__(self) -> None:
         super().__init__(
             Judged.LOOP_CLOSURE,
             forgotten=False,  # hopeless, and not judged again
-            # whether a clique of closures outside of the graph supports it while it is doubted
-            corroborated=False,
-            # what its next test waits for, see `Retests`: round of the last one, times that it was
-            # thrown out in turn, and the node until which it rests
-            round=NEVER, turns=0, resting=0)
+            # the round of its last test, and the id of the node until which it is not tested
+            round=NEVER, resting=0)
 
     @property
     def judged(self) -> BoolArray:
@@ -57,25 +51,14 @@ class ClosureStates(Judgements):
         """Return the numbers of those of some edges, given by their ids, that are closures."""
         return np.flatnonzero(np.isin(self.held, edges))
 
-    def forget(self, source: int) -> IntArray:
-        """Forget closures of a source if too many are not believed, hopeless ones first."""
+    def forget(self, source: int) -> None:
+        """Forget closures of a source if too many are not believed, the oldest doubted first."""
         kept = np.flatnonzero((self.source == source) & ~self.in_graph & self.judged)
         if len(kept) <= BELIEF.most_waiting:
-            return kept[:0]
-        doubted = self.state[kept] == DOUBTED
-        hopeless = doubted & ~self.corroborated[kept] & (
-            self.distance[kept]**2 > BELIEF.hopeless_closure * GATE)
-        order = np.lexsort((self.stamps_ns[kept, 0], ~doubted, ~hopeless))
-        gone = np.sort(kept[order[:len(kept) - BELIEF.left_waiting]])
-        self.forgotten[gone] = True
-        return gone
-
-    def changes_to(self, inside: BoolArray) -> dict[int, State]:
-        """Return the states of another set of believed ones, also of those that stay in it."""
-        now = self.in_graph[:len(inside)]
-        return {
-            k: (STATES[self.state[k]] if now[k] else State.BELIEVED) if inside[k]
-            else State.DOUBTED for k in np.flatnonzero(inside | now).tolist()}
+            return
+        order = np.lexsort((self.stamps_ns[kept, 0], self.state[kept] != DOUBTED))
+        # some more than need be, as this is not to be done for each new one
+        self.forgotten[kept[order[:len(kept) - 9 * BELIEF.most_waiting // 10]]] = True
 
     def totals(self, scales: Sequence[float] | None = None) -> dict[str, SourceVerdicts]:
         return {source: each._replace(n_forgotten=int(np.count_nonzero(
@@ -86,35 +69,25 @@ class ClosureStates(Judgements):
         """Return the ids of edges that are believed weakly, wait, and are doubted."""
         return [self.held[self.state == each] for each in (WEAK, WAITING, DOUBTED)]
 
-
-class ClosureReports:
-    """Tells what is decided on closures, and why."""
-
-    def __init__(self, states: ClosureStates, table: ClosureTable) -> None:
-        self._states, self._table = states, table
-        # by number: how many are around, those that agree, and those that do not
-        self._reasons: dict[int, tuple[int, list[int], list[int]]] = {}
-
-    def forget(self) -> None:
-        self._reasons.clear()
-
-    def of(self, graph: Graph, numbers: Sequence[int]) -> list[Verdict]:
-        states, verdicts = self._states, []
-        edges = graph.factors_at(states.held[list(numbers)])
-        for number, residual in zip(numbers, graph.errors(edges), strict=True):
-            agree, against = self._neighbours(number)
-            contradicted = [states.name(other) for other in against if USED[states.state[other]]]
-            if states.distance[number] > math.sqrt(GATE):
+    def reports(
+        self, graph: Graph, table: ClosureTable, numbers: Sequence[int],
+    ) -> list[Verdict]:
+        """Return what is decided on some closures, and why."""
+        verdicts = []
+        usable = ~self.forgotten
+        near = [table.near(number, usable) for number in numbers]
+        sizes = np.array([len(each) for each in near], dtype=np.int64)
+        others = np.concatenate([np.empty(0, np.int64), *near])
+        agree = np.split(table.agree(np.repeat(np.array(numbers, np.int64), sizes), others),
+                         np.cumsum(sizes)[:-1]) if len(sizes) > 0 else []
+        residuals = graph.errors(graph.factors_at(self.held[list(numbers)]))
+        for number, residual, around, agrees in zip(
+                numbers, residuals, near, agree, strict=True):
+            contradicted = [self.name(other) for other in around[~agrees]
+                            if USED[self.state[other]]]
+            if self.distance[number] > math.sqrt(GATE):
                 contradicted.insert(0, ODOMETRY)
-            verdicts.append(states.verdict(
-                number, residual, supported_by=agree, contradicted_by=contradicted))
+            verdicts.append(self.verdict(
+                number, residual, supported_by=around[agrees].tolist(),
+                contradicted_by=contradicted))
         return verdicts
-
-    def _neighbours(self, number: int) -> tuple[list[int], list[int]]:
-        """Return which closures agree with one and which do not; kept until there are more."""
-        crowd = self._table.crowd(number)
-        kept = self._reasons.get(number)
-        if kept is None or kept[0] != crowd:
-            agree, against = self._table.neighbours(number)
-            kept = self._reasons[number] = crowd, agree.tolist(), against.tolist()
-        return kept[1:]

@@ -140,17 +140,17 @@ class Judge:
 
     def may_solve(self) -> bool:
         """Tell whether an update that has diverged may solve for all at once."""
-        trial = self._closures.trial
+        redecision = self._closures.redecision
         is_large = self._smoother.graph.n_nodes > BELIEF.large
-        return not is_large and trial.may_solve()
+        return not is_large and redecision.may_solve()
 
     def solve_later(self, weights: Mapping[int, float]) -> None:
         """Solve the graph with some weights as a copy between the updates, as these diverge."""
-        self._closures.trial.solve_later(weights)
+        self._closures.redecision.solve_later(weights)
 
     @property
     def solves_later(self) -> bool:
-        return self._closures.trial.is_due_or_pausing
+        return self._closures.redecision.is_due_or_pausing
 
     def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
         number = one.number - first
@@ -185,7 +185,7 @@ class Judge:
     def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
         """Return the verdicts that are listed, see `Judgements`, and on what left unused."""
         graph, closures, fixes = self._smoother.graph, self._closures, self.fixes.states
-        return [*closures.reports.of(graph, closures.states.listed(most_believed).tolist()),
+        return [*closures.verdicts(closures.states.listed(most_believed)),
                 *self._odometry.verdicts(graph, fixes.believed_after),
                 *fixes.verdicts(graph, fixes.listed(most_believed)), *self._left]
 
@@ -205,7 +205,7 @@ class Judge:
                 *self.fixes.states.take_changes()]
 
     def totals(self) -> Mapping[str, SourceVerdicts]:
-        return {**self._odometry.totals(), **self._closures.totals(),
+        return {**self._odometry.totals(), **self._closures.states.totals(),
                 **self.fixes.states.totals()}
 
     def decide(self, name: str, decision: Decision) -> Answer:
@@ -238,7 +238,7 @@ class Judge:
     def saved(self) -> SavedJudgement:
         loosened = self.fixes.loosened
         return SavedJudgement(
-            self._closures.saved(), self.fixes.states.saved(),
+            self._closures.states.saved(), self.fixes.states.saved(),
             np.array([*loosened], dtype=np.int64), np.array([*loosened.values()]),
             dict(self._odometry.left))
 

@@ -43,6 +43,7 @@ TRIES, TRIED = 10_000, 8
 """Pairs of places that are tried for so many groups; a short drive has none that look alike."""
 AGAIN_S = 1.0  # within which a message that comes twice comes again
 MOVING = 1e-4  # motion in a period of the truth above which wheels turn [m]
+MODEL = OdometryNoise()
 CELL_S = 1.0
 """
 How often errors of odometry by the model are drawn [s].
@@ -134,13 +135,12 @@ def _by_model(generator: np.random.Generator, steps: FloatArray, wheels: Wheels)
     return steps + noise
 
 
-def model_variances(steps: FloatArray) -> FloatArray:
+def model_variances(steps: FloatArray, model: OdometryNoise = MODEL) -> FloatArray:
     """
-    Return the variances of motions by the noise model of the node, but for its floors.
+    Return the variances of motions by a noise model of the node, but for its floors.
 
     In: motions of the robot, shape (N, 3). Out: variances in its frame, shape (N, 3).
     """
-    model = OdometryNoise()
     distance, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
     return np.column_stack((
         model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,

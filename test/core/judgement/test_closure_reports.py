@@ -152,7 +152,7 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        closure_states, 'BELIEF', replace(BELIEF, most_waiting=6, left_waiting=4))
+        closure_states, 'BELIEF', replace(BELIEF, most_waiting=6))
     # each is so far off that none agrees with another one
     backend = driven(*(12.0 * (-1.0) ** k * (k + 2) for k in range(9)), 0.0, 0.0, 0.0, 0.0)
     total = backend.verdict_totals()['loop']

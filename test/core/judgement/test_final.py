@@ -20,7 +20,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.judgement import final
+from pose_graph_ros.core.judgement import closure_search
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.measurements import LoopClosure, Measurement, OdometrySample, Position
 
@@ -139,7 +139,7 @@ def test_any_order_of_arrival_ends_with_the_same_set_and_the_same_path(
 
 def test_in_a_very_large_graph_the_set_is_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = DRIVES[1, False]
-    monkeypatch.setattr(final, 'BELIEF', replace(BELIEF, most_at_end=100))
+    monkeypatch.setattr(closure_search, 'BELIEF', replace(BELIEF, most_at_end=100))
     backend = run(sorted([*drive.odometry, *drive.measurements], key=lambda one: one.stamp_ns))
     scans = {one.stamp_ns for one in drive.measurements}
     found = believed(backend)

@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What judgement keeps of nodes and constraints that have left the graph."""
 
-import math
-
 from hypothesis import given, settings, strategies as st
 import numpy as np
 from test_consistency import Drive
 
 from pose_graph_ros.core.judgement.closure_states import ClosureStates
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
-from pose_graph_ros.core.judgement.residual_scale import ScaleLeft, together
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED, State, WAITING
 from pose_graph_ros.core.measurements import LoopClosure
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
@@ -75,15 +72,3 @@ def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
         assert each.record(0) == (5, 5)
         assert each.totals()['scan'][-2:] == (3, 1)
         assert each.has_left('scan/2')
-
-
-def test_the_scale_of_a_source_outlives_its_closures() -> None:
-    left = ScaleLeft()
-    assert together(1.44, 30.0, left) == 1.44
-    left.add(50, 1.2**3)
-    assert together(1.0, 0.0, left) == 1.2**3
-    # those in the graph count as well
-    assert 1.2 <= together(1.0, 40.0, left) < 1.2**3
-    for _ in range(10):
-        left.add(50, 1.0)
-    assert math.isclose(left.scale, 1.0, rel_tol=1e-3)

@@ -12,14 +12,14 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.error_functions import energies, errors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement import final
+from pose_graph_ros.core.judgement import closure_search
 from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
 
 def believed(drive: Drive) -> list[bool]:
     problem = TruncatedProblem(drive.graph, drive.closures)
-    return list(to_the_end(final.select(problem)))
+    return list(to_the_end(closure_search.select(problem)))
 
 
 @pytest.mark.parametrize('seed', range(4))
@@ -30,7 +30,7 @@ def test_the_right_closures_are_found(seed: int, n_wrong: int, groups: tuple[int
     assert not np.any(found & ~drive.right)
     assert np.sum(found) >= 0.9 * np.sum(drive.right)
     problem = TruncatedProblem(drive.graph, drive.closures)
-    choice = to_the_end(final.best(problem))
+    choice = to_the_end(closure_search.best(problem))
     assert not np.any(choice.believed & ~drive.right)
     assert drive.error(choice.poses) < 1.0
 
@@ -43,7 +43,7 @@ def test_the_order_of_the_rows_does_not_matter(seed: int) -> None:
     shuffled.fill(rows._replace(factors=rows.factors.rows(order)))
     place = np.argsort(order)
     problem = TruncatedProblem(shuffled, place[drive.closures])
-    assert list(to_the_end(final.select(problem))) == believed(drive)
+    assert list(to_the_end(closure_search.select(problem))) == believed(drive)
 
 
 def test_a_gate_is_that_of_the_smoother() -> None:
@@ -51,7 +51,7 @@ def test_a_gate_is_that_of_the_smoother() -> None:
     problem = TruncatedProblem(drive.graph, drive.closures)
     none = np.zeros(len(problem))
     to_the_end(problem.solve(none))
-    gates = final._Gates(problem)
+    gates = closure_search._Gates(problem)
     everything = np.arange(len(problem))
     passing = to_the_end(gates.passing(everything))
     smoother = IncrementalSmoother()

@@ -5,11 +5,11 @@
 import numpy as np
 import pytest
 
+from pose_graph_ros.cli.closure_scale import give_scale, residual_scale
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement.residual_scale import give_scale, residual_scale
 
 SIGMAS = np.array([0.2, 0.3, 0.05])
 VECTORS, EACH = 10, 8

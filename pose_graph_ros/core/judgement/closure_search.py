@@ -1,25 +1,23 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The best set of believed loop closures of a whole graph, at the end of a stream or of a file.
+The best set of believed loop closures of a whole graph, while the robot drives and at the end.
 
-It is a function of the graph alone, while what is believed before depends on the order in which
-measurements come. `select` believes the surest ones first; `best` compares that with other sets.
-While the robot drives, `decide` looks for a set that is better than the present one.
+What is believed while closures come depends on their order, and little contradicts a group of
+wrong ones that came first. So `decide` looks for a set with a lower truncated cost on a copy of
+the graph, part by part. It compares the present set with that which believes the surest ones
+first (`select`), after retests of both.
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Mapping
+import math
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Start, Status
-from pose_graph_ros.core.batch.truncated import (
-    Choosing,
-    ROUGH,
-    Surrogate,
-    TruncatedProblem,
-)
+from pose_graph_ros.core.batch.truncated import Choice, Choosing, TruncatedProblem
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
@@ -29,6 +27,12 @@ from pose_graph_ros.core.judgement.closures import floored, forward, GATE
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.smoother.covariances import Innovations, innovations
+from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
+
+# Squared Mahalanobis distance that 90 % of errors with three components are within.
+WITHIN_90 = 6.251
+Job: TypeAlias = Generator[None, None, Any]
+"""Work on a copy of the graph, which pauses after each part."""
 
 
 def select(problem: TruncatedProblem) -> Generator[None, None, BoolArray | None]:
@@ -44,7 +48,7 @@ def select(problem: TruncatedProblem) -> Generator[None, None, BoolArray | None]
     What is believed also shows how large errors really are. Where covariances are far too large,
     the limits are lowered; else a wrong one would fit wherever the graph is claimed to be soft.
 
-    None if the graph cannot be solved.
+    None if the graph cannot be solved; else its poses are near the minimum of the set.
     """
     believed = np.zeros(len(problem), dtype=bool)
     if not (yield from problem.solve(believed.astype(np.float64))):
@@ -54,19 +58,17 @@ def select(problem: TruncatedProblem) -> Generator[None, None, BoolArray | None]
     for _ in range(BELIEF.most_rounds):
         waiting = gates.plausible(np.flatnonzero(~believed & (thrown < BELIEF.thrown_out)))
         waiting = waiting[np.argsort(gates.volume[waiting], kind='stable')]
-        n_first = max(BELIEF.first_volumes, int(BELIEF.first_volumes_share * len(waiting)))
         # volumes only shrink, so what is widest now is looked at where nothing else passes
-        passing = waiting[:0]
-        for some in (waiting[:n_first], waiting[n_first:]):
-            if len(passing) == 0:
-                passing = yield from gates.passing(some)
+        passing = yield from gates.passing(waiting[:BELIEF.first_volumes])
+        if len(passing) == 0:
+            passing = yield from gates.passing(waiting[BELIEF.first_volumes:])
         if len(passing) == 0:
             break
         volume = gates.volume[passing]
         new = passing[volume <= BELIEF.round_factor * np.min(volume)]
         believed[new], seen[new] = True, gates.squared[new] / limits[new]
         if np.sum(believed) >= BELIEF.limits_from:
-            shown = np.quantile(seen[believed], BELIEF.limits_share) * GATE / BELIEF.limits_chi2
+            shown = np.quantile(seen[believed], 0.9) * GATE / WITHIN_90
             problem.limits = limits * np.clip(
                 BELIEF.limits_margin * shown, BELIEF.least_limits, 1.0)
         if not (yield from problem.solve(believed.astype(np.float64), go_on=True)):
@@ -141,43 +143,44 @@ class _Gates:
         self.volume[numbers] = self._own[numbers] * np.sqrt(np.maximum(grown, 1.0))
 
 
-def best(problem: TruncatedProblem) -> Choosing:
+def best(
+    problem: TruncatedProblem, inside: BoolArray | None = None, present: FloatArray | None = None,
+    gain: float = 0.0,
+) -> Choosing:
     """
     Return the set with the lowest truncated cost; None if the graph cannot be solved.
 
-    All constraints are believed if they contradict nothing. Otherwise the sets compared are none,
-    and those of `select` and of graduated non-convexity, each after retests.
+    One set is `inside`, by default that of all constraints, from the `present` poses, by default
+    the start of the problem; another one costs less by some gain. If it contradicts nothing and
+    no constraint, it is the best one. The others are none, and that of `select`.
     """
-    everything = np.ones(len(problem), dtype=bool)
+    odometry, everything = problem.start, np.ones(len(problem), dtype=bool)
+    inside = everything if inside is None else inside
+    present = odometry if present is None else present
     # with wrong ones among them each iteration can take longer than a part may
-    if problem.factorisation(everything.astype(np.float64)) <= (
-            BELIEF.most_numbers * problem.graph.n_nodes):
-        choice = yield from problem.choice(everything, ROUGH)
+    is_sparse = problem.factorisation(inside.astype(np.float64)) <= (
+        BELIEF.most_numbers * problem.graph.n_nodes)
+    if is_sparse and np.all(inside):
+        problem.begin_at(present)
+        choice = yield from problem.choice(inside)
         if choice is not None and np.all(choice.energies <= problem.limits):
-            return (yield from problem.choice(everything))
-    surest, solved = (yield from select(problem)), []
-    sets = [*([] if surest is None else [surest]), ~everything]
-    for looking in (*map(problem.choice, sets), problem.graduated(Surrogate.TRUNCATED)):
-        choice = yield from looking
+            return choice
+    problem.begin_at(odometry)
+    surest = yield from select(problem)
+    # the surest ones have led to a minimum that is better than that from odometry
+    found = odometry if surest is None else problem.graph.poses.copy()
+    choices = list[tuple[float, Choice]]()
+    for believed, start, less in (
+            (inside if is_sparse else None, present, gain), (surest, found, 0.0),
+            (~everything, found, 0.0)):
+        problem.begin_at(start)
+        choice = None if believed is None else (yield from problem.choice(believed))
         if choice is not None:
-            solved.append((yield from problem.improved(choice)))
-    return min(solved, key=lambda each: each.cost, default=None)
+            choice = yield from problem.improved(choice)
+            choices.append((choice.cost - less, choice))
+    return min(choices, key=lambda each: each[0], default=(0.0, None))[1]
 
 
-def surest(problem: TruncatedProblem) -> Choosing:
-    """
-    Return the set of `select` after retests; None if the graph cannot be solved.
-
-    Early in a drive little contradicts a group of wrong constraints that agree, and to believe it
-    can cost less than to doubt each of them. But such a group does not pass the gates.
-    """
-    believed = yield from select(problem)
-    choice = None if believed is None else (yield from problem.choice(believed))
-    return None if choice is None else (yield from problem.improved(choice))
-
-
-# Least reduction of the truncated cost, that of one constraint [sigma^2].
-LEAST_GAIN = GATE
 CONFIG = SolverConfig(max_iterations=100)
 
 
@@ -188,10 +191,10 @@ def decide(
     """
     Return which loop closures to believe, with poses by row; None if the graph cannot be solved.
 
-    All closures are taken out, and the rest is solved: with robust weights from initial values, if
-    `losses` are given, else with the present weights. Then, while the robot drives, the result is
-    the surest set, or None if `inside`, the present one, costs as little. With more than
-    `most_at_end` nodes and closures it is `inside`, improved.
+    `inside` tells which are believed at present. At the end, what has a loss is weighed anew
+    without closures, if `losses` are given. While the robot drives, another set has to cost less
+    than the present one by one constraint. With more than `most_at_end` nodes and closures it is
+    the present set after retests.
     """
     copy, present = _copy(graph, np.union1d(ids, forced)), graph.poses.copy()
     others = Reweighting()
@@ -201,26 +204,19 @@ def decide(
     if graph.n_nodes + len(ids) > BELIEF.most_at_end:
         problem = TruncatedProblem(copy, ids, start=present)
         choice = yield from problem.choice(inside)
-        if choice is not None:
-            choice = yield from problem.improved(choice, BELIEF.retests_at_end)
-    else:
-        weights = dict.fromkeys(ids.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
-        copy.apply(GraphUpdate(weigh=weights))
-        starts = (Start.CHORDAL, Start.JOINT, Start.PRESENT)
-        result = yield from optimizer.in_parts(copy, CONFIG, starts)
-        if result.status is not Status.FAILED and len(others) > 0:
-            for number, weight in weights.items():
-                others.set_base_weight(number, weight)
-            result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
-        if result.status is Status.FAILED:
-            return None
-        problem = TruncatedProblem(copy, ids, start=copy.poses.copy())
-        choice = yield from (surest if losses is None else best)(problem)
-    if choice is None or losses is not None:
-        return choice
-    solved = yield from problem.choice(inside)
-    cost = min(problem.cost_at(present), np.inf if solved is None else solved.cost)
-    return choice if choice.cost < cost - LEAST_GAIN else None
+        return None if choice is None else (yield from problem.improved(choice))
+    weights = dict.fromkeys(ids.tolist(), 0.0) | dict.fromkeys(forced.tolist(), 1.0)
+    copy.apply(GraphUpdate(weigh=weights))
+    result = yield from optimizer.in_parts(
+        copy, CONFIG, (Start.CHORDAL, Start.JOINT, Start.PRESENT))
+    if result.status is not Status.FAILED and len(others) > 0:
+        for number, weight in weights.items():
+            others.set_base_weight(number, weight)
+        result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
+    if result.status is Status.FAILED:
+        return None
+    problem = TruncatedProblem(copy, ids, start=copy.poses.copy())
+    return (yield from best(problem, inside, present, GATE if losses is None else 0.0))
 
 
 def _copy(graph: Graph, closures: IntArray) -> Graph:
@@ -230,3 +226,74 @@ def _copy(graph: Graph, closures: IntArray) -> Graph:
     factors.records[at] = floored(forward(factors.rows(at))).records
     copy.fill(rows._replace(factors=factors))
     return copy
+
+
+class Redecision:
+    """
+    What is solved on copies of the graph, part by part, between the updates: one job at a time.
+
+    A job looks for a better set of closures, or solves for weights with which an update diverges.
+    The graph has to grow by a share until another one of either kind, so that all of them together
+    take a time in proportion to the drive.
+    """
+
+    def __init__(self, smoother: IncrementalSmoother) -> None:
+        self._smoother = smoother
+        self._job: Job | None = None
+        self._solves = False  # whether the job solves for what an update has diverged with
+        # next id of a node from which on there may be another one
+        self._next_search = self._next_solution = 0
+
+    def search(self, job: Job) -> None:
+        """Begin a search, unless there is a job or the graph has not grown since the last one."""
+        graph = self._smoother.graph
+        if self._job is None and graph.next_ids.node >= self._next_search:
+            self._next_search = _grown(graph, BELIEF.search_again)
+            self._job, self._solves = job, False
+
+    def solve_later(self, weights: Mapping[int, float]) -> None:
+        """Solve for weights, by id, with which an update diverges, but during a pause."""
+        if self.may_solve():
+            self._job, self._solves = self.tried(weights), True
+
+    def may_solve(self) -> bool:
+        """Tell whether all may be solved for now that an update has diverged; else in a pause."""
+        if self.is_due_or_pausing:
+            return False
+        self._next_solution = _grown(self._smoother.graph, BELIEF.pause)
+        return True
+
+    @property
+    def is_due_or_pausing(self) -> bool:
+        """Whether a copy is solved, or has to wait until the graph has grown."""
+        graph = self._smoother.graph
+        return (self._job is not None and self._solves) or (
+            graph.n_nodes > BELIEF.small and graph.next_ids.node < self._next_solution)
+
+    def tried(
+        self, weights: Mapping[int, float], poses: FloatArray | None = None,
+        may_adopt: Callable[[], bool] = lambda: True,
+    ) -> Generator[None, None, bool]:
+        """Solve a copy with other weights; return whether the graph is that now."""
+        trial = self._smoother.trial(GraphUpdate(weigh=weights), poses)
+        while trial.work():
+            yield
+        yield
+        return may_adopt() and self._smoother.adopt(trial).status is not Status.FAILED
+
+    def work(self) -> bool:
+        """Do a part of the job; tell whether there was one."""
+        if self._job is None:
+            return False
+        try:
+            next(self._job)
+        except StopIteration:
+            self._job = None
+        return True
+
+    def drop(self) -> None:
+        self._job = None
+
+
+def _grown(graph: Graph, share: float) -> int:
+    return graph.next_ids.node + math.ceil(share * graph.n_nodes)
