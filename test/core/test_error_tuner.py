@@ -192,8 +192,9 @@ def sigmas_of_odometry(backend: PoseGraphBackend) -> np.ndarray:
     edges = backend.graph.factors.edges
     rows = edges.kind == FactorKind.ODOMETRY
     assert set(edges.weight[rows]) == {1.0}
+    claimed = fed_once().rows(np.flatnonzero(fed_once().kind == FactorKind.ODOMETRY))
     return np.sqrt(np.linalg.inv(edges.information[rows])[:, 0, 0]) / np.sqrt(
-        np.linalg.inv(fed_once().information[rows])[:, 0, 0])
+        np.linalg.inv(claimed.information)[:, 0, 0])
 
 
 @functools.cache
