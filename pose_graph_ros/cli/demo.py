@@ -114,7 +114,7 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
 
 def _counts(values: Mapping[str, str], inputs: Inputs) -> dict[tuple[str, str], int]:
     """Return the counts of messages by source and answer that the diagnostics have."""
-    others = ('believed', 'believed_weakly', 'doubted', 'waiting', 'scale', 'forgotten', 'left',
+    others = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 'left',
               'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
     counts: dict[tuple[str, str], int] = {}
     for key, value in values.items():

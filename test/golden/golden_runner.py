@@ -196,7 +196,6 @@ def state_of(
         'believed': {source: states_text([each.state.value for each in verdicts
                                           if each.source == source])
                      for source in sorted({each.source for each in verdicts})},
-        'scales': {source: total.scale for source, total in backend.verdict_totals().items()},
         'fit': {source: {'used': fit.n, 'energy': fit.energy,
                          'errors': None if fit.in_use is None else [
                              fit.in_use.tau, fit.in_use.correlated, fit.in_use.white]}

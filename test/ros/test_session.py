@@ -205,7 +205,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
             (worker, lambda: status(sources={'fix': correlated}), WARN,
              'set fix.correlation_time to about 12 s'),
             (worker, lambda: status(verdicts={
-                'fix': SourceVerdicts({State.DOUBTED: 3}, 1.0, doubting=True)}), WARN,
+                'fix': SourceVerdicts({State.DOUBTED: 3}, doubting=True)}), WARN,
              'The newest measurements of fix are doubted and not used'),
             (worker, lambda: {'estimate': replace(
                 worker.estimate, alignment=AlignmentState.UNALIGNED)}, WARN, 'Unaligned'),

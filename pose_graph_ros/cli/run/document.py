@@ -227,11 +227,11 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
 def _judgement(
     totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
 ) -> dict[str, object]:
-    """Return counts and scale of each source, and all closures and all that is not believed."""
+    """Return counts of each source, and all closures and all that is not believed."""
     return {
         'sources': {source: {
             'states': {state.value: each.counts.get(state, 0) for state in ORDER},
-            'scale': each.scale, 'forgotten': each.n_forgotten}
+            'forgotten': each.n_forgotten}
             for source, each in totals.items()},
         'constraints': [as_json(each) for each in verdicts
                         if each.kind is Judged.LOOP_CLOSURE or is_notable(each)]}

@@ -195,6 +195,9 @@ def _graph_of(text: GraphText, edge2_order: str | None) -> GraphFile:
     # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
     ids, _ = np.unique(np.concatenate([
         table.ids.ravel() for tag, table in rows.items() if tag != 'FIX']), return_index=True)
+    if len(ids) == 0:
+        raise FileFormatError(
+            f'{text.path}: all edges lead from a vertex to itself, and no vertex is given')
     given, first = np.unique(vertices.ids.ravel(), return_index=True)
     if len(given) < len(vertices):
         again = np.setdiff1d(np.arange(len(vertices)), first)[0]

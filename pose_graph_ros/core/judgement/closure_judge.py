@@ -275,7 +275,9 @@ class ClosureJudge:
         decided = states.held[judged]
         choice = yield from decide(
             graph, decided, states.held[states.in_graph & ~states.judged], states.in_graph[judged])
-        if choice is None or np.all(states.in_graph[states.numbers(decided)] == choice.believed):
+        # some may have left the graph meanwhile
+        if choice is None or np.array_equal(
+                np.isin(decided, states.held[states.in_graph]), choice.believed):
             return
         believed = decided[choice.believed]
         changes = self._changes_to(decided, believed)

@@ -5,8 +5,8 @@ The best set of believed loop closures of a whole graph, while the robot drives 
 
 What is believed while closures come depends on their order, and little contradicts a group of
 wrong ones that came first. So `decide` looks for a set with a lower truncated cost on a copy of
-the graph, part by part. It compares the present set with that which believes the surest ones
-first (`select`), after retests of both.
+the graph, part by part. It compares the present set, that which believes the surest ones first
+(`select`) and none, each after retests.
 """
 
 from collections.abc import Callable, Generator, Mapping

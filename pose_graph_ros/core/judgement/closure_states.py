@@ -60,10 +60,10 @@ class ClosureStates(Judgements):
         # some more than need be, as this is not to be done for each new one
         self.forgotten[kept[order[:len(kept) - 9 * BELIEF.most_waiting // 10]]] = True
 
-    def totals(self, scales: Sequence[float] | None = None) -> dict[str, SourceVerdicts]:
+    def totals(self) -> dict[str, SourceVerdicts]:
         return {source: each._replace(n_forgotten=int(np.count_nonzero(
             self.forgotten[self.source == self.sources.index(source)])))
-            for source, each in super().totals(scales).items()}
+            for source, each in super().totals().items()}
 
     def drawn_ids(self) -> list[IntArray]:
         """Return the ids of edges that are believed weakly, wait, and are doubted."""

@@ -162,6 +162,8 @@ class ClosureTable:
             ('spread', np.float64, (3, 3))]))
         # way along the path to both ends [m]
         self._travel = GrowingArray((2,), np.float64)
+        # numbers by the way to the later end, and these ways; none after a change
+        self._by_end: tuple[IntArray, FloatArray] | None = None
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -187,21 +189,33 @@ class ClosureTable:
         self._rows.append(rows)
         self._travel.append(
             np.column_stack((self.chain.travel(new.i), self.chain.travel(new.j))))
+        self._by_end = None
 
     def truncate(self, size: int) -> None:
         for array in (self._rows, self._travel):
             array.truncate(size)
+        self._by_end = None
 
     def select(self, kept: IntArray) -> None:
         for array in (self._rows, self._travel):
             array.select(kept)
+        self._by_end = None
 
     def near(self, number: int, usable: BoolArray) -> IntArray:
         """Return usable closures with both ends near those of one, at most `most_compared`."""
-        apart = np.max(np.abs(self._travel.values - self._travel.values[number]).T, axis=0)
-        found = np.flatnonzero((apart <= BELIEF.near) & usable)
-        found = found[found != number]
-        return found[np.argsort(apart[found], kind='stable')[:BELIEF.most_compared]]
+        travel = self._travel.values
+        if self._by_end is None:
+            order = np.argsort(travel[:, 1], kind='stable')
+            self._by_end = order, travel[order, 1]
+        order, ends = self._by_end
+        start, end = travel[number].tolist()
+        # the rest of the work does not grow with the number of closures
+        first = np.searchsorted(ends, end - BELIEF.near, 'left')
+        last = np.searchsorted(ends, end + BELIEF.near, 'right')
+        around = np.sort(order[first:last])
+        apart = np.maximum(np.abs(travel[around, 0] - start), np.abs(travel[around, 1] - end))
+        close = (apart <= BELIEF.near) & usable[around] & (around != number)
+        return around[close][np.argsort(apart[close], kind='stable')[:BELIEF.most_compared]]
 
     def agree(self, a: IntArray, b: IntArray) -> BoolArray:
         """Tell which pairs of closures agree with one another, shape (P,)."""

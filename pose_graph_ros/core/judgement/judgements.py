@@ -63,7 +63,7 @@ class SavedVerdicts:
     """The columns of a table, and its sources."""
 
     sources: tuple[str, ...]
-    scales: Numbers  # of each source, the factor on its sigmas
+    scales: Numbers  # of each source, 1: older versions had a factor on its sigmas
     # of each source, how many have left the graph, by their states then
     left: Annotated[IntArray, SavedColumn(int, (len(State),))]
     held: Integers
@@ -230,25 +230,24 @@ class Judgements:
                 chosen[rows[max(len(rows) - most, 0):]] = True
         return np.flatnonzero(chosen)
 
-    def totals(self, scales: Sequence[float] | None = None) -> dict[str, SourceVerdicts]:
+    def totals(self) -> dict[str, SourceVerdicts]:
         totals = {}
         for index, source in enumerate(self.sources):
             left, newest = self._left[index], self.state[self.source == index][-BELIEF.newest:]
             totals[source] = SourceVerdicts(
                 dict(zip(STATES, self._counts(index).tolist(), strict=True)),
-                1.0 if scales is None else scales[index],
                 # wrong closures among right ones are what place recognition is like
                 doubting=(self._kind is not Judged.LOOP_CLOSURE and len(newest) > 0
                           and not bool(np.any(USED[newest]))),
                 n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~USED])))
         return totals
 
-    def saved(self, scales: Sequence[float] | None = None) -> SavedVerdicts:
+    def saved(self) -> SavedVerdicts:
         columns = {column[0]: self.records[column[0]].copy() for column in COLUMNS}
         columns['distance'] = np.nan_to_num(columns['distance'], nan=-1.0)
         return SavedVerdicts(
             tuple(self.sources),
-            np.ones(len(self.sources)) if scales is None else np.array(scales, dtype=np.float64),
+            np.ones(len(self.sources)),
             np.array(self._left, dtype=np.int64).reshape(-1, len(STATES)), **columns)
 
     def restore(self, saved: SavedVerdicts) -> None:

@@ -137,6 +137,6 @@ class OdometryStates:
             counts[doubt.verdict.source] += len(doubt.edges)
         n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
         return {source: SourceVerdicts(
-            {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]}, 1.0,
+            {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]},
             doubting=False, n_left=n_left, n_left_unused=self.left[source])
             for source in (counts | self.left)}

@@ -165,8 +165,6 @@ def totals_text(totals: SourceVerdicts) -> str:
         parts.append(f'{totals.n_forgotten} forgotten')
     if totals.n_left > 0:
         parts.append(f'{totals.n_left} left the window, {totals.n_left_unused} of them unused')
-    if totals.scale != 1.0:
-        parts.append(f'sigmas times {short(totals.scale, 3)}')
     return ', '.join(parts)
 
 
@@ -180,8 +178,7 @@ def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
             f'{source}.believed': str(counts.get(State.BELIEVED, 0) + weakly),
             f'{source}.believed_weakly': str(weakly),
             f'{source}.doubted': str(counts.get(State.DOUBTED, 0)),
-            f'{source}.waiting': str(counts.get(State.WAITING, 0)),
-            f'{source}.scale': f'{each.scale:.3g}'}
+            f'{source}.waiting': str(counts.get(State.WAITING, 0))}
         if each.n_forgotten > 0:
             values[f'{source}.forgotten'] = str(each.n_forgotten)
         if each.n_left > 0:

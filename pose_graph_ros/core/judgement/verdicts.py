@@ -91,7 +91,6 @@ class Change(NamedTuple):
 class SourceVerdicts(NamedTuple):
     # number of its constraints by state; states without any may be missing
     counts: Mapping[State, int]
-    scale: float  # factor on its sigmas in the graph; 1 where too little is known
     # whether its newest measurements are doubted or wait, while the estimate goes on
     doubting: bool
     n_forgotten: int = 0  # number of hopeless loop closures that are not judged again

@@ -5,7 +5,7 @@
 from pathlib import Path
 import re
 
-from hypothesis import given, strategies as st
+from hypothesis import example, given, strategies as st
 import numpy as np
 import pytest
 from random_graphs import random_edges, random_information, random_poses, snapshot
@@ -302,6 +302,7 @@ def plausible_lines(draw: st.DrawFn) -> str:
     return ' '.join([tag, *map(str, ids), *map(repr, numbers)])
 
 
+@example(text='EDGE 0 0 0 0 0 0 0 0 0 0 0', edge2_order=None)
 @given(st.one_of(
     st.text(), st.lists(st.lists(words).map(' '.join)).map('\n'.join),
     st.lists(st.one_of(plausible_lines(), st.lists(words).map(' '.join))).map('\n'.join)),

@@ -5,13 +5,18 @@
 from dataclasses import replace
 import math
 
+from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, LOOP_CLOSURES, Loss, Robust
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import closure_states
+from pose_graph_ros.core.judgement.closures import Closures, ClosureTable
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Decision
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
@@ -173,3 +178,36 @@ def test_a_decision_on_a_loaded_graph_is_since_its_newest_node() -> None:
     backend = PoseGraphBackend.restored(None, saved)
     backend.decide('loop/0', Decision.OUT)
     assert backend.verdicts()[0].since_ns == saved.nodes.stamps_ns[-1]
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_neighbours_are_those_of_a_comparison_of_all(seed: int) -> None:
+    rng, n = np.random.default_rng(seed), 60
+    graph = Graph()
+    graph.apply(GraphUpdate(
+        hidden=np.column_stack((2.0 * np.arange(n), np.zeros((n, 2)))), fix=(0,),
+        factors=Factors(np.arange(n - 1), np.arange(1, n), np.tile((2.0, 0.0, 0.0), (n - 1, 1)),
+                        np.tile(np.eye(3), (n - 1, 1, 1)), [FactorKind.ODOMETRY] * (n - 1))))
+    chain = OdometryChain()
+    chain.extend(graph)
+    table, ends = ClosureTable(chain), np.empty((0, 2), dtype=np.int64)
+    for step in rng.choice(3, 8).tolist():
+        if step == 0 or len(ends) < 2:
+            new = np.sort(rng.integers(0, n, (int(rng.integers(1, 40)), 2)), axis=1)
+            table.append(Closures(new[:, 0], new[:, 1], np.zeros((len(new), 3)),
+                                  np.tile(np.eye(3), (len(new), 1, 1))))
+            ends = np.concatenate((ends, new))
+        elif step == 1:
+            ends = ends[:-1]
+            table.truncate(len(ends))
+        else:
+            kept = np.flatnonzero(rng.random(len(ends)) < 0.8)
+            table.select(kept)
+            ends = ends[kept]
+        usable = rng.random(len(ends)) < 0.7
+        for number in rng.integers(0, len(ends), 3).tolist() if len(ends) > 0 else ():
+            apart = np.max(2.0 * np.abs(ends - ends[number]), axis=1)
+            others = [k for k in np.argsort(apart, kind='stable').tolist()
+                      if k != number and usable[k] and apart[k] <= BELIEF.near]
+            assert table.near(number, usable).tolist() == others[:BELIEF.most_compared]

@@ -206,3 +206,31 @@ def test_a_bias_does_not_make_a_distant_place_large(correlation_time: float) -> 
     assert np.any(backend.graph.is_bias) == (correlation_time > 0.0)
     only, = (each for each in backend.verdicts() if each.source == 'scan')
     assert only.state is State.WAITING
+
+
+@pytest.mark.parametrize('n_parts', [1, 40, 200])
+def test_closures_may_leave_while_a_better_set_is_looked_for(n_parts: int) -> None:
+    rng, backend = np.random.default_rng(3), PoseGraphBackend()
+    by_stamp = {each.stamp_ns: each for each in (*true_ones(rng), *false_ones(rng))}
+    for k, pose in enumerate(ODOMETRY):
+        backend.add_odometry(OdometrySample((k + 1) * SECOND, pose))
+        if (k + 1) * SECOND in by_stamp:
+            backend.add_measurement(by_stamp[(k + 1) * SECOND], 'scan')
+        if k % 20 == 0:
+            backend.update()
+    backend.update()
+    judge = backend._judge._closures
+    states = judge.states
+    # all are left out, as if none had been tested, so that there is something to look for
+    judge._change(dict.fromkeys(np.flatnonzero(states.in_graph).tolist(), State.DOUBTED))
+    job = judge._searched()
+    for _ in range(n_parts):
+        next(job, None)
+    n, left = len(states), states.held[::3].copy()
+    judge.forget(np.empty(0, dtype=np.int64), left)
+    for _ in job:
+        pass
+    assert len(states) == n - len(left)
+    assert np.count_nonzero(states.in_graph) > 5
+    np.testing.assert_array_equal(
+        backend.graph.weights[backend.graph.factor_rows(states.held)], states.in_graph)

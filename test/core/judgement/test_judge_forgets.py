@@ -64,7 +64,7 @@ def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
     assert (states.find('scan/1'), states.has_left('scan/1')) == (-1, True)
     assert states.name(states.find('scan/4')) == 'scan/4'
     assert not states.has_left('scan/10')
-    saved, again = states.saved([1.5]), ClosureStates()
+    saved, again = states.saved(), ClosureStates()
     again.restore(saved)
     for each in (states, again):
         added(each, range(30, 31))
