@@ -156,16 +156,14 @@ class Posterior:
     def __init__(
         self, rows: Records, slips: FloatArray, known: Known, *,
         spread: float = BANK.spread, least_white: float = BANK.least_white,
-        finest: float = FINEST, constant: bool = True,
+        finest: float = FINEST, rate: float = BANK.rate, scale: float = BANK.scale,
     ) -> None:
-        """Take slips as `log_density` does, and whether odometry may have constant errors."""
+        """Take slips as `log_density` does, and sigmas of constant errors of odometry."""
         self._least = dict.fromkeys(
             (axes_of(source)[0] for source in known.sources), math.log2(least_white))
         self.rows, self.slips, self.known = np.ascontiguousarray(rows), slips, known
         self._spread, self.finest = spread, finest
-        self._begin = np.zeros(4)
-        if constant:
-            self._begin[2:] = BANK.rate**2, BANK.scale**2
+        self._begin = np.array((0.0, 0.0, rate**2, scale**2))
         self.heading = 0.0
         self._values: dict[Point, float] = {}
         self.constants: dict[Point, FloatArray] = {}  # at the end, see `Learnt`
@@ -257,14 +255,12 @@ def most_likely(posterior: Posterior) -> Generator[None, None, Minimum]:
     return best
 
 
-def _without(posterior: Posterior, best: Minimum) -> Generator[None, None, Minimum]:
-    """Return the best point by which odometry is as it is given, without constant errors."""
+def _as_given(posterior: Posterior, best: Minimum) -> Generator[None, None, Minimum]:
+    """Return the best point by which odometry is as noisy as it is given."""
     known = posterior.known
-    without = Posterior(posterior.rows, posterior.slips, known, constant=False)
-    without.heading = posterior.heading
     axes = [axis for source in known.sources for axis in axes_of(source)
             if best.point[axis] > NO_SLOW]
-    return (yield from descend(without, [moved(
+    return (yield from descend(posterior, [moved(
         best.point, {WAY: known.point[WAY], TURN: known.point[TURN]})], axes))
 
 
@@ -285,9 +281,9 @@ def search(
             posterior = Posterior(rows, slips, known)
             best = yield from most_likely(posterior)
             if known.odometry:
-                without = yield from _without(posterior, best)
-                if without.value - best.value < BANK.odometry_evidence:
-                    best = without
+                given = yield from _as_given(posterior, best)
+                if given.value - best.value < BANK.odometry_evidence:
+                    best = given
             learnt[slips.tobytes()] = best.point
         return learnt[slips.tobytes()]
 
@@ -323,11 +319,13 @@ def _slips(rows: Records, decided: Decided) -> FloatArray:
 def _constants(
     rows: Records, slips: FloatArray, known: Known, point: Point,
 ) -> Generator[None, None, FloatArray]:
-    """Return the constant errors of odometry, 0 unless much shows them."""
-    posterior = Posterior(rows, slips, known)
-    without = Posterior(rows, slips, known, constant=False)
-    yield from posterior.find_heading()
-    without.heading = posterior.heading
-    none, some = (yield from without.value(point)), (yield from posterior.value(point))
-    is_shown = known.odometry and none - some > BANK.odometry_evidence
-    return posterior.constants[point] if is_shown else np.zeros(4)
+    """Return the constant errors of odometry; what the measurements do not show is 0."""
+    best, constants = math.inf, np.zeros(4)
+    for rate in (0.0, BANK.rate) if known.odometry else ():
+        for scale in (0.0, BANK.scale):
+            posterior = Posterior(rows, slips, known, rate=rate, scale=scale)
+            yield from posterior.find_heading()
+            value = yield from posterior.value(point)
+            if value < best:
+                best, constants = value, posterior.constants[point]
+    return constants

@@ -38,8 +38,8 @@ class BankSettings:
     least_heading: float = 0.05
 
     # --- how noisy all is
-    # evidence that is needed for slow errors of a source, and for odometry that is not as it
-    # claims [nats]
+    # evidence that is needed for slow errors of a source, and for odometry that is not as noisy as
+    # it claims [nats]
     slow_evidence: float = 10.0
     odometry_evidence: float = 3.0
     # medians of variances in units of what is claimed, and sigmas of their logarithms: nobody
