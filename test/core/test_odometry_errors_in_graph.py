@@ -101,7 +101,7 @@ def test_constant_errors_are_taken_out_and_fixes_aside_after_an_outage_are_refus
 
 
 def test_neither_the_order_of_arrival_nor_a_file_in_between_changes_the_path() -> None:
-    events, _ = drive(3)
+    events, _ = drive(1)
     events = [event for event in events if event.stamp_ns < OUTAGE * SECOND]
     random = np.random.default_rng(0)
     late = [event.stamp_ns + (30 * SECOND * random.random() if isinstance(event, Position) else 0)
@@ -134,7 +134,7 @@ def test_errors_of_odometry_are_found_in_a_window() -> None:
 
 
 def test_where_a_person_has_put_the_robot_is_not_changed_by_errors_of_odometry() -> None:
-    events, truth = drive(5)
+    events, truth = drive(1)
     half = next(k for k, event in enumerate(events) if event.stamp_ns > 145 * SECOND)
     backend = fed(events[:half])[0]
     assert backend.estimate().odometry_errors.turn < 1.0

@@ -13,6 +13,7 @@ Searches are generators: each step takes a bounded time.
 """
 
 from collections.abc import Collection, Generator, Sequence
+import itertools
 import math
 from typing import NamedTuple
 
@@ -282,7 +283,9 @@ def search(
             best = yield from most_likely(posterior)
             if known.odometry:
                 given = yield from _as_given(posterior, best)
-                if given.value - best.value < BANK.odometry_evidence:
+                if BANK.noise_evidence + (yield from _constants(
+                        rows, slips, known, best.point)).cost > (yield from _constants(
+                        rows, slips, known, given.point)).cost:
                     best = given
             learnt[slips.tobytes()] = best.point
         return learnt[slips.tobytes()]
@@ -302,9 +305,9 @@ def search(
                 yield
             trial.decide()
             slips = _slips(rows, trial.told(first))
+            constants = yield from _constants(rows, slips, known, point)
             found[point] = Learnt(
-                point, trial.evidence + log_prior(point, known),
-                (yield from _constants(rows, slips, known, point)))
+                point, trial.evidence + log_prior(point, known), constants.values)
             point = yield from learn(slips)
     return Found(max(found.values(), key=lambda each: each.evidence), found)
 
@@ -316,16 +319,23 @@ def _slips(rows: Records, decided: Decided) -> FloatArray:
     return np.where(is_believed(decided.choice) & (rows['decides'] == 1), slips, -1.0)
 
 
+class _Constants(NamedTuple):
+    cost: float  # of the measurements with these, and of the evidence that they need [nats]
+    values: FloatArray  # as in `Learnt`
+
+
 def _constants(
     rows: Records, slips: FloatArray, known: Known, point: Point,
-) -> Generator[None, None, FloatArray]:
+) -> Generator[None, None, _Constants]:
     """Return the constant errors of odometry; what the measurements do not show is 0."""
-    best, constants = math.inf, np.zeros(4)
-    for rate in (0.0, BANK.rate) if known.odometry else ():
-        for scale in (0.0, BANK.scale):
-            posterior = Posterior(rows, slips, known, rate=rate, scale=scale)
-            yield from posterior.find_heading()
-            value = yield from posterior.value(point)
-            if value < best:
-                best, constants = value, posterior.constants[point]
-    return constants
+    best = _Constants(math.inf, np.zeros(4))
+    some = (False, True) if known.odometry else (False,)
+    for has_rate, has_scale in itertools.product(some, some):
+        posterior = Posterior(rows, slips, known, rate=BANK.rate * has_rate,
+                              scale=BANK.scale * has_scale)
+        yield from posterior.find_heading()
+        cost = (yield from posterior.value(point)) + BANK.constant_evidence * (
+            has_rate + has_scale)
+        if cost < best.cost:
+            best = _Constants(cost, posterior.constants[point])
+    return best

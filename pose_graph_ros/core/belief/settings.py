@@ -38,10 +38,11 @@ class BankSettings:
     least_heading: float = 0.05
 
     # --- how noisy all is
-    # evidence that is needed for slow errors of a source, and for odometry that is not as noisy as
-    # it claims [nats]
+    # evidence that is needed for slow errors of a source, for odometry that is not as noisy as it
+    # claims, and for each of its constant errors [nats]
     slow_evidence: float = 10.0
-    odometry_evidence: float = 3.0
+    noise_evidence: float = 3.0
+    constant_evidence: float = 2.0
     # medians of variances in units of what is claimed, and sigmas of their logarithms: nobody
     # knows how noisy turns are; what receivers claim of slow errors may be a small part of them
     way: tuple[float, float] = (1.0, 2.0)

@@ -162,7 +162,7 @@ def test_the_noise_of_way_and_turns_and_constant_errors_are_found(
     assert np.median([each.rate for each in every]) == pytest.approx(
         -settings.get('rate', 0.0), abs=5e-4 * max(turn, 1.0))
     assert np.median([each.scale for each in every]) == pytest.approx(
-        -settings.get('longer', 0.0), abs=2e-3 * max(way, 1.0))
+        -settings.get('longer', 0.0), abs=3e-3 * max(way, 1.0))  # wrong headings shorten the way
 
 
 def test_what_is_given_is_not_learnt() -> None:
