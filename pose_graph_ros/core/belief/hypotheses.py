@@ -64,7 +64,7 @@ TREE = types.Array(from_dtype(BRANCH), 2, 'C')
 
 # Copies of the settings that kernels use.
 BETWEEN_FAULTS, FAULT, BETWEEN_SLIPS = BANK.between_faults, BANK.fault, BANK.between_slips
-SLIP_SIZE2 = BANK.slip_size**2
+BETWEEN_JUMPS, JUMP_SIZE2, SLIP_SIZE2 = BANK.between_jumps, BANK.jump_size**2, BANK.slip_size**2
 UNMOVED_WAY, UNMOVED = BANK.unmoved_way, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
 NEAR2, FAR2 = BANK.near_fault**2, BANK.far_fault**2
@@ -177,18 +177,21 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     fresh_square, fresh_spread = gx * gx + gy * gy, 0.5 * (gxx + gyy)
     heading = heading_density(x, p, row)
     any_heading = -LOG_2PI if row.heading_variance > 0.0 else 0.0
-    begins = 1.0 - math.exp(-row.gap / BETWEEN_FAULTS)
+    size2 = JUMP_SIZE2 if in_fault else FAULT_SIZE2
+    begins = 1.0 - math.exp(-row.gap / (BETWEEN_JUMPS if in_fault else BETWEEN_FAULTS))
     ends = 1.0 - math.exp(-row.gap / FAULT)
     slips = 1.0 - math.exp(-row.gap / BETWEEN_SLIPS)
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
     weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
     weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
     weights[BEGINS] = (math.log(max(begins, 1e-12)) + LN_NO_OUTLIER
-                       + cauchy(square, FAULT_SIZE2 + spread) + any_heading)
+                       + cauchy(square, size2 + spread) + any_heading)
     weights[GOES_ON] = LEAST
     if in_fault:
-        weights[GOES_ON] = (math.log(max(1.0 - ends, 1e-12)) + LN_NO_OUTLIER + with_error
-                            + any_heading)
+        stays = math.log(max(1.0 - ends, 1e-12))
+        weights[BEGINS] += stays
+        weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + LN_NO_OUTLIER
+                            + with_error + any_heading)
     weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + LN_NO_OUTLIER
                         + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
@@ -215,7 +218,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
         return
     if choice == BEGINS:
         ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
-        more = (FAULT_SIZE2 + ex * ex + ey * ey) / 3.0
+        more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
         p[first, first] += more
         p[first + 1, first + 1] += more
         one.in_fault[r] = 1

@@ -20,6 +20,9 @@ class BankSettings:
     slip_heading: float = 0.3  # sigma of the heading after a slip [rad]
     # the offset in a fault is as mobile as the error of a good receiver, and wanders [m/sqrt(s)]
     wander: float = 0.1
+    # reflections change: in a fault the offset jumps, about so often [s] and so far [m]
+    between_jumps: float = 10.0
+    jump_size: float = 3.0
     # wheels that spin make the way too long, so a robot that must have moved farther than its
     # odometry says by so much has hardly slipped: that is less likely by so many nats
     unmoved_way: float = 5.0
