@@ -69,7 +69,7 @@ def measure(case: Case) -> Found:
     paths = peers.paths(changed)
     paths['ours'], ours = engine.run(changed, engine.config(POSITIONS))
     paths['oracle'], oracle = engine.run(
-        right, engine.config(replace(POSITIONS, robust=Robust.NONE)))
+        right, engine.config(replace(POSITIONS, robust=Robust.NONE)), changed)
     if case.drive in KINDS:
         told = MeasurementSource(
             covariance=CovariancePolicy(override=(scenario.sigma,)), robust=Robust.NONE,
@@ -87,8 +87,8 @@ def page(found: Sequence[Found]) -> str:
     Return a summary by scenario, and all cases, as Markdown.
 
     Errors are rms of positions to the truth [m], in the map: of the path at the stamps of the
-    fixes when all is known, and *online* of the newest pose just after each fix, from
-    {engine.SETTLED_S:.0f} s on and once it is in the map. The *oracle* is the same engine with
+    fixes when all is known, and *online* of the newest pose just after each fix, right or wrong,
+    from {engine.SETTLED_S:.0f} s on and once it is in the map. The *oracle* is the same engine with
     defaults, which is given the right fixes alone, all believed, and in *slip* odometry without
     the slip; *knowing* is also told the true noise of odometry and fixes by parameters, for
     simulated drives. Huber, Cauchy and GNC-TLS are those of {peers.SAID}, over the whole drive.

@@ -44,9 +44,16 @@ def error(path: Trajectory, drive: Drive) -> float:
     return rms((path.at(stamps) - drive.truth.at(stamps))[:, :2])
 
 
-def run(drive: Drive, settings: BackendConfig) -> tuple[Trajectory, dict[str, float]]:
-    """Update after each fix; return the path at the end, and figures by column of the page."""
+def run(
+    drive: Drive, settings: BackendConfig, asked: Drive | None = None,
+) -> tuple[Trajectory, dict[str, float]]:
+    """
+    Update after each fix; return the path at the end, and figures by column of the page.
+
+    Where the newest pose is asked for online, another drive with more fixes may say.
+    """
     backend, events = PoseGraphBackend(settings), drive.events()
+    at_ns, n_asked = fix_stamps(asked or drive), 0
     settled_ns = drive.odometry.stamps_ns[0] + round(SETTLED_S * SECOND)
     newest: list[tuple[FloatArray, FloatArray]] = []
     arrived, begin = False, time.thread_time()
@@ -56,11 +63,14 @@ def run(drive: Drive, settings: BackendConfig) -> tuple[Trajectory, dict[str, fl
             arrived = True
             continue
         backend.add_odometry(event)
-        if not arrived:
+        is_asked = n_asked < len(at_ns) and event.stamp_ns >= at_ns[n_asked]
+        if not arrived and not is_asked:
             continue
         arrived = False
         backend.update()
-        if event.stamp_ns >= settled_ns and drive.truth.covers(event.stamp_ns):
+        if is_asked:
+            n_asked = int(np.searchsorted(at_ns, event.stamp_ns, side='right'))
+        if is_asked and event.stamp_ns >= settled_ns and drive.truth.covers(event.stamp_ns):
             estimate = backend.estimate(with_path=False)
             if estimate is not None and estimate.alignment is AlignmentState.ALIGNED:
                 newest.append(off_truth(backend, drive.truth))

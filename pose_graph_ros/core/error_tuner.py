@@ -119,8 +119,7 @@ class ErrorTuner:
             except StopIteration as end:
                 self._search = None
                 found: learning.Found = end.value
-                if found.is_better_than(self._in_use, SIMILAR):
-                    self._use(found.best, newest=BANK.most_learnt)
+                self._use(found.instead_of(self._in_use, SIMILAR), newest=BANK.most_learnt)
         return 0.0
 
     @property
@@ -140,8 +139,10 @@ class ErrorTuner:
 
         If not all, the graph follows only where it differs much.
         """
-        fixes, self._in_use = self._judge.fixes, learnt.point
-        fixes.adopt(learning.noise_at(learnt.point), newest)
+        fixes = self._judge.fixes
+        if newest is None or learnt.point != self._in_use:
+            self._in_use = learnt.point
+            fixes.adopt(learning.noise_at(learnt.point), newest)
         if newest is None or learnt.is_far_from(self._odometry):
             self._odometry = learnt.odometry()
         for source in self._factors.finding():

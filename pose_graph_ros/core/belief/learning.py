@@ -98,11 +98,12 @@ class Found(NamedTuple):
     best: Learnt
     every: dict[Point, Learnt]
 
-    def is_better_than(self, point: Point | None, needed: float) -> bool:
-        """Tell whether it explains the measurements better than noise that was tried as well."""
-        other = None if point is None else self.every.get(
+    def instead_of(self, point: Point | None, needed: float) -> Learnt:
+        """Return the best, or what is as good up to so much evidence with noise that is in use."""
+        used = None if point is None else self.every.get(
             (*point, *self.best.point[len(point):]))
-        return other is None or self.best.evidence - other.evidence > needed
+        return used if used is not None and (
+            self.best.evidence - used.evidence <= needed) else self.best
 
 
 def widened(point: Point, known: Known) -> Point:
