@@ -45,6 +45,7 @@ MOST, N_SOURCES = BANK.hypotheses, BANK.sources
 HYPOTHESIS = np.dtype([
     ('weight', 'f8'),
     ('in_fault', 'i8', (N_SOURCES,)),  # whether a source is in a fault
+    ('slips', 'i8'),  # whether odometry slipped before the last good measurement
     ('state', 'f8', (N_STATES,)),
     ('covariance', 'f8', (N_STATES, N_STATES))])
 
@@ -63,14 +64,16 @@ HYPOTHESES = types.Array(from_dtype(HYPOTHESIS), 1, 'C')
 TREE = types.Array(from_dtype(BRANCH), 2, 'C')
 
 # Copies of the settings that kernels use.
-BETWEEN_FAULTS, FAULT, BETWEEN_SLIPS = BANK.between_faults, BANK.fault, BANK.between_slips
-BETWEEN_JUMPS, JUMP_SIZE2, SLIP_SIZE2 = BANK.between_jumps, BANK.jump_size**2, BANK.slip_size**2
+BETWEEN_FAULTS, FAULT, BETWEEN_JUMPS = BANK.between_faults, BANK.fault, BANK.between_jumps
+BETWEEN_SLIPS, SLIP, SLIP_SIZE2 = BANK.between_slips, BANK.slip, BANK.slip_size**2
+JUMP_SIZE2 = BANK.jump_size**2
 UNMOVED_WAY, UNMOVED = BANK.unmoved_way, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
 NEAR2, FAR2 = BANK.near_fault**2, BANK.far_fault**2
 RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
 HOPELESS, ALIKE = BANK.hopeless, BANK.alike
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
+ALIKE_SPREAD = BANK.alike_spread
 EQUAL2, EQUAL = BANK.equal**2, BANK.equal
 LEAST = -1e300
 
@@ -88,7 +91,7 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
         for k in range(n_headings):
             one = bank[n]
             x, p = one.state, one.covariance
-            x[:], p[:, :], one.in_fault[:] = 0.0, 0.0, 0
+            x[:], p[:, :], one.in_fault[:], one.slips = 0.0, 0.0, 0, 0
             heading, variance = 2.0 * math.pi * k / n_headings, HEADING2
             if n_headings == 1:
                 heading, variance = seen.mean[2] - seen.offset[2], seen.heading_variance
@@ -180,7 +183,8 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     size2 = JUMP_SIZE2 if in_fault else FAULT_SIZE2
     begins = 1.0 - math.exp(-row.gap / (BETWEEN_JUMPS if in_fault else BETWEEN_FAULTS))
     ends = 1.0 - math.exp(-row.gap / FAULT)
-    slips = 1.0 - math.exp(-row.gap / BETWEEN_SLIPS)
+    slips = math.exp(-row.gap / SLIP) if one.slips != 0 else (
+        1.0 - math.exp(-row.gap / BETWEEN_SLIPS))
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
     weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
     weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
@@ -196,6 +200,9 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
                         + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
         weights[SLIPPED] -= UNMOVED
+    holds = math.log(max(1.0 - slips, 1e-12))
+    for choice in (GOOD, BEGINS, GOES_ON):
+        weights[choice] += holds
     if row.judged == 0:
         weights[BEGINS] = weights[SLIPPED] = LEAST
     for choice in range(N_CHOICES):
@@ -216,6 +223,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     first, choice = ERROR + 2 * r, branch.choice
     if choice == ALONE:
         return
+    one.slips = 1 if choice == SLIPPED else 0
     if choice == BEGINS:
         ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
         more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
@@ -245,7 +253,7 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
     x, p = one.state, one.covariance
     for m in range(n):
         other = bank[m]
-        same = True
+        same = one.slips == other.slips
         for r in range(n_sources):
             same = same and one.in_fault[r] == other.in_fault[r]
         if not same:
@@ -255,7 +263,9 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
         spread = min(one_spread, other_spread)
         far2 = (x[0] - y[0])**2 + (x[1] - y[1])**2
         turn = abs(factors.wrap(x[2] - y[2])) / math.sqrt(min(p[2, 2], q[2, 2]))
-        if not (far2 < SAME_PLACE2 * spread and turn < SAME_HEADING):
+        # what is known exactly and what is hardly known are not in the same place
+        if not (far2 < SAME_PLACE2 * spread and turn < SAME_HEADING
+                and max(one_spread, other_spread) < ALIKE_SPREAD * spread):
             continue
         equal = (far2 < EQUAL2 * spread and turn < EQUAL
                  and max(one_spread, other_spread) < 2.0 * spread)
@@ -276,7 +286,7 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
 @kernel
 def _copy(bank, n, other, m, n_states):  # type: ignore[no-untyped-def]
     one, from_one = bank[n], other[m]
-    one.weight = from_one.weight
+    one.weight, one.slips = from_one.weight, from_one.slips
     for r in range(N_SOURCES):
         one.in_fault[r] = from_one.in_fault[r]
     for i in range(n_states):

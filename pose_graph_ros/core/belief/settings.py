@@ -13,6 +13,7 @@ class BankSettings:
     between_faults: float = 300.0  # mean time from one fault of a receiver to the next [s]
     fault: float = 30.0  # mean time that a fault lasts [s]
     between_slips: float = 10000.0  # mean time between slips of odometry [s]
+    slip: float = 3.0  # mean time that one lasts, as wheels spin for some seconds [s]
     outliers: float = 0.01  # share of measurements that are wrong by themselves
     # scale of the Cauchy density of what is wrong: hardly anything is known of its size [m]
     fault_size: float = 20.0
@@ -67,7 +68,8 @@ class BankSettings:
     sources: int = 4  # sources with an error of their own; further ones share that of the last
     hopeless: float = 30.0  # a hypothesis is dropped that is less likely by so many nats
     alike: int = 4  # most hypotheses with the same faults in the same place
-    same_place: float = 2.0  # that is within so many sigmas
+    same_place: float = 2.0  # that is within so many sigmas,
+    alike_spread: float = 10.0  # with variances within such a factor
     equal: float = 0.3  # within so many sigmas two become one
     period_ns: int = 1_000_000_000  # of each source one measurement in such a time decides [ns]
     checkpoint: int = 16  # rows from one state that is kept to the next
