@@ -162,7 +162,7 @@ def fitted(rows: Records) -> Noise:
     scaled['slow'] *= 2.0**multiple
     posterior = Posterior(
         scaled, used, known, spread=CLAIM_SPREAD, least_white=SMALLEST, finest=FINEST)
-    likely = best = to_the_end(most_likely(posterior))
+    likely = best = to_the_end(most_likely(posterior))[-1]
     is_slow = best.point[SLOW] > NO_SLOW
     kept: tuple[int, ...] = ()
     axes = (WAY, TURN) if is_slow else (WAY, TURN, WHITE)

@@ -43,6 +43,7 @@ SLOW_BEGINS = (-2.0, -3.0), (0.0, -3.0), (2.0, -3.0), (-1.0, -1.0), (1.0, -1.0)
 SLOW_TAUS = 10.0, 60.0
 UNLEARNT_SLOW = (-1.0, math.log2(40.0), -1.0)
 MOST_ROUNDS = 2  # of learning from what is believed
+UNDECIDED = 5.0  # what is less likely by so many nats may be the best with all hypotheses
 ROWS_IN_STEP = 8000  # measurements that are filtered in a step, of about a microsecond each
 BANK_ROWS_IN_STEP = 80  # the same of a bank, of about 0.1 ms each
 
@@ -232,8 +233,8 @@ def moved(point: Point, to: dict[int, float]) -> Point:
     return tuple(to.get(axis, exponent) for axis, exponent in enumerate(point))
 
 
-def most_likely(posterior: Posterior) -> Generator[None, None, Minimum]:
-    """Return the best point; with slow errors only where much shows them."""
+def most_likely(posterior: Posterior) -> Generator[None, None, list[Minimum]]:
+    """Return the best point, after the best ones with slow errors of fewer sources."""
     known = posterior.known
     yield from posterior.find_heading()
     axes, best = known.free, Minimum(math.inf, known.point)
@@ -243,6 +244,7 @@ def most_likely(posterior: Posterior) -> Generator[None, None, Minimum]:
         begins += [moved(known.point, {WAY: way, TURN: turn}) for way, turn in ODOMETRY_BEGINS]
     for some in ([known.point], begins):
         best = min(best, (yield from descend(posterior, some, axes)))
+    every = [best]
     for source in known.sources:
         own = axes_of(source)
         wider = (*axes, *own[1:])
@@ -252,9 +254,11 @@ def most_likely(posterior: Posterior) -> Generator[None, None, Minimum]:
                 found = min(found, (yield from descend(posterior, [
                     moved(point, {own[0]: part, own[1]: slow, own[2]: math.log2(tau)})
                     for slow, part in SLOW_BEGINS], wider)))
+        if found.value < best.value + UNDECIDED:
+            every.append(found)
         if found.value < best.value:
             best, axes = found, wider
-    return best
+    return every if every[-1] is best else [*every, best]
 
 
 def _as_given(posterior: Posterior, best: Minimum) -> Generator[None, None, Minimum]:
@@ -276,19 +280,20 @@ def search(
     """
     same = bank.again(bank.noise, newest)
     first, rows, found = same.begin, same.rows[same.begin:].copy(), dict[Point, Learnt]()
-    learnt = dict[bytes, Point]()  # by what is believed
+    learnt = dict[bytes, list[Point]]()  # by what is believed, the best one last
 
-    def learn(slips: FloatArray) -> Generator[None, None, Point]:
+    def learn(slips: FloatArray) -> Generator[None, None, list[Point]]:
         if slips.tobytes() not in learnt:
-            posterior = Posterior(rows, slips, known)
-            best = yield from most_likely(posterior)
-            if known.odometry:
-                given = yield from _as_given(posterior, best)
-                if BANK.noise_evidence + (yield from _constants(
-                        rows, slips, known, best.point)).cost > (yield from _constants(
-                        rows, slips, known, given.point)).cost:
-                    best = given
-            learnt[slips.tobytes()] = best.point
+            posterior, points = Posterior(rows, slips, known), list[Point]()
+            for best in (yield from most_likely(posterior)):
+                points.append(best.point)
+                if known.odometry:
+                    given = yield from _as_given(posterior, best)
+                    if BANK.noise_evidence + (yield from _constants(
+                            rows, slips, known, best.point)).cost > (yield from _constants(
+                            rows, slips, known, given.point)).cost:
+                        points[-1] = given.point
+            learnt[slips.tobytes()] = points
         return learnt[slips.tobytes()]
 
     unlearnt = moved(known.point, {
@@ -296,20 +301,21 @@ def search(
         for axis, value in zip(axes_of(source), (
             UNLEARNT_SLOW[2], *UNLEARNT_SLOW[:2]), strict=True)})
     as_all = yield from learn(np.where(rows['decides'] == 1, 0.0, -1.0))
-    for begin in dict.fromkeys((as_all, known.point, unlearnt, *begins)):
-        point = begin
-        for _ in range(1 + MOST_ROUNDS):
-            if point in found:
-                break
-            trial = same.again(noise_at(point), len(rows))
-            while trial.advance(BANK_ROWS_IN_STEP):
-                yield
-            trial.decide()
-            slips = _slips(rows, trial.told(first))
-            constants = yield from _constants(rows, slips, known, point)
-            found[point] = Learnt(
-                point, trial.evidence + log_prior(point, known), constants.values)
-            point = yield from learn(slips)
+    waiting = [(point, 0) for point in dict.fromkeys((
+        *as_all, known.point, unlearnt, *begins))]
+    for point, n_rounds in waiting:
+        if point in found:
+            continue
+        trial = same.again(noise_at(point), len(rows))
+        while trial.advance(BANK_ROWS_IN_STEP):
+            yield
+        trial.decide()
+        slips = _slips(rows, trial.told(first))
+        constants = yield from _constants(rows, slips, known, point)
+        found[point] = Learnt(
+            point, trial.evidence + log_prior(point, known), constants.values)
+        if n_rounds < MOST_ROUNDS:
+            waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)
 
 

@@ -54,7 +54,7 @@ class BankSettings:
     spread: float = 0.5  # of the logarithm of all of what a source claims: that is known best
     slow: tuple[float, float] = (0.25, 2.0)
     tau: tuple[float, float] = (40.0, 1.0)  # of the time constant of slow errors [s]
-    least_white: float = 0.1  # least white part of what a source claims, as a variance
+    least_white: float = 0.01  # least white part of what a source claims, as a variance
     astray: int = 8  # successive measurements that are wrong after which a filter begins again
     # at which numbers of measurements noise is learnt: the first, the ratio of the next one, and
     # the most between
