@@ -165,12 +165,18 @@ def _begin_again(  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _white(white, one, r):  # type: ignore[no-untyped-def]
+    """Return the white variance of a source: in a fault at least as claimed, as none is learnt."""
+    return max(white, 1.0) if one.in_fault[r] != 0 else white
+
+
+@kernel
 def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     """Write the weights of the choices of a hypothesis, and how far the measurement is off."""
     x, p, r = one.state, one.covariance, row.source
     white, slow = noise.white[r], noise.slow[r] * row.slow
     first, in_fault = ERROR + 2 * r, one.in_fault[r] != 0
-    ex, ey, xx, xy, yy, _, _ = innovation(x, p, row, first, white, 0.0)
+    ex, ey, xx, xy, yy, _, _ = innovation(x, p, row, first, _white(white, one, r), 0.0)
     with_error, d2 = density(ex, ey, xx, xy, yy)
     square, spread = ex * ex + ey * ey, 0.5 * (xx + yy)
     gx, gy, gxx, gxy, gyy, fresh = ex, ey, xx, xy, yy, with_error
@@ -239,7 +245,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
             p[0, 0] += more
             p[1, 1] += more
             p[2, 2] += SLIP_HEADING2
-    correct(x, p, n, row, first, noise.white[r], one.in_fault[r] == 0)
+    correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
 
 
 @kernel
