@@ -367,7 +367,8 @@ class FixJudge:
             return
         while self.step():
             pass
-        before, self._slips = self._begin(), {}
+        before = self._begin()
+        self._slips, self._loosened = {}, {}
         self._bank.decide()
         self._apply(self._bank.told(0))
         change = self._with_weights(GraphUpdate(), before)

@@ -127,7 +127,7 @@ def test_the_density_is_that_of_the_full_covariance(*, constant: bool) -> None:
 
 
 @pytest.mark.parametrize(('tau', 'period', 'n'), [
-    (10.0, 2.0, 300), (60.0, 1.0, 400), (60.0, 5.0, 240)])
+    (10.0, 2.0, 300), (60.0, 1.0, 400), (60.0, 5.0, 300)])
 def test_the_time_constant_is_found_within_a_factor(tau: float, period: float, n: int) -> None:
     every = [errors_in(a_drive(seed, n=n, period=period, tau=tau)) for seed in range(3)]
     known = [each for each in every if each is not None]
