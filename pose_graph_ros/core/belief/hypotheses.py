@@ -44,14 +44,16 @@ MOST, N_SOURCES = BANK.hypotheses, BANK.sources
 
 HYPOTHESIS = np.dtype([
     ('weight', 'f8'),
-    ('in_fault', 'i8', (N_SOURCES,)),  # whether a source is in a fault
+    # whether a source is in a fault: 0, 1: as noisy as it is else, 2: at least as it claims
+    ('in_fault', 'i8', (N_SOURCES,)),
     ('slips', 'i8'),  # whether odometry slipped before the last good measurement
     ('state', 'f8', (N_STATES,)),
     ('covariance', 'f8', (N_STATES, N_STATES))])
 
-# What a hypothesis says of a measurement. The second and the third are one run of wrong ones.
-GOOD, ALONE, BEGINS, GOES_ON, SLIPPED = range(5)
-N_CHOICES = 5
+# What a hypothesis says of a measurement. That a noisy fault begins is told as any beginning.
+GOOD, ALONE, BEGINS, GOES_ON, SLIPPED, BEGINS_NOISY = range(6)
+N_CHOICES = 6
+LN_KINDS = math.log(0.5)  # either kind of fault is as likely
 
 # A hypothesis after a measurement, as a member of the tree of all.
 BRANCH = np.dtype([
@@ -79,13 +81,21 @@ LEAST = -1e300
 
 
 @kernel
+def _white(white, one, r):  # type: ignore[no-untyped-def]
+    """Return the white variance of a source in units of what it claims."""
+    return max(white, 1.0) if one.in_fault[r] == 2 else white
+
+
+@kernel
 def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
     """Write the hypotheses on a first measurement: any heading, good or in a fault."""
     seen, noise = table[row], noises[0]
     r = seen.source
     in_fault = FAULT / (FAULT + BETWEEN_FAULTS)
-    n = 0
-    for fault in range(3 if seen.judged != 0 else 1):
+    n, n_faults = 0, 0
+    if seen.judged != 0:
+        n_faults = 4 if noise.white[r] < 1.0 else 2
+    for fault in range(1 + n_faults):
         # in a fault the heading of a pose is wrong as well
         n_headings = 1 if fault == 0 and seen.heading_variance > 0.0 else HEADINGS
         for k in range(n_headings):
@@ -106,18 +116,19 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
                     p[i, i] = noise.slow[other] * seen.slow
             slow = noise.slow[r] * seen.slow
             if fault > 0:
-                slow = NEAR2 if fault == 1 else FAR2
-                one.in_fault[r] = 1
-            p[0, 0] = noise.white[r] * seen.noise[0] + slow
-            p[0, 1] = noise.white[r] * seen.noise[1]
+                slow = NEAR2 if fault % 2 == 1 else FAR2
+                one.in_fault[r] = 1 if fault <= 2 else 2
+            white = _white(noise.white[r], one, r)
+            p[0, 0] = white * seen.noise[0] + slow
+            p[0, 1] = white * seen.noise[1]
             p[1, 0] = p[0, 1]
-            p[1, 1] = noise.white[r] * seen.noise[2] + slow
+            p[1, 1] = white * seen.noise[2] + slow
             for i in range(2):
                 j = ERROR + 2 * r + i
                 p[j, j] = slow
                 p[i, j] = -slow
                 p[j, i] = -slow
-            share = 1.0 - in_fault if fault == 0 else 0.5 * in_fault
+            share = 1.0 - in_fault if fault == 0 else in_fault / n_faults
             one.weight = math.log(share / n_headings)
             n += 1
     return n
@@ -165,12 +176,6 @@ def _begin_again(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _white(white, one, r):  # type: ignore[no-untyped-def]
-    """Return the white variance of a source: in a fault at least as claimed, as none is learnt."""
-    return max(white, 1.0) if one.in_fault[r] != 0 else white
-
-
-@kernel
 def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     """Write the weights of the choices of a hypothesis, and how far the measurement is off."""
     x, p, r = one.state, one.covariance, row.source
@@ -196,6 +201,10 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
     weights[BEGINS] = (math.log(max(begins, 1e-12)) + LN_NO_OUTLIER
                        + cauchy(square, size2 + spread) + any_heading)
+    weights[BEGINS_NOISY] = LEAST
+    if not in_fault and white < 1.0:
+        weights[BEGINS] += LN_KINDS
+        weights[BEGINS_NOISY] = weights[BEGINS]
     weights[GOES_ON] = LEAST
     if in_fault:
         stays = math.log(max(1.0 - ends, 1e-12))
@@ -207,10 +216,10 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
         weights[SLIPPED] -= UNMOVED
     holds = math.log(max(1.0 - slips, 1e-12))
-    for choice in (GOOD, BEGINS, GOES_ON):
+    for choice in (GOOD, BEGINS, BEGINS_NOISY, GOES_ON):
         weights[choice] += holds
     if row.judged == 0:
-        weights[BEGINS] = weights[SLIPPED] = LEAST
+        weights[BEGINS] = weights[BEGINS_NOISY] = weights[SLIPPED] = LEAST
     for choice in range(N_CHOICES):
         weights[choice] += one.weight
         if not weights[choice] > LEAST:
@@ -230,12 +239,13 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     if choice == ALONE:
         return
     one.slips = 1 if choice == SLIPPED else 0
-    if choice == BEGINS:
+    if choice == BEGINS or choice == BEGINS_NOISY:
         ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
         more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
         p[first, first] += more
         p[first + 1, first + 1] += more
-        one.in_fault[r] = 1
+        if one.in_fault[r] == 0:
+            one.in_fault[r] = 1 if choice == BEGINS else 2
     elif choice != GOES_ON:
         if one.in_fault[r] != 0:
             forget_error(x, p, n, first, noise.slow[r] * row.slow)
@@ -376,5 +386,6 @@ def _stay(bank, n, row, weights, branches, leaves):  # type: ignore[no-untyped-d
 @kernel
 def _note(leaves, n, branch, before):  # type: ignore[no-untyped-def]
     leaf = leaves[n]
-    leaf.before, leaf.choice = before, branch.choice
+    leaf.before = before
+    leaf.choice = BEGINS if branch.choice == BEGINS_NOISY else branch.choice
     leaf.far, leaf.d2 = branch.far, branch.d2
