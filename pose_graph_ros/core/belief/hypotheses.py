@@ -46,6 +46,7 @@ HYPOTHESIS = np.dtype([
     ('weight', 'f8'),
     # whether a source is in a fault: 0, 1: as noisy as it is else, 2: at least as it claims
     ('in_fault', 'i8', (N_SOURCES,)),
+    ('turned', 'f8', (N_SOURCES,)),  # by what the last heading of a source in a fault was off
     ('slips', 'i8'),  # whether odometry slipped before the last good measurement
     ('state', 'f8', (N_STATES,)),
     ('covariance', 'f8', (N_STATES, N_STATES))])
@@ -87,6 +88,12 @@ def _white(white, one, r):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _off(one, row):  # type: ignore[no-untyped-def]
+    """Return by what a measured heading is off."""
+    return factors.wrap(row.mean[2] - row.offset[2] - one.state[2])
+
+
+@kernel
 def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
     """Write the hypotheses on a first measurement: any heading, good or in a fault."""
     seen, noise = table[row], noises[0]
@@ -110,6 +117,8 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
             x[1] = seen.mean[1] - s * seen.offset[0] - c * seen.offset[1]
             x[2] = heading
             p[2, 2] = variance
+            one.turned[:] = 0.0
+            one.turned[r] = _off(one, seen)
             p[RATE, RATE], p[SCALE, SCALE] = RATE2, SCALE2
             for other in range(n_sources):
                 for i in range(ERROR + 2 * other, ERROR + 2 * other + 2):
@@ -209,8 +218,13 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     if in_fault:
         stays = math.log(max(1.0 - ends, 1e-12))
         weights[BEGINS] += stays
+        if row.heading_variance > 0.0:
+            # in a fault the heading stays off by what it was, or is any
+            e = factors.wrap(_off(one, row) - one.turned[r])
+            variance = 2.0 * row.heading_variance + noise.turn * row.turn[5]
+            heading = max(-0.5 * (LOG_2PI + math.log(variance) + e * e / variance), any_heading)
         weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + LN_NO_OUTLIER
-                            + with_error + any_heading)
+                            + with_error + heading)
     weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + LN_NO_OUTLIER
                         + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
@@ -238,7 +252,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     first, choice = ERROR + 2 * r, branch.choice
     if choice == ALONE:
         return
-    one.slips = 1 if choice == SLIPPED else 0
+    one.slips, one.turned[r] = 1 if choice == SLIPPED else 0, _off(one, row)
     if choice == BEGINS or choice == BEGINS_NOISY:
         ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
         more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
@@ -304,7 +318,7 @@ def _copy(bank, n, other, m, n_states):  # type: ignore[no-untyped-def]
     one, from_one = bank[n], other[m]
     one.weight, one.slips = from_one.weight, from_one.slips
     for r in range(N_SOURCES):
-        one.in_fault[r] = from_one.in_fault[r]
+        one.in_fault[r], one.turned[r] = from_one.in_fault[r], from_one.turned[r]
     for i in range(n_states):
         one.state[i] = from_one.state[i]
         for j in range(n_states):
