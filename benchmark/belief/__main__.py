@@ -88,9 +88,9 @@ def page(found: Sequence[Found]) -> str:
 
     Errors are rms of positions to the truth [m], in the map: of the path at the stamps of the
     fixes when all is known, and *online* of the newest pose just after each fix, right or wrong,
-    from {engine.SETTLED_S:.0f} s on and once it is in the map. The *oracle* is the same engine with
-    defaults, which is given the right fixes alone, all believed, and in *slip* odometry without
-    the slip; *knowing* is also told the true noise of odometry and fixes by parameters, for
+    from {engine.SETTLED_S:.0f} s on and once it is in the map. The *oracle* is the same engine
+    with defaults, which is given the right fixes alone, all believed, and in *slip* odometry
+    without the slip; *knowing* is also told the true noise of odometry and fixes by parameters, for
     simulated drives. Huber, Cauchy and GNC-TLS are those of {peers.SAID}, over the whole drive.
     Ratios are over the oracle, that of *ours online* over the oracle online. Nobody can tell which
     receiver is wrong in *two_all*; the seed chooses it. NEES is of positions: 1 if what is claimed

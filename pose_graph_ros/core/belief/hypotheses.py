@@ -253,7 +253,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     if choice == ALONE:
         return
     one.slips, one.turned[r] = 1 if choice == SLIPPED else 0, _off(one, row)
-    if choice == BEGINS or choice == BEGINS_NOISY:
+    if choice in (BEGINS, BEGINS_NOISY):
         ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
         more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
         p[first, first] += more
