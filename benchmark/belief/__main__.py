@@ -87,16 +87,16 @@ def page(found: Sequence[Found]) -> str:
     Return a summary by scenario, and all cases, as Markdown.
 
     Errors are rms of positions to the truth [m], in the map: of the path at the stamps of the
-    fixes when all is known, and *online* of the newest pose just after each fix, right or wrong,
-    from {engine.SETTLED_S:.0f} s on and once it is in the map. The *oracle* is the same engine
-    with defaults, which is given the right fixes alone, all believed, and in *slip* odometry
-    without the slip; *knowing* is also told the true noise of odometry and fixes by parameters, for
-    simulated drives. Huber, Cauchy and GNC-TLS are those of {peers.SAID}, over the whole drive.
-    Ratios are over the oracle, that of *ours online* over the oracle online. Nobody can tell which
-    receiver is wrong in *two_all*; the seed chooses it. NEES is of positions: 1 if what is claimed
-    is right.
-    Times are of the processor; those per fix are of all calls online. What is tuned is tuned on
-    seeds 0 to 4. There is no truth of husky: the path by its recorded fixes stands for it.
+    fixes when all is known, and *online* of the newest pose just after each fix, right or
+    wrong, from {engine.SETTLED_S:.0f} s on and once it is in the map. The *oracle* is the same
+    engine with defaults, which is given the right fixes alone, all believed, and in *slip*
+    odometry without the slip; *knowing* is also told the true noise of odometry and fixes by
+    parameters, for simulated drives. Huber, Cauchy and GNC-TLS are those of {peers.SAID}, over
+    the whole drive. Ratios are over the oracle, that of *ours online* over the oracle online.
+    Nobody can tell which receiver is wrong in *two_all*; the seed chooses it. NEES is of
+    positions: 1 if what is claimed is right. Times are of the processor; those per fix are of
+    all calls online. What is tuned is tuned on seeds 0 to 4. There is no truth of husky: the
+    path by its recorded fixes stands for it.
     """
     summary = Table('Ratios: geometric mean (worst)', ('scenario', 'cases', *RATIOS))
     cases = Table('Cases', ('scenario', 'odometry', 'seed', *found[0].figures))
