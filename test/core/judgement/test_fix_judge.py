@@ -154,7 +154,8 @@ def grow(drive: Drive) -> None:
     (150, lambda drive: drive.move(60.0, 120.0, (-60.0, 80.0)), (60.0, 120.0), 1, 130, 1.5),
     # or at the beginning
     (100, lambda drive: drive.move(0.0, 20.0, (30.0, 20.0)), (0.0, 20.0), 3, 99, 1.0),
-    (200, lambda drive: drive.slip(60.0, 12.0), (0.0, 0.0), 65, 105, 1.0),
+    # which it was for some seconds
+    (200, lambda drive: drive.slip(60.0, 12.0), (0.0, 0.0), 2, 75, 0.5),
     (150, turn, (0.0, 0.0), 2, 125, 1.0),
     # odometry that is worse than it claims
     (200, noisier(2.0), (0.0, 0.0), 2, 190, 1.0), (200, noisier(4.0), (0.0, 0.0), 2, 190, 1.0),
@@ -238,6 +239,34 @@ def test_poses_in_the_wrong_corridor() -> None:
     assert {f'other/{number}' for number in range(50, 75)} <= driven.doubted
     assert len(driven.doubted) <= 27
     assert driven.rms < 0.5
+
+
+def test_a_wrong_heading_that_stays_off_is_not_a_slip() -> None:
+    drive = Drive(60)
+    poses: list[tuple[str, Measurement]] = []
+    for time in range(60):
+        pose = drive.truth[5 * time] + drive.rng.standard_normal(3) * (0.1, 0.1, 0.02)
+        if 20 <= time < 28:
+            pose = pose + (3.0, 2.0, 0.5)
+        poses.append(('other', GlobalPose(
+            SECOND + time * SECOND, se2.wrapped(pose), np.diag((0.01, 0.01, 0.0004)))))
+    driven = Driven(drive, poses)
+    assert driven.doubted == {f'other/{number}' for number in range(20, 28)}
+    assert driven.rms < 0.2
+
+
+@pytest.mark.parametrize('scatter', [0.1, 1.0])
+def test_a_fault_of_an_exact_receiver_is_exact_or_noisy(scatter: float) -> None:
+    drive = Drive(200)
+    drive.fixes = drive.truth[::5, :2] + 0.1 * drive.rng.standard_normal((200, 2))
+    drive.claimed = 1.0
+    drive.move(100.0, 130.0, (15.0, -8.0))
+    at = drive.between(100.0, 130.0)
+    drive.fixes[at] += scatter * drive.rng.standard_normal((30, 2))
+    driven = Driven(drive)
+    assert driven.doubted == ids(drive, 100.0, 130.0)
+    assert max(driven.newest[at] for at in range(105, 200)) < 2.5   # m, by odometry meanwhile
+    assert driven.rms < 0.3
 
 
 def test_correlated_errors_are_judged_as_well() -> None:
