@@ -160,12 +160,12 @@ class ErrorTuner:
             self._correct_odometry(self._wanted())
 
     def decide(self) -> None:
-        """Use the noise that all measurements show; for the end of a stream."""
+        """Use the noise that all measurements show if they are enough, at the end of a stream."""
         self.finish_change()
         self._search = None
         fixes = self._judge.fixes
         fixes.prepare()
-        if len(fixes.bank) == 0:
+        if np.count_nonzero(fixes.bank.rows['decides']) < BANK.first_learnt:
             return
         # what was in use depends on the order of arrival
         found = to_the_end(learning.search(fixes.bank, fixes.known()))

@@ -64,7 +64,7 @@ class BankSettings:
     most_learnt: int = 3000  # newest ones that it is learnt from while measurements come
 
     # --- the bank
-    hypotheses: int = 96
+    hypotheses: int = 96  # at least 5 for each heading that is tried
     sources: int = 4  # sources with an error of their own; further ones share that of the last
     hopeless: float = 30.0  # a hypothesis is dropped that is less likely by so many nats
     alike: int = 4  # most hypotheses with the same faults in the same place

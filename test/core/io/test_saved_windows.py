@@ -3,6 +3,7 @@
 """Saved graphs that nodes have left: by a window, and by thinning."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from tum_files import read_tum
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.config import BackendConfig, OdometrySource, POSITIONS
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.g2o import read_g2o, STANDING_FOR
@@ -34,7 +35,7 @@ def interrupted(
 ) -> tuple[Estimate, Estimate, SavedGraph]:
     """Return final estimates of a drive and of one that was saved halfway, and what was saved."""
     at = 12 * (len(events) // 24)
-    once, first = (run(some, config.window) for some in (events, events[:at]))
+    once, first = (run(some, None, PoseGraphBackend(config)) for some in (events, events[:at]))
     saved = first.saved()
     second = run(events[at:], None, PoseGraphBackend.restored(
         config, through_files(saved, folder)))
@@ -55,7 +56,11 @@ def test_a_drive_of_two_odometries_goes_on_with_its_window_as_without_saving(
             events.append(('visual', OdometrySample(
                 what.stamp_ns + 30_000_000, se2.compose(
                     np.array([1.0, 2.0, -1.0]), what.pose + rng.normal(0.0, 1e-3, 3)))))
-    one, other, saved = interrupted(events, BackendConfig(window=WINDOW), tmp_path)
+    # noise that is learnt is begun anew from a file
+    told = BackendConfig(
+        window=WINDOW, odometry={'odom': OdometrySource(sigma_scale=1.0)},
+        measurements={'fix': replace(POSITIONS, correlation_time=0.0)})
+    one, other, saved = interrupted(events, told, tmp_path)
     assert one.n_edges > 1.5 * (one.n_hidden - one.n_frozen)
     assert len(saved.rows.priors) > 0
     assert len(saved.nodes.frozen) > 40

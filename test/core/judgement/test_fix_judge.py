@@ -247,7 +247,7 @@ def test_a_wrong_heading_that_stays_off_is_not_a_slip() -> None:
     for time in range(60):
         pose = drive.truth[5 * time] + drive.rng.standard_normal(3) * (0.1, 0.1, 0.02)
         if 20 <= time < 28:
-            pose = pose + (3.0, 2.0, 0.5)
+            pose += np.array((3.0, 2.0, 0.5))
         poses.append(('other', GlobalPose(
             SECOND + time * SECOND, se2.wrapped(pose), np.diag((0.01, 0.01, 0.0004)))))
     driven = Driven(drive, poses)
