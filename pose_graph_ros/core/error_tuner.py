@@ -47,7 +47,7 @@ from pose_graph_ros.core.transaction import succeeds
 # Number of measurements that a step moves, online and at the end of a stream.
 PART, WHOLE = 100, 5000
 # Slow errors that differ by less than this factor are not changed online in the graph.
-ALIKE = 1.9
+ALIKE = 1.5
 # Noise that explains the measurements better by less than this changes nothing online [nats].
 SIMILAR = 1.0
 

@@ -154,7 +154,6 @@ def fitted(rows: Records) -> Noise:
     used, known = np.zeros(len(rows)), ALL_UNKNOWN
     # claims may be wrong by more than the search goes: it begins with the best of some multiples
     posterior = Posterior(rows, used, known)
-    to_the_end(posterior.find_heading())
     multiple = min(MULTIPLES, key=lambda exponent: to_the_end(
         posterior.value(moved(known.point, {WHITE: exponent}))))
     scaled = rows.copy()

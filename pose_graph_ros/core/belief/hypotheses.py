@@ -42,10 +42,12 @@ from pose_graph_ros.core.graph import factors
 
 MOST, N_SOURCES = BANK.hypotheses, BANK.sources
 
+# In a fault a source is as noisy as it is else, or at least as noisy as it claims.
+QUIET, NOISY = 1, 2
+
 HYPOTHESIS = np.dtype([
     ('weight', 'f8'),
-    # whether a source is in a fault: 0, 1: as noisy as it is else, 2: at least as it claims
-    ('in_fault', 'i8', (N_SOURCES,)),
+    ('in_fault', 'i8', (N_SOURCES,)),  # whether a source is in a fault, `QUIET` or `NOISY`; or 0
     ('turned', 'f8', (N_SOURCES,)),  # by what the last heading of a source in a fault was off
     ('slips', 'i8'),  # whether odometry slipped before the last good measurement
     ('state', 'f8', (N_STATES,)),
@@ -84,7 +86,7 @@ LEAST = -1e300
 @kernel
 def _white(white, one, r):  # type: ignore[no-untyped-def]
     """Return the white variance of a source in units of what it claims."""
-    return max(white, 1.0) if one.in_fault[r] == 2 else white
+    return max(white, 1.0) if one.in_fault[r] == NOISY else white
 
 
 @kernel
@@ -126,7 +128,7 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
             slow = noise.slow[r] * seen.slow
             if fault > 0:
                 slow = NEAR2 if fault % 2 == 1 else FAR2
-                one.in_fault[r] = 1 if fault <= 2 else 2
+                one.in_fault[r] = QUIET if fault <= 2 else NOISY
             white = _white(noise.white[r], one, r)
             p[0, 0] = white * seen.noise[0] + slow
             p[0, 1] = white * seen.noise[1]
@@ -259,7 +261,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
         p[first, first] += more
         p[first + 1, first + 1] += more
         if one.in_fault[r] == 0:
-            one.in_fault[r] = 1 if choice == BEGINS else 2
+            one.in_fault[r] = QUIET if choice == BEGINS else NOISY
     elif choice != GOES_ON:
         if one.in_fault[r] != 0:
             forget_error(x, p, n, first, noise.slow[r] * row.slow)

@@ -13,7 +13,6 @@ Searches are generators: each step takes a bounded time.
 """
 
 from collections.abc import Collection, Generator, Sequence
-import itertools
 import math
 from typing import NamedTuple
 
@@ -37,15 +36,16 @@ NO_SLOW = -math.inf  # exponent of a source without slow errors
 LN_2 = math.log(2.0)
 # Steps on the lattice, and bounds.
 COARSEST, FINEST, LEAST, MOST = 2.0, 0.25, -12.0, 16.0
-# What searches begin with: way and turn; slow and white variance; time constants [s].
+# What searches begin with: way and turn; slow and white variance; time constants [s]; and white
+# and slow variance with the time constant, where nothing is learnt yet.
 ODOMETRY_BEGINS = (-4.0, -4.0), (0.0, 4.0), (4.0, 0.0), (4.0, 4.0)
 SLOW_BEGINS = (-2.0, -3.0), (0.0, -3.0), (2.0, -3.0), (-1.0, -1.0), (1.0, -1.0)
 SLOW_TAUS = 10.0, 60.0
-UNLEARNT_SLOW = (-1.0, math.log2(40.0), -1.0)
+UNLEARNT = -1.0, -1.0, math.log2(40.0)
 MOST_ROUNDS = 2  # of learning from what is believed
 UNDECIDED = 5.0  # what is less likely by so many nats may be the best with all hypotheses
 ROWS_IN_STEP = 8000  # measurements that are filtered in a step, of about a microsecond each
-BANK_ROWS_IN_STEP = 80  # the same of a bank, of about 0.1 ms each
+BANK_ROWS_IN_STEP = 80  # the same of a bank, of 0.1 to 0.4 ms each
 
 Search = Generator[None, None, 'Found']
 
@@ -153,27 +153,35 @@ class Minimum(NamedTuple):
     point: Point
 
 
+class Shown(NamedTuple):
+    """Constant errors of odometry that are shown."""
+
+    cost: float  # of the measurements with these, and of the evidence that they need [nats]
+    constants: FloatArray  # as in `Learnt`
+
+
 class Posterior:
     """The negative logarithm of the posterior density of noise, at most once at each point."""
 
     def __init__(
         self, rows: Records, slips: FloatArray, known: Known, *,
         spread: float = BANK.spread, least_white: float = BANK.least_white,
-        finest: float = FINEST, rate: float = BANK.rate, scale: float = BANK.scale,
+        finest: float = FINEST,
     ) -> None:
-        """Take slips as `log_density` does, and sigmas of constant errors of odometry."""
+        """Take slips as `log_density` does."""
         self._least = dict.fromkeys(
             (axes_of(source)[0] for source in known.sources), math.log2(least_white))
         self.rows, self.slips, self.known = np.ascontiguousarray(rows), slips, known
         self._spread, self.finest = spread, finest
-        self._begin = np.array((0.0, 0.0, rate**2, scale**2))
-        self.heading = 0.0
-        self._values: dict[Point, float] = {}
-        self.constants: dict[Point, FloatArray] = {}  # at the end, see `Learnt`
+        self._heading: float | None = None
+        self._values: dict[Point, float] = {}  # with constant errors of odometry
         self._left = ROWS_IN_STEP
 
-    def density(self, point: Point, heading: float) -> tuple[float, FloatArray]:
-        constants = self._begin.copy()
+    def _density(
+        self, point: Point, heading: float, has_rate: bool = True, has_scale: bool = True,
+    ) -> tuple[float, FloatArray]:
+        constants = np.array((
+            0.0, 0.0, (BANK.rate * has_rate)**2, (BANK.scale * has_scale)**2))
         n_sources = (len(point) - 2) // 3
         return float(log_density(self.rows, self.slips, n_sources, noise_at(point), heading,
                                  constants)), constants
@@ -181,22 +189,37 @@ class Posterior:
     def clipped(self, axis: int, exponent: float) -> float:
         return min(max(exponent, self._least.get(axis, LEAST)), MOST)
 
-    def find_heading(self) -> Generator[None, None, None]:
-        """Find the heading at the first position that makes all as claimed the most likely."""
-        angles = 2.0 * math.pi / BANK.headings * np.arange(BANK.headings)
-        most = -math.inf
-        for angle in angles.tolist():
-            value, _ = self.density(self.known.point, angle)
-            if value > most:
-                most, self.heading = value, angle
-            yield from self._pause()
+    def heading(self) -> Generator[None, None, float]:
+        """Return the heading at the first position that makes all as claimed the most likely."""
+        if self._heading is None:
+            angles = 2.0 * math.pi / BANK.headings * np.arange(BANK.headings)
+            values: list[tuple[float, float]] = []
+            for angle in angles.tolist():
+                values.append((-self._density(self.known.point, angle)[0], angle))
+                yield from self._pause()
+            self._heading = min(values)[1]
+        return self._heading
 
     def value(self, point: Point) -> Generator[None, None, float]:
         if point not in self._values:
-            density, self.constants[point] = self.density(point, self.heading)
+            heading = yield from self.heading()
+            density, _ = self._density(point, heading)
             self._values[point] = -density - log_prior(point, self.known, self._spread)
             yield from self._pause()
         return self._values[point]
+
+    def shown(self, point: Point) -> Generator[None, None, Shown]:
+        """Return the constant errors of odometry that the measurements show; the others are 0."""
+        heading, best = (yield from self.heading()), Shown(math.inf, np.zeros(4))
+        prior, some = log_prior(point, self.known, self._spread), (False, True)
+        for has_rate in some if self.known.odometry else (False,):
+            for has_scale in some if self.known.odometry else (False,):
+                density, constants = self._density(point, heading, has_rate, has_scale)
+                yield from self._pause()
+                cost = BANK.constant_evidence * (has_rate + has_scale) - density - prior
+                if cost < best.cost:
+                    best = Shown(cost, constants)
+        return best
 
     def _pause(self) -> Generator[None, None, None]:
         self._left -= len(self.rows)
@@ -236,7 +259,6 @@ def moved(point: Point, to: dict[int, float]) -> Point:
 def most_likely(posterior: Posterior) -> Generator[None, None, list[Minimum]]:
     """Return the best point, after the best ones with slow errors of fewer sources."""
     known = posterior.known
-    yield from posterior.find_heading()
     axes, best = known.free, Minimum(math.inf, known.point)
     white = axes[2 if known.odometry else 0:]
     begins = [moved(known.point, dict.fromkeys(white, at)) for at in (-3.0, 3.0)]
@@ -280,26 +302,27 @@ def search(
     """
     same = bank.again(bank.noise, newest)
     first, rows, found = same.begin, same.rows[same.begin:].copy(), dict[Point, Learnt]()
-    learnt = dict[bytes, list[Point]]()  # by what is believed, the best one last
+    posteriors, learnt = dict[bytes, Posterior](), dict[bytes, list[Point]]()  # by the slips
+
+    def posterior(slips: FloatArray) -> Posterior:
+        return posteriors.setdefault(slips.tobytes(), Posterior(rows, slips, known))
 
     def learn(slips: FloatArray) -> Generator[None, None, list[Point]]:
-        if slips.tobytes() not in learnt:
-            posterior, points = Posterior(rows, slips, known), list[Point]()
-            for best in (yield from most_likely(posterior)):
-                points.append(best.point)
+        if (key := slips.tobytes()) not in learnt:
+            every, learnt[key] = posterior(slips), []
+            for best in (yield from most_likely(every)):
+                better = best
                 if known.odometry:
-                    given = yield from _as_given(posterior, best)
-                    if BANK.noise_evidence + (yield from _constants(
-                            rows, slips, known, best.point)).cost > (yield from _constants(
-                            rows, slips, known, given.point)).cost:
-                        points[-1] = given.point
-            learnt[slips.tobytes()] = points
-        return learnt[slips.tobytes()]
+                    given = yield from _as_given(every, best)
+                    gained = (yield from every.shown(given.point)).cost - (
+                        yield from every.shown(best.point)).cost
+                    better = best if gained >= BANK.noise_evidence else given
+                learnt[key].append(better.point)
+        return learnt[key]
 
     unlearnt = moved(known.point, {
         axis: value for source in known.sources
-        for axis, value in zip(axes_of(source), (
-            UNLEARNT_SLOW[2], *UNLEARNT_SLOW[:2]), strict=True)})
+        for axis, value in zip(axes_of(source), UNLEARNT, strict=True)})
     as_all = yield from learn(np.where(rows['decides'] == 1, 0.0, -1.0))
     waiting = [(point, 0) for point in dict.fromkeys((
         *as_all, known.point, unlearnt, *begins))]
@@ -311,9 +334,8 @@ def search(
             yield
         trial.decide()
         slips = _slips(rows, trial.told(first))
-        constants = yield from _constants(rows, slips, known, point)
-        found[point] = Learnt(
-            point, trial.evidence + log_prior(point, known), constants.values)
+        found[point] = Learnt(point, trial.evidence + log_prior(point, known), (
+            yield from posterior(slips).shown(point)).constants)
         if n_rounds < MOST_ROUNDS:
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)
@@ -324,25 +346,3 @@ def _slips(rows: Records, decided: Decided) -> FloatArray:
     far = np.where(decided.choice == SLIPPED, decided.far, 0.0)
     slips = np.where(decided.choice == SLIPPED, (BANK.slip_size**2 + far**2) / 3.0, 0.0)
     return np.where(is_believed(decided.choice) & (rows['decides'] == 1), slips, -1.0)
-
-
-class _Constants(NamedTuple):
-    cost: float  # of the measurements with these, and of the evidence that they need [nats]
-    values: FloatArray  # as in `Learnt`
-
-
-def _constants(
-    rows: Records, slips: FloatArray, known: Known, point: Point,
-) -> Generator[None, None, _Constants]:
-    """Return the constant errors of odometry; what the measurements do not show is 0."""
-    best = _Constants(math.inf, np.zeros(4))
-    some = (False, True) if known.odometry else (False,)
-    for has_rate, has_scale in itertools.product(some, some):
-        posterior = Posterior(rows, slips, known, rate=BANK.rate * has_rate,
-                              scale=BANK.scale * has_scale)
-        yield from posterior.find_heading()
-        cost = (yield from posterior.value(point)) + BANK.constant_evidence * (
-            has_rate + has_scale)
-        if cost < best.cost:
-            best = _Constants(cost, posterior.constants[point])
-    return best

@@ -103,6 +103,15 @@ class Driven:
             verdict.id for verdict in backend.verdicts() if verdict.state is State.DOUBTED}
 
 
+def global_poses(
+    drive: Drive, changed: Callable[[int, FloatArray], FloatArray],
+) -> list[tuple[str, Measurement]]:
+    """Return poses of 0.1 m and 0.02 rad at 1 Hz, changed by their time [s]."""
+    return [('other', GlobalPose(SECOND + time * SECOND, se2.wrapped(changed(
+        time, pose + drive.rng.standard_normal(3) * (0.1, 0.1, 0.02))),
+        np.diag((0.01, 0.01, 0.0004)))) for time, pose in enumerate(drive.truth[::5])]
+
+
 class Aside(Drive):
     """Fixes of 1 m at 3 m/s, the yaw rate is off: a minute without any, then 30 s all aside."""
 
@@ -228,14 +237,8 @@ def test_receivers_that_contradict_each_other_the_first_one_is_believed() -> Non
 
 def test_poses_in_the_wrong_corridor() -> None:
     drive = Drive(120)
-    poses: list[tuple[str, Measurement]] = []
-    for time in range(120):
-        pose = drive.truth[5 * time] + drive.rng.standard_normal(3) * (0.1, 0.1, 0.02)
-        if 50 <= time < 75:
-            pose = se2.compose(pose, np.array((0.0, 5.0, np.pi)))
-        poses.append(('other', GlobalPose(
-            SECOND + time * SECOND, se2.wrapped(pose), np.diag((0.01, 0.01, 0.0004)))))
-    driven = Driven(drive, poses)
+    driven = Driven(drive, global_poses(drive, lambda time, pose: se2.compose(
+        pose, np.array((0.0, 5.0, np.pi)) * (50 <= time < 75))))
     assert {f'other/{number}' for number in range(50, 75)} <= driven.doubted
     assert len(driven.doubted) <= 27
     assert driven.rms < 0.5
@@ -243,14 +246,8 @@ def test_poses_in_the_wrong_corridor() -> None:
 
 def test_a_wrong_heading_that_stays_off_is_not_a_slip() -> None:
     drive = Drive(60)
-    poses: list[tuple[str, Measurement]] = []
-    for time in range(60):
-        pose = drive.truth[5 * time] + drive.rng.standard_normal(3) * (0.1, 0.1, 0.02)
-        if 20 <= time < 28:
-            pose += np.array((3.0, 2.0, 0.5))
-        poses.append(('other', GlobalPose(
-            SECOND + time * SECOND, se2.wrapped(pose), np.diag((0.01, 0.01, 0.0004)))))
-    driven = Driven(drive, poses)
+    driven = Driven(drive, global_poses(
+        drive, lambda time, pose: pose + np.array((3.0, 2.0, 0.5)) * (20 <= time < 28)))
     assert driven.doubted == {f'other/{number}' for number in range(20, 28)}
     assert driven.rms < 0.2
 
