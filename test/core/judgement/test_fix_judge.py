@@ -252,6 +252,19 @@ def test_a_wrong_heading_that_stays_off_is_not_a_slip() -> None:
     assert driven.rms < 0.2
 
 
+@pytest.mark.parametrize(('wrong', 'right'), [(5, 5), (8, 4), (3, 7)])
+def test_errors_that_come_and_go_are_doubted_each_time(wrong: int, right: int) -> None:
+    drive = Drive(260)
+    for begin in range(60, 240, wrong + right):
+        angle = drive.rng.uniform(-np.pi, np.pi)
+        drive.move(begin, begin + wrong, (15.0 * np.cos(angle), 15.0 * np.sin(angle)))
+    driven = Driven(drive)
+    assert driven.doubted == {f'fix/{number}' for number in range(60, 260)
+                              if (number - 60) % (wrong + right) < wrong and number < 240}
+    assert max(driven.newest.values()) < 2.0
+    assert driven.rms < 0.4
+
+
 @pytest.mark.parametrize('scatter', [0.1, 1.0])
 def test_a_fault_of_an_exact_receiver_is_exact_or_noisy(scatter: float) -> None:
     drive = Drive(200)
