@@ -323,7 +323,7 @@ def search(
     unlearnt = moved(known.point, {
         axis: value for source in known.sources
         for axis, value in zip(axes_of(source), UNLEARNT, strict=True)})
-    as_all = yield from learn(np.where(rows['decides'] == 1, 0.0, -1.0))
+    as_all = yield from learn(np.zeros(len(rows)))
     waiting = [(point, 0) for point in dict.fromkeys((
         *as_all, known.point, unlearnt, *begins))]
     for point, n_rounds in waiting:
@@ -333,16 +333,29 @@ def search(
         while trial.advance(BANK_ROWS_IN_STEP):
             yield
         trial.decide()
-        slips = _slips(rows, trial.told(first))
-        found[point] = Learnt(point, trial.evidence + log_prior(point, known), (
+        slips = _slips(trial.told(first))
+        # the bank has the evidence of what decides; of the others, that of what it believes
+        more = yield from _others(rows, slips, point, posterior(slips))
+        found[point] = Learnt(point, trial.evidence + more + log_prior(point, known), (
             yield from posterior(slips).shown(point)).constants)
         if n_rounds < MOST_ROUNDS:
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)
 
 
-def _slips(rows: Records, decided: Decided) -> FloatArray:
-    """Return what is believed and decides, and the slips before it, for `log_density`."""
+def _others(
+    rows: Records, slips: FloatArray, point: Point, believed: Posterior,
+) -> Generator[None, None, float]:
+    """Return the evidence of the believed rows that do not decide, given those that do."""
+    decides = rows['decides'] == 1
+    if np.all(decides):
+        return 0.0
+    deciding = Posterior(rows, np.where(decides, slips, -1.0), believed.known)
+    return (yield from deciding.value(point)) - (yield from believed.value(point))
+
+
+def _slips(decided: Decided) -> FloatArray:
+    """Return what is believed, and the slips before it, for `log_density`."""
     far = np.where(decided.choice == SLIPPED, decided.far, 0.0)
     slips = np.where(decided.choice == SLIPPED, (BANK.slip_size**2 + far**2) / 3.0, 0.0)
-    return np.where(is_believed(decided.choice) & (rows['decides'] == 1), slips, -1.0)
+    return np.where(is_believed(decided.choice), slips, -1.0)
