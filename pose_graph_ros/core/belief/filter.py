@@ -118,9 +118,11 @@ def innovation(x, p, row, first, white, more):  # type: ignore[no-untyped-def]
     c, s = math.cos(x[2]), math.sin(x[2])
     ox, oy = c * row.offset[0] - s * row.offset[1], s * row.offset[0] + c * row.offset[1]
     ex, ey = row.mean[0] - x[0] - ox, row.mean[1] - x[1] - oy
-    xx = p[0, 0] - 2.0 * oy * p[0, 2] + oy * oy * p[2, 2] + white * row.noise[0] + more
+    xx = p[0, 0] - 2.0 * oy * p[0, 2] + oy * oy * p[2, 2] + more
+    xx += max(white * row.noise[0], row.least)
     xy = p[0, 1] - oy * p[1, 2] + ox * p[0, 2] - ox * oy * p[2, 2] + white * row.noise[1]
-    yy = p[1, 1] + 2.0 * ox * p[1, 2] + ox * ox * p[2, 2] + white * row.noise[2] + more
+    yy = p[1, 1] + 2.0 * ox * p[1, 2] + ox * ox * p[2, 2] + more
+    yy += max(white * row.noise[2], row.least)
     if first >= 0:
         a, b = first, first + 1
         ex, ey = ex - x[a], ey - x[b]

@@ -130,10 +130,10 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
                 slow = NEAR2 if fault % 2 == 1 else FAR2
                 one.in_fault[r] = QUIET if fault <= 2 else NOISY
             white = _white(noise.white[r], one, r)
-            p[0, 0] = white * seen.noise[0] + slow
+            p[0, 0] = max(white * seen.noise[0], seen.least) + slow
             p[0, 1] = white * seen.noise[1]
             p[1, 0] = p[0, 1]
-            p[1, 1] = white * seen.noise[2] + slow
+            p[1, 1] = max(white * seen.noise[2], seen.least) + slow
             for i in range(2):
                 j = ERROR + 2 * r + i
                 p[j, j] = slow

@@ -300,8 +300,9 @@ def search(
 
     It begins also with some points. The bank stays as it is.
     """
-    same = bank.again(bank.noise, newest)
-    first, rows, found = same.begin, same.rows[same.begin:].copy(), dict[Point, Learnt]()
+    same, found = bank.again(bank.noise, newest), dict[Point, Learnt]()
+    first, rows = same.begin, same.rows[same.begin:].copy()
+    rows['least'] = 0.0  # how exact receivers are is learnt as it is
     posteriors, learnt = dict[bytes, Posterior](), dict[bytes, list[Point]]()  # by the slips
 
     def posterior(slips: FloatArray) -> Posterior:
@@ -346,12 +347,18 @@ def search(
 def _others(
     rows: Records, slips: FloatArray, point: Point, believed: Posterior,
 ) -> Generator[None, None, float]:
-    """Return the evidence of the believed rows that do not decide, given those that do."""
+    """
+    Return the evidence of the rows that do not decide, given those that do.
+
+    Those that are not believed are as likely as the others, so that to doubt gains nothing.
+    """
     decides = rows['decides'] == 1
-    if np.all(decides):
+    n_believed = np.count_nonzero(~decides & (slips >= 0.0))
+    if n_believed == 0:
         return 0.0
     deciding = Posterior(rows, np.where(decides, slips, -1.0), believed.known)
-    return (yield from deciding.value(point)) - (yield from believed.value(point))
+    more = (yield from deciding.value(point)) - (yield from believed.value(point))
+    return more * np.count_nonzero(~decides) / n_believed
 
 
 def _slips(decided: Decided) -> FloatArray:

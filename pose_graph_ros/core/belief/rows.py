@@ -30,6 +30,7 @@ MEASURED = np.dtype([
     ('mean', 'f8', (3,)),  # what was measured; of a position, the heading is 0 [m, m, rad]
     # claimed covariance of the position in map axes: xx, xy, yy [m^2]
     ('noise', 'f8', (3,)),
+    ('least', 'f8'),  # least white variance of a coordinate to decide by [m^2]
     # variance that the slow error is measured in units of: the claimed one, or its own [m^2]
     ('slow', 'f8'),
     ('heading_variance', 'f8'),  # 0 of a position [rad^2]
@@ -72,7 +73,7 @@ def measured(
                 noise[:, 2, 2] + np.where(
                     biased[which], given.constants[which, 3] / STRETCH, 0.0)**2,
                 BANK.least_heading**2)
-    rows['noise'][:, [0, 2]] = np.maximum(rows['noise'][:, [0, 2]], least_position**2)
+    rows['least'] = least_position**2
     rows['slow'] = np.where(biased, given.constants[:, 2]**2, 0.5 * (
         rows['noise'][:, 0] + rows['noise'][:, 2]))
     return np.asarray(rows[placed])

@@ -46,7 +46,7 @@ class BankSettings:
     # claims, and for each of its constant errors [nats]
     slow_evidence: float = 10.0
     noise_evidence: float = 3.0
-    constant_evidence: float = 2.0
+    constant_evidence: float = 1.0
     # medians of variances in units of what is claimed, and sigmas of their logarithms: nobody
     # knows how noisy turns are; what receivers claim of slow errors may be a small part of them
     way: tuple[float, float] = (1.0, 2.0)
@@ -58,7 +58,7 @@ class BankSettings:
     astray: int = 8  # successive measurements that are wrong after which a filter begins again
     # at which numbers of measurements noise is learnt: the first, the ratio of the next one, and
     # the most between
-    first_learnt: int = 30
+    first_learnt: int = 10
     next_learnt: float = 1.3
     most_between: int = 500
     most_learnt: int = 3000  # newest ones that it is learnt from while measurements come

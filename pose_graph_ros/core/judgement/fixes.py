@@ -428,7 +428,7 @@ def _determines(rows: Records) -> bool:
     if np.any(rows['heading_variance'] > 0.0):
         return True
     return len(rows) >= LEAST and float(np.max(np.ptp(rows['mean'][:, :2], axis=0))) > float(
-        np.sqrt(np.min(rows['noise'][:, 0])))
+        np.sqrt(np.min(np.maximum(rows['noise'][:, 0], rows['least']))))
 
 
 def _odometry_between(graph: Graph, begin: int, end: int) -> IntArray:
