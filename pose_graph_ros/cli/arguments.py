@@ -144,6 +144,9 @@ def tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--folds', metavar='N', type=number(2, 50, whole=True), default=4,
                         help='parts of the drive that are held out in turn '
                              '(default: %(default)s)')
+    parser.add_argument('--stretch', metavar='S', type=number(1.0, 3600.0), default=None,
+                        help='length of the stretches that a part has [s] (default: by how slowly '
+                             'the errors change)')
     parser.add_argument('--json', action='store_true', help='print the results as JSON')
     _add_span(parser)
     _add_inputs(parser, hold_out=False)

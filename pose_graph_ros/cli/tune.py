@@ -34,7 +34,7 @@ def execute(options: argparse.Namespace) -> int:
         truth = None if options.truth is None else read_truth(bag, options.truth)
         tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values, _show)
     try:
-        outcome = tuning.tune(options.folds, truth)
+        outcome = tuning.tune(options.folds, truth, options.stretch)
     finally:
         _show('')
     names = ' '.join(each.name for each in options.bags)

@@ -120,7 +120,9 @@ class Tuning:
                     f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
                     f'poses or loop closures are needed; used are {topics}')
 
-    def tune(self, folds: int, truth: Trajectory | None) -> Outcome:
+    def tune(
+        self, folds: int, truth: Trajectory | None, stretch: Seconds | None = None,
+    ) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
         # what the settings before say is not looked for by the engine: it shows in other runs
         self._looking = {**self._values, **{
@@ -140,7 +142,7 @@ class Tuning:
             tuned, tau = self._estimate(runs, doubted)
         period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
                       for some in self._sources.values()), default=1.0)
-        stretch = noise.stretch_length(self._duration, period, tau, folds)
+        stretch = stretch or noise.stretch_length(self._duration, period, tau, folds)
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
         one, other = (noise.joined_errors(errors) for errors in zip(*(
             pair for errors, _ in tried for pair in errors), strict=True))

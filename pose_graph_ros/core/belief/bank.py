@@ -202,16 +202,21 @@ class Bank:
         """Logarithm of the probability density of all measurements."""
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
 
-    def again(self, noise: Records, newest: int | None = None) -> Self:
+    def again(
+        self, noise: Records, newest: int | None = None, least: float | None = None,
+    ) -> Self:
         """
         Return a bank with the same rows and another noise, before the first of them.
 
         Or before about so many of the newest ones; what is decided on those before these stays.
+        The rows may have another least white variance to decide by [m^2].
         """
         begin = 0 if newest is None else max(
             (at for at in self._kept if at <= len(self) - newest), default=0)
         other = copy(self)
         other._take(self, begin, noise)  # noqa: SLF001
+        if least is not None:
+            other._rows.values['least'] = least  # noqa: SLF001
         return other
 
     def _take(self, other: Self, begin: int, noise: Records) -> None:

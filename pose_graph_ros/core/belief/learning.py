@@ -300,9 +300,9 @@ def search(
 
     It begins also with some points. The bank stays as it is.
     """
-    same, found = bank.again(bank.noise, newest), dict[Point, Learnt]()
+    # how exact receivers are is learnt as it is
+    same, found = bank.again(bank.noise, newest, least=0.0), dict[Point, Learnt]()
     first, rows = same.begin, same.rows[same.begin:].copy()
-    rows['least'] = 0.0  # how exact receivers are is learnt as it is
     posteriors, learnt = dict[bytes, Posterior](), dict[bytes, list[Point]]()  # by the slips
 
     def posterior(slips: FloatArray) -> Posterior:
