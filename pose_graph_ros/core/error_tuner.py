@@ -225,7 +225,7 @@ class ErrorTuner:
         # constant errors are those of one odometry; states of the graph are what calibrates it
         calibrated = self._factors.config.odometry_source(self._nodes.primary).calibrate
         if self._nodes.n_primaries > 1 or calibrated:
-            return self._odometry._replace(rate=0.0, scale=0.0)
+            return OdometryErrors(self._odometry.way, self._odometry.turn)
         return self._odometry
 
     def _odometry_is_due(self) -> bool:

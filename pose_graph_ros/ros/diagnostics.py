@@ -28,6 +28,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
 from pose_graph_ros.core.odometry.gyro import CONTRADICTORY, MOST_BIAS
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.ros.input import EXPECTED
@@ -80,6 +81,9 @@ def _state(session: 'Session') -> dict[str, object]:
             'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
             'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
             'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
+        if (errors := estimate.odometry_errors) != AS_CLAIMED:
+            found |= {f'{estimate.primary}.errors_{name}': short(value, 4)
+                      for name, value in errors._asdict().items()}
     for rank, largest in enumerate(session.searches.energies, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (
             '' if largest.unweighted == largest.energy else

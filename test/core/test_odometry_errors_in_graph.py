@@ -88,6 +88,8 @@ def test_constant_errors_are_taken_out_and_fixes_aside_after_an_outage_are_refus
     assert errors.rate == pytest.approx(RATE, abs=3e-4)
     assert errors.scale == pytest.approx(-LONGER, abs=1e-2)
     assert errors.turn < 0.5
+    assert abs(errors.rate - RATE) < 3.0 * errors.rate_sigma < 1.5e-3
+    assert 0.0 < errors.scale_sigma < 0.01
     doubted = {verdict.stamp_ns for verdict in backend.verdicts()
                if verdict.state is State.DOUBTED}
     assert doubted == {second * SECOND for second in range(ASIDE, BACK)}

@@ -100,7 +100,7 @@ def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
     active.drive(10.0)
     active.wait(lambda: len(paths) > 0, 'a path comes')
     # from now on only after an optimisation
-    active.configure(path_period=1000.0)
+    active.configure(path_period=1000.0, odom__sigma_scale=2.0)
     active.session.worker.call(lambda _: None).result(PATIENCE)
     newest_ns = active.session.out.path.stamp_ns
     report = active.session.optimize()
@@ -120,6 +120,7 @@ def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
     assert float(values['alignment_yaw_deg']) == pytest.approx(122.0, abs=1.0)
     assert values['datum'].startswith('[48.1')
     assert values['fix.lever_arm'] == '[0.000, 0.000] from none'
+    assert (values['odom.errors_turn'], values['odom.errors_rate']) == ('4', '0')
     assert values['global_pose.silence_s'] == 'never received'
     assert float(values['odom.rate_hz']) > 0.0
     assert 0.0 <= float(values['fix.squared_residual']) < 0.1

@@ -211,10 +211,15 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
              f'{report.chi2:.6g}; {estimate.alignment.value}']
     errors = estimate.odometry_errors
     if errors != AS_CLAIMED:
-        lines.append(
+        corrected = [f'{short(factor * value, 3)} +- {short(factor * sigma, 2)} {unit}'
+                     for value, sigma, factor, unit in (
+                         (errors.rate, errors.rate_sigma, 1.0, 'rad/s'),
+                         (errors.scale, errors.scale_sigma, 100.0, '% of the way'))
+                     if value != 0.0]
+        lines.append('; corrected by '.join(filter(None, (
             f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
-            f'turns {short(math.sqrt(errors.turn), 3)} times what it claims; corrected by '
-            f'{short(errors.rate, 3)} rad/s and {short(100.0 * errors.scale, 3)} % of the way')
+            f'turns {short(math.sqrt(errors.turn), 3)} times what it claims',
+            ' and '.join(corrected)))))
     lines += [f'{source}: {totals_text(of_source)}' for source, of_source in totals.items()]
     lines += [f'{each["level"]:8} {each["text"]}' for each in told['findings']]
     if 'new_bag' in facts:

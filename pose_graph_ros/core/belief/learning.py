@@ -75,8 +75,9 @@ class Learnt(NamedTuple):
     constants: FloatArray  # rate and scale of odometry, and their variances, shape (4,)
 
     def odometry(self) -> OdometryErrors:
-        rate, scale, _, _ = self.constants.tolist()
-        return OdometryErrors(2.0**self.point[WAY], 2.0**self.point[TURN], rate, scale)
+        rate, scale, *variances = self.constants.tolist()
+        return OdometryErrors(
+            2.0**self.point[WAY], 2.0**self.point[TURN], rate, scale, *map(math.sqrt, variances))
 
     def is_far_from(self, known: OdometryErrors) -> bool:
         """Tell whether errors of odometry differ by more than what is known of them."""

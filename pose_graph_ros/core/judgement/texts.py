@@ -61,7 +61,7 @@ def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
     Of a drive that is over, its start [ns] is given: times are since then, `12.3 s`, else stamps.
     """
     since, far = _time(verdict.since_ns, start_ns), _far(verdict.distance)
-    reason = _jump(verdict, start_ns) or _doubt(verdict.distance)
+    reason = _jump(verdict, start_ns) or _doubt(verdict)
     supported = '' if len(verdict.supported_by) == 0 else (
         f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
     # that odometry contradicts it is what its distance tells
@@ -111,8 +111,13 @@ def _far(distance: float) -> str:
         f'it was {distance:.1f} sigma from the path without it')
 
 
-def _doubt(distance: float) -> str:
-    """Return why a constraint is doubted, by its distance from the path without it [sigma]."""
+def _doubt(verdict: Verdict) -> str:
+    """Return why a constraint is doubted."""
+    distance, (x, y, theta) = verdict.distance, verdict.residual.tolist()
+    if verdict.kind is Judged.FIX and math.isfinite(x + y):
+        # what was expected when it came may have been as wrong
+        turned = '' if math.isnan(theta) else f' and {abs(theta):.2f} rad'
+        return f'it is {short(math.hypot(x, y))} m{turned} from the path that the others tell'
     if distance > PLAUSIBLE:
         return _far(distance)
     alone = '' if math.isnan(distance) else (

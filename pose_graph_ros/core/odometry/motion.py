@@ -115,6 +115,8 @@ class OdometryErrors(NamedTuple):
     turn: float = 1.0  # factor on the rest
     rate: float = 0.0  # what the yaw rate is larger than odometry says [rad/s]
     scale: float = 0.0  # by which part the way is longer than odometry says
+    rate_sigma: float = 0.0  # standard deviations of these two; 0 where they are not corrected
+    scale_sigma: float = 0.0
 
     @classmethod
     def scaled(cls, sigmas: float) -> 'OdometryErrors':
@@ -156,9 +158,9 @@ class OdometryErrors(NamedTuple):
         return float((self.way**2 * self.turn)**(1.0 / 6.0))
 
     def is_close(self, other: 'OdometryErrors') -> bool:
-        """Tell whether the numbers are those of others, but for rounding."""
+        """Tell whether the errors are others, but for rounding, however well they are known."""
         return all(math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
-                   for a, b in zip(self, other, strict=True))
+                   for a, b in zip(self[:4], other[:4], strict=True))
 
 
 AS_CLAIMED = OdometryErrors()

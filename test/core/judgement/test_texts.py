@@ -37,6 +37,12 @@ def test_a_sentence_says_state_and_reason() -> None:
     assert sentence(replace(CLOSURE, distance=0.04, contradicted_by=())) == (
         'Doubted and not used since 1700.500: by itself it could be right, 0.0 sigma from the '
         'path without it, but all others together agree better without it.')
+    # of a fix, what was expected when it came may have been as wrong
+    fix = replace(CLOSURE, kind=Judged.FIX, distance=0.04, contradicted_by=('odometry',),
+                  supported_by=('fix/3', 'fix/4'), residual=np.array([4.0, -3.0, math.nan]))
+    assert sentence(fix) == ('Doubted and not used since 1700.500: it is 5 m from the path that '
+                             'the others tell; fix/3, fix/4 agree with it.')
+    assert 'it is 5 m and 0.20 rad from' in sentence(replace(fix, residual=CLOSURE.residual))
     assert sentence(replace(
         CLOSURE, state=State.BELIEVED, distance=1.0, supported_by=('loop_closure/3',),
         contradicted_by=())) == (
