@@ -44,6 +44,8 @@ def estimate(
     motion, motion_noise = _turned(parts, motion, motion_noise)
     newest = se2.compose(node.pose, motion)
     cov = covariance.propagated(*node, motion, motion_noise)
+    if state is AlignmentState.ALIGNED:
+        cov = cov + _torn(parts, newest)
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
@@ -111,6 +113,13 @@ def _turned(
     turn = se2.rotation(motion[2])
     return (np.append(motion[:2] + turn @ step[:2], motion[2] + step[2]),
             noise - total * np.outer(gain, gain))
+
+
+def _torn(parts: Parts, newest: FloatArray) -> FloatArray:
+    """Return the covariance at a pose by what may have happened, but is not believed."""
+    spread = parts.judge.fixes.bank.spread()
+    return covariance.propagated(
+        spread.pose, spread.covariance, se2.between(spread.pose, newest), np.zeros((3, 3)))
 
 
 class Corrected(NamedTuple):

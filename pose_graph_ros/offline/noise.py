@@ -52,8 +52,8 @@ from pose_graph_ros.core.sources.source_report import estimate
 # Rise of the negative logarithm of the likelihood at the ends of an interval of 95 %, and that
 # which makes a factor of 1 unlikely enough to be changed (99 %).
 RISE, CHANGE_RISE = 1.92, 3.31
-# Sigma of the logarithm of the variance of a source before it is seen: what claims are is found.
-CLAIM_SPREAD = 3.0
+# Sigmas of the logarithm of the variance of a source before it is seen: what claims are is found.
+CLAIM_SPREAD = 3.0, 3.0
 # Smallest step of an exponent of 2.
 FINEST = 1.0 / 16.0
 # An interval with a larger ratio of its ends says nothing.

@@ -29,8 +29,8 @@ SECOND = 1_000_000_000
 EPOCH = 1_767_225_600 * SECOND
 # The path after the closing full optimisation [m, rad] ...
 SAME_PATH = 1e-9
-# ... and what the smoother's tolerance leaves before it [m].
-SAME_ONLINE = 3e-3
+# ... and what the smoother's tolerance, and noise that was learnt earlier, leave before it [m].
+SAME_ONLINE = 1e-2
 LONGEST_DELAY = 60.0
 WINDOW = 0.25
 DURATION = 40.0
@@ -172,8 +172,9 @@ def run(events: list[Event], config: BackendConfig, updates: frozenset[int]) -> 
         feed(backend, event)
         if k in updates:
             assert backend.update().status is not Status.FAILED
-    for _ in range(20):
-        backend.update()
+    backend.update()
+    while not backend.refine().finished:
+        pass
     online = backend.estimate()
     assert online is not None
     report = backend.optimize()

@@ -24,6 +24,7 @@ from pose_graph_ros.core.belief.hypotheses import (
 from pose_graph_ros.core.belief.rows import count, join_motions, MEASURED, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 
@@ -44,6 +45,13 @@ class Prior(NamedTuple):
     node: int
     pose: FloatArray  # in the map, shape (3,) [m, m, rad]
     covariance: FloatArray  # in map axes, shape (3, 3)
+
+
+class Spread(NamedTuple):
+    """How far the hypotheses are apart on where the robot is, at the newest row."""
+
+    pose: FloatArray  # by the best one, shape (3,) [m, m, rad]
+    covariance: FloatArray  # of the poses of all about it, shape (3, 3)
 
 
 class Decided(NamedTuple):
@@ -201,6 +209,16 @@ class Bank:
     def evidence(self) -> float:
         """Logarithm of the probability density of all measurements."""
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
+
+    def spread(self) -> Spread:
+        """Return how far what else may have happened is from the best hypothesis."""
+        some = self._bank[:self._n]
+        if len(some) == 0:
+            return Spread(np.zeros(3), np.zeros((3, 3)))
+        likely = np.exp(some['weight'] - np.max(some['weight']))
+        best = some['state'][np.argmax(likely), :3].copy()
+        off = se2.wrapped(some['state'][:, :3] - best)
+        return Spread(best, (off.T * (likely / np.sum(likely))) @ off)
 
     def again(
         self, noise: Records, newest: int | None = None, least: float | None = None,

@@ -294,10 +294,12 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
         one_spread, other_spread = p[0, 0] + p[1, 1], q[0, 0] + q[1, 1]
         spread = min(one_spread, other_spread)
         far2 = (x[0] - y[0])**2 + (x[1] - y[1])**2
-        turn = abs(factors.wrap(x[2] - y[2])) / math.sqrt(min(p[2, 2], q[2, 2]))
         # what is known exactly and what is hardly known are not in the same place
-        if not (far2 < SAME_PLACE2 * spread and turn < SAME_HEADING
+        if not (far2 < SAME_PLACE2 * spread
                 and max(one_spread, other_spread) < ALIKE_SPREAD * spread):
+            continue
+        turn = abs(factors.wrap(x[2] - y[2])) / math.sqrt(min(p[2, 2], q[2, 2]))
+        if not turn < SAME_HEADING:
             continue
         equal = (far2 < EQUAL2 * spread and turn < EQUAL
                  and max(one_spread, other_spread) < 2.0 * spread)
@@ -327,18 +329,6 @@ def _copy(bank, n, other, m, n_states):  # type: ignore[no-untyped-def]
             one.covariance[i, j] = from_one.covariance[i, j]
 
 
-@kernel
-def _best(weights):  # type: ignore[no-untyped-def]
-    """Return the number of the largest weight, which is taken away."""
-    best = 0
-    for k in range(1, len(weights)):
-        if weights[k] > weights[best]:
-            best = k
-    weight = weights[best]
-    weights[best] = LEAST
-    return best, weight
-
-
 @kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, NOISES, TREE),
         allocates=True)
 def advance(  # type: ignore[no-untyped-def]
@@ -365,11 +355,11 @@ def advance(  # type: ignore[no-untyped-def]
             continue
         for k in range(n):
             _copy(before, k, bank, k, n_states)
-        flat, n, most = weights[:n].copy().reshape(-1), 0, LEAST
-        while n < MOST:
-            place, weight = _best(flat)
-            most = max(most, weight)
-            if weight < most - HOPELESS or weight <= LEAST:
+        flat, n = weights[:n].copy().reshape(-1), 0
+        least = max(np.max(flat) - HOPELESS, LEAST)
+        for place in np.argsort(-flat, kind='mergesort'):
+            weight = flat[place]
+            if n == MOST or not weight > least:
                 break
             k, choice = place // N_CHOICES, place % N_CHOICES
             _copy(bank, n, before, k, n_states)

@@ -129,7 +129,9 @@ def noise_at(point: Point) -> Records:
     return noise
 
 
-def log_prior(point: Point, known: Known, spread: float = BANK.spread) -> float:
+def log_prior(
+    point: Point, known: Known, spread: tuple[float, float] = BANK.spread,
+) -> float:
     """Return the logarithm of the prior of what is to be found, with its Occam factor."""
     total = 0.0
 
@@ -141,7 +143,8 @@ def log_prior(point: Point, known: Known, spread: float = BANK.spread) -> float:
         add(TURN, *BANK.turn)
     for source in known.sources:
         white, slow, tau = axes_of(source)
-        total -= 0.5 * (math.log(2.0**point[white] + 2.0**point[slow]) / spread)**2
+        size = math.log(2.0**point[white] + 2.0**point[slow])
+        total -= 0.5 * (size / spread[size > 0.0])**2
         if point[slow] > NO_SLOW:
             add(slow, *BANK.slow)
             add(tau, *BANK.tau)
@@ -166,7 +169,7 @@ class Posterior:
 
     def __init__(
         self, rows: Records, slips: FloatArray, known: Known, *,
-        spread: float = BANK.spread, least_white: float = BANK.least_white,
+        spread: tuple[float, float] = BANK.spread, least_white: float = BANK.least_white,
         finest: float = FINEST,
     ) -> None:
         """Take slips as `log_density` does."""

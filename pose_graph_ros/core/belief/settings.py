@@ -51,7 +51,9 @@ class BankSettings:
     # knows how noisy turns are; what receivers claim of slow errors may be a small part of them
     way: tuple[float, float] = (1.0, 2.0)
     turn: tuple[float, float] = (1.0, 3.0)
-    spread: float = 0.5  # of the logarithm of all of what a source claims: that is known best
+    # of the logarithm of all of what a source claims, below and above: hardly any receiver is
+    # better than it says, many are worse
+    spread: tuple[float, float] = (0.5, 1.0)
     slow: tuple[float, float] = (0.25, 2.0)
     tau: tuple[float, float] = (40.0, 1.0)  # of the time constant of slow errors [s]
     least_white: float = 0.01  # least white part of what a source claims, as a variance

@@ -201,3 +201,27 @@ def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
         backend.update()
     assert n_turned >= 1
     assert {second * SECOND for second in range(1, 16)} <= doubted(backend)
+
+
+def test_where_it_is_torn_the_covariance_says_so() -> None:
+    """Fixes are wrong from the start on; then they, or the later ones, may be those in a fault."""
+    events, _ = drive(0, wrong=0.0, tau=1e-3, n=70)
+    backend, sigmas = PoseGraphBackend(BackendConfig(measurements={'fix': POSITIONS})), {}
+    for event in events:
+        if isinstance(event, OdometrySample):
+            backend.add_odometry(event)
+            continue
+        second = event.stamp_ns // SECOND
+        aside = np.array((30.0, -20.0)) * (second <= 30)
+        backend.add_measurement(replace(event, position=event.position + aside), 'fix')
+        backend.update()
+        while not backend.refine().finished:
+            pass
+        estimate = backend.estimate()
+        assert estimate is not None
+        error = np.hypot(*(estimate.T_map_base[:2] - event.position))
+        sigmas[second] = float(np.sqrt(np.trace(estimate.covariance[:2, :2])))
+        if second > 32:
+            assert error < 8.0 * sigmas[second], second
+    assert sigmas[29] < 1.0         # nothing speaks against them yet
+    assert 3.0 < sigmas[36] < sigmas[55]
