@@ -45,7 +45,7 @@ def estimate(
     newest = se2.compose(node.pose, motion)
     cov = covariance.propagated(*node, motion, motion_noise)
     if state is AlignmentState.ALIGNED:
-        cov = cov + _torn(parts, newest)
+        cov = cov + _of_other_hypotheses(parts, newest)
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
@@ -115,7 +115,7 @@ def _turned(
             noise - total * np.outer(gain, gain))
 
 
-def _torn(parts: Parts, newest: FloatArray) -> FloatArray:
+def _of_other_hypotheses(parts: Parts, newest: FloatArray) -> FloatArray:
     """Return the covariance at a pose by what may have happened, but is not believed."""
     spread = parts.judge.fixes.bank.spread()
     return covariance.propagated(

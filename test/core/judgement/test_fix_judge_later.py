@@ -203,7 +203,7 @@ def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
     assert {second * SECOND for second in range(1, 16)} <= doubted(backend)
 
 
-def test_where_it_is_torn_the_covariance_says_so() -> None:
+def test_the_covariance_is_wide_while_nobody_can_tell_which_fixes_are_wrong() -> None:
     """Fixes are wrong from the start on; then they, or the later ones, may be those in a fault."""
     events, _ = drive(0, wrong=0.0, tau=1e-3, n=70)
     backend, sigmas = PoseGraphBackend(BackendConfig(measurements={'fix': POSITIONS})), {}
