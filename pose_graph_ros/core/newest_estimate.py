@@ -117,7 +117,7 @@ def _turned(
 
 def _of_other_hypotheses(parts: Parts, newest: FloatArray) -> FloatArray:
     """Return the covariance at a pose by what may have happened, but is not believed."""
-    spread = parts.judge.fixes.bank.spread()
+    spread = parts.judge.fixes.spread
     return covariance.propagated(
         spread.pose, spread.covariance, se2.between(spread.pose, newest), np.zeros((3, 3)))
 

@@ -48,10 +48,10 @@ class Prior(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How far the hypotheses are apart on where the robot is, at the newest row."""
+    """How far hypotheses by which other sources are in a fault are from the best one."""
 
-    pose: FloatArray  # by the best one, shape (3,) [m, m, rad]
-    covariance: FloatArray  # of the poses of all about it, shape (3, 3)
+    pose: FloatArray  # by the best one, at the newest row, shape (3,) [m, m, rad]
+    covariance: FloatArray  # of the poses of those others about it, shape (3, 3)
 
 
 class Decided(NamedTuple):
@@ -211,14 +211,15 @@ class Bank:
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
 
     def spread(self) -> Spread:
-        """Return how far what else may have happened is from the best hypothesis."""
+        """Return how far what else may have happened is from the best, at the newest row."""
         some = self._bank[:self._n]
         if len(some) == 0:
             return Spread(np.zeros(3), np.zeros((3, 3)))
-        likely = np.exp(some['weight'] - np.max(some['weight']))
-        best = some['state'][np.argmax(likely), :3].copy()
-        off = se2.wrapped(some['state'][:, :3] - best)
-        return Spread(best, (off.T * (likely / np.sum(likely))) @ off)
+        likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
+        best = int(np.argmax(likely))
+        off = se2.wrapped(some['state'][:, :3] - some['state'][best, :3])
+        likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
+        return Spread(some['state'][best, :3].copy(), (off.T * likely) @ off)
 
     def again(
         self, noise: Records, newest: int | None = None, least: float | None = None,

@@ -13,13 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief.bank import Bank, Decided, is_believed, Odometry, Prior
+from pose_graph_ros.core.belief.bank import (
+    Bank,
+    Decided,
+    is_believed,
+    Odometry,
+    Prior,
+    Spread,
+)
 from pose_graph_ros.core.belief.hypotheses import ALONE, BEGINS, GOES_ON, GOOD, SLIPPED
 from pose_graph_ros.core.belief.learning import axes_of, claimed, Known, TURN, WAY
 from pose_graph_ros.core.belief.rows import measured, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.config import BackendConfig, Robust
-from pose_graph_ros.core.geometry.se2 import IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -84,6 +91,7 @@ class FixJudge:
         self._new_ids: IntArray = np.empty(0, dtype=np.int64)  # rows that came with the update
         self._now_ns = -1   # newest stamp of odometry
         self._is_restored = False  # whether the bank does not know the records yet
+        self._spread = self._bank.spread()  # until it does, that of a file
 
     @property
     def loosened(self) -> Mapping[int, float]:
@@ -238,6 +246,11 @@ class FixJudge:
     def source(self, name: str) -> int | None:
         """Return the number of the errors of a source; None if the bank has nothing of it."""
         return min(self._sources.index(name), BANK.sources - 1) if name in self._sources else None
+
+    @property
+    def spread(self) -> Spread:
+        """What others than the best hypothesis say of where the robot is."""
+        return self._spread if self._is_restored else self._bank.spread()
 
     def adopt(self, noise: Records, newest: int | None = None) -> None:
         """Judge the newest measurements, or all, anew with another noise, step by step."""
@@ -417,8 +430,12 @@ class FixJudge:
         verdict, = states.verdicts(self._smoother.graph, np.array((number,)))
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
 
-    def restore(self, saved: SavedVerdicts, loosened: Mapping[int, float], now_ns: int) -> None:
+    def restore(
+        self, saved: SavedVerdicts, loosened: Mapping[int, float], spread: FloatArray, now_ns: int,
+    ) -> None:
         self._now_ns, self._is_restored = now_ns, True
+        if len(spread) > 0:
+            self._spread = Spread(spread[0], spread[1:])
         self._states.restore(saved)
         self._loosened = dict(loosened)
 

@@ -12,7 +12,7 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from pose_graph_ros.core.judgement.verdicts import (
 from pose_graph_ros.core.measurements import Answer, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
-from pose_graph_ros.core.saved_columns import Integers, Numbers
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, NewConstraint
 
@@ -50,6 +50,8 @@ class SavedJudgement:
     weights: Numbers  # their weights
     # number of odometry edges of some sources that have left the graph doubted
     odometry_left: Mapping[str, int]
+    # pose and covariance of the hypotheses on fixes, see `Spread`; empty in older files
+    spread: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
 
 
 class Judge:
@@ -240,12 +242,12 @@ class Judge:
         return SavedJudgement(
             self._closures.states.saved(), self.fixes.states.saved(),
             np.array([*loosened], dtype=np.int64), np.array([*loosened.values()]),
-            dict(self._odometry.left))
+            dict(self._odometry.left), np.vstack(self.fixes.spread))
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
         self._closures.restore(saved.closures, now_ns)
         self.fixes.restore(saved.fixes, dict(zip(
-            saved.loosened.tolist(), saved.weights.tolist(), strict=True)), now_ns)
+            saved.loosened.tolist(), saved.weights.tolist(), strict=True)), saved.spread, now_ns)
         self._odometry.left.update(saved.odometry_left)
         self._odometry.keep_gaps(self.fixes.loosened, self._smoother.graph, now_ns)
         self._odometry.take_changes()   # which were told before

@@ -77,7 +77,9 @@ def uninterrupted(kind: str) -> Estimate:
     return closed(backend)
 
 
-def assert_same_estimate(actual: Estimate, expected: Estimate, tolerance: float = 0.0) -> None:
+def assert_same_estimate(
+    actual: Estimate, expected: Estimate, tolerance: float = 0.0, of_covariance: float = 0.0,
+) -> None:
     np.testing.assert_array_equal(actual.path.stamps_ns, expected.path.stamps_ns)
     for one, other in ((actual.path.poses, expected.path.poses),
                        (actual.T_map_odom, expected.T_map_odom),
@@ -87,7 +89,7 @@ def assert_same_estimate(actual: Estimate, expected: Estimate, tolerance: float 
         np.testing.assert_allclose(
             se2.wrap(one[..., 2] - other[..., 2]), 0.0, rtol=0.0, atol=tolerance)
     np.testing.assert_allclose(
-        actual.covariance, expected.covariance, rtol=0.0, atol=tolerance)
+        actual.covariance, expected.covariance, rtol=0.0, atol=tolerance + of_covariance)
     for name in (
             'n_hidden', 'n_edges', 'n_observed', 'n_biases', 'primary', 'alignment', 'odometry'):
         assert getattr(actual, name) == getattr(expected, name), name
@@ -123,7 +125,8 @@ def test_a_graph_comes_back_to_the_bit_and_grows_on_as_without_saving(kind: str,
     for source, measurement in resent:
         assert after.add_measurement(measurement, source).status is not AnswerStatus.REJECTED
     feed_all(after, stream[cut:])
-    assert_same_estimate(closed(after), uninterrupted(kind), SAME_PATH)
+    # what else may have happened is weighed anew from a file
+    assert_same_estimate(closed(after), uninterrupted(kind), SAME_PATH, 1e-6)
 
 
 def test_a_robot_that_was_put_elsewhere_stays_there() -> None:
