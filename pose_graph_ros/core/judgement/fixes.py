@@ -13,14 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief.bank import (
-    Bank,
-    Decided,
-    is_believed,
-    Odometry,
-    Prior,
-    Spread,
-)
+from pose_graph_ros.core.belief.bank import Bank, Decided, is_believed, Odometry, Prior, Spread
 from pose_graph_ros.core.belief.hypotheses import ALONE, BEGINS, GOES_ON, GOOD, SLIPPED
 from pose_graph_ros.core.belief.learning import axes_of, claimed, Known, TURN, WAY
 from pose_graph_ros.core.belief.rows import measured, Records
@@ -34,13 +27,7 @@ from pose_graph_ros.core.judgement.fix_states import FixStates, LONE
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.texts import sentence, unknown
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    BELIEVED,
-    Decision,
-    DECISIONS,
-    Verdict,
-)
+from pose_graph_ros.core.judgement.verdicts import AUTO, BELIEVED, Decision, DECISIONS, Verdict
 from pose_graph_ros.core.measurements import (
     Answer,
     AnswerStatus,
