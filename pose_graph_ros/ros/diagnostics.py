@@ -82,7 +82,8 @@ def _state(session: 'Session') -> dict[str, object]:
             'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
             'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
         if (errors := estimate.odometry_errors) != AS_CLAIMED:
-            found |= {f'{estimate.primary}.errors_{name}': short(value, 4)
+            # never a whole number: those are counts
+            found |= {f'{estimate.primary}.errors_{name}': f'{value:.6f}'
                       for name, value in errors._asdict().items()}
     for rank, largest in enumerate(session.searches.energies, 1):
         found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (

@@ -120,7 +120,7 @@ def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
     assert float(values['alignment_yaw_deg']) == pytest.approx(122.0, abs=1.0)
     assert values['datum'].startswith('[48.1')
     assert values['fix.lever_arm'] == '[0.000, 0.000] from none'
-    assert (values['odom.errors_turn'], values['odom.errors_rate']) == ('4', '0')
+    assert (values['odom.errors_turn'], values['odom.errors_rate']) == ('4.000000', '0.000000')
     assert values['global_pose.silence_s'] == 'never received'
     assert float(values['odom.rate_hz']) > 0.0
     assert 0.0 <= float(values['fix.squared_residual']) < 0.1
