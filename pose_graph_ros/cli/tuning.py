@@ -36,7 +36,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.judgement.texts import states_by_stamps
+from pose_graph_ros.core.judgement.texts import short, states_by_stamps
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import (
     Absolute,
@@ -124,6 +124,10 @@ class Tuning:
         self, folds: int, truth: Trajectory | None, stretch: Seconds | None = None,
     ) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
+        if stretch is not None and stretch > self._duration / folds:
+            raise BagError(
+                f'{self._path}: expected stretches of at most {short(self._duration / folds)} s, '
+                f'as it lasts {short(self._duration)} s in {folds} parts, got {short(stretch)}')
         # what the settings before say is not looked for by the engine: it shows in other runs
         self._looking = {**self._values, **{
             f'{name}.correlation_time': -1.0 for name in self._sources
@@ -142,7 +146,8 @@ class Tuning:
             tuned, tau = self._estimate(runs, doubted)
         period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
                       for some in self._sources.values()), default=1.0)
-        stretch = stretch or noise.stretch_length(self._duration, period, tau, folds)
+        if stretch is None:
+            stretch = noise.stretch_length(self._duration, period, tau, folds)
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
         one, other = (noise.joined_errors(errors) for errors in zip(*(
             pair for errors, _ in tried for pair in errors), strict=True))

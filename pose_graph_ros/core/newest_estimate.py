@@ -117,9 +117,10 @@ def _turned(
 
 def _of_other_hypotheses(parts: Parts, newest: FloatArray) -> FloatArray:
     """Return the covariance at a pose by what may have happened, but is not believed."""
-    spread = parts.judge.fixes.spread
-    return covariance.propagated(
-        spread.pose, spread.covariance, se2.between(spread.pose, newest), np.zeros((3, 3)))
+    pose, spread = parts.judge.fixes.spread
+    moved = np.eye(3)
+    moved[0, 2], moved[1, 2] = pose[1] - newest[1], newest[0] - pose[0]
+    return np.asarray(moved @ spread @ moved.T)
 
 
 class Corrected(NamedTuple):

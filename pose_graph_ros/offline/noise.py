@@ -137,6 +137,8 @@ def noise_of(
 
     None if there are too few positions.
     """
+    if source not in parts.factors.sources:
+        return None
     rows = parts.judge.fixes.path(source, without).copy()
     if len(rows) < LEAST_POSITIONS:
         return None

@@ -71,6 +71,20 @@ def test_no_file_is_written_where_nothing_becomes_better(tmp_path, capsys) -> No
     assert json.loads(capsys.readouterr().out)['file'] is None
 
 
+def test_stretches_that_are_too_long_are_refused(overconfident, capsys) -> None:
+    assert main(['tune', str(overconfident), '--folds', '2', '--stretch', '3600']) == 2
+    assert re.search(r'at most \d+ s, as it lasts \d+ s in 2 parts, got 3600',
+                     capsys.readouterr().err)
+
+
+def test_a_part_may_have_all_fixes(tmp_path, capsys) -> None:
+    odometry, fixes = made(4, 62)
+    bag = write(tmp_path / 'bag', odometry, fixes[:25], claimed=1.0)
+    assert main(['tune', str(bag), '--folds', '2', '--stretch', '30', '--json',
+                 '-o', str(tmp_path / 'tuned.yaml')]) == 1
+    assert json.loads(capsys.readouterr().out)['after']['n'] <= 25
+
+
 def test_progress_has_a_total(overconfident, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr('sys.stderr.isatty', lambda: True)
     main(['tune', str(overconfident), '--folds', '2', '-o', str(tmp_path / 'tuned.yaml')])

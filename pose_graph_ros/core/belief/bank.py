@@ -54,6 +54,9 @@ class Spread(NamedTuple):
     covariance: FloatArray  # of the poses of those others about it, shape (3, 3)
 
 
+NO_SPREAD = Spread(np.zeros(3), np.zeros((3, 3)))
+
+
 class Decided(NamedTuple):
     """What is decided on the rows from the first one whose decision has changed."""
 
@@ -72,6 +75,7 @@ class Bank:
         self._begin_at({0: np.zeros(0, HYPOTHESIS)})
         self._first_node = -1  # node that the motion to the first row begins at, if it is known
         self.n_sources = 0
+        self.spread = NO_SPREAD  # when it was last decided
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -181,6 +185,7 @@ class Bank:
     def decide(self) -> Decided:
         """Take the bank along all rows that it has not seen; return what is decided anew."""
         self.advance(len(self))
+        self.spread = self._spread()
         return self._trace()
 
     def _trace(self) -> Decided:
@@ -210,11 +215,11 @@ class Bank:
         """Logarithm of the probability density of all measurements."""
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
 
-    def spread(self) -> Spread:
+    def _spread(self) -> Spread:
         """Return how far what else may have happened is from the best, at the newest row."""
         some = self._bank[:self._n]
         if len(some) == 0:
-            return Spread(np.zeros(3), np.zeros((3, 3)))
+            return NO_SPREAD
         likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
         best = int(np.argmax(likely))
         off = se2.wrapped(some['state'][:, :3] - some['state'][best, :3])

@@ -78,7 +78,7 @@ class FixJudge:
         self._new_ids: IntArray = np.empty(0, dtype=np.int64)  # rows that came with the update
         self._now_ns = -1   # newest stamp of odometry
         self._is_restored = False  # whether the bank does not know the records yet
-        self._spread = self._bank.spread()  # until it does, that of a file
+        self._spread = self._bank.spread  # until it does, that of a file
 
     @property
     def loosened(self) -> Mapping[int, float]:
@@ -237,7 +237,7 @@ class FixJudge:
     @property
     def spread(self) -> Spread:
         """What others than the best hypothesis say of where the robot is."""
-        return self._spread if self._is_restored else self._bank.spread()
+        return self._spread if self._is_restored else self._bank.spread
 
     def adopt(self, noise: Records, newest: int | None = None) -> None:
         """Judge the newest measurements, or all, anew with another noise, step by step."""

@@ -158,7 +158,7 @@ class OdometryErrors(NamedTuple):
         return float((self.way**2 * self.turn)**(1.0 / 6.0))
 
     def is_close(self, other: 'OdometryErrors') -> bool:
-        """Tell whether the errors are others, but for rounding, however well they are known."""
+        """Tell whether the errors are the same, but for rounding, however well they are known."""
         return all(math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
                    for a, b in zip(self[:4], other[:4], strict=True))
 
