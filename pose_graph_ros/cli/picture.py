@@ -8,6 +8,7 @@ A simulated one has the truth in place of a corrected path.
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from matplotlib import rc_context
@@ -76,7 +77,8 @@ def draw_drive(
         (drive.placed_odometry.poses[:, :2], drive.fix_positions)))
     wide, tall = (high - low).tolist()
     with rc_context(STYLE):
-        if tall > 1.15 * wide:
+        is_tall = tall > 1.15 * wide
+        if is_tall:
             figure = Figure(figsize=(16.0, 10.0), dpi=100, layout='constrained')
             plan, errors = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
         else:
@@ -87,7 +89,9 @@ def draw_drive(
         plan.set_aspect('equal', anchor='NW')
         plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         if names is None:
-            plan.set_title(_facts(drive), loc='left', fontsize=12, color=GREY)
+            # beside a tall map there is the title of the errors
+            facts = fill(_facts(drive), 44) if is_tall else _facts(drive)
+            plan.set_title(facts, loc='left', fontsize=12, color=GREY)
         handles, labels = plan.get_legend_handles_labels()
         for name, other in (names or {}).items():
             labels = [label.replace(name, other) for label in labels]
