@@ -141,7 +141,7 @@ SCALARS: Final = np.dtype([
     # damping of Levenberg-Marquardt, as a factor on the squared diagonal scales
     ('damping', 'f8'),
     ('chi2', 'f8'),             # energy of all factors and priors, weighted [sigma^2]
-    ('lowest', 'f8'),           # lowest chi2 of the refinement so far [sigma^2]
+    ('lowest', 'f8'),           # lowest chi2 of the step or the refinement so far [sigma^2]
     # largest change of a coordinate of a position by the last iteration of the refinement [m]
     ('largest_move', 'f8'),
 ], align=True)

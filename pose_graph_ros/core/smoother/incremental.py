@@ -352,7 +352,7 @@ class IncrementalSmoother:
         while (code := step.run(head, iterations, entered)) == tree_update.MORE_MEMORY:
             self._make_room()
             entered = step.AFTER_BATCH if entered == step.AFTER_BATCH else step.RESUMED
-        if code == tree_update.DIVERGED and not fall_back:
+        if code == tree_update.DIVERGED and (entered == step.AFTER_BATCH or not fall_back):
             self.graph.rollback()
             return UpdateResult(Status.FAILED, DIVERGED)
         if code == tree_update.DIVERGED:

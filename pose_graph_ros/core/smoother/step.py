@@ -41,14 +41,15 @@ def _has_diverged(head, out_of_iterations):  # type: ignore[no-untyped-def]
     """
     Tell whether the iterations have diverged.
 
-    That is so if the squared linearization error is large, in sigma^2 and against chi2 (a false
-    constraint raises chi2 and all linearization errors with it), and either no iteration remains,
-    the last one has not halved the error, or it is so large that another can only increase it.
+    That is so if the squared linearization error is large, in sigma^2 and against the lowest chi2
+    of the step (a false constraint raises chi2 and all linearization errors with it), and either
+    no iteration remains, the last one has not halved the error, or it is so large that another can
+    only increase it.
     """
     scalars = tb.scalars(head)[0]
     error2, before = scalars.error2_sum, scalars.error2_before
-    scalars.error2_before = error2
-    if error2 <= 1.0 or error2 <= 1e-3 * scalars.chi2:
+    scalars.error2_before, scalars.lowest = error2, min(scalars.lowest, scalars.chi2)
+    if error2 <= 1.0 or error2 <= 1e-3 * scalars.lowest:
         return False
     return out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6
 
@@ -70,6 +71,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
     if entered == FIRST:
         _reset_counters(head)
+    if entered != RESUMED:
+        tb.scalars(head)[0].lowest = tb.scalars(head)[0].chi2
     head[tb.N_TURNED] = 0   # cliques that were listed in the last update may have been replaced
     settled = True
     while True:
@@ -84,7 +87,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         if settled:
             break
         out_of_iterations = head[tb.N_ITERATIONS] >= max_iterations
-        if _has_diverged(head, out_of_iterations) and entered != AFTER_BATCH:
+        if _has_diverged(head, out_of_iterations):
             return DIVERGED
         if out_of_iterations:
             break

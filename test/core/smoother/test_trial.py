@@ -12,6 +12,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import Trial
@@ -146,15 +147,37 @@ def test_the_batch_fallback_lets_nodes_leave_as_well() -> None:
     assert smoother.chi2() == pytest.approx(result.chi2, rel=1e-3)
 
 
+def crossed(seed: int) -> IncrementalSmoother:
+    """Return a bent chain with six wrong closures of weight 0: Gauss-Newton leads away."""
+    rng = np.random.default_rng(seed)
+    i = rng.integers(0, 140, 6)
+    return bent_chain(stiff(
+        i, i + rng.integers(100, 160, 6), rng.uniform(-1.0, 1.0, (6, 3)) * (30, 30, 3), 0.0))
+
+
+CROSSING = dict.fromkeys(range(300, 306), 1.0)
+
+
 def test_a_minimum_that_later_updates_would_diverge_at_is_not_adopted() -> None:
-    # wrong closures bend a chain until Gauss-Newton leads away from the minimum
-    rng, n = np.random.default_rng(4), 6
-    i = rng.integers(0, 140, n)
-    smoother = bent_chain(stiff(
-        i, i + rng.integers(100, 160, n), rng.uniform(-1.0, 1.0, (n, 3)) * (30, 30, 3), 0.0))
+    smoother = crossed(4)
     before = state(smoother.graph)
-    trial = smoother.trial(GraphUpdate(weigh=dict.fromkeys(range(300, 300 + n), 1.0)))
+    trial = smoother.trial(GraphUpdate(weigh=CROSSING))
     assert finished(trial) < 100
     assert status(trial) is Status.FAILED
     assert smoother.adopt(trial).status is Status.FAILED
     assert differences(before, state(smoother.graph)) == []
+
+
+@pytest.mark.parametrize('seed', [2, 5, 36])
+def test_no_update_ends_uphill(seed: int) -> None:
+    """Where the batch finds no minimum that a step stays at, the graph is as before."""
+    smoother = crossed(seed)
+    before, factors = state(smoother.graph), smoother.graph.factors_at(np.array([*CROSSING]))
+    highest = float(np.sum(energies(smoother.graph.errors(factors), factors.information)))
+    result = smoother.update(GraphUpdate(weigh=CROSSING))
+    assert smoother.chi2() < highest
+    if result.status is Status.FAILED:
+        assert differences(before, state(smoother.graph)) == []
+    for weight in (0.999, 0.998, 0.997):
+        smoother.update(GraphUpdate(weigh={300: weight}))
+        assert smoother.chi2() < highest
