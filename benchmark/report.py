@@ -45,7 +45,7 @@ def write(
     curves : list of Curve
 
     """
-    parts = [f'# {title}', '', *_environment(command), '', about, '',
+    parts = [f'# {title}', '', *environment(command), '', about, '',
              '## Requirements', '', *_verdicts(sections)]
     picture = folder / 'step_time.png'
     if len(curves) > 0:
@@ -66,7 +66,8 @@ def write(
     return path
 
 
-def _environment(command: str) -> list[str]:
+def environment(command: str) -> list[str]:
+    """Return the day, the machine, versions, and by which command a page is made."""
     versions = [f'{name} {metadata.version(name)}' if find_spec(name) else f'without {name}'
                 for name in VERSIONS]
     return [f'{date.today().isoformat()}, {_processor()}, {os.cpu_count()} cores, '

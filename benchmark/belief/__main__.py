@@ -13,6 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 import itertools
 from pathlib import Path
+import sys
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from benchmark.belief import engine, peers
 from benchmark.belief.odometry import drive, KINDS, RECORDED
 from benchmark.belief.scenarios import SCENARIOS
 from benchmark.files import DATA
-from benchmark.report import markdown
+from benchmark.report import environment, markdown
 from benchmark.section import about, say, Table
 from pose_graph_ros.core.config import CovariancePolicy, MeasurementSource, POSITIONS, Robust
 from pose_graph_ros.core.warm_up import warm_up
@@ -82,7 +83,7 @@ def measure(case: Case) -> Found:
         'oracle online': oracle['online'], 'ratio': errors['ours'] / errors['oracle'], **ours})
 
 
-def page(found: Sequence[Found]) -> str:
+def page(found: Sequence[Found], command: str) -> str:
     """
     Return a summary by scenario, and all cases, as Markdown.
 
@@ -105,8 +106,8 @@ def page(found: Sequence[Found]) -> str:
         summary.rows.append((name, str(len(rows)), *(
             _summed(np.array([one.ratio(ratio) for one in rows])) for ratio in RATIOS)))
         cases.rows.extend(one.row() for one in rows)
-    return '\n'.join(['# Belief in positions', '', about(page), '', *markdown(summary),
-                      *markdown(cases)])
+    return '\n'.join(['# Belief in positions', '', *environment(command), '', about(page), '',
+                      *markdown(summary), *markdown(cases)])
 
 
 def _summed(ratios: np.ndarray) -> str:
@@ -140,13 +141,14 @@ def main() -> None:
     cases = itertools.starmap(Case, itertools.product(
         options.scenarios, drives, itertools.chain(*options.seeds), [options.data]))
     found: list[Found] = []
+    command = f'python -m benchmark.belief {" ".join(sys.argv[1:])}'
     with ProcessPoolExecutor(options.jobs, initializer=warm_up) as pool:
         for one in pool.map(measure, cases):
             found.append(one)
             say(' | '.join(one.row()))
             if options.out is not None:
-                options.out.write_text(page(found), encoding='utf-8')
-    print(page(found))
+                options.out.write_text(page(found, command), encoding='utf-8')
+    print(page(found, command))
 
 
 if __name__ == '__main__':
