@@ -25,6 +25,8 @@ from pose_graph_ros.adapters.sources import (
     Source,
 )
 from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.measurements import Answer
+from pose_graph_ros.core.quantities import StampNs
 
 logger = logging.getLogger(__name__)
 
@@ -195,19 +197,16 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)
 
 
-class BagPose(NamedTuple):
-    """A planar pose of a message."""
+def poses_on(bag: Bag, topic: str, span: Span) -> Iterator[tuple[StampNs, FloatArray]]:
+    """
+    Yield stamps and valid poses, (3,), of a topic with one of `POSE_TYPES`.
 
-    stamp_ns: int
-    pose: FloatArray  # shape (3,) [m, m, rad]
-
-
-def poses_on(bag: Bag, topic: str, span: Span = WHOLE) -> Iterator[BagPose]:
-    """Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored."""
+    Invalid messages are ignored.
+    """
     bare = bag.topics[topic].type == POSE
     for bag_message in bag.messages([topic], span):
         with suppress(MessageError):
             message = bag_message.decode()
             pose = planar_pose(message.pose if bare else message.pose.pose)
-            if pose is not None:
-                yield BagPose(stamp_ns(message), pose)
+            if not isinstance(pose, Answer):
+                yield stamp_ns(message), pose

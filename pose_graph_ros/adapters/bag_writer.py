@@ -9,16 +9,8 @@ import shutil
 import tempfile
 from typing import Any, Final, Self
 
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, Qos, QosDurability
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
@@ -36,7 +28,8 @@ from pose_graph_ros.adapters.damaged_bags import NO_HASH
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
-FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
+# the "infinite" duration of rmw, 2^63 - 1 ns
+FOREVER = interfaces.QosTime(9223372036, 854775807)
 Convert = Callable[[bytes], bytes | memoryview]
 """From a message of ROS 1 to CDR."""
 
@@ -149,8 +142,9 @@ def _qos(*, latched: bool) -> Qos:
     depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
                          else (10, QosDurability.VOLATILE))
     return Qos(
-        QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
-        QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
+        interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE, durability,
+        FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
+        avoid_ros_namespace_conventions=False)
 
 
 def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Convert]:

@@ -137,21 +137,17 @@ class CdrStream:
     """A stream of CDR: the position of each number is a multiple of its size."""
 
     def __init__(self) -> None:
-        self._data = bytearray()
+        self.data = bytearray()
 
     def add(self, code: str, *numbers: npt.ArrayLike) -> None:
         """Add numbers, or an array, as a type of NumPy."""
         array = np.asarray(numbers, dtype=code)
-        self._data += bytes(-len(self._data) % array.itemsize) + array.tobytes()
+        self.data += bytes(-len(self.data) % array.itemsize) + array.tobytes()
 
     def add_text(self, text: str) -> None:
         """Add a string."""
         name = text.encode() + b'\0'
-        self._data += bytes(-len(self._data) % 4) + _LENGTH.pack(len(name)) + name
-
-    def message(self) -> bytes:
-        """Return the message, with the bytes that tell the encoding in front."""
-        return CDR + bytes(self._data)
+        self.data += bytes(-len(self.data) % 4) + _LENGTH.pack(len(name)) + name
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +204,7 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
         kind, size, points, point_colours = drawn[number]
         _add_marker(
             stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
-    return stream.message()
+    return CDR + bytes(stream.data)
 
 
 def colours(sigmas: FloatArray) -> Colours:

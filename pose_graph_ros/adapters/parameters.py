@@ -18,15 +18,9 @@ from typing import Any, cast
 
 import yaml
 
+from pose_graph_ros.adapters import parameter_table as table
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.parameter_table import (
-    Change,
-    DEFAULT_SOURCES,
-    OF_ALL,
-    Parameter,
-    PARAMETERS,
-    Value,
-)
+from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
 from pose_graph_ros.adapters.sources import (
     backend_config,
     KINDS,
@@ -73,7 +67,8 @@ def _of_source(parameter: Parameter, source: str) -> Parameter:
 
 def listed_sources(given: Mapping[str, Any]) -> list[str]:
     """Return the names of all sources; raises `ConfigError` for equal or bad names."""
-    names = checked_value(PARAMETERS[0], given.get('sources', list(DEFAULT_SOURCES)))
+    names: list[str] = checked_value(
+        PARAMETERS[0], given.get('sources', list(table.DEFAULT_SOURCES)))
     for name in names:
         if _NAME.fullmatch(name) is None or name in _TAKEN:
             raise ConfigError(f'parameter sources: {name!r} cannot be the name of a source; '
@@ -200,23 +195,19 @@ def changed(
         parameter = parameters[name]
         good = checked_value(
             parameter, [] if value is None and parameter.default == [] else value)
-        if good != new[name]:
-            _require_changeable(parameter, configured=configured)
-            new[name] = good
+        if good == new[name]:
+            continue
+        if parameter.change is Change.START:
+            raise ConfigError(f'parameter {name} is read at the start: give it in a parameter '
+                              f'file or by -p {name}:=..., and start the node again')
+        if parameter.change is Change.UNCONFIGURED and configured:
+            raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
+                              'lifecycle set` it to deactivate and cleanup, change it, and '
+                              'configure it again')
+        new[name] = good
     new = checked(new)
     require_together(new)
     return new
-
-
-def _require_changeable(parameter: Parameter, *, configured: bool) -> None:
-    name = parameter.name
-    if parameter.change is Change.START:
-        raise ConfigError(f'parameter {name} is read at the start: give it in a parameter file '
-                          f'or by -p {name}:=..., and start the node again')
-    if parameter.change is Change.UNCONFIGURED and configured:
-        raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
-                          'lifecycle set` it to deactivate and cleanup, change it, and configure '
-                          'it again')
 
 
 def require_together(values: Mapping[str, Any]) -> None:
@@ -242,7 +233,10 @@ def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
         except (OSError, ValueError, yaml.YAMLError):
             continue  # what rcl cannot read ends the node
         sections = list(_sections(content))
-        if not any(_matches(section, node) for section in sections):
+        # with wildcards as rcl matches them
+        patterns = [re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(r'/\*', r'/\w+')
+                    for section in sections]
+        if not any(re.fullmatch(pattern, node) for pattern in patterns):
             yield (f'{name} has no effect: it has parameters for '
                    f'{", ".join(sections) or "no node"}, and none for {node}: begin it with '
                    f'{node} or /**')
@@ -256,12 +250,6 @@ def _sections(content: Any, name: str = '') -> Iterator[str]:
                 yield name
             else:
                 yield from _sections(inner, f'{name}/{str(key).strip("/")}')
-
-
-def _matches(section: str, node: str) -> bool:
-    """Match a name with wildcards as rcl does."""
-    pattern = re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(r'/\*', r'/\w+')
-    return re.fullmatch(pattern, node) is not None
 
 
 # --- the tables as text

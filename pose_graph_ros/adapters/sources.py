@@ -131,21 +131,21 @@ class Source:
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
     """Return the sources by the checked parameters, odometry in the order of preference."""
-    return tuple(_source(name, _own(values, name)) for name in source_names(values['sources']))
+    found = []
+    for name in source_names(values['sources']):
+        own = _own(values, name)
+        given = _same(own, Source)
+        if 'beacons' in given:
+            given['beacons'] = dict(_beacon(name, text) for text in given['beacons'])
+        found.append(Source(name, KINDS[own['type']], time_offset_ns=round(
+            own['time_offset'] * NANOSECONDS), **given))
+    return tuple(found)
 
 
 def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return the parameters of a source by their names without its own."""
     return {name.removeprefix(f'{source}.'): value for name, value in values.items()
             if name.startswith(f'{source}.')}
-
-
-def _source(name: str, own: Mapping[str, Any]) -> Source:
-    given = _same(own, Source)
-    if 'beacons' in given:
-        given['beacons'] = dict(_beacon(name, text) for text in given['beacons'])
-    return Source(name, KINDS[own['type']],
-                  time_offset_ns=round(own['time_offset'] * NANOSECONDS), **given)
 
 
 def _beacon(source: str, text: str) -> tuple[str, tuple[float, float]]:
@@ -210,14 +210,11 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
-def _same(
-    own: Mapping[str, Any], settings: type, but: Collection[str] = (),
-) -> dict[str, Any]:
+def _same(own: Mapping[str, Any], settings: type, but: Collection[str] = ()) -> dict[str, Any]:
     """Return the parameters that are named as the settings that they are."""
-    given = {each.name: own[each.name] for each in fields(settings)
-             if each.name in own and each.name not in but}
-    return {name: tuple(value) if isinstance(value, list) else value
-            for name, value in given.items()}
+    names = [each.name for each in fields(settings) if each.name in own and each.name not in but]
+    return {name: tuple(own[name]) if isinstance(own[name], list) else own[name]
+            for name in names}
 
 
 def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
-from pose_graph_ros.adapters.bags import Bag, BagError, open_bags
+from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
 from pose_graph_ros.adapters.sources import (
     backend_config,
     CLOSURES,
@@ -117,7 +117,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
     """Replay bags."""
     values = shared.parameter_values(options)
     with ExitStack() as stack:
-        bag = stack.enter_context(open_bags(options.bags))
+        bag = stack.enter_context(open_bag(*options.bags))
         inputs = shared.inputs_of(bag, options, values, options.hold_out)
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.fixes) > 0)

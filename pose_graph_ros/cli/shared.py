@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Iterable, Mapping
+from copy import copy
 import math
 from pathlib import Path
 import sys
@@ -112,4 +113,6 @@ def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
 
 def watched_bag(bag: Bag, title: str) -> Bag:
     """Return a bag that shows on a terminal how far its messages have been read."""
-    return bag.watched(lambda messages, total: watched(messages, desc=title, total=total))
+    seen = copy(bag)
+    seen.watch = lambda messages, total: watched(messages, desc=title, total=total)
+    return seen

@@ -11,7 +11,7 @@ import sys
 import time
 from typing import Any
 
-from pose_graph_ros.adapters.bags import BagError, open_bags
+from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import read_truth
 from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
@@ -29,7 +29,7 @@ def execute(options: argparse.Namespace) -> int:
     where = options.out if options.out.exists() else options.out.resolve().parent
     if not os.access(where, os.W_OK):
         raise BagError(f'{options.out}: cannot be written: no permission')
-    with open_bags(options.bags) as bag:
+    with open_bag(*options.bags) as bag:
         inputs = shared.inputs_of(bag, options, values)
         truth = None if options.truth is None else read_truth(bag, options.truth)
         tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values, _show)

@@ -54,9 +54,21 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''  # why the last transition failed
         self._session: Session | None = None
         self._offered: Services | None = None
-        self._given = self._declared()  # the node's own parameters that have a value
+        self._given = self._declare(PARAMETERS)  # the node's own parameters that have a value
+        for source in listed_sources(self._given):
+            kind = self._declare([type_parameter(source)])[f'{source}.type']
+            self._given |= self._declare(source_parameters(source, kind))
         self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
-        self._warn_of_unknown()
+        # rclpy does not warn of unknown parameters, as a file may be for several nodes;
+        # pose_graph.yaml has defaults of sources that `sources` may leave out
+        usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
+                 for parameter in source_parameters(source, kind.name)}
+        for name, value in sorted(self._overrides.items()):
+            # those of rclpy are declared, or will be with the publishers and subscriptions
+            if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
+                    is_own(name, self._own)) and (
+                    name not in usual or not is_same(plain(value), usual[name])):
+                logger.warning('%s', unknown(name, self._own))
 
     def destroy_node(self) -> None:
         """Destroy the node; what is logged from now on goes elsewhere."""
@@ -149,21 +161,23 @@ class PoseGraphNode(LifecycleNode):
             return []
         return super().declare_parameters(namespace, parameters, ignore_override)
 
-    def _declared(self) -> dict[str, Any]:
-        """Declare all parameters and return those that are set."""
-        given = self._declare(PARAMETERS)
-        for source in listed_sources(given):
-            kind = self._declare([type_parameter(source)])[f'{source}.type']
-            given |= self._declare(source_parameters(source, kind))
-        return given
-
     def _declare(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
+        """Declare parameters and return those that are set."""
         given: dict[str, Any] = {}
         for parameter in parameters:
             if not self.has_parameter(parameter.name):
-                # an array without a value has no type yet; numbers may be given as 5 for 5.0
+                descriptor = ParameterDescriptor(
+                    description=f'{parameter.description} [{parameter.unit}]'.removesuffix(' []'),
+                    additional_constraints=constraints(parameter),
+                    read_only=parameter.change is Change.START,
+                    # numbers may be given as 5 for 5.0
+                    dynamic_typing=not isinstance(parameter.default, bool | str))
+                if parameter.smallest is not None and parameter.largest is not None:
+                    descriptor.floating_point_range = [FloatingPointRange(
+                        from_value=parameter.smallest, to_value=parameter.largest)]
+                # an array without a value has no type yet
                 default = None if parameter.default == [] else parameter.default
-                self.declare_parameter(parameter.name, default, _descriptor(parameter))
+                self.declare_parameter(parameter.name, default, descriptor)
             value = self.get_parameter(parameter.name).value
             is_list = isinstance(parameter.default, list)
             if value is not None and not (is_list and value in NOTHING):
@@ -171,18 +185,6 @@ class PoseGraphNode(LifecycleNode):
             elif is_list and parameter.default != [] and parameter.name in self._overrides:
                 given[parameter.name] = []  # so rcl hands over [], which is not the default
         return given
-
-    def _warn_of_unknown(self) -> None:
-        """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
-        # pose_graph.yaml has defaults of sources that `sources` may leave out
-        usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
-                 for parameter in source_parameters(source, kind.name)}
-        for name, value in sorted(self._overrides.items()):
-            # those of rclpy are declared, or will be with the publishers and subscriptions
-            if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
-                    is_own(name, self._own)) and (
-                    name not in usual or not is_same(plain(value), usual[name])):
-                logger.warning('%s', unknown(name, self._own))
 
     def set_parameters_atomically(
         self, parameter_list: list[RosParameter],
@@ -236,15 +238,3 @@ class PoseGraphNode(LifecycleNode):
 
 def _refused(reason: object) -> SetParametersResult:
     return SetParametersResult(successful=False, reason=str(reason))
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        description=f'{parameter.description} [{parameter.unit}]'.removesuffix(' []'),
-        additional_constraints=constraints(parameter),
-        read_only=parameter.change is Change.START,
-        dynamic_typing=not isinstance(parameter.default, bool | str))
-    if parameter.smallest is not None and parameter.largest is not None:
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=parameter.smallest, to_value=parameter.largest)]
-    return descriptor

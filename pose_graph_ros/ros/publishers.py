@@ -36,6 +36,7 @@ from pose_graph_ros.adapters.output_cdr import (
     UNKNOWN_VARIANCE,
 )
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
+from pose_graph_ros.adapters.parameters import FRAMES
 from pose_graph_ros.adapters.sources import JUDGE, source_list
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -105,9 +106,8 @@ class Publishers:
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node = node
-        self.map_frame = frame(values['map_frame'])
-        self.odom_frame = frame(values['odom_frame'])
-        self.base_frame = frame(values['base_link_frame'])
+        self.frames = tuple(frame(values[name]) for name in FRAMES)
+        self.map_frame, self.odom_frame, self.base_frame = self.frames
         self._publishers = {
             name: self._publisher(type_name, values[f'outputs.{name}'],
                                   LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
@@ -167,31 +167,42 @@ class Publishers:
         if len(wanted) == 0:
             return
         prediction = predict(estimate, sample)
-        if self._is_unplaced(estimate):
-            prediction = prediction._replace(covariance=UNPLACED)
+        is_local = estimate.alignment is AlignmentState.LOCAL
+        if is_local:
+            # without a source that is to tell where odometry lies, that is the map
+            self._awaits_map = self._awaits_map or any(
+                self._node.count_publishers(topic) > 0 for topic in self._map_topics)
+            if self._awaits_map:
+                prediction = prediction._replace(covariance=UNPLACED)
         if self._odometry in wanted:
             self._odometry.publish(odometry_cdr(
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
             self._pose.publish(stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before the first measurement in the map, its place on the Earth is unknown
-        if (self._fix in wanted and plane is not None
-                and estimate.alignment is not AlignmentState.LOCAL):
-            self._fix.publish(fix_message(
-                stamp, prediction, plane, datum.altitude, self.base_frame))
+        if self._fix in wanted and plane is not None and not is_local:
+            self._fix.publish(self._fix_at(stamp, prediction, plane, datum.altitude))
+
+    def _fix_at(
+        self, stamp_ns: StampNs, prediction: Prediction, plane: TangentPlane, altitude: Metres,
+    ) -> NavSatFix:
+        """Return the robot's position on the Earth, its covariance in east and north."""
+        latitude, longitude, _ = plane.to_geodetic(
+            prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
+        covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
+        turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+        covariance[:2, :2] = 0.5 * (turned + turned.T)
+        return NavSatFix(
+            header=_header(stamp_ns, self.base_frame),
+            status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
+            longitude=float(longitude), altitude=float(altitude),
+            position_covariance=covariance.ravel(),
+            position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
 
     def _holds(self, estimate: Estimate) -> bool:
         """Tell whether nothing is to be published of an estimate, as it is not in the map yet."""
         return (self._waits and len(self._map_topics) > 0
                 and estimate.alignment is not AlignmentState.ALIGNED)
-
-    def _is_unplaced(self, estimate: Estimate) -> bool:
-        """Tell whether a source is to tell where odometry lies; without one, that is the map."""
-        if estimate.alignment is not AlignmentState.LOCAL:
-            return False
-        self._awaits_map = self._awaits_map or any(
-            self._node.count_publishers(topic) > 0 for topic in self._map_topics)
-        return self._awaits_map
 
     def jump(self) -> None:
         """Let the next transform be published without limits: the robot was put elsewhere."""
@@ -229,7 +240,7 @@ class Publishers:
             # of those that are believed, the newest of each source
             verdicts = backend.verdicts(50)
             publish(self.verdicts, state, lambda at: verdicts_message(
-                verdicts, status.verdicts, self._header(at)))
+                verdicts, status.verdicts, _header(at, self.map_frame)))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""
@@ -244,11 +255,8 @@ class Publishers:
                         markers=[Marker(header=header, action=Marker.DELETEALL)])),
                     (self.verdicts, lambda header: verdicts_message([], {}, header))):
                 if view.stamp_ns > 0:
-                    view.publisher.publish(empty(self._header(view.stamp_ns + 1)))
+                    view.publisher.publish(empty(_header(view.stamp_ns + 1, self.map_frame)))
                 view.forget()
-
-    def _header(self, stamp_ns: StampNs) -> Header:
-        return Header(stamp=time_message(stamp_ns), frame_id=self.map_frame)
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
@@ -302,24 +310,6 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
     return Trajectory(path.stamps_ns[kept], path.poses[kept])
 
 
-def time_message(stamp_ns: int) -> Time:
-    """Return a stamp [ns] as a message."""
+def _header(stamp_ns: StampNs, frame_id: str) -> Header:
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
-    return Time(sec=seconds, nanosec=nanoseconds)
-
-
-def fix_message(
-    stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: Metres, base_frame: str,
-) -> NavSatFix:
-    """Return the robot's position on the Earth, its covariance in east and north."""
-    latitude, longitude, _ = plane.to_geodetic(
-        prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
-    covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
-    turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
-    covariance[:2, :2] = 0.5 * (turned + turned.T)
-    return NavSatFix(
-        header=Header(stamp=time_message(stamp_ns), frame_id=base_frame),
-        status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
-        longitude=float(longitude), altitude=float(altitude),
-        position_covariance=covariance.ravel(),
-        position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)

@@ -141,9 +141,12 @@ def _path(run: Run, errors: Mapping[str, Any] | None) -> Iterator[Finding]:
         far_off, turn = run.drive.truth_moved
         text += (', each where it fits best (the truth was moved by '
                  f'{short(far_off)} m and {short(math.degrees(turn))} deg)')
+    aligned, ratio = run.estimate.alignment is AlignmentState.ALIGNED, 0.0
+    sigma = np.array([np.nan if each is None else each for each in errors['sigma'] or ()])
+    known = np.isfinite(sigma) & (sigma > 0.0)
     # else the covariances are those to the first pose, which is no better known than the others
-    aligned = run.estimate.alignment is AlignmentState.ALIGNED
-    ratio = _to_claimed(errors, far) if aligned else 0.0
+    if aligned and errors['against'] == 'truth' and np.any(known):
+        ratio = math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
     # errors of a path are few independent ones, as they go on for minutes
     overconfident = ratio > 2.5
     if overconfident:
@@ -153,15 +156,6 @@ def _path(run: Run, errors: Mapping[str, Any] | None) -> Iterator[Finding]:
     better = alone is None or float(short(rms)) < float(short(alone))
     yield Finding('warning' if worse else 'good' if better and not overconfident
                   else 'notice', text, 'errors')
-
-
-def _to_claimed(errors: Mapping[str, Any], far: FloatArray) -> float:
-    """Return the ratio of the errors of a path, shape (N,) [m], to what it claims; 0 unknown."""
-    sigma = np.array([np.nan if each is None else each for each in errors['sigma'] or ()])
-    known = np.isfinite(sigma) & (sigma > 0.0)
-    if errors['against'] != 'truth' or not np.any(known):
-        return 0.0
-    return math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
 
 
 def _measurements(run: Run) -> Iterator[Finding]:
