@@ -56,7 +56,15 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     values = shared.parameter_values(options)
     options.out.mkdir(parents=True, exist_ok=True)
-    bag_path, wanted, truth, title = _bag(options)
+    bag_path, truth, wanted = options.bag, options.truth, shared.wanted_topics(options)
+    title = 'Simulated drive' if bag_path is None else bag_path.stem
+    if bag_path is None:
+        bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
+        print(f'simulating a drive (seed {options.seed})')
+        write_drive(record(course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])), bag_path,
+                    overwrite=True)
+        wanted = {source: topic or SIMULATED_TOPICS.get(source)
+                  for source, topic in wanted.items()}
     with open_bag(bag_path) as bag:
         inputs = choose_inputs(
             bag, source_list(values), wanted, options.hold_out, truth=truth)
@@ -124,21 +132,6 @@ def _counts(values: Mapping[str, str], inputs: Inputs) -> dict[tuple[str, str], 
     return counts
 
 
-def _bag(
-    options: argparse.Namespace,
-) -> tuple[Path, Mapping[str, str | None], str | None, str]:
-    """Return the bag to play, its topics, the topic of the truth, and the title of the picture."""
-    if options.bag is not None:
-        return options.bag, shared.wanted_topics(options), options.truth, options.bag.stem
-    path = options.out / 'simulated_drive'
-    print(f'simulating a drive (seed {options.seed})')
-    way = course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])
-    write_drive(record(way), path, overwrite=True)
-    wanted = {source: topic or SIMULATED_TOPICS.get(source)
-              for source, topic in shared.wanted_topics(options).items()}
-    return path, wanted, options.truth or '/ground_truth', 'Simulated drive'
-
-
 def _run(
     bag: Path, inputs: Inputs, values: Mapping[str, Any], options: argparse.Namespace,
 ) -> bool:
@@ -167,7 +160,12 @@ def _run(
                     {name: values[f'{name}.topic'] for name in inputs.topics}, rate=options.rate,
                     is_running=lambda: node.poll() is None)
             finally:
-                code = _stop(node)
+                node.send_signal(signal.SIGINT)  # nothing happens if it has ended
+                try:
+                    code = node.wait(15.0)
+                except subprocess.TimeoutExpired:
+                    node.kill()
+                    code = node.wait()
         finally:
             os.environ.clear()
             os.environ.update(before)
@@ -201,13 +199,3 @@ def isolated_environment(log: Path) -> Iterator[dict[str, str]]:
         env['ROS_LOG_DIR'] = str(log)
         env.pop('ROS_LOCALHOST_ONLY', None)
         yield env
-
-
-def _stop(node: 'subprocess.Popen[bytes]') -> int:
-    """Stop a process by SIGINT, as Ctrl-C does; return its exit code."""
-    node.send_signal(signal.SIGINT)  # nothing happens if it has ended
-    try:
-        return node.wait(15.0)
-    except subprocess.TimeoutExpired:
-        node.kill()
-        return node.wait()

@@ -7,23 +7,18 @@ The bag is a copy with the path, odometry in the map, and the transform to odom.
 """
 
 import bisect
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagMessage, MessageError, Span
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.output_cdr import (
-    odometry_cdr,
-    path_cdr,
-    transform_cdr,
-    UNKNOWN_VARIANCE,
-)
 from pose_graph_ros.adapters.sources import KINDS, MessageReader
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli.arguments import Exports
@@ -34,23 +29,18 @@ from pose_graph_ros.core.estimate import Estimate, predict, Prediction
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, Pose
 from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection, Trajectory
-from pose_graph_ros.core.io.path_files import (
-    csv_lines,
-    geojson_lines,
-    gpx_lines,
-    kitti_lines,
-    kml_lines,
-)
+from pose_graph_ros.core.io import path_files
 from pose_graph_ros.core.measurements import Measurement, OdometrySample
 
-LINES = {'geojson': geojson_lines, 'kml': kml_lines, 'gpx': gpx_lines}
+LINES = {'geojson': path_files.geojson_lines, 'kml': path_files.kml_lines,
+         'gpx': path_files.gpx_lines}
 PATH, ODOMETRY, TF = '/path', '/odometry/filtered', '/tf'
 """Topics that are written, as those of the node."""
 TYPES = {PATH: 'nav_msgs/msg/Path', ODOMETRY: 'nav_msgs/msg/Odometry',
          TF: 'tf2_msgs/msg/TFMessage'}
 MESSAGES = message_types()
 LATCHED = (PATH,)
-UNKNOWN = UNKNOWN_VARIANCE * np.eye(3)
+UNKNOWN = output_cdr.UNKNOWN_VARIANCE * np.eye(3)
 MOST_POSES = 100_000  # of a path in a message; of more only every second is written, or fewer
 
 
@@ -80,9 +70,9 @@ def write_exports(exports: Exports, folder: Path, run: Run, datum: Datum | None)
               and run.estimate.alignment is not AlignmentState.LOCAL)
     for name in exports.formats:
         if name == 'kitti':
-            lines = kitti_lines(path)
+            lines = path_files.kitti_lines(path)
         elif name == 'csv':
-            lines = csv_lines(path, run.covariances)
+            lines = path_files.csv_lines(path, run.covariances)
         elif placed:
             assert datum is not None
             places = datum.geodetic(path.poses[:, :2])[:, :2]
@@ -142,9 +132,10 @@ class LivePoses:
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of a table, as that of the path."""
-        return csv_lines(Trajectory(np.array(self._stamps, dtype=np.int64),
-                                    np.array(self._poses).reshape(-1, 3)),
-                         np.array(self._covariances).reshape(-1, 3, 3))
+        return path_files.csv_lines(
+            Trajectory(np.array(self._stamps, dtype=np.int64),
+                       np.array(self._poses).reshape(-1, 3)),
+            np.array(self._covariances).reshape(-1, 3, 3))
 
 
 class _Corrector:
@@ -156,23 +147,20 @@ class _Corrector:
         self._has_poses = inputs.kinds[self._source] is KINDS['odometry']
         self.map_frame, self.odom_frame, self._base_frame = (
             frame(values[key]) for key in ('map_frame', 'odom_frame', 'base_link_frame'))
-        odometry = interpolated(path, self._samples(
-            bag.messages([self.topic], inputs.span), MessageReader(values)))
-        self._correction = PathCorrection(path, odometry)
+        reader = MessageReader(values)
+
+        def samples() -> Iterator[tuple[int, Pose]]:
+            """Yield stamps and poses of odometry, if that has poses."""
+            for message in bag.messages([self.topic], inputs.span) if self._has_poses else ():
+                with suppress(MessageError):
+                    sample = reader.read(self._source, message.decode())
+                    if isinstance(sample, OdometrySample):
+                        yield sample.stamp_ns, _pose(sample)
+        self._correction = PathCorrection(path, interpolated(path, samples()))
         self._stamps, self._covariances = path.stamps_ns.tolist(), run.covariances
         self._newest_ns = 0
         # from the first message on again, as it remembers the stamps before
         self._reader = reader_of(bag, values)
-
-    def _samples(
-        self, messages: Iterable[BagMessage], reader: MessageReader,
-    ) -> Iterator[tuple[int, Pose]]:
-        """Yield stamps and poses of odometry, if that has poses."""
-        for message in messages if self._has_poses else ():
-            with suppress(MessageError):
-                sample = reader.read(self._source, message.decode())
-                if isinstance(sample, OdometrySample):
-                    yield sample.stamp_ns, _pose(sample)
 
     def outputs(self, message: BagMessage) -> Iterator[tuple[str, bytes]]:
         """Yield topics and serialised messages; none outside the path."""
@@ -188,13 +176,13 @@ class _Corrector:
         if pose is None:
             return
         covariance = self._covariances[bisect.bisect_right(self._stamps, stamp_ns) - 1]
-        yield ODOMETRY, odometry_cdr(
+        yield ODOMETRY, output_cdr.odometry_cdr(
             stamp_ns, Prediction(np.array(pose), UNKNOWN if np.isnan(covariance[0, 0])
                                  else covariance), source, self.map_frame, self._base_frame)
         if (self._has_poses and stamp_ns > self._newest_ns
                 and frame(source.header.frame_id) == self.odom_frame):
             self._newest_ns = stamp_ns
-            yield TF, transform_cdr(
+            yield TF, output_cdr.transform_cdr(
                 stamp_ns, np.array(compose_one(pose, between_one(odometry, (0.0, 0.0, 0.0)))),
                 self.map_frame, self.odom_frame)
 
@@ -211,10 +199,11 @@ def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> di
     `LATCHED` topic.
     """
     corrector, path = _Corrector(bag, inputs, run), run.estimate.path
-    begin_ns = inputs.span.begin_ns
+    begin_ns, step = inputs.span.begin_ns, -(-len(path) // MOST_POSES)
     writer.write(
         PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
-        path_cdr(_thinned(path), int(path.stamps_ns[-1]), corrector.map_frame))
+        output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]),
+                            int(path.stamps_ns[-1]), corrector.map_frame))
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
@@ -252,8 +241,3 @@ def _copy(writer: BagWriter, message: BagMessage, ours: _Corrector) -> bool:
 def _pose(sample: OdometrySample) -> Pose:
     x, y, theta = sample.pose.tolist()
     return x, y, theta
-
-
-def _thinned(path: Trajectory) -> Trajectory:
-    step = -(-len(path) // MOST_POSES)
-    return Trajectory(path.stamps_ns[::step], path.poses[::step])

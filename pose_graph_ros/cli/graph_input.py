@@ -25,13 +25,17 @@ from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
+SAVED = b'{\n"sha256": "'  # begin of the .json file of a saved graph
 SECOND = 1_000_000_000
 
 
 def read(path: Path, edge2_order: str | None) -> GraphFile:
     """Return the graph in a file; warnings go to stderr. Raises FileFormatError."""
-    side = path if path.suffix == '.json' else path.with_suffix('.json')
-    if side == path or (side.is_file() and _begins_as_saved(side)):
+    side, begin = path if path.suffix == '.json' else path.with_suffix('.json'), b''
+    if side != path and side.is_file():
+        with side.open('rb') as file:
+            begin = file.read(len(SAVED))
+    if side == path or begin == SAVED:
         # what reads saved graphs takes longer to load than all else here
         from pose_graph_ros.core.io.graph_files import read_graph  # noqa: PLC0415
 
@@ -56,12 +60,6 @@ def read_file(path: Path, edge2_order: str | None) -> GraphFile:
     for line in lines:
         print(f'warning: {path}: {line}', file=sys.stderr)
     return file
-
-
-def _begins_as_saved(path: Path) -> bool:
-    begin = b'{\n"sha256": "'
-    with path.open('rb') as file:
-        return file.read(len(begin)) == begin
 
 
 def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
@@ -108,9 +106,14 @@ def read_measurements(
     odometry = steps[first]
     closures = np.setdiff1d(np.arange(len(edges)), odometry)
     last = np.maximum(edges.i, edges.j)[closures].tolist()
+    others = edges.rows(closures)
     events: list[tuple[int, OdometrySample | LoopClosure]] = [
         *enumerate(_odometry(edges.rows(odometry), stamps_ns)),
-        *zip(last, _closures(edges.rows(closures), stamps_ns), strict=True)]
+        # covariances from the axes of the measured pose to those of the reference
+        *((when, LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
+                             reference_ns=int(stamps_ns[i])))
+          for when, i, j, mean, cov in zip(
+              last, others.i, others.j, others.mean, _covariances(others), strict=True))]
     return [each for _, each in sorted(events, key=itemgetter(0))]
 
 
@@ -141,13 +144,6 @@ def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
             stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
             variances[step] / elapsed[step])
         pose = se2.compose(pose, motions[step])
-
-
-def _closures(edges: Factors, stamps_ns: IntArray) -> Iterator[LoopClosure]:
-    for i, j, mean, cov in zip(edges.i, edges.j, edges.mean, _covariances(edges), strict=True):
-        # from the axes of the measured pose to those of the reference
-        yield LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
-                          reference_ns=int(stamps_ns[i]))
 
 
 def _covariances(edges: Factors) -> FloatArray:

@@ -9,29 +9,15 @@ from contextlib import ExitStack
 import time
 from typing import Any, NamedTuple
 
+from pose_graph_ros.adapters import sources
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
-from pose_graph_ros.adapters.sources import (
-    backend_config,
-    CLOSURES,
-    Kind,
-    LOOP_CLOSURE,
-    MessageReader,
-    ODOMETRY,
-    source_list,
-)
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, MessageReader
 from pose_graph_ros.adapters.surroundings import Datum
-from pose_graph_ros.cli import shared
+from pose_graph_ros.cli import exports, shared
 from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
-from pose_graph_ros.cli.exports import (
-    LATCHED,
-    LivePoses,
-    require_datum,
-    write_corrected,
-    write_exports,
-    write_lines,
-)
+from pose_graph_ros.cli.exports import LivePoses, require_datum
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import Recorder, Run, Update
 from pose_graph_ros.cli.run.document import write_results
@@ -84,7 +70,7 @@ def run_measurements(
     recorder: Recorder | None = None, live: LivePoses | None = None,
 ) -> tuple[PoseGraphBackend, UpdateReport]:
     """Return a new engine after adding measurements, and the report of the full optimisation."""
-    backend = PoseGraphBackend(backend_config(values))
+    backend = PoseGraphBackend(sources.backend_config(values))
     recorder = Recorder() if recorder is None else recorder
     next_update = UPDATE_EVERY
     for source, measurement in measurements:
@@ -122,7 +108,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
         require_datum(options.export, known=len(values['datum']) > 0 or len(
             inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
-            BagWriter(options.new_bag, latched=LATCHED))
+            BagWriter(options.new_bag, latched=exports.LATCHED))
         if not options.json:
             print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         start = time.monotonic()
@@ -142,7 +128,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
             values=values, kinds=inputs.kinds, seconds=seconds)
         facts: dict[str, Any] = {'bags': [str(path) for path in options.bags], 'seconds': seconds}
         if writer is not None:
-            facts['new_bag'] = write_corrected(
+            facts['new_bag'] = exports.write_corrected(
                 writer, shared.watched_bag(bag, 'writing the bag'), inputs, done)
     return _report(options, done, facts, result.datum, live)
 
@@ -154,7 +140,8 @@ def _execute_g2o(options: argparse.Namespace) -> int:
                        '--from and --until')
     require_datum(options.export, known=False)
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
-    odometry = next(source.name for source in source_list(values) if source.kind.is_odometry)
+    odometry = next(
+        each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [
         (odometry if isinstance(each, OdometrySample) else CLOSURES, each)
         for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
@@ -165,7 +152,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
         ((*each, False) for each in measurements), backend, odometry, result.refused)
     return _report(options, _run_of(
         options, result, drive, values=values,
-        kinds={odometry: ODOMETRY, CLOSURES: LOOP_CLOSURE}, seconds=seconds),
+        kinds={odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}, seconds=seconds),
         {'seconds': seconds})
 
 
@@ -185,10 +172,10 @@ def _report(
     """Write the results and print a summary; return the exit code."""
     lines = write_results(done, options.out, facts)
     write_g2o(done.backend.graph, options.out / 'graph.g2o')
-    exported = write_exports(options.export, options.out, done, datum)
+    exported = exports.write_exports(options.export, options.out, done, datum)
     if live is not None:
         exported.append(options.out / 'live.csv')
-        write_lines(exported[-1], live.lines())
+        exports.write_lines(exported[-1], live.lines())
     names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
              *(path.name for path in exported)]
     if options.json:

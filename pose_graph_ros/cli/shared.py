@@ -82,24 +82,19 @@ def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None
             flat[prefix + name] = value
 
 
-def span_of(bag: Bag, options: argparse.Namespace) -> Span:
-    """Return the time of recording that the options ask for; raises `BagError` if it is empty."""
+def inputs_of(
+    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
+) -> Inputs:
+    """Return what is read of a bag by the options; raises `BagError` if that is nothing."""
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]
-    span, length = Span(*limits), (bag.end_ns - bag.start_ns) * 1e-9
+    length = (bag.end_ns - bag.start_ns) * 1e-9
     until = math.inf if options.until is None else options.until
     if (options.begin or 0.0) >= min(length, until):
         raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
                        f'recording is {max(length, 0.0):.3f} s long')
-    return span
-
-
-def inputs_of(
-    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
-) -> Inputs:
-    """Return what is read of a bag by the options."""
     return choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
-                         span_of(bag, options), truth=options.truth)
+                         Span(*limits), truth=options.truth)
 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:

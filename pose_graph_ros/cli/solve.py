@@ -8,13 +8,13 @@ What takes long to load, such as compiled kernels, is imported where it is used.
 # ruff: noqa: PLC0415
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable
 import json
 import math
 from pathlib import Path
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -23,20 +23,18 @@ from pose_graph_ros.cli.graph_input import read_file, rows_of
 from pose_graph_ros.cli.solve_starts import CONFIG, Problem, Solution, solve, with_certificate
 from pose_graph_ros.core.batch.levenberg_marquardt import Status
 from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
-from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import upper
 from pose_graph_ros.core.io.g2o import write_g2o
-
-if TYPE_CHECKING:
-    from pose_graph_ros.core.graph.graph import Graph
 
 N_LARGEST = 5  # edges, observed nodes, and names, that are printed
 COLUMNS = ('id', 'x', 'y', 'theta', 'cov_xx', 'cov_xy', 'cov_xtheta', 'cov_yy', 'cov_ytheta',
            'cov_thetatheta')
 
 
-def _complete(options: argparse.Namespace) -> None:
-    """Complete the arguments: in `--robust FILE`, what follows the option is the file."""
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    # in `--robust FILE`, what follows the option is the file
     if options.robust not in (None, *METHODS):
         if options.graph is not None:
             raise ConfigError(
@@ -47,16 +45,11 @@ def _complete(options: argparse.Namespace) -> None:
     for path in options.out:
         if not path.parent.is_dir():
             raise ConfigError(f'--out: there is no folder {path.parent} for {path.name}')
+    return _solve(options, (lambda _: None) if options.json else print)
 
 
-def execute(options: argparse.Namespace) -> int:
-    """Run the tool; return the exit code."""
-    _complete(options)
-
-    def say(line: str) -> None:
-        if not options.json:
-            print(line)
-
+def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+    """Solve, write and print the results; return the exit code."""
     file = read_file(options.graph, options.edge2)
     tables = [path for path in options.out if path.suffix == '.csv']
     which = options.marginals or ('all' if len(tables) > 0 else None)
@@ -89,9 +82,11 @@ def execute(options: argparse.Namespace) -> int:
     say('\n'.join([*_lines(problem, solution, seconds, doubted),
                    *([] if certificate is None else certificate.lines())]))
     table, error = ([], 0.0) if rows is None else _marginals(problem, solution, rows)
+    text = '\n'.join([','.join(COLUMNS), *(','.join(
+        '' if value is None else repr(value) for value in row.values()) for row in table), ''])
     for path in options.out:
         if path in tables:
-            path.write_text(_csv(table), encoding='ascii')
+            path.write_text(text, encoding='ascii')
         else:
             write_g2o(problem.graph, path, problem.ids)
     if options.json:
@@ -104,7 +99,7 @@ def execute(options: argparse.Namespace) -> int:
                        **({} if len(tables) > 0 else {'marginals': table})}
         print(json.dumps(_finite(values), indent=2, allow_nan=False))
     elif rows is not None and len(tables) == 0:
-        print(_csv(table), end='')
+        print(text, end='')
     return 0 if solution.result.status is Status.CONVERGED else 1
 
 
@@ -163,11 +158,6 @@ def _chosen(problem: Problem, which: str) -> IntArray:
     return rows_of(problem.ids, which, '--marginals')
 
 
-def _csv(table: Iterable[Mapping[str, float | None]]) -> str:
-    return '\n'.join([','.join(COLUMNS), *(','.join(
-        '' if value is None else repr(value) for value in row.values()) for row in table), ''])
-
-
 def _marginals(
     problem: Problem, solution: Solution, rows: IntArray,
 ) -> tuple[list[dict[str, float | None]], float]:
@@ -193,19 +183,8 @@ def _marginals(
         if not graph.is_pose[row]:
             values = [None if k in {2, 5, 7, 8} else value for k, value in enumerate(values)]
         table.append(dict(zip(COLUMNS, [int(problem.ids[row]), *values], strict=True)))
-    error = float(np.finfo(float).eps) * _condition(graph, covariances)
-    if error > 1e-6:
-        print(f'warning: by rounding, covariances may be off by {error:.1g} of themselves',
-              file=sys.stderr)
-    return table, error
-
-
-def _condition(graph: 'Graph', covariances: Covariances) -> float:
-    """
-    Return a bound of the condition number of H with a diagonal of ones.
-
-    The trace of its inverse, each variance times what constraints add to H there.
-    """
+    # a bound of the condition number of H with a diagonal of ones: the trace of its inverse, each
+    # variance times what constraints add to H there
     added, factors = np.zeros((graph.n_nodes, 3)), graph.factors_by_row
     information = factors.weighted_information
     position = information[:, 0, 0] + information[:, 1, 1]
@@ -213,4 +192,9 @@ def _condition(graph: 'Graph', covariances: Covariances) -> float:
     by_factor = np.column_stack((position, position, information[:, 2, 2] + arm * position))
     for ends in (factors.i, factors.j):
         np.add.at(added, ends[ends >= 0], by_factor[ends >= 0])
-    return max(float(np.sum(added * np.einsum('mii->mi', covariances))), 1.0)
+    error = float(np.finfo(float).eps) * max(
+        float(np.sum(added * np.einsum('mii->mi', covariances))), 1.0)
+    if error > 1e-6:
+        print(f'warning: by rounding, covariances may be off by {error:.1g} of themselves',
+              file=sys.stderr)
+    return table, error

@@ -121,7 +121,15 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
     from pose_graph_ros.core.batch import optimizer  # noqa: PLC0415
 
     graph = problem.engine
-    graph.set_poses(_composed(graph) if start == 'odometry' else poses)
+    if start == 'odometry':
+        # composed from odometry if that joins all nodes, else from all edges
+        edges, poses, known = graph.factors.edges, graph.poses.copy(), graph.fixed.copy()
+        edges = edges.rows(edges.weight > 0.0)
+        steps = edges.rows(np.abs(edges.j - edges.i) == 1)
+        joins_all = len(np.unique(np.minimum(steps.i, steps.j))) == graph.n_nodes - 1
+        compose_missing(poses, known, steps if joins_all else edges)
+        poses[~graph.is_pose, 2] = 0.0
+    graph.set_poses(poses)
     optimize = (optimizer.optimize_from_linear_start if start == 'chordal' else optimizer.optimize)
     result, determined = _held_weakly(graph, optimize)
     reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
@@ -132,17 +140,6 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
         names[start] = Start.CHORDAL.value
     return Solution(replace(result, reason=reason), names.get(start, result.start.value),
                     determined)
-
-
-def _composed(graph: 'Graph') -> FloatArray:
-    """Return poses composed from odometry if it joins all nodes, else from all edges."""
-    edges, poses, known = graph.factors.edges, graph.poses.copy(), graph.fixed.copy()
-    edges = edges.rows(edges.weight > 0.0)
-    steps = edges.rows(np.abs(edges.j - edges.i) == 1)
-    joins_all = len(np.unique(np.minimum(steps.i, steps.j))) == graph.n_nodes - 1
-    compose_missing(poses, known, steps if joins_all else edges)
-    poses[~graph.is_pose, 2] = 0.0
-    return poses
 
 
 def _held_weakly(
