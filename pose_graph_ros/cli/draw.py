@@ -27,9 +27,9 @@ from pose_graph_ros.cli.graph_input import read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.io.g2o import GraphFile
-from pose_graph_ros.offline.drawing import views
-from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, pattern
-from pose_graph_ros.offline.drawing.views import Role, Sort
+from pose_graph_ros.offline import graph_views as views
+from pose_graph_ros.offline.graph_views import Role, Sort
+from pose_graph_ros.offline.pattern import elimination_order, Pattern, pattern
 
 N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
 INK, GREY = '#111111', '#7a828c'

@@ -24,8 +24,8 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph_update import GraphUpdate
 from pose_graph_ros.core.io.g2o import compose_missing, GraphFile
 from pose_graph_ros.core.sparse import components
-from pose_graph_ros.offline.certificate.certify import Certificate, certify, NearHessian, Verdict
-from pose_graph_ros.offline.certificate.objective import formulate, NotCoveredError
+from pose_graph_ros.offline.certify import Certificate, certify, NearHessian, Verdict
+from pose_graph_ros.offline.chordal_objective import formulate, NotCoveredError
 
 if TYPE_CHECKING:
     from pose_graph_ros.core.graph.graph import Graph

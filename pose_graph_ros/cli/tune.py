@@ -46,8 +46,8 @@ from pose_graph_ros.core.sources.kinds import validate
 from pose_graph_ros.core.sources.validation import Validated
 from pose_graph_ros.offline import noise
 from pose_graph_ros.offline.noise import Errors, Found, Noise, Summary
-from pose_graph_ros.offline.residuals.source_residuals import RowFit, ScaleFit
-from pose_graph_ros.offline.residuals.variance_components import analyse
+from pose_graph_ros.offline.source_residuals import RowFit, ScaleFit
+from pose_graph_ros.offline.variance_components import analyse
 
 Key = tuple[str, StampNs]  # source and stamp of a measurement
 LEAST = 20  # measurements of a source whose noise is estimated

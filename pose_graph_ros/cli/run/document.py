@@ -31,9 +31,8 @@ from pose_graph_ros.core.judgement import texts
 from pose_graph_ros.core.judgement.texts import Key, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, Verdict
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
-from pose_graph_ros.offline.drawing import pattern as patterns
-from pose_graph_ros.offline.residuals import variance_components
-from pose_graph_ros.offline.residuals.source_residuals import spread
+from pose_graph_ros.offline import pattern as patterns, variance_components
+from pose_graph_ros.offline.source_residuals import spread
 
 REFUSED_SOMEHOW = 'Refused; the counts of its source say why.'
 MOST_POSES = 10_000  # of a path

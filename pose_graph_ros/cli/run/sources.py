@@ -15,9 +15,9 @@ from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
-from pose_graph_ros.offline.residuals import source_residuals
-from pose_graph_ros.offline.residuals.source_residuals import ScaleFit, SourceResiduals, Whiteness
-from pose_graph_ros.offline.residuals.variance_components import Analysis
+from pose_graph_ros.offline import source_residuals
+from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, Whiteness
+from pose_graph_ros.offline.variance_components import Analysis
 
 WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong
 _NAMES = {'map': ('x', 'y', 'heading'), 'edge': ('along', 'across', 'heading')}

@@ -39,7 +39,7 @@ from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
-from pose_graph_ros.offline.residuals.source_residuals import (
+from pose_graph_ros.offline.source_residuals import (
     bounded,
     collect,
     fit,

@@ -20,7 +20,7 @@ from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.tables import N_CLIQUES
-from pose_graph_ros.offline.drawing.views import hidden, markov_random_field, terms
+from pose_graph_ros.offline.graph_views import hidden, markov_random_field, terms
 
 MOST_BINS = 120
 

@@ -4,7 +4,7 @@
 Whether a minimum is the global one, and if not, a lower one.
 
 1. The headings of the given poses are moved to the near minimum of the objective of
-   `objective`, positions eliminated.
+   `chordal_objective`, positions eliminated.
 2. The certificate matrix of this minimum proves a lower bound (`examined`). If it is f, but for
    the gap that rounding needs, the minimum is global.
 3. Else headings become rows of one number more (the Riemannian staircase: N. Boumal,
@@ -45,7 +45,7 @@ import numpy as np
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.sparse import BlockFactors
-from pose_graph_ros.offline.certificate.objective import Formulation, QuadraticForm
+from pose_graph_ros.offline.chordal_objective import Formulation, QuadraticForm
 
 Operator = Callable[[ComplexArray], ComplexArray]
 Preconditioner = Callable[[ComplexArray, ComplexArray], ComplexArray]
