@@ -157,11 +157,15 @@ def certify(
         return Certificate(Verdict.CERTIFIED, cost, near, cost, None, 1,
                            formulation.poses(form.positions(z)[:, 0], z[:, 0]))
     spectrum = examined(form, z, eigenvalue=eigenvalue)
-    bound, rank = spectrum.bound, 1
+    bound, y = spectrum.bound, z
     if not spectrum.positive:
-        y, rank, above = _staircase(form, z, spectrum)
+        above = spectrum    # a minimum over rows of more numbers
+        while (not above.positive and y.shape[1] < TUNING.max_rank
+               and above.direction is not None):
+            y = minimized(form, _escaped(form, y, above.direction))
+            above = examined(form, y)
+            bound = max(bound, above.bound)
         other = minimized(form, rounded(y))
-        bound = max(bound, above)
         if form.cost(other) < near - TUNING.lower * max(near, 1.0):
             z, cost = other, form.cost(other)
             spectrum = examined(form, z, eigenvalue=eigenvalue)
@@ -170,21 +174,7 @@ def certify(
     certified = gap <= TUNING.gap * max(cost, 1.0)
     return Certificate(
         Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED, cost, near, gap,
-        spectrum.smallest, rank,
-        formulation.poses(form.positions(z)[:, 0], z[:, 0]))
-
-
-def _staircase(
-    form: QuadraticForm, y: ComplexArray, spectrum: Spectrum,
-) -> tuple[ComplexArray, int, float]:
-    """Return rows at a minimum over rows of more numbers, how many, and the best bound."""
-    bound = spectrum.bound
-    while (not spectrum.positive and y.shape[1] < TUNING.max_rank
-           and spectrum.direction is not None):
-        y = minimized(form, _escaped(form, y, spectrum.direction))
-        spectrum = examined(form, y)
-        bound = max(bound, spectrum.bound)
-    return y, y.shape[1], bound
+        spectrum.smallest, y.shape[1], formulation.poses(form.positions(z)[:, 0], z[:, 0]))
 
 
 def _escaped(form: QuadraticForm, y: ComplexArray, direction: ComplexArray) -> ComplexArray:

@@ -16,7 +16,7 @@ its interval. The path depends on ratios of noise: where a source keeps more tha
 odometry keeps as much more.
 
 How far what was held out is from a path shows in metres and in sigmas how good that is. Held out
-are whole stretches of a drive (`fold_of`): single measurements share their slow errors
+are whole stretches of a drive (`stretch_length`): single measurements share their slow errors
 with their neighbours, so that a path which follows these errors would look good.
 """
 
@@ -316,11 +316,6 @@ def stretch_length(duration: float, period: float, tau: float, folds: int) -> fl
     """
     wanted = max(SHORTEST, min(IN_TAU * tau, LONGEST), IN_PERIODS * period)
     return min(wanted, duration / (LEAST_STRETCHES * folds))
-
-
-def fold_of(stamps_ns: IntArray, start_ns: int, stretch: float, folds: int) -> IntArray:
-    """Return in which fold measurements are held out, (M,); the first begins at `start_ns`."""
-    return np.asarray(((stamps_ns - start_ns) * 1e-9 / stretch).astype(np.int64) % folds)
 
 
 def errors_at(

@@ -32,24 +32,14 @@ from scipy.sparse.linalg import splu
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.error_functions import errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
-from pose_graph_ros.offline.source_residuals import (
-    bounded,
-    collect,
-    fit,
-    inverse,
-    LEAST_INDEPENDENT,
-    ScaleFit,
-    scales_in_use,
-    SourceResiduals,
-    whiteness,
-)
+from pose_graph_ros.offline import source_residuals
+from pose_graph_ros.offline.source_residuals import inverse, ScaleFit, SourceResiduals
 
 # Random signs for each trace: its error is half of that of the squares that it is compared to.
 PROBES = 4
@@ -86,7 +76,7 @@ class Found(NamedTuple):
             return math.nan, math.nan, math.nan, 0.0
         variance = float(share @ self.covariance[np.ix_(k, k)] @ share) / total**2
         independent = 0.5 / variance
-        if independent < LEAST_INDEPENDENT:
+        if independent < source_residuals.LEAST_INDEPENDENT:
             return math.nan, math.nan, math.nan, independent
         ratio, width = math.sqrt(total / count), math.exp(1.96 * math.sqrt(variance))
         return ratio, ratio / width, ratio * width, independent
@@ -105,45 +95,34 @@ def constraints(graph: Graph) -> Constraints:
     poses = graph.poses
     used = np.flatnonzero(graph.weights > 0.0)
     factors = graph.factors_by_row.rows(used)
-    error, values, columns = _linearized(poses, factors)
-    n = 3 * len(error)
-    size = 3 * len(poses)
-    jacobian = csr_array((values.reshape(n, 9).ravel(), columns.reshape(n, 9).ravel(),
-                          np.arange(0, 9 * n + 1, 9)), shape=(n, size))
-    free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
-    return Constraints(
-        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
-        factors.weight, jacobian[:, free], _prior(graph, size)[free][:, free], used)
-
-
-def _linearized(poses: FloatArray, table: Factors) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return errors with their derivatives by the nodes of the ends, and the columns of these."""
-    n, error = len(poses), errors(poses, table)
+    error = errors(poses, factors)
+    # derivatives by the nodes of the ends, and their columns
     values, columns = [], []
     for name in 'ijk':
-        ends = getattr(table, name)
+        ends = getattr(factors, name)
         for k in range(3):
             step = np.zeros(3)
             step[k] = 1e-5   # m or rad
             moved = np.concatenate((poses, poses + step, poses - step))
-            after, before = (errors(moved, table.replaced(**{
-                name: np.where(ends < 0, ends, ends + part * n)})) for part in (1, 2))
+            after, before = (errors(moved, factors.replaced(**{
+                name: np.where(ends < 0, ends, ends + part * len(poses))})) for part in (1, 2))
             change = after - before
             change[:, 2] = se2.wrap(change[:, 2])
             values.append(change / 2e-5)
             columns.append(np.tile(3 * np.maximum(ends, 0)[:, None] + k, (1, 3)))
-    return error, np.stack(values, axis=2), np.stack(columns, axis=2)
-
-
-def _prior(graph: Graph, size: int) -> csr_array:
-    """Return the information of the dense priors of a graph, shape (size, size)."""
-    total = csr_array((size, size))
+    n, size = 3 * len(error), 3 * len(poses)
+    jacobian = csr_array((np.stack(values, axis=2).ravel(), np.stack(columns, axis=2).ravel(),
+                          np.arange(0, 9 * n + 1, 9)), shape=(n, size))
+    priors = csr_array((size, size))
     for prior in graph.priors:
         at = (3 * graph.node_rows(prior.nodes)[:, None] + np.arange(3)).ravel()
-        i, j = np.meshgrid(at, at, indexing='ij')
-        total = total + csr_array((prior.information.ravel(), (i.ravel(), j.ravel())),
-                                  shape=(size, size))
-    return total
+        row, column = np.meshgrid(at, at, indexing='ij')
+        priors = priors + csr_array((prior.information.ravel(), (row.ravel(), column.ravel())),
+                                    shape=(size, size))
+    free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
+    return Constraints(
+        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
+        factors.weight, jacobian[:, free], priors[free][:, free], used)
 
 
 class _Projection:
@@ -233,7 +212,7 @@ def _statistics(
                 traces[k] = np.sum(spread * signs[rows]) / PROBES
         energies = np.sum(np.einsum('mij,mj->mi', back[k], residuals[rows])**2, axis=1)
         freedom = ranks[k, rows]
-        squares[k] = np.sum(bounded(
+        squares[k] = np.sum(source_residuals.bounded(
             energies, traces[k] / np.sum(freedom) * freedom, freedom))
     return traces, products + products.T, squares
 
@@ -254,20 +233,19 @@ def analyse(parts: Parts) -> Analysis:
 
     All edits of the engine have been solved for.
     """
-    smoother, nodes, factors = parts.smoother, parts.nodes, parts.factors
-    residuals = collect(smoother, nodes, factors, scales_in_use(parts.graph, parts.reweighting))
+    residuals, nodes = source_residuals.collect(parts), parts.nodes
     if nodes.primary in residuals:
         # its edges have the noise that was found, and a ratio is one to what is claimed
         of_odometry = residuals[nodes.primary]
         residuals[nodes.primary] = of_odometry._replace(
             scale=of_odometry.scale * nodes.errors.mean_sigma)
-    fits = {source: fit(each, factors.errors_in_use(source))
+    fits = {source: source_residuals.fit(each, parts.factors.errors_in_use(source))
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
     correlated = frozenset(
         source for source, each in white.items() if each.kind == 'map'
-        and (found := whiteness(each)) is not None and found.tau > 0.0)
+        and (found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
     if len(correlated) == 0:
         fits |= _together(parts, fits, white)
     return Analysis(residuals, fits, correlated)

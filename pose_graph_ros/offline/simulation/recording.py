@@ -27,18 +27,15 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres, Seconds
-from pose_graph_ros.offline.simulation import sensors
+from pose_graph_ros.offline.simulation import sensors, settings
 from pose_graph_ros.offline.simulation.sensors import Measured
 from pose_graph_ros.offline.simulation.settings import (
     CLOSURES,
-    Closures,
     FIXES,
     GYRO,
-    Jump,
     ODOMETRY,
     POSES,
     Setup,
-    START_NS,
     TOPICS,
     TRUTH,
 )
@@ -138,7 +135,18 @@ def record(way: Course) -> Recording:
     fixes = absolute(way, FIXES, truth)
     fixes = fixes._replace(values=CITY.to_geodetic(fixes.values))
     heard = fixes.rows(sensors.heard(fixes.stamps_ns, FIXES, setup.outages)).values
-    to_map = _fixed_map(heard[0]) if len(heard) > 0 else _map(truth, odometry.poses[0])
+    # from the world to the frame in which odometry begins, or to the plane that touches the Earth
+    # at the first fix
+    begin = se2.compose(odometry.poses[0], se2.inverse(truth.poses[0]))
+    plane = None if len(heard) == 0 else TangentPlane(*heard[0].tolist())
+
+    def to_map(poses: FloatArray) -> FloatArray:
+        if plane is None:
+            return se2.compose(begin, poses)
+        poses = poses.copy()
+        poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
+        return poses
+
     poses = absolute(way, POSES, Trajectory(truth.stamps_ns, to_map(truth.poses)))
     closures, missing = _closures(way)
     every = {
@@ -174,51 +182,34 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
                          setup.jumps_of(topic))
 
 
-def _map(truth: Trajectory, origin: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what moves poses of the world to the frame in which odometry begins."""
-    moved = se2.compose(origin, se2.inverse(truth.poses[0]))
-    return lambda poses: se2.compose(moved, poses)
-
-
-def _fixed_map(fix: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what moves poses of the world to the plane that touches the Earth at a fix."""
-    plane = TangentPlane(*fix.tolist())
-
-    def to_map(poses: FloatArray) -> FloatArray:
-        poses = poses.copy()
-        poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
-        return poses
-    return to_map
-
-
 def _closures(way: Course) -> tuple[Measured, int]:
     """Return closures, and how many groups of false ones are missing."""
-    settings = way.setup.closures
-    if settings is None:
+    closures = way.setup.closures
+    if closures is None:
         none = np.empty(0, dtype=np.int64)
         return Measured(none.reshape(0, 2), np.empty((0, 3)), none), 0
-    ends, poses = _true_closures(way.streams['closures'], way.motion, settings)
-    found = way.streams['rate'].random(len(ends)) < settings.rate
+    ends, poses = _true_closures(way.streams['closures'], way.motion, closures)
+    found = way.streams['rate'].random(len(ends)) < closures.rate
     return sensors.with_false(
-        way.streams['false'], way.motion, settings, ends[found], poses[found])
+        way.streams['false'], way.motion, closures, ends[found], poses[found])
 
 
 def _true_closures(
-    generator: np.random.Generator, path: Motion, settings: Closures,
+    generator: np.random.Generator, path: Motion, closures: settings.Closures,
 ) -> tuple[IntArray, FloatArray]:
     """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
     stamps = path.truth.stamps_ns
     # by distance, so that a vehicle at rest is at one place only
     places = np.unique(np.searchsorted(
-        path.distance, np.arange(0.0, path.distance[-1], settings.place_distance)))
-    places = places[stamps[places] >= stamps[0] + settings.first_s * 1e9]
-    old, new = sensors.revisits(generator, path, places, settings)
+        path.distance, np.arange(0.0, path.distance[-1], closures.place_distance)))
+    places = places[stamps[places] >= stamps[0] + closures.first_s * 1e9]
+    old, new = sensors.revisits(generator, path, places, closures)
     # stamps of a camera, which is not synchronised with the other sensors
     ends = stamps[places[np.column_stack((old, new))]]
     ends += generator.integers(1, round(PERIOD_S * 1e9), ends.shape)
     ends = np.minimum(ends, stamps[-1])
     poses = path.truth.at(ends)
-    return ends, sensors.closure_poses(generator, poses[:, 0], poses[:, 1], settings)
+    return ends, sensors.closure_poses(generator, poses[:, 0], poses[:, 1], closures)
 
 
 # --- a graph
@@ -282,7 +273,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
 
 
 def odometry_edges(
-    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[Jump] = (),
+    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
 ) -> Factors:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
@@ -292,7 +283,7 @@ def odometry_edges(
         if jump.step is None:
             raise ConfigError(f'jump of {ODOMETRY}: in a graph it cannot begin again, expected '
                               'DX,DY')
-        k = int(np.searchsorted(truth.stamps_ns, START_NS + round(jump.at_s * 1e9))) - 1
+        k = int(np.searchsorted(truth.stamps_ns, settings.START_NS + round(jump.at_s * 1e9))) - 1
         if 0 <= k < n:
             mean[k] = se2.compose(mean[k], np.array(jump.step))
     information = np.zeros((n, 3, 3))
@@ -311,20 +302,20 @@ def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
 
 def _loop_edges(way: Course, path: Motion, node_distance: float) -> tuple[Factors, IntArray, int]:
     """Return loop closures, the group of each, and how many groups are missing."""
-    settings, streams, truth = way.setup.closures, way.streams, path.truth
-    if settings is None:
+    closures, streams, truth = way.setup.closures, way.streams, path.truth
+    if closures is None:
         return Factors(), np.empty(0, dtype=np.int64), 0
-    settings = replace(settings, first_s=0.0)
+    closures = replace(closures, first_s=0.0)
     # so that no two closures of a group have the same ends
-    spacing = max(settings.false.spacing, 1.5 * node_distance)
-    settings = replace(settings, false=replace(settings.false, spacing=spacing))
-    old, new = sensors.revisits(streams['closures'], path, np.arange(len(truth)), settings)
-    found = streams['rate'].random(len(old)) < settings.rate
+    spacing = max(closures.false.spacing, 1.5 * node_distance)
+    closures = replace(closures, false=replace(closures.false, spacing=spacing))
+    old, new = sensors.revisits(streams['closures'], path, np.arange(len(truth)), closures)
+    found = streams['rate'].random(len(old)) < closures.rate
     old, new = old[found], new[found]
     poses = sensors.closure_poses(
-        streams['closures'], truth.poses[old], truth.poses[new], settings)
+        streams['closures'], truth.poses[old], truth.poses[new], closures)
     every, missing = sensors.with_false(
-        streams['false'], path, settings, truth.stamps_ns[np.column_stack((old, new))], poses)
+        streams['false'], path, closures, truth.stamps_ns[np.column_stack((old, new))], poses)
     every = every.rows(sensors.heard(every.later_ns, CLOSURES, way.setup.outages))
     ends = np.searchsorted(truth.stamps_ns, every.stamps_ns)
     information = np.diag(np.array(way.setup.sigmas(CLOSURES))**-2)

@@ -27,15 +27,12 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Metres
+from pose_graph_ros.offline.simulation import settings
 from pose_graph_ros.offline.simulation.settings import (
     Closures,
     FalseClosures,
     FIXES,
-    Fixes,
-    Jump,
-    Outage,
     Setup,
-    START_NS,
     Wheels,
 )
 
@@ -95,7 +92,7 @@ def follow(
     distance = gaussian_filter1d(np.interp(time, knots, np.repeat(length, 2)), 0.25 / PERIOD_S)
     time, distance = time[time <= duration_s], distance[time <= duration_s]
     poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
-    stamps: IntArray = START_NS + np.round(time * 1e9).astype(np.int64)
+    stamps: IntArray = settings.START_NS + np.round(time * 1e9).astype(np.int64)
     return Motion(Trajectory(stamps, poses), distance), arrival
 
 
@@ -259,7 +256,7 @@ CAR = Limits(speed=7.2, acceleration=1.4, lateral_acceleration=2.0)
 
 # Of the drive: the outage of fixes, from the second lap on [s], and reflected signals (multipath).
 OUTAGE_S = (-40.0, 30.0)
-REFLECTED = Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
+REFLECTED = settings.Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +274,14 @@ class World:
 def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
     """Return a drive along the circuit, at random within the lane, with random waits at lights."""
     heading, stops, lap_length = _circuit(duration_s)
-    path = wandering(generator, _streets(heading), CIRCUIT_STEP, LANE_SIGMA)
+    # on straight streets, and then along bent ones
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
+    grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
+    bent = grid + np.column_stack((
+        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
+        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
+    path = wandering(generator, bent @ se2.rotation(STREET_BEARING).T, CIRCUIT_STEP, LANE_SIGMA)
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))
     motion, arrival = follow(path, stops, waits, CAR, duration_s)
     lap = round(lap_length / CIRCUIT_STEP)
@@ -316,23 +320,12 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     return heading, np.round(stops / CIRCUIT_STEP).astype(np.int64), lap_length
 
 
-def _streets(heading: FloatArray) -> FloatArray:
-    """Return the path along bent streets, shape (N, 2), with headings on straight ones."""
-    middle = 0.5 * (heading[1:] + heading[:-1])
-    steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
-    grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
-    bent = grid + np.column_stack((
-        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
-        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
-    return np.asarray(bent @ se2.rotation(STREET_BEARING).T)
-
-
 def _drive_setup(motion: Motion) -> Setup:
     outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
     return Setup(
-        wheels=Wheels(start=(3.2, -1.4, -2.0)), fixes=Fixes(),
+        wheels=Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
         closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
-        outages=(Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
+        outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
         jumps=(REFLECTED,))
 
 
@@ -348,15 +341,6 @@ def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
     return follow(path, stops, waits, FORKLIFT, duration_s)[0]
 
 
-def _hall_setup(_motion: Motion) -> Setup:
-    return Setup(
-        wheels=Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
-        closures=Closures(
-            sigmas=(0.05, 0.05, 0.01), spacing=5.0, radius=1.0, min_distance=20.0,
-            place_distance=1.0, first_s=REST_S,
-            false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))
-
-
 def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
     length = (duration_s + MARGIN_S) * CART.speed
     corners = street_corners(
@@ -369,17 +353,18 @@ def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
     return follow(path, stops, np.array([REST_S]), CART, duration_s)[0]
 
 
-def _grid_setup(_motion: Motion) -> Setup:
-    return Setup(
+WORLDS = {
+    'drive': World(drive_circuit, _drive_setup, one_stream=True),
+    'hall': World(_hall, lambda _: Setup(
+        wheels=Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
+        closures=Closures(
+            sigmas=(0.05, 0.05, 0.01), spacing=5.0, radius=1.0, min_distance=20.0,
+            place_distance=1.0, first_s=REST_S,
+            false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))),
+    'grid': World(_grid, lambda _: Setup(
         wheels=Wheels(track_width=0.8),
         closures=Closures(
             rate=0.5, sigmas=(0.1, 0.1, 0.02), spacing=1.0, radius=1.5, min_distance=10.0,
             first_s=REST_S,
-            false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0)))
-
-
-WORLDS = {
-    'drive': World(drive_circuit, _drive_setup, one_stream=True),
-    'hall': World(_hall, _hall_setup),
-    'grid': World(_grid, _grid_setup),
+            false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0)))),
 }
