@@ -15,14 +15,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-from pose_graph_ros.adapters.bags import (
-    BAG_FILE_SUFFIXES,
-    BagError,
-    BagMessage,
-    MessageError,
-    one_line,
-    own_types,
-)
+from pose_graph_ros.adapters import bags
+from pose_graph_ros.adapters.bags import BagError, BagMessage, MessageError
 from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
@@ -63,7 +57,7 @@ class BagWriter:
             self._scratch = Path(tempfile.mkdtemp(
                 prefix=f'.{self.folder.name}-', dir=self.folder.parent))
         except OSError as error:
-            raise BagError(f'{folder}: cannot be written: {one_line(error)}') from error
+            raise BagError(f'{folder}: cannot be written: {bags.one_line(error)}') from error
         self._writer = Writer(
             self._scratch / self.folder.name, version=BAG_VERSION,
             storage_plugin=StoragePlugin.MCAP)
@@ -97,7 +91,7 @@ class BagWriter:
                 message = self._types.serialize_cdr(message, type_name)
             except Exception as error:  # generated code on a foreign object
                 raise BagError(
-                    f'{self.folder}: {topic}: no valid {type_name}: {one_line(error)}',
+                    f'{self.folder}: {topic}: no valid {type_name}: {bags.one_line(error)}',
                 ) from error
         self._writer.write(self._connections[key], recorded_ns, message)
 
@@ -117,14 +111,14 @@ class BagWriter:
             except Exception as error:  # generated code can raise anything on invalid bytes
                 raise MessageError(
                     f'{message.topic}: message recorded at {message.recorded_ns} ns is no '
-                    f'{message.type}: {one_line(error)}') from error
+                    f'{message.type}: {bags.one_line(error)}') from error
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
                 self._connect(key, types, _qos(
                     latched=message.topic in self._latched or bool(source.ext.latching)))
             else:
-                self._connect(key, own_types(source) or self._types,
+                self._connect(key, bags.own_types(source) or self._types,
                               *source.ext.offered_qos_profiles, digest=source.digest)
         self._writer.write(self._connections[key], message.recorded_ns, data)
 
@@ -155,7 +149,7 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
     """
     from rosbags.convert import converter  # noqa: PLC0415  (needed for few bags)
 
-    own = own_types(source) or get_typestore(Stores.ROS1_NOETIC)
+    own = bags.own_types(source) or get_typestore(Stores.ROS1_NOETIC)
     name, types = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype), jazzy
     if name not in jazzy.fielddefs:
         types = get_typestore(Stores.EMPTY)
@@ -176,5 +170,5 @@ def _is_nothing_but_a_bag(folder: Path) -> bool:
     metadata = folder / 'metadata.yaml'
     if not metadata.is_file() or b'rosbag2_bagfile_information' not in metadata.read_bytes():
         return False
-    suffixes = (*BAG_FILE_SUFFIXES, '.zstd')
+    suffixes = (*bags.BAG_FILE_SUFFIXES, '.zstd')
     return all(p == metadata or (p.is_file() and p.suffix in suffixes) for p in folder.iterdir())

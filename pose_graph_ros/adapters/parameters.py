@@ -18,16 +18,10 @@ from typing import Any, cast
 
 import yaml
 
-from pose_graph_ros.adapters import parameter_table as table
+from pose_graph_ros.adapters import parameter_table as table, sources
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
-from pose_graph_ros.adapters.sources import (
-    backend_config,
-    KINDS,
-    KNOWN_SOURCES,
-    source_names,
-    TYPE,
-)
+from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE
 from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -75,7 +69,7 @@ def listed_sources(given: Mapping[str, Any]) -> list[str]:
                               'expected letters, digits and _, and no reserved name')
     if len(set(names)) < len(names):
         raise ConfigError(f'parameter sources: expected different names, got {list(names)}')
-    return source_names(names)
+    return sources.source_names(names)
 
 
 def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
@@ -220,7 +214,7 @@ def require_together(values: Mapping[str, Any]) -> None:
         raise ConfigError(f'parameters {", ".join(FRAMES)}: expected three different names, got '
                           f'{", ".join(map(repr, frames))}')
     datum_of(values)
-    backend_config(values)
+    sources.backend_config(values)
 
 
 def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:

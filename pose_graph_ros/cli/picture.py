@@ -17,16 +17,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from pose_graph_ros.cli.drive import (
-    BELIEVED,
-    distances,
-    DOUBTED,
-    Drive,
-    extent,
-    REFUSED,
-    WAITING,
-    WEAKLY_BELIEVED,
-)
+from pose_graph_ros.cli import drive as drives
+from pose_graph_ros.cli.drive import distances, Drive, extent
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.se2 import Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
@@ -38,10 +30,11 @@ from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
 SKY, INK, GREY, GRID, SHADE = '#56B4E9', '#222222', '#666666', '#E2E2E2', '#F0F0F0'
 LOOPS = (  # states, name in the legend, colour, line, and order in depth
-    ((BELIEVED,), 'loop closures', GREEN, '-', 5),
-    ((WEAKLY_BELIEVED,), 'loop closures\nbelieved weakly', GREEN, '--', 5),
-    ((WAITING,), 'loop closures that wait,\nnot used', SKY, '--', 2),
-    ((DOUBTED, REFUSED), 'doubted or refused\nloop closures, not used', GREY, '--', 2))
+    ((drives.BELIEVED,), 'loop closures', GREEN, '-', 5),
+    ((drives.WEAKLY_BELIEVED,), 'loop closures\nbelieved weakly', GREEN, '--', 5),
+    ((drives.WAITING,), 'loop closures that wait,\nnot used', SKY, '--', 2),
+    ((drives.DOUBTED, drives.REFUSED), 'doubted or refused\nloop closures, not used', GREY, '--',
+     2))
 USED_FIXES: dict[str, Any] = {
     'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
@@ -117,7 +110,7 @@ def _facts(drive: Drive) -> str:
     numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()
                if kind != 'refused'}
     doubted, waiting = (int(np.sum(np.isin(drive.loop_states, states)))
-                        for states in ((DOUBTED, REFUSED), (WAITING,)))
+                        for states in ((drives.DOUBTED, drives.REFUSED), (drives.WAITING,)))
     parts = [f'{numbers.pop("used")} fixes used' + ''.join(
         f', {number} {kind}' for kind, number in numbers.items() if number > 0),
         f'{len(drive.loop_stamps_ns) - doubted - waiting} loop closures' + ''.join(
@@ -265,7 +258,8 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
         stamps = np.append(fixes.stamps_ns, poses.stamps_ns)
         wrong = np.append(fixes.wrong, poses.wrong) >= 0
     nothing = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    fix_states, loop_states = (np.where(false, drives.DOUBTED, drives.BELIEVED)
+                               for false in (wrong, group >= 0))
     draw_drive(Drive(
-        odometry, nothing, truth, stamps, measured, np.where(wrong, DOUBTED, BELIEVED),
-        [''] * len(stamps), ends, np.where(group >= 0, DOUBTED, BELIEVED), [''] * len(ends)),
-        file, title, SIMULATED)
+        odometry, nothing, truth, stamps, measured, fix_states, [''] * len(stamps), ends,
+        loop_states, [''] * len(ends)), file, title, SIMULATED)

@@ -16,13 +16,7 @@ from typing import Any
 from pose_graph_ros.cli.arguments import number
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.offline.simulation import settings
-from pose_graph_ros.offline.simulation.settings import (
-    DURATIONS_S,
-    Jump,
-    NODE_DISTANCES,
-    OdometryErrors,
-    Setup,
-)
+from pose_graph_ros.offline.simulation.settings import DURATIONS_S, Jump, OdometryErrors, Setup
 
 PICTURES = ('.png', '.pdf', '.svg')
 FALSE_SIZE = 4  # closures of a group of false ones
@@ -91,7 +85,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     out = parser.add_argument_group('output')
     out.add_argument('--node-distance', metavar='M', type=number(0.01),
                      help='distance of the nodes of a graph [m] '
-                          f'(default: {_by_world(NODE_DISTANCES)})')
+                          f'(default: {_by_world(settings.NODE_DISTANCES)})')
     out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
     out.add_argument('--plot', metavar='FILE', type=Path,
                      help=f'draw a map; the name ends in {", ".join(PICTURES)}')

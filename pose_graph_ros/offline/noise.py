@@ -28,18 +28,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
-from pose_graph_ros.core.belief.learning import (
-    claimed,
-    descend,
-    Known,
-    Minimum,
-    most_likely,
-    moved,
-    NO_SLOW,
-    Posterior,
-    TURN,
-    WAY,
-)
+from pose_graph_ros.core.belief import learning
+from pose_graph_ros.core.belief.learning import Minimum, Posterior, TURN, WAY
 from pose_graph_ros.core.belief.rows import Records
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
@@ -69,7 +59,7 @@ STEP = 0.25
 # Axes of the source in a point.
 WHITE, SLOW, TAU = 2, 3, 4
 # What nothing is known of but odometry and one source.
-ALL_UNKNOWN = Known(claimed(1), odometry=True, sources=(0,))
+ALL_UNKNOWN = learning.Known(learning.claimed(1), odometry=True, sources=(0,))
 LEAST_POSITIONS = 20
 # Time in which slow errors of a receiver change: satellites, ionosphere, reflections [s].
 CHANGE = 300.0
@@ -157,14 +147,14 @@ def fitted(rows: Records) -> Noise:
     # claims may be wrong by more than the search goes: it begins with the best of some multiples
     posterior = Posterior(rows, used, known)
     multiple = min(MULTIPLES, key=lambda exponent: to_the_end(
-        posterior.value(moved(known.point, {WHITE: exponent}))))
+        posterior.value(learning.moved(known.point, {WHITE: exponent}))))
     scaled = rows.copy()
     scaled['noise'] *= 2.0**multiple
     scaled['slow'] *= 2.0**multiple
     posterior = Posterior(
         scaled, used, known, spread=CLAIM_SPREAD, least_white=SMALLEST, finest=FINEST)
-    likely = best = to_the_end(most_likely(posterior))[-1]
-    is_slow = best.point[SLOW] > NO_SLOW
+    likely = best = to_the_end(learning.most_likely(posterior))[-1]
+    is_slow = best.point[SLOW] > learning.NO_SLOW
     kept: tuple[int, ...] = ()
     axes = (WAY, TURN) if is_slow else (WAY, TURN, WHITE)
     while len(kept) < len(axes):
@@ -199,8 +189,9 @@ def _at(
 ) -> Minimum:
     """Return the minimum near a point with another exponent on an axis."""
     free = [other for other, at in enumerate(best.point)
-            if other not in fixed and not (other >= SLOW and best.point[SLOW] == NO_SLOW)]
-    return to_the_end(descend(posterior, [moved(best.point, {axis: exponent})], free))
+            if other not in fixed and not (other >= SLOW and best.point[SLOW] == learning.NO_SLOW)]
+    start = learning.moved(best.point, {axis: exponent})
+    return to_the_end(learning.descend(posterior, [start], free))
 
 
 def _interval(

@@ -10,23 +10,8 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParam
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 
+from pose_graph_ros.adapters import parameters as rules
 from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
-from pose_graph_ros.adapters.parameters import (
-    all_parameters,
-    changed,
-    checked,
-    constraints,
-    is_own,
-    is_same,
-    listed_sources,
-    NOTHING,
-    plain,
-    require_together,
-    source_parameters,
-    type_parameter,
-    unknown,
-    without_effect,
-)
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.log import NodeLog
@@ -55,20 +40,20 @@ class PoseGraphNode(LifecycleNode):
         self._session: Session | None = None
         self._offered: Services | None = None
         self._given = self._declare(PARAMETERS)  # the node's own parameters that have a value
-        for source in listed_sources(self._given):
-            kind = self._declare([type_parameter(source)])[f'{source}.type']
-            self._given |= self._declare(source_parameters(source, kind))
-        self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
+        for source in rules.listed_sources(self._given):
+            kind = self._declare([rules.type_parameter(source)])[f'{source}.type']
+            self._given |= self._declare(rules.source_parameters(source, kind))
+        self._own = {parameter.name: parameter for parameter in rules.all_parameters(self._given)}
         # rclpy does not warn of unknown parameters, as a file may be for several nodes;
         # pose_graph.yaml has defaults of sources that `sources` may leave out
         usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
-                 for parameter in source_parameters(source, kind.name)}
+                 for parameter in rules.source_parameters(source, kind.name)}
         for name, value in sorted(self._overrides.items()):
             # those of rclpy are declared, or will be with the publishers and subscriptions
             if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
-                    is_own(name, self._own)) and (
-                    name not in usual or not is_same(plain(value), usual[name])):
-                logger.warning('%s', unknown(name, self._own))
+                    rules.is_own(name, self._own)) and (
+                    name not in usual or not rules.is_same(rules.plain(value), usual[name])):
+                logger.warning('%s', rules.unknown(name, self._own))
 
     def destroy_node(self) -> None:
         """Destroy the node; what is logged from now on goes elsewhere."""
@@ -79,7 +64,7 @@ class PoseGraphNode(LifecycleNode):
 
     def begin(self, arguments: Sequence[str]) -> None:
         """Tell of parameter files in the arguments that are for others; start by `autostart`."""
-        for sentence in without_effect(arguments, self.get_fully_qualified_name()):
+        for sentence in rules.without_effect(arguments, self.get_fully_qualified_name()):
             logger.warning('%s', sentence)
         if self.get_parameter('autostart').value:
             self.start()
@@ -136,8 +121,8 @@ class PoseGraphNode(LifecycleNode):
         return self._session
 
     def _configure(self) -> None:
-        values = checked(self._given)
-        require_together(values)
+        values = rules.checked(self._given)
+        rules.require_together(values)
         check_topics(self, values, self._overrides)
         self._session = Session(self, values)
         self._offered = Services(self, self._session)
@@ -168,7 +153,7 @@ class PoseGraphNode(LifecycleNode):
             if not self.has_parameter(parameter.name):
                 descriptor = ParameterDescriptor(
                     description=f'{parameter.description} [{parameter.unit}]'.removesuffix(' []'),
-                    additional_constraints=constraints(parameter),
+                    additional_constraints=rules.constraints(parameter),
                     read_only=parameter.change is Change.START,
                     # numbers may be given as 5 for 5.0
                     dynamic_typing=not isinstance(parameter.default, bool | str))
@@ -180,8 +165,8 @@ class PoseGraphNode(LifecycleNode):
                 self.declare_parameter(parameter.name, default, descriptor)
             value = self.get_parameter(parameter.name).value
             is_list = isinstance(parameter.default, list)
-            if value is not None and not (is_list and value in NOTHING):
-                given[parameter.name] = plain(value)
+            if value is not None and not (is_list and value in rules.NOTHING):
+                given[parameter.name] = rules.plain(value)
             elif is_list and parameter.default != [] and parameter.name in self._overrides:
                 given[parameter.name] = []  # so rcl hands over [], which is not the default
         return given
@@ -199,10 +184,10 @@ class PoseGraphNode(LifecycleNode):
         for parameter in parameter_list:
             name = parameter.name
             if not self.has_parameter(name):
-                return _refused(unknown(name, self._own))
+                return _refused(rules.unknown(name, self._own))
             value = self._plain(name, parameter.value)
             refused_by_rclpy = value == [] or self.describe_parameter(name).read_only
-            if not refused_by_rclpy or not is_same(
+            if not refused_by_rclpy or not rules.is_same(
                     value, self._plain(name, self.get_parameter(name).value)):
                 # without a value rclpy would undeclare it
                 changes.append(parameter if value != [] else RosParameter(
@@ -211,7 +196,7 @@ class PoseGraphNode(LifecycleNode):
         if len(changes) == 0:
             return SetParametersResult(successful=True)
         try:
-            given = changed(self._given, own, configured=self._session is not None)
+            given = rules.changed(self._given, own, configured=self._session is not None)
         except ConfigError as error:
             return _refused(error)
         result = super().set_parameters_atomically(changes)
@@ -233,7 +218,7 @@ class PoseGraphNode(LifecycleNode):
     def _plain(self, name: str, value: Any) -> Any:
         """Return a value of a parameter with its arrays as lists, also where it is unset."""
         can_be_unset = name in self._own and self._own[name].default == []
-        return [] if can_be_unset and value in NOTHING else plain(value)
+        return [] if can_be_unset and value in rules.NOTHING else rules.plain(value)
 
 
 def _refused(reason: object) -> SetParametersResult:

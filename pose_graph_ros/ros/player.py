@@ -28,12 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from pose_graph_ros.adapters.bag_inputs import (
-    Inputs,
-    read_inputs,
-    read_static_frames,
-    STATIC_FRAMES,
-)
+from pose_graph_ros.adapters import bag_inputs
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import MessageError, open_bag
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
@@ -73,7 +68,7 @@ class Player(Node):
     """Publishes a bag and records the node's outputs."""
 
     def __init__(
-        self, inputs: Inputs, topics: Mapping[str, str], context: Context,
+        self, inputs: bag_inputs.Inputs, topics: Mapping[str, str], context: Context,
         is_running: Callable[[], bool],
     ) -> None:
         super().__init__('pose_graph_player', context=context)
@@ -84,7 +79,7 @@ class Player(Node):
             message_class(kind.message_type), topics[source], RELIABLE)
             for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
-            TFMessage, STATIC_FRAMES[0], STATIC)
+            TFMessage, bag_inputs.STATIC_FRAMES[0], STATIC)
         # topic, type, time of arrival [ns] and bytes of the node's messages
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
@@ -153,7 +148,7 @@ class Player(Node):
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
             if self._static is not None:
-                for frames in read_static_frames(reader):
+                for frames in bag_inputs.read_static_frames(reader):
                     self._static.publish(frames.raw)
             # the other side of a match may learn of it a little later
             settled = time.monotonic() + 0.5
@@ -161,7 +156,7 @@ class Player(Node):
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
             start = first_ns = None
             progress = tqdm(total=total, disable=None, unit=' messages')     # on a terminal
-            for source, message, held_out in read_inputs(reader, self._inputs):
+            for source, message, held_out in bag_inputs.read_inputs(reader, self._inputs):
                 if held_out:
                     published['held_out'] += 1
                     continue
@@ -229,7 +224,7 @@ class Player(Node):
 
 
 def play(
-    bag: Path, out: Path, inputs: Inputs, topics: Mapping[str, str], *, rate: float,
+    bag: Path, out: Path, inputs: bag_inputs.Inputs, topics: Mapping[str, str], *, rate: float,
     is_running: Callable[[], bool],
 ) -> bool:
     """

@@ -27,14 +27,9 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.output_cdr import (
-    markers_cdr,
-    odometry_cdr,
-    path_cdr,
-    stamped_pose_cdr,
-    UNKNOWN_VARIANCE,
-)
+from pose_graph_ros.adapters.output_cdr import UNKNOWN_VARIANCE
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.adapters.parameters import FRAMES
 from pose_graph_ros.adapters.sources import JUDGE, source_list
@@ -50,15 +45,8 @@ from pose_graph_ros.core.judgement.texts import details, sentence, total_values,
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import Metres, NANOSECONDS, Seconds, StampNs
-from pose_graph_ros.ros.transforms import (
-    message_class,
-    Slew,
-    TF_QOS,
-    TF_TYPE,
-    TFMessage,
-    TOPIC,
-    TransformPublisher,
-)
+from pose_graph_ros.ros import transforms
+from pose_graph_ros.ros.transforms import Slew, TFMessage, TransformPublisher
 from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
@@ -128,7 +116,8 @@ class Publishers:
 
     def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
-            message_class(type_name), topic, copy(qos),  # rclpy writes the overrides into it
+            transforms.message_class(type_name), topic,
+            copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def configure(self, values: Mapping[str, Any]) -> None:
@@ -138,9 +127,9 @@ class Publishers:
                 'tf2_msgs is not installed: the transform from map to odom is not published',
                 once=True)
         elif values['publish_tf'] and self.transforms is None:
+            publisher = self._publisher(transforms.TF_TYPE, transforms.TOPIC, transforms.TF_QOS)
             self.transforms = TransformPublisher(
-                self._node, self._publisher(TF_TYPE, TOPIC, TF_QOS), self.map_frame,
-                self.odom_frame)
+                self._node, publisher, self.map_frame, self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
@@ -175,10 +164,10 @@ class Publishers:
             if self._awaits_map:
                 prediction = prediction._replace(covariance=UNPLACED)
         if self._odometry in wanted:
-            self._odometry.publish(odometry_cdr(
+            self._odometry.publish(output_cdr.odometry_cdr(
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
-            self._pose.publish(stamped_pose_cdr(stamp, prediction, self.map_frame))
+            self._pose.publish(output_cdr.stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before the first measurement in the map, its place on the Earth is unknown
         if self._fix in wanted and plane is not None and not is_local:
             self._fix.publish(self._fix_at(stamp, prediction, plane, datum.altitude))
@@ -231,10 +220,11 @@ class Publishers:
             newest = backend.estimate()
             assert newest is not None
             path = thinned(newest.path, newest.n_frozen)
-            publish(self.path, estimate, lambda at: path_cdr(path, at, self.map_frame))
+            publish(self.path, estimate, lambda at: output_cdr.path_cdr(path, at, self.map_frame))
         period = max(2.0 * self._path_period, 0.1)
         if self.markers.is_due(None, period) and (view := backend.view()) is not None:
-            publish(self.markers, None, lambda at: markers_cdr(view, at, self.map_frame))
+            publish(self.markers, None,
+                    lambda at: output_cdr.markers_cdr(view, at, self.map_frame))
         state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
         if self.verdicts.is_due(state, 0.0 if at_once else period):
             # of those that are believed, the newest of each source

@@ -29,21 +29,12 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres, Seconds
 from pose_graph_ros.offline.simulation import sensors, settings
 from pose_graph_ros.offline.simulation.sensors import Measured
-from pose_graph_ros.offline.simulation.settings import (
-    CLOSURES,
-    FIXES,
-    GYRO,
-    ODOMETRY,
-    POSES,
-    Setup,
-    TOPICS,
-    TRUTH,
-)
+from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, ODOMETRY, POSES, Setup
 from pose_graph_ros.offline.simulation.worlds import Motion, PERIOD_S, World
 
 CITY = TangentPlane(50.7271, 7.0866, 61.0)  # worlds are on the plane that touches the Earth here
 STREAMS = ('world', 'gyro', 'odometry', 'fixes', 'poses', 'closures', 'rate', 'jumps',
-           'pose jumps', 'false', 'truth', *TOPICS)
+           'pose jumps', 'false', 'truth', *settings.TOPICS)
 """Who draws random numbers of its own; the place in this list is a part of its seed."""
 
 
@@ -151,16 +142,17 @@ def record(way: Course) -> Recording:
     closures, missing = _closures(way)
     every = {
         ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
-        GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
+        settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
         FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)), CLOSURES: closures}
     kept = {topic: each.rows(sensors.heard(each.later_ns, topic, setup.outages))
             for topic, each in every.items()}
     arrivals = {topic: sensors.arrivals(streams[topic], topic, each.later_ns, setup)
                 for topic, each in kept.items()}
     stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
-    arrivals[TRUTH] = sensors.arrivals(np.random.default_rng(0), TRUTH, stamps, setup)
+    arrivals[settings.TRUTH] = sensors.arrivals(
+        np.random.default_rng(0), settings.TRUTH, stamps, setup)
     ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
-                        if each.topic == topic) for topic in TOPICS}
+                        if each.topic == topic) for topic in settings.TOPICS}
     return Recording(
         setup, float(way.motion.distance[-1]), Trajectory(stamps, to_map(truth.at(stamps))),
         {topic: each._replace(stamps_ns=each.stamps_ns + ahead[topic])

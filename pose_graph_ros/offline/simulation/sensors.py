@@ -22,20 +22,8 @@ from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.simulation.settings import (
-    Closures,
-    Fixes,
-    GlobalPoses,
-    Gyro,
-    Jump,
-    LATENCY_S,
-    ODOMETRY,
-    OdometryErrors,
-    Outage,
-    Setup,
-    START_NS,
-    Wheels,
-)
+from pose_graph_ros.offline.simulation import settings
+from pose_graph_ros.offline.simulation.settings import Closures, Setup, START_NS, Wheels
 from pose_graph_ros.offline.simulation.worlds import gauss_markov, Motion, PERIOD_S
 
 ODOMETRY_PERIOD_S = 0.05
@@ -85,7 +73,7 @@ def jittered_stamps(
 def odometry(generator: np.random.Generator, truth: Trajectory, wheels: Wheels) -> Trajectory:
     """Return `T_odom_base` by odometry."""
     steps = se2.between(truth.poses[:-1], truth.poses[1:])
-    measured = (_by_wheels if wheels.errors is OdometryErrors.WHEELS else _by_model)(
+    measured = (_by_wheels if wheels.errors is settings.OdometryErrors.WHEELS else _by_model)(
         generator, steps, wheels)
     x, y, turned = (0.0, 0.0, -truth.poses[0, 2]) if wheels.start is None else wheels.start
     heading = se2.wrap(truth.poses[0, 2] + turned) + np.concatenate((
@@ -154,7 +142,9 @@ def velocities(path: Trajectory) -> FloatArray:
     return np.concatenate((rates[:1], rates))
 
 
-def yaw_rates(generator: np.random.Generator, heading: FloatArray, gyro: Gyro) -> FloatArray:
+def yaw_rates(
+    generator: np.random.Generator, heading: FloatArray, gyro: settings.Gyro,
+) -> FloatArray:
     """Return yaw rates, (R,) [rad/s], given true headings every `PERIOD_S`, not wrapped [rad]."""
     n = len(heading)
     walk = np.cumsum(generator.normal(0.0, gyro.bias_walk * np.sqrt(PERIOD_S), n))
@@ -164,7 +154,7 @@ def yaw_rates(generator: np.random.Generator, heading: FloatArray, gyro: Gyro) -
 
 
 def positions(
-    generator: np.random.Generator, truth: Trajectory, fixes: Fixes,
+    generator: np.random.Generator, truth: Trajectory, fixes: settings.Fixes,
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of fixes, shape (M,), and their positions, shape (M, 2) [m]."""
     stamps = jittered_stamps(generator, truth, fixes.period_s)
@@ -176,7 +166,7 @@ def positions(
 
 
 def global_poses(
-    generator: np.random.Generator, truth: Trajectory, poses: GlobalPoses,
+    generator: np.random.Generator, truth: Trajectory, poses: settings.GlobalPoses,
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of global poses, shape (M,), and the poses, shape (M, 3) [m, m, rad]."""
     stamps = jittered_stamps(generator, truth, poses.period_s)
@@ -292,7 +282,7 @@ def with_false(
 def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
     """Return odometry with its jumps, in the order of their times."""
     poses = odometry.poses.copy()
-    for jump in sorted(setup.jumps_of(ODOMETRY), key=lambda each: each.at_s):
+    for jump in sorted(setup.jumps_of(settings.ODOMETRY), key=lambda each: each.at_s):
         k = int(np.searchsorted(odometry.stamps_ns, START_NS + round(jump.at_s * 1e9)))
         if k == len(poses):
             continue
@@ -303,7 +293,8 @@ def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
 
 
 def moved(
-    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray, jumps: list[Jump],
+    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray,
+    jumps: list[settings.Jump],
 ) -> Measured:
     """Return fixes or global poses, shape (M, 2 or 3), with jumps."""
     time = (stamps_ns - START_NS) * 1e-9
@@ -317,7 +308,7 @@ def moved(
     return Measured(stamps_ns, values, wrong)
 
 
-def heard(stamps_ns: IntArray, topic: str, outages: Iterable[Outage]) -> BoolArray:
+def heard(stamps_ns: IntArray, topic: str, outages: Iterable[settings.Outage]) -> BoolArray:
     """Return which measurements of a topic are in no outage, shape (M,)."""
     time = (stamps_ns - START_NS) * 1e-9
     kept = np.ones(len(stamps_ns), dtype=bool)
@@ -335,7 +326,7 @@ def arrivals(
     """
     n = len(stamps_ns)
     late, again = generator.random(n), generator.random((2, n))
-    seconds = np.full(n, LATENCY_S[topic])
+    seconds = np.full(n, settings.LATENCY_S[topic])
     for delay in setup.delays:
         if delay.topic == topic:
             seconds = delay.seconds + delay.jitter_s * late

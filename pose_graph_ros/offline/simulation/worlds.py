@@ -28,13 +28,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation import settings
-from pose_graph_ros.offline.simulation.settings import (
-    Closures,
-    FalseClosures,
-    FIXES,
-    Setup,
-    Wheels,
-)
+from pose_graph_ros.offline.simulation.settings import Closures, FalseClosures, FIXES, Setup
 
 PERIOD_S = 0.01  # sample period of the motion [s]
 MARGIN_S = 5.0  # by which paths last longer than the motion, whose end is smoothed [s]
@@ -323,7 +317,7 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
 def _drive_setup(motion: Motion) -> Setup:
     outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
     return Setup(
-        wheels=Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
+        wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
         closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
         outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
         jumps=(REFLECTED,))
@@ -356,13 +350,13 @@ def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
 WORLDS = {
     'drive': World(drive_circuit, _drive_setup, one_stream=True),
     'hall': World(_hall, lambda _: Setup(
-        wheels=Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
+        wheels=settings.Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
         closures=Closures(
             sigmas=(0.05, 0.05, 0.01), spacing=5.0, radius=1.0, min_distance=20.0,
             place_distance=1.0, first_s=REST_S,
             false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))),
     'grid': World(_grid, lambda _: Setup(
-        wheels=Wheels(track_width=0.8),
+        wheels=settings.Wheels(track_width=0.8),
         closures=Closures(
             rate=0.5, sigmas=(0.1, 0.1, 0.02), spacing=1.0, radius=1.5, min_distance=10.0,
             first_s=REST_S,
