@@ -91,9 +91,7 @@ def _position_and_quaternion(pose: FloatArray) -> tuple[float, ...]:
     return x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0)
 
 
-def transform_cdr(
-    stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
-) -> bytes:
+def transform_cdr(stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str) -> bytes:
     """Return a serialised tf2_msgs/TFMessage with the transform from map to odom."""
     return _head(stamp_ns, map_frame, odom_frame, count=_LENGTH.pack(1)) + _POSE.pack(
         *_position_and_quaternion(T_map_odom))
@@ -227,9 +225,7 @@ def _dashed(lines: Lines) -> Lines:
     return Lines(points.reshape(-1, 2, 2), np.repeat(lines.sigmas, LOOK.dashes))
 
 
-def _plain(
-    points: FloatArray, colour: tuple[float, ...],
-) -> tuple[FloatArray, Colours]:
+def _plain(points: FloatArray, colour: tuple[float, ...]) -> tuple[FloatArray, Colours]:
     """Return points, shape (..., 2), as one array, and the same colour for each of them."""
     points = points.reshape(-1, 2)
     return points, np.tile(np.array(colour, dtype=np.float32), (len(points), 1))

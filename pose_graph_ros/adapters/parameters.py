@@ -187,8 +187,7 @@ def changed(
         if name not in parameters:
             raise unknown(name, parameters)
         parameter = parameters[name]
-        good = checked_value(
-            parameter, [] if value is None and parameter.default == [] else value)
+        good = checked_value(parameter, [] if value is None and parameter.default == [] else value)
         if good == new[name]:
             continue
         if parameter.change is Change.START:
@@ -273,9 +272,7 @@ def as_yaml() -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _entry(
-    parameter: Parameter, leaf: str, indent: str, commented: set[str],
-) -> Iterator[str]:
+def _entry(parameter: Parameter, leaf: str, indent: str, commented: set[str]) -> Iterator[str]:
     """Return the lines of one parameter; a comment in `commented` is not repeated."""
     facts = '; '.join(fact for fact in (
         parameter.unit, _range(parameter), parameter.change.value) if fact != '')

@@ -213,8 +213,7 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
 def _same(own: Mapping[str, Any], settings: type, but: Collection[str] = ()) -> dict[str, Any]:
     """Return the parameters that are named as the settings that they are."""
     names = [each.name for each in fields(settings) if each.name in own and each.name not in but]
-    return {name: tuple(own[name]) if isinstance(own[name], list) else own[name]
-            for name in names}
+    return {name: tuple(own[name]) if isinstance(own[name], list) else own[name] for name in names}
 
 
 def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:

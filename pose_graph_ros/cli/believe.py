@@ -124,8 +124,7 @@ def believe(
     optimize(copy, CONFIG)
     result = BelievedEdges(closures, believed, n_parts, copy.poses.copy(), scale, np.inf, None)
     # who asks for more than the usual sigmas wants to believe what costs more by those of the file
-    return _not_worse(
-        result, graph, edges, starts if np.all(sigmas <= FLOORS) else [], plain)
+    return _not_worse(result, graph, edges, starts if np.all(sigmas <= FLOORS) else [], plain)
 
 
 def _not_worse(

@@ -66,8 +66,7 @@ def execute(options: argparse.Namespace) -> int:
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}
     with open_bag(bag_path) as bag:
-        inputs = choose_inputs(
-            bag, source_list(values), wanted, options.hold_out, truth=truth)
+        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out, truth=truth)
     if bag_path.suffix == '.bag':
         raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
                        'pose-graph replay reads it')

@@ -91,8 +91,7 @@ class Drive:
             if np.any(inside):
                 odometry = self.odometry.at(stamps[inside])[:, :2]
                 pose = fit_motion(odometry, positions[inside])
-                return Trajectory(
-                    self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
+                return Trajectory(self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
         return self.odometry
 
     @cached_property
@@ -130,8 +129,7 @@ def place_truth(drive: Drive) -> Drive:
     pose = fit_motion(before, drive.corrected.at(truth.stamps_ns[inside])[:, :2])
     placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
     shift = np.mean(placed.poses[inside, :2] - before, axis=0)
-    return replace(drive, truth=placed, truth_moved=(
-        float(np.hypot(*shift)), abs(float(pose[2]))))
+    return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), abs(float(pose[2]))))
 
 
 def distances(

@@ -87,8 +87,7 @@ def draw_drive(
         figure.legend(handles, labels, loc='outside right upper', labelspacing=0.9,
                       alignment='left', title=_compared(drive)[1])
         _draw_errors(errors, drive)
-        figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold',
-                        parse_math=False)
+        figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold', parse_math=False)
         figure.savefig(file)
 
 
@@ -249,8 +248,7 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
         wrong = np.isin(np.arange(len(measured)), simulated.wrong)
     else:
         odometry = simulated.odometry
-        fixes, poses, closures = (
-            simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
+        fixes, poses, closures = (simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
         ends, group, measured = closures.stamps_ns, closures.wrong, poses.values[:, :2]
         if len(fixes.values) > 0:
             plane = TangentPlane(*fixes.values[0].tolist())

@@ -105,8 +105,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         bag = stack.enter_context(open_bag(*options.bags))
         inputs = shared.inputs_of(bag, options, values, options.hold_out)
-        require_datum(options.export, known=len(values['datum']) > 0 or len(
-            inputs.fixes) > 0)
+        require_datum(options.export, known=len(values['datum']) > 0 or len(inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(
             BagWriter(options.new_bag, latched=exports.LATCHED))
         if not options.json:
@@ -140,8 +139,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
                        '--from and --until')
     require_datum(options.export, known=False)
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
-    odometry = next(
-        each.name for each in sources.source_list(values) if each.kind.is_odometry)
+    odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [
         (odometry if isinstance(each, OdometrySample) else CLOSURES, each)
         for each in read_measurements(options.bags[0], options.stamps, options.edge2)]

@@ -162,12 +162,10 @@ def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
             gyro, *drive.measured[gyro][:2],
             setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S))
     if setup.fixes is not None:
-        topics[fixes] = fix_messages(
-            fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
+        topics[fixes] = fix_messages(fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
     if setup.poses is not None:
         stamps_ns, values, _ = drive.measured[poses]
-        topics[poses] = _poses(
-            poses, stamps_ns, ['map'] * len(values), values, covariances[poses])
+        topics[poses] = _poses(poses, stamps_ns, ['map'] * len(values), values, covariances[poses])
     if setup.closures is not None:
         topics[closures] = loop_closure_messages(
             closures, *drive.measured[closures][:2], covariances[closures])
@@ -207,9 +205,7 @@ def _about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
         **_disturbances(way.setup)}
 
 
-def _closures(
-    group: IntArray, missing: int, what: str, ends: IntArray,
-) -> dict[str, Any]:
+def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:
     false = np.flatnonzero(group >= 0)
     return {'true_closures': int(np.sum(group < 0)),
             'false_closures': [{what: pair, 'group': number} for pair, number in zip(

@@ -103,9 +103,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     return 0 if solution.result.status is Status.CONVERGED else 1
 
 
-def _lines(
-    problem: Problem, solution: Solution, seconds: float, doubted: IntArray,
-) -> list[str]:
+def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArray) -> list[str]:
     """Return chi2 with how it was reached, and the largest energies."""
     graph, ids, result = problem.graph, problem.ids, solution.result
     energies, factors = graph.energies().factors, graph.factors

@@ -234,8 +234,7 @@ def with_certificate(
     begin, graph = time.monotonic(), problem.graph
 
     def none(reason: str) -> tuple[Solution, Report]:
-        return solution, Report(
-            None, reason, time.monotonic() - begin, solution.result.chi2)
+        return solution, Report(None, reason, time.monotonic() - begin, solution.result.chi2)
 
     if not solution.determined:
         return none('the constraints do not determine the poses')

@@ -104,11 +104,9 @@ def formulate(graph: Constrained) -> Formulation:
     kappa = np.maximum(information[:, 2, 2], 0.0)
     with np.errstate(over='ignore', invalid='ignore'):
         trace = xx + yy
-        tau = np.maximum(
-            2.0 * (xx * yy - xy * xy) / np.where(trace > 0.0, trace, 1.0), 0.0)
+        tau = np.maximum(2.0 * (xx * yy - xy * xy) / np.where(trace > 0.0, trace, 1.0), 0.0)
     terms = Terms.of_factors(factors, len(poses))
-    places = np.concatenate((
-        complex_of(poses[fixed]), terms.arm_i[(factors.j < 0) & (tau > 0.0)]))
+    places = np.concatenate((complex_of(poses[fixed]), terms.arm_i[(factors.j < 0) & (tau > 0.0)]))
     origin = complex(np.mean(places)) if len(places) > 0 else 0j
     # of all nodes, and of the map behind them: unknown, its heading and position as far as known
     number = np.append(np.where(fixed, 0, np.cumsum(~fixed)), 0)

@@ -114,8 +114,7 @@ def factor_graph(rows: GraphRows, ids: IntArray | None = None) -> Any:
             measured.add(place)
         if j >= 0 or used or place not in measured:
             found.append(Term(sort, tuple(node for node in (i, j, k) if node >= 0), used))
-    found += [Term(Sort.PRIOR, tuple(rows.rows_of(prior.nodes).tolist()))
-              for prior in rows.priors]
+    found += [Term(Sort.PRIOR, tuple(rows.rows_of(prior.nodes).tolist())) for prior in rows.priors]
     for n, term in enumerate(found):
         factor = graph.number_of_nodes()
         graph.add_node(factor, name=f'f{n}', role=Role.FACTOR, term=term)

@@ -110,8 +110,7 @@ class Noise(NamedTuple):
         if self.tau is not None and (
                 self.tau.is_wide or self.seconds < KNOWN_FROM * self.tau.value):
             return self.size.written(1.0)
-        return self.size.written(
-            max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
+        return self.size.written(max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
 
     @property
     def excess(self) -> float:
@@ -119,9 +118,7 @@ class Noise(NamedTuple):
         return max(self.proven.value / self.size.value, 1.0)
 
 
-def noise_of(
-    parts: Parts, source: str, without: Collection[StampNs] = (),
-) -> Noise | None:
+def noise_of(parts: Parts, source: str, without: Collection[StampNs] = ()) -> Noise | None:
     """
     Return the noise by the positions of a source in an engine, but for some stamps [ns].
 

@@ -134,8 +134,7 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
             graph.factors_at(ids))
         # J P J^T of measurements of points of the robot, in map axes
         rows = graph.node_rows(table.i)
-        arms = np.einsum(
-            'kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])
+        arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])
         J = np.tile(np.eye(3), (len(rows), 1, 1))
         J[:, 0, 2], J[:, 1, 2] = -arms[:, 1], arms[:, 0]
         errors = factors.errors_in_use(source)
@@ -269,8 +268,7 @@ def _row(
     claimed, taken = (each[there, row, row] for each in (known.covariances, known.taken))
     # variances of residuals in units of those of measurements; with a diagonal R these shares add
     # up to the redundancy
-    left = float(np.mean(np.clip(
-        1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0)))
+    left = float(np.mean(np.clip(1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0)))
     independent = _independent(values, left, used.stamps_ns[measured], errors)
     return RowFit(
         row, len(values), float(np.sqrt(np.mean(sigma**2))), math.sqrt(left),

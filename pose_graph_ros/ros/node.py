@@ -96,9 +96,7 @@ class PoseGraphNode(LifecycleNode):
 
     on_shutdown = on_error = on_cleanup
 
-    def _transition(
-        self, change: Callable[[], None], done: str = '',
-    ) -> TransitionCallbackReturn:
+    def _transition(self, change: Callable[[], None], done: str = '') -> TransitionCallbackReturn:
         """Change the state, and log that; if it fails, keep the reason, which rclpy does not."""
         try:
             change()
@@ -171,9 +169,7 @@ class PoseGraphNode(LifecycleNode):
                 given[parameter.name] = []  # so rcl hands over [], which is not the default
         return given
 
-    def set_parameters_atomically(
-        self, parameter_list: list[RosParameter],
-    ) -> SetParametersResult:
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """
         Set several parameters, all or none, as the services for parameters do.
 

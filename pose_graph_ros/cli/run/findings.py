@@ -201,8 +201,7 @@ def _closures(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
     of_all = f'of {number_of(len(every), Judged.LOOP_CLOSURE)}'
     doubted = [each for each in every if each.state is State.DOUBTED]
     if len(doubted) > 0:
-        worst = max(doubted, key=lambda each: np.nan_to_num(
-            each.distance, nan=-1.0, posinf=-1.0))
+        worst = max(doubted, key=lambda each: np.nan_to_num(each.distance, nan=-1.0, posinf=-1.0))
         far = f', {worst.distance:.1f} sigma' if np.isfinite(worst.distance) else ''
         yield Finding(
             'warning' if len(doubted) >= MANY else 'notice', f'{source}: {len(doubted)} {of_all} '

@@ -254,8 +254,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
         poses = se2.between(poses[0], poses)
     truth = Trajectory(way.motion.truth.stamps_ns[at], poses)
     odometry = odometry_edges(streams['odometry'], truth, setup.jumps_of(ODOMETRY))
-    loops, group, missing = _loop_edges(
-        way, Motion(truth, way.motion.distance[at]), node_distance)
+    loops, group, missing = _loop_edges(way, Motion(truth, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
     return SimulatedGraph(

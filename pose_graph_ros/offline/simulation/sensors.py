@@ -190,8 +190,7 @@ def revisits(
     old, new = old[good], new[good]
     # one random pair of each stretch of the path
     order = generator.permutation(len(new))
-    _, first = np.unique(
-        path.distance[places[new[order]]] // closures.spacing, return_index=True)
+    _, first = np.unique(path.distance[places[new[order]]] // closures.spacing, return_index=True)
     return old[order[first]], new[order[first]]
 
 
