@@ -44,8 +44,14 @@ class BagWriter:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not overwrite:
             raise BagError(f'{folder}: exists already, not overwritten')
-        if self.folder.exists() and not _is_nothing_but_a_bag(self.folder):
-            raise BagError(f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
+        if self.folder.exists():
+            metadata, suffixes = self.folder / 'metadata.yaml', (*bags.BAG_FILE_SUFFIXES, '.zstd')
+            if not metadata.is_file() or (
+                    b'rosbag2_bagfile_information' not in metadata.read_bytes()) or not all(
+                        each == metadata or (each.is_file() and each.suffix in suffixes)
+                        for each in self.folder.iterdir()):
+                raise BagError(
+                    f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
         self._latched = {STATIC_TRANSFORMS, *latched}
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[tuple[str, str], Connection] = {}
@@ -163,12 +169,3 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
 def message_types() -> dict[str, Any]:
     """Return the classes of the ROS 2 Jazzy messages by name of the type."""
     return dict(get_typestore(Stores.ROS2_JAZZY).types)
-
-
-def _is_nothing_but_a_bag(folder: Path) -> bool:
-    """Tell whether a folder holds the metadata and files of a rosbag2, and no other files."""
-    metadata = folder / 'metadata.yaml'
-    if not metadata.is_file() or b'rosbag2_bagfile_information' not in metadata.read_bytes():
-        return False
-    suffixes = (*bags.BAG_FILE_SUFFIXES, '.zstd')
-    return all(p == metadata or (p.is_file() and p.suffix in suffixes) for p in folder.iterdir())

@@ -42,21 +42,19 @@ _TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'ou
 
 def type_parameter(source: str) -> Parameter:
     """Return the parameter with the kind of a source, on which its other parameters depend."""
-    return _of_source(TYPE, source)
+    kind = KNOWN_SOURCES[source][0].name if source in KNOWN_SOURCES else ''
+    return replace(TYPE, name=f'{source}.{TYPE.name}', default=kind)
 
 
 def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
     """Return all parameters of a source with their full names, if it has a kind."""
-    checked_value(type_parameter(source), kind)
-    return tuple(_of_source(parameter, source)
-                 for parameter in (TYPE, *OF_ALL, *KINDS[kind].parameters))
-
-
-def _of_source(parameter: Parameter, source: str) -> Parameter:
-    kind, topic = KNOWN_SOURCES.get(source, (None, source))
-    own = {'type': '' if kind is None else kind.name, 'topic': topic}
-    return replace(parameter, name=f'{source}.{parameter.name}',
-                   default=own.get(parameter.name, parameter.default))
+    of_type = type_parameter(source)
+    checked_value(of_type, kind)
+    _, topic = KNOWN_SOURCES.get(source, (None, source))
+    return of_type, *(
+        replace(each, name=f'{source}.{each.name}',
+                default=topic if each.name == 'topic' else each.default)
+        for each in (*OF_ALL, *KINDS[kind].parameters))
 
 
 def listed_sources(given: Mapping[str, Any]) -> list[str]:

@@ -123,11 +123,6 @@ class Source:
     # places of beacons in the map by name, as far as they are known [m]
     beacons: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    @property
-    def needs_frame(self) -> bool:
-        """Whether the frame_id of its messages matters, and no parameter stands for it."""
-        return self.mounting == 'tf' and not any(self.lever_arm)
-
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
     """Return the sources by the checked parameters, odometry in the order of preference."""
@@ -192,7 +187,19 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
                     gyros[source.name] = GyroSource(
                         config.RateNoise(own['noise']), **_same(own, GyroSource))
                 case MeasurementSource() as settings:
-                    measurements[source.name] = _measurement_source(own, settings)
+                    policy, loss = settings.covariance, config.Loss(own['robust_loss'])
+                    floors = own.get('sigma_floor', (policy.position_floor, policy.heading_floor))
+                    measurements[source.name] = replace(
+                        settings, covariance=replace(
+                            policy, override=tuple(own['covariance_override']),
+                            scale=own['covariance_scale'], position_floor=floors[0],
+                            heading_floor=floors[1],
+                            heading=config.Heading(own.get('heading', 'auto'))),
+                        robust=config.Robust(own['robust']), loss=loss,
+                        # for Tukey's loss that for 95 % of the accuracy of least squares [sigma]
+                        rejection_threshold=(5.0 if loss is config.Loss.TUKEY
+                                             else settings.rejection_threshold),
+                        correlation_time=own.get('correlation_time', 0.0))
         except ConfigError as error:
             setting, _, rest = str(error).partition(': ')
             raise ConfigError(
@@ -214,20 +221,6 @@ def _same(own: Mapping[str, Any], settings: type, but: Collection[str] = ()) -> 
     """Return the parameters that are named as the settings that they are."""
     names = [each.name for each in fields(settings) if each.name in own and each.name not in but]
     return {name: tuple(own[name]) if isinstance(own[name], list) else own[name] for name in names}
-
-
-def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:
-    policy, loss = default.covariance, config.Loss(own['robust_loss'])
-    floors = own.get('sigma_floor', (policy.position_floor, policy.heading_floor))
-    return replace(
-        default, covariance=replace(
-            policy, override=tuple(own['covariance_override']), scale=own['covariance_scale'],
-            position_floor=floors[0], heading_floor=floors[1],
-            heading=config.Heading(own.get('heading', 'auto'))),
-        robust=config.Robust(own['robust']), loss=loss,
-        # for Tukey's loss that for 95 % of the accuracy of least squares [sigma]
-        rejection_threshold=(5.0 if loss is config.Loss.TUKEY else default.rejection_threshold),
-        correlation_time=own.get('correlation_time', 0.0))
 
 
 class MessageReader:

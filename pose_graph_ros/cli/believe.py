@@ -106,7 +106,12 @@ def believe(
         choice = to_the_end(SELECTIONS[method](problem))
         if choice is not None and (best is None or choice.cost < best.cost):
             best, rows = choice, problem.ids
-    plain = _minimum_of_all(graph, edges, closures)
+    plain, copy = None, _filled(graph, edges)
+    problem = TruncatedProblem(copy, closures, graph.poses.copy())
+    # so many edges between random nodes that it is nearly dense are never right
+    if (problem.factorisation(np.ones(len(closures))) <= BELIEF.most_numbers * graph.n_nodes
+            and optimizer.optimize_from_linear_start(copy, CONFIG).status is not Status.FAILED):
+        plain = copy.poses.copy()
     starts = [poses for poses in (plain, graph.poses.copy() if given else None)
               if poses is not None]
     for start in starts:
@@ -152,21 +157,6 @@ def _filled(graph: Graph, edges: Factors) -> Graph:
     copy = Graph()
     copy.fill(graph.rows()._replace(factors=edges))
     return copy
-
-
-def _minimum_of_all(graph: Graph, edges: Factors, closures: IntArray) -> FloatArray | None:
-    """
-    Return the poses of a minimum of chi2 with all closures from a linear start, shape (N, 3).
-
-    None if there is none, or if so many edges between random nodes make the factorisation nearly
-    dense, which right ones never do.
-    """
-    copy = _filled(graph, edges)
-    problem = TruncatedProblem(copy, closures, graph.poses.copy())
-    if (problem.factorisation(np.ones(len(closures))) > BELIEF.most_numbers * graph.n_nodes
-            or optimizer.optimize_from_linear_start(copy, CONFIG).status is Status.FAILED):
-        return None
-    return copy.poses.copy()
 
 
 SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {

@@ -94,7 +94,19 @@ def read_measurements(
     """
     file = read_file(path, edge2)
     edges, n = file.graph.factors.edges, file.graph.n_nodes
-    stamps_ns = SECOND * np.arange(1, n + 1) if stamps is None else _read_stamps(stamps, n)
+    stamps_ns = SECOND * np.arange(1, n + 1)
+    if stamps is not None:
+        try:
+            words = [line.split()[0] for line in stamps.read_text(encoding='utf-8').splitlines()
+                     if line.strip() != '' and not line.startswith('#')]
+            stamps_ns = np.array([round(float(word) * SECOND) for word in words], dtype=np.int64)
+        except (OSError, ValueError, OverflowError) as error:
+            raise FileFormatError(f'{stamps}: expected a stamp [s] at the begin of each line '
+                                  f'({error})') from error
+        if len(stamps_ns) < n or np.any(np.diff(stamps_ns[:n]) <= 0):
+            raise FileFormatError(
+                f'{stamps}: expected {n} increasing stamps, got {len(stamps_ns)}')
+        stamps_ns = stamps_ns[:n]
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)
     # of several edges the first one in the file is odometry
     starts, first = np.unique(np.minimum(edges.i, edges.j)[steps], return_index=True)
@@ -115,20 +127,6 @@ def read_measurements(
           for when, i, j, mean, cov in zip(
               last, others.i, others.j, others.mean, _covariances(others), strict=True))]
     return [each for _, each in sorted(events, key=itemgetter(0))]
-
-
-def _read_stamps(path: Path, n: int) -> IntArray:
-    """Return the first n stamps in a file [ns], shape (n,)."""
-    try:
-        words = [line.split()[0] for line in path.read_text(encoding='utf-8').splitlines()
-                 if line.strip() != '' and not line.startswith('#')]
-        stamps = np.array([round(float(word) * SECOND) for word in words], dtype=np.int64)
-    except (OSError, ValueError, OverflowError) as error:
-        raise FileFormatError(f'{path}: expected a stamp [s] at the begin of each line '
-                              f'({error})') from error
-    if len(stamps) < n or np.any(np.diff(stamps[:n]) <= 0):
-        raise FileFormatError(f'{path}: expected {n} increasing stamps, got {len(stamps)}')
-    return stamps[:n]
 
 
 def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:

@@ -11,17 +11,24 @@ import numpy as np
 from pose_graph_ros.cli.arguments import LANDMARKS
 from pose_graph_ros.cli.graph_input import read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import GraphFile, write_g2o
+from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.marginalization.marginalize import marginalize, standing_for
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     file = read(options.graph, options.edge2)
-    leaving, graph = _leaving(options, file), Graph()
+    if options.nodes == LANDMARKS:
+        leaving = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)
+        if len(leaving) == 0:
+            raise ConfigError(f'{options.graph}: has no landmarks')
+    else:
+        leaving = rows_of(file.ids, options.nodes, '--nodes')
+    if not np.any(np.delete(file.rows.is_pose, leaving)):
+        raise ConfigError('--nodes: no pose would be left')
+    graph = Graph()
     graph.fill(file.rows)
     before = graph.energies().chi2
     graph.apply(marginalize(graph, file.rows.node_ids[leaving]))
@@ -57,16 +64,3 @@ def execute(options: argparse.Namespace) -> int:
                   'nodes')
         print(f'written: {options.out}')
     return 0
-
-
-def _leaving(options: argparse.Namespace, file: GraphFile) -> IntArray:
-    """Return the rows of the nodes that leave; raise ConfigError unless there are some."""
-    if options.nodes == LANDMARKS:
-        rows = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)
-        if len(rows) == 0:
-            raise ConfigError(f'{options.graph}: has no landmarks')
-    else:
-        rows = rows_of(file.ids, options.nodes, '--nodes')
-    if not np.any(np.delete(file.rows.is_pose, rows)):
-        raise ConfigError('--nodes: no pose would be left')
-    return rows

@@ -158,9 +158,14 @@ def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
         settings.TRUTH: odometry_messages(
             settings.TRUTH, 'map', drive.truth, (0.0,) * 6)}
     if setup.gyro is not None:
-        topics[gyro] = rate_messages(
-            gyro, *drive.measured[gyro][:2],
-            setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S))
+        stamps_ns, values, _ = drive.measured[gyro]
+        sigma = setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S)
+        nothing, variances = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
+        # yaw rates in base_link [rad/s], and nothing else
+        topics[gyro] = ((gyro, _IMU, stamp, _TYPES[_IMU](
+            _header(stamp, 'base_link'), _of('Quaternion', 0.0, 0.0, 0.0, 1.0), nothing,
+            _of('Vector3', 0.0, 0.0, rate), variances, _of('Vector3', 0.0, 0.0, 0.0), nothing))
+            for stamp, rate in zip(stamps_ns.tolist(), values.tolist(), strict=True))
     if setup.fixes is not None:
         topics[fixes] = fix_messages(fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
     if setup.poses is not None:
@@ -271,17 +276,6 @@ def fix_messages(
         yield topic, _FIX, stamp, _TYPES[_FIX](
             _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
             covariance.ravel(), _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
-
-
-def rate_messages(
-    topic: str, stamps_ns: StampsNs, rates: FloatArray, sigma: float,
-) -> Iterator[Message]:
-    """Return sensor_msgs/Imu messages of yaw rates in base_link [rad/s], and nothing else."""
-    none, covariance = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
-    for stamp, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
-        yield topic, _IMU, stamp, _TYPES[_IMU](
-            _header(stamp, 'base_link'), _of('Quaternion', 0.0, 0.0, 0.0, 1.0), none,
-            _of('Vector3', 0.0, 0.0, rate), covariance, _of('Vector3', 0.0, 0.0, 0.0), none)
 
 
 def loop_closure_messages(

@@ -55,7 +55,9 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     which = options.marginals or ('all' if len(tables) > 0 else None)
     problem = Problem(file, plain=(
         options.robust is None and which is None and options.start == 'chordal'))
-    rows = None if which is None else _chosen(problem, which)
+    rows = None if which is None else np.arange(len(problem.ids)) if which == 'all' else (
+        np.array([problem.engine.newest_pose]) if which == 'newest'
+        else rows_of(problem.ids, which, '--marginals'))
     held, graph = problem.held, problem.graph
     before = graph.energies().chi2
     say(f'{graph.n_nodes} hidden nodes, {len(graph.factors.edges)} edges, '
@@ -90,14 +92,23 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         else:
             write_g2o(problem.graph, path, problem.ids)
     if options.json:
-        values = _values(problem, solution, doubted, file.ids[held]) | {
+        graph, result = problem.graph, solution.result
+        edges = graph.factors_at(doubted)
+        print(json.dumps(_finite({
+            'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
+            'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
+            'iterations': result.iterations, 'status': result.status.value,
+            'reason': result.reason, 'start': solution.start, 'starts': [
+                {'start': name, 'chi2': each.chi2, 'iterations': each.iterations,
+                 'status': each.status.value} for name, each in solution.tried],
+            'held': file.ids[held].tolist(),
+            'doubted': np.stack((problem.ids[edges.i], problem.ids[edges.j]), axis=1).tolist(),
             'chi2_start': before, 'seconds': seconds, 'edge2': file.edge2_order,
             'robust': decision,
-            'certificate': None if certificate is None else certificate.values()}
-        if rows is not None:
-            values |= {'marginals_relative_error': error,
-                       **({} if len(tables) > 0 else {'marginals': table})}
-        print(json.dumps(_finite(values), indent=2, allow_nan=False))
+            'certificate': None if certificate is None else certificate.values(),
+            **({} if rows is None else {'marginals_relative_error': error}),
+            **({} if rows is None or len(tables) > 0 else {'marginals': table})}),
+            indent=2, allow_nan=False))
     elif rows is not None and len(tables) == 0:
         print(text, end='')
     return 0 if solution.result.status is Status.CONVERGED else 1
@@ -121,23 +132,6 @@ def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArr
           for k in order[~is_edge][:N_LARGEST])]
 
 
-def _values(
-    problem: Problem, solution: Solution, doubted: IntArray, held: IntArray,
-) -> dict[str, Any]:
-    """Return most of the JSON output."""
-    graph, ids, result = problem.graph, problem.ids, solution.result
-    edges = graph.factors_at(doubted)
-    return {
-        'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
-        'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
-        'iterations': result.iterations, 'status': result.status.value, 'reason': result.reason,
-        'start': solution.start, 'starts': [
-            {'start': name, 'chi2': each.chi2, 'iterations': each.iterations,
-             'status': each.status.value} for name, each in solution.tried],
-        'held': held.tolist(),
-        'doubted': np.stack((ids[edges.i], ids[edges.j]), axis=1).tolist()}
-
-
 def _finite(value: Any) -> Any:
     """Return values for JSON, which has no infinity: None in its place."""
     if isinstance(value, dict):
@@ -145,15 +139,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _chosen(problem: Problem, which: str) -> IntArray:
-    """Return the rows of the nodes whose marginals are asked for."""
-    if which == 'all':
-        return np.arange(len(problem.ids))
-    if which == 'newest':
-        return np.array([problem.engine.newest_pose])
-    return rows_of(problem.ids, which, '--marginals')
 
 
 def _marginals(

@@ -150,10 +150,8 @@ class Tuning:
         if stretch is None:
             stretch = noise.stretch_length(self._duration, period, tau, folds)
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
-        one, other = (noise.joined_errors(errors) for errors in zip(*(
+        one, other = noise.comparable(*zip(*(
             pair for errors, _ in tried for pair in errors), strict=True))
-        right = ~noise.far_from_all([one, other])
-        one, other = one.rows(right), other.rows(right)
         verdict = Verdict.SAME
         if len(changed(tuned)) > 0:
             verdict = Verdict.BETTER if noise.is_better(

@@ -298,7 +298,17 @@ def minimized(
     """
     cost, radius = form.cost(y), np.inf
     product = form.product(y)
-    precondition = precondition or _preconditioner(form, multipliers(y, product))
+    if precondition is None:
+        # v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite
+        damping = 1e-12 * form.diagonal   # makes it definite
+        factors = form.factors(damping - multipliers(y, product), turned=False)
+        if not factors.is_positive:
+            factors = form.factors(damping, turned=False)
+
+        def precondition(_: ComplexArray, v: ComplexArray) -> ComplexArray:
+            out = form.inverse(factors, v)
+            out[0] = 0.0
+            return out
     for _ in range(300):
         diagonal = multipliers(y, product)[:, None]
         tangent = _projection(y)
@@ -331,20 +341,6 @@ def _projection(y: ComplexArray) -> Operator:
         v[0] = 0.0
         return v
     return tangent
-
-
-def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Preconditioner:
-    """Return v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite."""
-    damping = 1e-12 * form.diagonal   # makes it definite
-    factors = form.factors(damping - diagonal, turned=False)
-    if not factors.is_positive:
-        factors = form.factors(damping, turned=False)
-
-    def solve(_: ComplexArray, v: ComplexArray) -> ComplexArray:
-        out = form.inverse(factors, v)
-        out[0] = 0.0
-        return out
-    return solve
 
 
 def _step(

@@ -288,11 +288,13 @@ class Summary(NamedTuple):
     """Of the errors, by their autocorrelation [s]; 0 if there is none."""
 
 
-def joined_errors(parts: Sequence[Errors]) -> Errors:
-    """Return the errors of several folds, by stamp."""
-    columns: Any = map(np.concatenate, zip(*parts, strict=True))
-    together = Errors(*columns)
-    return together.rows(np.argsort(together.stamps_ns, kind='stable'))
+def comparable(*of_paths: Sequence[Errors]) -> list[Errors]:
+    """Return the errors of each path in all folds, by stamp, but for those far from all paths."""
+    columns: Any = [map(np.concatenate, zip(*parts, strict=True)) for parts in of_paths]
+    joined = [Errors(*each) for each in columns]
+    joined = [each.rows(np.argsort(each.stamps_ns, kind='stable')) for each in joined]
+    far = np.all([each.distances > WRONG * np.median(each.distances) for each in joined], axis=0)
+    return [each.rows(~far) for each in joined]
 
 
 def stretch_length(duration: float, period: float, tau: float, folds: int) -> float:
@@ -334,12 +336,6 @@ def errors_at(
     spread = jacobian @ covariances[np.minimum(after, len(path) - 1)] @ np.swapaxes(jacobian, 1, 2)
     own = factor * np.array([each.covariance[:2, :2] for each in chosen])
     return Errors(stamps, positions - poses[:, :2] - arms, spread + own)
-
-
-def far_from_all(parts: Sequence[Errors]) -> BoolArray:
-    """Return which positions are far from all paths, shape (K,); the same ones in all parts."""
-    far = [each.distances > WRONG * np.median(each.distances) for each in parts]
-    return np.asarray(np.all(far, axis=0))
 
 
 def is_better(before: Errors, after: Errors, start_ns: int, stretch: float) -> bool:

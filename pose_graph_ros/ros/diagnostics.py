@@ -351,6 +351,7 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
             elif found != expected:
                 yield (f'{name} has the {what} {found!r}, but the parameter {parameter} is '
                        f'{expected!r}: set it, else {consequence}')
-    elif parent == '' and source.needs_frame and source.kind.without_frame != '':
+    elif parent == '' and source.kind.without_frame != '' and not (
+            source.mounting != 'tf' or any(source.lever_arm)):  # no parameter stands for it
         yield f'{name} has no frame_id: ' + source.kind.without_frame.format(
             base=out.base_frame, map=out.map_frame, name=name)

@@ -188,22 +188,19 @@ def springs(
             # from where the estimate has it to where it was measured
             node = each.nodes[0]
             ends = [*ends, place(stamps[node], path.poses[node, :2] + residual[:2])]
+        name = each.name
+        if each.stamp_ns >= 0:  # with the time since the start of the drive
+            what, _, rest = name.partition(' at ')
+            seconds = (each.stamp_ns - frame.start_ns) * 1e-9
+            name = f'{what} at {seconds:.1f} s{rest.partition(" s")[2]}'
         found.append({
             'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
-            'name': names.get(each.number, _name(each, frame.start_ns)),
+            'name': names.get(each.number, name),
             'energy': number(each.energy), 'expected': number(
                 expected if math.isfinite(expected) else float(each.freedom)),
             'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,
             'text': _text(each, here if len(each.nodes) < 2 else ends, residual)})
     return found
-
-
-def _name(each: ConstraintEnergy, start_ns: int) -> str:
-    """Return the name of a constraint, with the time since the start of the drive [ns]."""
-    if each.stamp_ns < 0:
-        return each.name
-    what, _, rest = each.name.partition(' at ')
-    return f'{what} at {(each.stamp_ns - start_ns) * 1e-9:.1f} s{rest.partition(" s")[2]}'
 
 
 def _text(
