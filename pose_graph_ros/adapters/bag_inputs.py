@@ -100,12 +100,20 @@ def choose_inputs(
             chosen[name] = topic
         elif name not in chosen:
             logger.warning('%s: no topic %s for %s', reader.path, topic, name)
-    topics = {name: _checked(reader, name, kinds[name], topic) for name, topic in chosen.items()}
+    topics = dict(chosen)
+    for name, topic in chosen.items():
+        option, wanted_type = (
+            f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'), kinds[name].message_type
+        info = reader.topics.get(topic)
+        if info is None:
+            raise BagError(
+                f'{reader.path}: no topic {topic} ({option}); the bag has {reader.describe()}')
+        if info.type != wanted_type:
+            raise BagError(f'{reader.path}: {option} {topic} is of type {info.type}, '
+                           f'expected {wanted_type}')
     for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu', 'gyro'):
-        if name in topics or name not in kinds or name in named:
-            continue
-        guess = _guess(reader, name, kinds, topics, asked=asked, truth=truth)
-        if guess is not None:
+        if name not in topics and name in kinds and name not in named and (guess := _guess(
+                reader, name, kinds, topics, asked=asked, truth=truth)) is not None:
             topics[name] = guess
     ordered = {name: topics[name] for name in kinds if name in topics}
     inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out, span)
@@ -118,19 +126,6 @@ def choose_inputs(
 
 def _option(name: str) -> str:
     return name.replace('_', '-')
-
-
-def _checked(reader: Bag, name: str, kind: Kind, topic: str) -> str:
-    """Return a topic that was asked for, if the bag has it and it is of the type of the source."""
-    option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
-    info = reader.topics.get(topic)
-    if info is None:
-        raise BagError(
-            f'{reader.path}: no topic {topic} ({option}); the bag has {reader.describe()}')
-    if info.type != kind.message_type:
-        raise BagError(f'{reader.path}: {option} {topic} is of type {info.type}, '
-                       f'expected {kind.message_type}')
-    return topic
 
 
 def _guess(

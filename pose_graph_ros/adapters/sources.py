@@ -130,8 +130,19 @@ def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
     for name in source_names(values['sources']):
         own = _own(values, name)
         given = _same(own, Source)
+        places: dict[str, tuple[float, float]] = {}
+        for text in given.get('beacons', ()):
+            try:
+                beacon, x, y = text.split()
+                places[beacon] = float(x), float(y)
+                good = all(abs(each) < 1e7 for each in places[beacon])
+            except ValueError:
+                good = False
+            if not good:
+                raise ConfigError(f'parameter {name}.beacons: expected name, x and y, such as '
+                                  f'"anchor_1 12.5 -3.0", got {text!r}')
         if 'beacons' in given:
-            given['beacons'] = dict(_beacon(name, text) for text in given['beacons'])
+            given['beacons'] = places
         found.append(Source(name, KINDS[own['type']], time_offset_ns=round(
             own['time_offset'] * NANOSECONDS), **given))
     return tuple(found)
@@ -141,19 +152,6 @@ def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return the parameters of a source by their names without its own."""
     return {name.removeprefix(f'{source}.'): value for name, value in values.items()
             if name.startswith(f'{source}.')}
-
-
-def _beacon(source: str, text: str) -> tuple[str, tuple[float, float]]:
-    """Return name and place of a beacon by the parameter `beacons`."""
-    try:
-        name, x, y = text.split()
-        place = float(x), float(y)
-    except ValueError:
-        place = math.nan, math.nan
-    if not all(abs(each) < 1e7 for each in place):
-        raise ConfigError(f'parameter {source}.beacons: expected name, x and y, such as '
-                          f'"anchor_1 12.5 -3.0", got {text!r}')
-    return name, place
 
 
 def source_names(listed: list[str]) -> list[str]:

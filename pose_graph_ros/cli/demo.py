@@ -46,6 +46,9 @@ from pose_graph_ros.offline.simulation.worlds import WORLDS
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
 DIAGNOSTICS, ODOMETRY = '/diagnostics', '/odometry/filtered'
+NO_ANSWERS = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 'left',
+              'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
+"""Ends of keys of the diagnostics that are not counts of messages by what was answered."""
 
 
 class DemoError(PoseGraphError):
@@ -81,11 +84,16 @@ def execute(options: argparse.Namespace) -> int:
     backend = PoseGraphBackend.restored(backend_config(values), saved)
     report = backend.optimize()
     diagnostics = _updates(options.out / RECORDED, recorder, int(backend.node_stamps_ns[-1]))
+    counts: dict[tuple[str, str], int] = {}  # of messages by source and answer
+    for key, value in diagnostics.items():
+        source, _, answer = key.rpartition('.')
+        if source in inputs.topics and answer not in NO_ANSWERS and value.isdecimal():
+            counts[source, answer] = int(value)
     with open_bag(bag_path) as bag:
         drive = drive_in(bag, inputs, values, backend, truth, origin=saved.datum)
     lines = write_results(Run(
-        title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds,
-        _counts(diagnostics, inputs), report, seconds), options.out, {
+        title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds, counts,
+        report, seconds), options.out, {
             'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
             'seconds': seconds, 'node': diagnostics})
     print('\n'.join([*lines, f'written to {options.out}/: path.tum, corrected/ (rosbag2), '
@@ -117,18 +125,6 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
                     count - before[0])
                 before = count, total, longest
     return values
-
-
-def _counts(values: Mapping[str, str], inputs: Inputs) -> dict[tuple[str, str], int]:
-    """Return the counts of messages by source and answer that the diagnostics have."""
-    others = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 'left',
-              'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
-    counts: dict[tuple[str, str], int] = {}
-    for key, value in values.items():
-        source, _, answer = key.rpartition('.')
-        if source in inputs.topics and answer not in others and value.isdecimal():
-            counts[source, answer] = int(value)
-    return counts
 
 
 def _run(

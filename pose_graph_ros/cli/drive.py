@@ -188,14 +188,6 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     return found
 
 
-def consistency_lines(found: Mapping[str, dict[str, Any] | None]) -> list[str]:
-    """Return the NEES as text."""
-    return [f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
-        f'{each["mean"]:.4g}, expected {each["expected"]}, {each["interval"][0]:.4f} to '
-        f'{each["interval"][1]:.4f} if errors were independent; {100.0 * each["within"]:.1f} % '
-        f'below the 95 % quantile')) for name, each in found.items()]
-
-
 def format_table(rows: Sequence[ErrorRow]) -> str:
     """Return the rows as a plain text table of less than 80 columns."""
     if len(rows) == 0:

@@ -20,9 +20,7 @@ import numpy as np
 from pose_graph_ros.cli import drive as drives
 from pose_graph_ros.cli.drive import distances, Drive, extent
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 
@@ -65,8 +63,17 @@ def draw_drive(
     In the legend some names may be other ones.
     """
     paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
-    low, high = _limits(np.concatenate([path.poses[:, :2] for path in paths]), np.concatenate(
-        (drive.placed_odometry.poses[:, :2], drive.fix_positions)))
+    near = np.concatenate([path.poses[:, :2] for path in paths])
+    stray = np.concatenate((drive.placed_odometry.poses[:, :2], drive.fix_positions))
+    if len(near) == 0:
+        near = stray if len(stray) else np.zeros((1, 2))
+    low, high = near.min(axis=0), near.max(axis=0)
+    margin = max(0.2 * float(np.max(high - low)), 5.0)
+    # what strays far from what must be in it is cut off
+    shown = np.concatenate((near, np.clip(stray, low - margin, high + margin)))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    pad = max(0.03 * float(np.max(high - low)), 1.0)
+    low, high = low - pad, high + pad
     wide, tall = (high - low).tolist()
     with rc_context(STYLE):
         if tall > 1.15 * wide:
@@ -89,18 +96,6 @@ def draw_drive(
         _draw_errors(errors, drive)
         figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold', parse_math=False)
         figure.savefig(file)
-
-
-def _limits(near: Points, stray: Points) -> tuple[Points, Points]:
-    """Return two corners of a map; what strays far from what must be in it is cut off."""
-    if len(near) == 0:
-        near = stray if len(stray) else np.zeros((1, 2))
-    low, high = near.min(axis=0), near.max(axis=0)
-    margin = max(0.2 * float(np.max(high - low)), 5.0)
-    shown = np.concatenate((near, np.clip(stray, low - margin, high + margin)))
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    pad = max(0.03 * float(np.max(high - low)), 1.0)
-    return low - pad, high + pad
 
 
 def _facts(drive: Drive) -> str:
@@ -215,26 +210,21 @@ def _draw_errors(axes: Axes, drive: Drive) -> None:
         axes.set_ylim(0.0, max(1.15 * max(highest), 0.1))
     axes.set(xlabel='time [s]', ylabel='distance [m]')
     axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold')
-    for outage in _outages(drive, begin, end):
-        axes.axvspan(*outage, color=SHADE, zorder=0)
+    used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
+    used = used[(used > begin) & (used < end)]
+    if len(used) < 3:
+        return
+    # no fixes were used for 5 s and 10 median periods
+    edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
+    pauses = np.diff(edges)
+    for k in np.flatnonzero(pauses > max(5.0, 10.0 * float(np.median(pauses)))).tolist():
+        axes.axvspan(float(edges[k]), float(edges[k + 1]), color=SHADE, zorder=0)
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
 
 
 def thinned(points: np.ndarray) -> np.ndarray:
     """Return every n-th point, at most 20 000: more take hundreds of MB, and do not show."""
     return points[::max(-(-len(points) // 20_000), 1)]
-
-
-def _outages(drive: Drive, begin: StampNs, end: StampNs) -> list[tuple[float, float]]:
-    """Return when no fixes were used for 5 s and 10 median periods: begin and end [s]."""
-    used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
-    used = used[(used > begin) & (used < end)]
-    if len(used) < 3:
-        return []
-    edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
-    pauses = np.diff(edges)
-    long = pauses > max(5.0, 10.0 * float(np.median(pauses)))
-    return list(zip(edges[:-1][long].tolist(), edges[1:][long].tolist(), strict=True))
 
 
 def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:

@@ -182,11 +182,6 @@ class ReceivedMessage(NamedTuple):
     measurement: OdometrySample | Measurement
     refusal: Answer | None = None  # why it is not used, by its stamp
 
-    @property
-    def stamp_ns(self) -> int:
-        """Its stamp, with the offset of its source [ns]."""
-        return self.measurement.stamp_ns
-
 
 class Decision(NamedTuple):
     """What is to be done after a message has come."""
@@ -256,7 +251,8 @@ class TimeJumps:
     def _is_old(self, received: ReceivedMessage) -> bool:
         if self._drained is None:
             return False
-        if received.source not in self._drained and received.stamp_ns > self._old_above_ns:
+        if received.source not in self._drained and (
+                received.measurement.stamp_ns > self._old_above_ns):
             return True
         self._drained.add(received.source)
         self._n_new += isinstance(received.measurement, OdometrySample)

@@ -84,6 +84,7 @@ class Player(Node):
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
+        self.n_poses = 0  # of the newest path
         outputs = {name: OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
         if TFMessage is not None:
             outputs['tf'] = '/tf', TF_TYPE
@@ -108,11 +109,6 @@ class Player(Node):
                 return
             self.diagnostics = {value.key: value.value for value in own[0].values}
         self._recorded.append(received)
-
-    @property
-    def n_poses(self) -> int:
-        """Number of poses of the newest path."""
-        return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
 
     @property
     def processed(self) -> int:
@@ -204,19 +200,18 @@ class Player(Node):
         self._spin_until(is_last, PATIENCE.answer, 'no path came after the optimisation')
         return bool(response.success), str(response.message)
 
-    def save_graph(self) -> None:
-        """Have the node save its graph."""
-        answer = self._call(self._save, 'saving the graph')
-        if not answer.success:
-            raise PlayError(f'~/save_graph: {answer.message}')
-
     def _call(self, service: Client, what: str) -> Trigger.Response:
         asked = service.call_async(Trigger.Request())
         self._spin_until(asked.done, PATIENCE.answer, f'no answer to {what}')
         return asked.result()
 
     def write(self, folder: Path) -> None:
-        """Write a rosbag2 of all; of path and verdicts the last message."""
+        """Have the node save its graph, and write a rosbag2 of all that it has published."""
+        answer = self._call(self._save, 'saving the graph')
+        if not answer.success:
+            raise PlayError(f'~/save_graph: {answer.message}')
+        path = deserialize_message(self._newest['path'][-1], PathMessage)
+        self.n_poses = len(path.poses)
         newest = list(self._newest.values())
         with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
             for message in (*self._recorded, *newest):
@@ -238,7 +233,6 @@ def play(
         player = Player(inputs, topics, context, is_running)
         published = player.play(bag, rate)
         success, answer = player.request_final_optimization()
-        player.save_graph()
         player.write(out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '

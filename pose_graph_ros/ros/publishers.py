@@ -69,24 +69,14 @@ class View:
 
     def forget(self) -> None:
         """Let the next message have any stamp, at once."""
-        self.stamp_ns = 0
-        self._at = -math.inf
+        self.stamp_ns, self.at = 0, -math.inf
         self.shown: object = None
 
     def is_due(self, state: object, period: Seconds) -> bool:
         """Tell whether to publish what is new, if a state is given, wanted, and not too soon."""
         return ((state is None or state != self.shown)
-                and time.monotonic() - self._at >= period
+                and time.monotonic() - self.at >= period
                 and bool(self.publisher.get_subscription_count() > 0))
-
-    def publish(
-        self, state: object, stamp_ns: StampNs, message_at: Callable[[StampNs], object],
-    ) -> None:
-        """Publish a message, with a stamp that is newer than that of the one before."""
-        self.shown, self._at = state, time.monotonic()
-        # with the same newest odometry: 1 ns keeps the stamps increasing
-        self.stamp_ns = max(stamp_ns, self.stamp_ns + 1)
-        self.publisher.publish(message_at(self.stamp_ns))
 
 
 class Publishers:
@@ -213,7 +203,10 @@ class Publishers:
         def publish(view: View, state: object, message_at: Callable[[StampNs], object]) -> None:
             with self._lock:
                 if graph == self.graph:
-                    view.publish(state, estimate.stamp_ns, message_at)
+                    view.shown, view.at = state, time.monotonic()
+                    # with the same newest odometry: 1 ns keeps the stamps increasing
+                    view.stamp_ns = max(estimate.stamp_ns, view.stamp_ns + 1)
+                    view.publisher.publish(message_at(view.stamp_ns))
 
         is_due = estimate is not self.path.shown and self.path.is_due(None, self._path_period)
         if (is_due or at_once) and not self._holds(estimate):

@@ -202,7 +202,12 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
         lines.append('new bag: {original} messages copied, {left_out} left out, {corrected} poses '
                      'of odometry corrected'.format(**facts['new_bag']))
     return [*lines, 'counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()),
-            '', drives.format_table(drive.rows), *drives.consistency_lines(nees), '']
+            '', drives.format_table(drive.rows), *(
+                f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
+                    f'{each["mean"]:.4g}, expected {each["expected"]}, '
+                    f'{each["interval"][0]:.4f} to {each["interval"][1]:.4f} if errors were '
+                    f'independent; {100.0 * each["within"]:.1f} % below the 95 % quantile'))
+                for name, each in nees.items()), '']
 
 
 # --- the map
