@@ -123,12 +123,6 @@ class NearHessian(NamedTuple):
     # from derivatives of chi2 by the headings of these, (F,), to their part of a Gauss-Newton step
     solve: Callable[[FloatArray], FloatArray]
 
-    def order(self, formulation: Formulation) -> IntArray:
-        """Return the place of each unknown of the objective, the map last."""
-        places = np.full(formulation.n_unknowns, len(self.places))
-        places[1:] = self.places
-        return places
-
     def precondition(self, y: ComplexArray, v: ComplexArray) -> ComplexArray:
         """Return a change of headings that are angles, given the derivatives by them."""
         change = np.zeros_like(v)
@@ -145,7 +139,9 @@ def certify(
 
     Raises LinearSolveError if the objective does not determine the positions or headings.
     """
-    form = QuadraticForm(formulation, None if hessian is None else hessian.order(formulation))
+    # the map is the last that is eliminated
+    form = QuadraticForm(formulation, None if hessian is None else np.concatenate(
+        ([len(hessian.places)], hessian.places)))
     if form.n == 1:
         cost = form.cost(np.ones((1, 1), dtype=np.complex128))
         return Certificate(Verdict.CERTIFIED, cost, cost, 0.0, None, 1, poses.copy())

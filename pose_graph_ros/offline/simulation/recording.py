@@ -167,7 +167,9 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
     if topic == FIXES and setup.fixes is not None:
         stamps, values = sensors.positions(streams['fixes'], truth, setup.fixes)
     elif topic == POSES and setup.poses is not None:
-        stamps, values = sensors.global_poses(streams['poses'], truth, setup.poses)
+        stamps = sensors.jittered_stamps(streams['poses'], truth, setup.poses.period_s)
+        values = se2.wrapped(truth.at(stamps) + np.array(
+            setup.poses.sigmas) * streams['poses'].standard_normal((len(stamps), 3)))
     else:
         stamps, values = np.empty(0, dtype=np.int64), np.empty((0, 2 if topic == FIXES else 3))
     return sensors.moved(streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
@@ -201,7 +203,8 @@ def _true_closures(
     ends += generator.integers(1, round(PERIOD_S * 1e9), ends.shape)
     ends = np.minimum(ends, stamps[-1])
     poses = path.truth.at(ends)
-    return ends, sensors.closure_poses(generator, poses[:, 0], poses[:, 1], closures)
+    noise = generator.normal(0.0, closures.sigmas, (len(ends), 3))
+    return ends, se2.compose(se2.between(poses[:, 0], poses[:, 1]), noise)
 
 
 # --- a graph
@@ -303,8 +306,8 @@ def _loop_edges(way: Course, path: Motion, node_distance: float) -> tuple[Factor
     old, new = sensors.revisits(streams['closures'], path, np.arange(len(truth)), closures)
     found = streams['rate'].random(len(old)) < closures.rate
     old, new = old[found], new[found]
-    poses = sensors.closure_poses(
-        streams['closures'], truth.poses[old], truth.poses[new], closures)
+    noise = streams['closures'].normal(0.0, closures.sigmas, (len(new), 3))
+    poses = se2.compose(se2.between(truth.poses[old], truth.poses[new]), noise)
     every, missing = sensors.with_false(
         streams['false'], path, closures, truth.stamps_ns[np.column_stack((old, new))], poses)
     every = every.rows(sensors.heard(every.later_ns, CLOSURES, way.setup.outages))

@@ -166,27 +166,6 @@ def _middle(a: IntArray, b: IntArray) -> tuple[int, int]:
     return int(a[0] + b[0]), int(a[1] + b[1])
 
 
-def aisle_corners(
-    rng: np.random.Generator, length: Metres, aisles: int, spacing: Metres, depth: Metres,
-) -> FloatArray:
-    """
-    Return the corners of a way through the aisles of a hall in random order, shape (K, 2) [m].
-
-    Aisle k leads from (k spacing, 0) to (k spacing, depth). At both ends a lane joins all aisles.
-    The robot drives each aisle from end to end and then changes to any other.
-    """
-    aisle, y, driven = int(rng.integers(aisles)), 0.0, 0.0
-    corners = [(aisle * spacing, y)]
-    while driven <= length:
-        y = depth - y
-        corners.append((aisle * spacing, y))
-        other = (aisle + int(rng.integers(1, aisles))) % aisles
-        driven += depth + spacing * abs(other - aisle)
-        aisle = other
-        corners.append((aisle * spacing, y))
-    return np.array(corners)
-
-
 def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, FloatArray]:
     """
     Return points along straight lines with right-angled turns, and where the corners are on it.
@@ -324,10 +303,23 @@ def _drive_setup(motion: Motion) -> Setup:
 
 
 def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
-    length = (duration_s + MARGIN_S) * FORKLIFT.speed
-    corners = aisle_corners(generator, length + 2.0 * AISLE_DEPTH, AISLES, AISLE_SPACING,
-                            AISLE_DEPTH)
-    points, middles = rounded(corners, ROBOT_TURN, PATH_STEP)
+    """
+    Return a drive through the aisles of a hall in random order.
+
+    Aisle k leads from (k spacing, 0) to (k spacing, depth). At both ends a lane joins all aisles.
+    The robot drives each aisle from end to end and then changes to any other.
+    """
+    length = (duration_s + MARGIN_S) * FORKLIFT.speed + 2.0 * AISLE_DEPTH
+    aisle, y, driven = int(generator.integers(AISLES)), 0.0, 0.0
+    corners = [(aisle * AISLE_SPACING, y)]
+    while driven <= length:
+        y = AISLE_DEPTH - y
+        corners.append((aisle * AISLE_SPACING, y))
+        other = (aisle + int(generator.integers(1, AISLES))) % AISLES
+        driven += AISLE_DEPTH + AISLE_SPACING * abs(other - aisle)
+        aisle = other
+        corners.append((aisle * AISLE_SPACING, y))
+    points, middles = rounded(np.array(corners), ROBOT_TURN, PATH_STEP)
     path = wandering(generator, points, PATH_STEP, ASIDE)
     picks = middles[1:-1][generator.random(len(middles) - 2) < PICKS]
     stops = np.unique(np.round(picks / PATH_STEP).astype(np.int64))
