@@ -163,7 +163,13 @@ class Bag:
                 topic, last_ns, kind = _absolute(connection), recorded_ns, connection.msgtype
                 seen[topic] += 1
                 if (path, kind) not in self._decoders:
-                    self._decoders[path, kind] = _decoder(reader, connection)
+                    # by the definition in the bag, else by the standard one
+                    is_ros1 = isinstance(reader, Rosbag1Reader)
+                    types = own_types(connection) or get_typestore(
+                        Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+                    self._decoders[path, kind] = partial(
+                        types.deserialize_ros1 if is_ros1 else types.deserialize_cdr,
+                        typename=kind)
                 yield BagMessage(topic, kind, recorded_ns, bytes(raw), connection,
                                  self._decoders[path, kind])
         except Exception as error:  # the parsers can raise anything on a damaged file
@@ -183,15 +189,6 @@ class Bag:
                 if seen[topic] != count:
                     logger.warning('%s: %s should have %d messages, %d were found',
                                    path, topic, count, seen[topic])
-
-
-def _decoder(reader: Reader, connection: Connection) -> Callable[[bytes], Any]:
-    """Return the decoder of a type, by its definition in the bag, else by the standard one."""
-    is_ros1 = isinstance(reader, Rosbag1Reader)
-    types = own_types(connection) or get_typestore(
-        Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-    decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-    return partial(decode, typename=connection.msgtype)
 
 
 def open_bag(*paths: str | Path) -> Bag:

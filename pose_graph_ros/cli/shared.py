@@ -32,7 +32,7 @@ def parameter_values(
     options: argparse.Namespace, usual: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
-    given = {**usual, **({} if options.params_file is None else _read_file(options.params_file))}
+    given = {**usual, **_read_file(options.params_file)}
     for text in options.param:
         name, separator, value = text.partition(':=')
         if separator == '':
@@ -54,8 +54,10 @@ def ros_arguments(options: argparse.Namespace) -> list[str]:
     return arguments
 
 
-def _read_file(path: Path) -> dict[str, Any]:
-    """Return the parameters for the node in a ROS 2 parameter file."""
+def _read_file(path: Path | None) -> dict[str, Any]:
+    """Return the parameters for the node in a ROS 2 parameter file, if there is one."""
+    if path is None:
+        return {}
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

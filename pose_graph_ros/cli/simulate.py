@@ -29,7 +29,7 @@ from pose_graph_ros.core.io.g2o import g2o_text
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.quantities import Metres, StampsNs
 from pose_graph_ros.offline.simulation import recording, settings
-from pose_graph_ros.offline.simulation.recording import Course, Recording, SimulatedGraph
+from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.sensors import velocities
 from pose_graph_ros.offline.simulation.worlds import PERIOD_S, WORLDS
 
@@ -73,7 +73,18 @@ def execute(options: argparse.Namespace) -> int:
     if is_graph:
         simulated = recording.graph_of(
             way, options.node_distance or settings.NODE_DISTANCES[options.world])
-        about |= _about_graph(way, simulated)
+        n, loops, observed = len(simulated.truth), simulated.loops, simulated.observed
+        about |= {
+            'distance_m': float(way.motion.distance[-1]), 'nodes': n,
+            'edges': n - 1 + len(loops), 'observed_nodes': len(observed),
+            # the degrees of freedom of chi2 at the truth
+            'measured_numbers': 3 * len(simulated.edges) + int(np.sum(
+                np.diagonal(observed.information, 0, 1, 2) > 0.0)),
+            'chi2_of_the_truth': simulated.graph(simulated.truth.poses).energies().chi2,
+            **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
+                (loops.i, loops.j))),
+            'wrong_observed_nodes': observed.i[simulated.wrong].tolist(),
+            **_disturbances(way.setup)}
         for path, poses in ((options.out, simulated.start),
                             (beside['g2o'], simulated.truth.poses)):
             files[path] = g2o_text(simulated.graph(poses).rows()).encode()
@@ -192,22 +203,6 @@ def _delivered(
         if left[k] == 0:
             del kept[k]
         yield topic, type_name, recorded, message
-
-
-def _about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
-    """Return what there is to say of a graph."""
-    n, loops, observed = len(simulated.truth), simulated.loops, simulated.observed
-    measured = np.diagonal(observed.information, 0, 1, 2) > 0.0
-    return {
-        'distance_m': float(way.motion.distance[-1]), 'nodes': n,
-        'edges': n - 1 + len(loops), 'observed_nodes': len(observed),
-        # the degrees of freedom of chi2 at the truth
-        'measured_numbers': 3 * len(simulated.edges) + int(np.sum(measured)),
-        'chi2_of_the_truth': simulated.graph(simulated.truth.poses).energies().chi2,
-        **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
-            (loops.i, loops.j))),
-        'wrong_observed_nodes': observed.i[simulated.wrong].tolist(),
-        **_disturbances(way.setup)}
 
 
 def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:

@@ -22,7 +22,7 @@ graph has as a bias keep their covariances, and what their residuals at the esti
 such errors are taken for independent, nothing is known of the others either.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -35,7 +35,6 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray,
 from pose_graph_ros.core.graph.error_functions import errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
 from pose_graph_ros.offline import source_residuals
@@ -264,10 +263,18 @@ def _together(
     place = np.full(graph.n_factors, -1)
     place[data.rows] = np.arange(len(data.rows))
     own, shares = claimed.copy(), {source: np.zeros_like(claimed) for source in sources}
-    for source, row, motion in _motions(graph, nodes, parts.judge.closures()):
+    # what odometry adds to loop closures
+    ids, stamps_ns = parts.judge.closures()
+    for k, mean, (stamp, other) in zip(place[graph.factor_rows(ids)].tolist(), graph.factors_at(
+            ids).mean, stamps_ns.tolist(), strict=True):
+        reference, attachment = attach(nodes, other), attach(nodes, stamp)
+        if isinstance(reference, Answer) or isinstance(attachment, Answer):
+            continue
+        source = nodes.primary_at(stamp)
+        pose = se2.compose(se2.compose(se2.inverse(reference.motion), mean), attachment.motion)
+        motion = closure_covariance(np.zeros((3, 3)), pose, reference, attachment)
         # of a graph that was loaded, less is known of what odometry has added
-        if (k := place[row]) >= 0 and source in shares and (
-                np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0):
+        if k >= 0 and source in shares and np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0:
             shares[source][k], own[k] = motion, claimed[k] - motion
     fixed = claimed / data.weight[:, None, None]
     rows = {source: place[graph.factor_rows(each.ids)][each.used]
@@ -285,25 +292,6 @@ def _together(
         {kind: k for k, (name, kind) in enumerate(components) if name == source},
         in_use=nodes.errors.mean_sigma if source == nodes.primary else 1.0)
         for source, at in rows.items() if len(at) > 0}
-
-
-def _motions(
-    graph: Graph, nodes: HiddenNodes, closures: tuple[IntArray, IntArray],
-) -> Iterator[tuple[str, int, FloatArray]]:
-    """
-    Yield source, row of the edge, and covariance of what odometry adds to loop closures.
-
-    These are given by the ids of their edges, and stamps of each and of its other end [ns].
-    """
-    ids, stamps_ns = closures
-    for row, mean, (stamp, other) in zip(graph.factor_rows(ids).tolist(), graph.factors_at(
-            ids).mean, stamps_ns.tolist(), strict=True):
-        reference, attachment = attach(nodes, other), attach(nodes, stamp)
-        if isinstance(reference, Answer) or isinstance(attachment, Answer):
-            continue
-        pose = se2.compose(se2.compose(se2.inverse(reference.motion), mean), attachment.motion)
-        yield nodes.primary_at(stamp), row, closure_covariance(
-            np.zeros((3, 3)), pose, reference, attachment)
 
 
 def _with_factors(

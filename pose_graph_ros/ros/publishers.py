@@ -36,15 +36,14 @@ from pose_graph_ros.adapters.sources import JUDGE, source_list
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.estimate import Estimate, predict, Prediction
+from pose_graph_ros.core.estimate import Estimate, predict
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
-from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.quantities import Metres, NANOSECONDS, Seconds, StampNs
+from pose_graph_ros.core.quantities import NANOSECONDS, Seconds, StampNs
 from pose_graph_ros.ros import transforms
 from pose_graph_ros.ros.transforms import Slew, TFMessage, TransformPublisher
 from pose_graph_ros.ros.worker import Worker
@@ -160,23 +159,19 @@ class Publishers:
             self._pose.publish(output_cdr.stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before the first measurement in the map, its place on the Earth is unknown
         if self._fix in wanted and plane is not None and not is_local:
-            self._fix.publish(self._fix_at(stamp, prediction, plane, datum.altitude))
-
-    def _fix_at(
-        self, stamp_ns: StampNs, prediction: Prediction, plane: TangentPlane, altitude: Metres,
-    ) -> NavSatFix:
-        """Return the robot's position on the Earth, its covariance in east and north."""
-        latitude, longitude, _ = plane.to_geodetic(
-            prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
-        covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
-        turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
-        covariance[:2, :2] = 0.5 * (turned + turned.T)
-        return NavSatFix(
-            header=_header(stamp_ns, self.base_frame),
-            status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
-            longitude=float(longitude), altitude=float(altitude),
-            position_covariance=covariance.ravel(),
-            position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
+            altitude = datum.altitude
+            latitude, longitude, _ = plane.to_geodetic(
+                prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
+            # in east and north
+            covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
+            turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+            covariance[:2, :2] = 0.5 * (turned + turned.T)
+            self._fix.publish(NavSatFix(
+                header=_header(stamp, self.base_frame),
+                status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
+                longitude=float(longitude), altitude=float(altitude),
+                position_covariance=covariance.ravel(),
+                position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN))
 
     def _holds(self, estimate: Estimate) -> bool:
         """Tell whether nothing is to be published of an estimate, as it is not in the map yet."""

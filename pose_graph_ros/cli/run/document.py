@@ -25,7 +25,6 @@ from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.io.path_files import write_tum
 from pose_graph_ros.core.judgement import texts
 from pose_graph_ros.core.judgement.texts import Key, sentence, short
@@ -77,6 +76,8 @@ def document(run: Run) -> dict[str, Any]:
     analyses = analyse(run, analysis)
     lines, at_ns = _lines(drive, frame)
     start, updates = np.datetime64(run.start_ns, 'ns'), None
+    whole, factor = (of(run.backend.graph) for of in (patterns.hessian, patterns.factor))
+    upper = (whole.nonzeros + whole.size) // 2
     if len(run.recorder.updates) > 0:
         stamps, nodes, milliseconds, chi2 = zip(*thinned(run.recorder.updates), strict=True)
         updates = {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
@@ -99,7 +100,12 @@ def document(run: Run) -> dict[str, Any]:
             'median', 'rms', 'p95', 'maximum')} for row in drive.rows],
         'sources': [source_entry(each, frame) for each in analyses.values()],
         'springs': springs(run, analysis.residuals, frame),
-        'updates': updates, 'sparsity': _sparsity(run.backend.graph), 'texts': list(frame.texts)}
+        'updates': updates, 'sparsity': [
+            {'title': title, 'size': each.size, 'nonzeros': each.nonzeros, 'fill': max(fill, 0),
+             'bins': each.bins, 'cells': each.cells.tolist()} for title, each, fill in (
+                 ('H, poses in the order of time, then biases', whole, 0),
+                 ('R, in the order of elimination', factor, factor.nonzeros - upper))],
+        'texts': list(frame.texts)}
 
 
 def _facts(run: Run) -> list[dict[str, str]]:
@@ -136,16 +142,6 @@ def _facts(run: Run) -> list[dict[str, str]]:
     if longest is not None:
         facts.append(('longest update', f'{longest:.1f} ms', f'of {run.recorder.n_updates}'))
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
-
-
-def _sparsity(graph: Graph) -> list[dict[str, Any]]:
-    """Return the patterns of H and of its factor."""
-    whole, factor = patterns.hessian(graph), patterns.factor(graph)
-    upper = (whole.nonzeros + whole.size) // 2
-    return [{'title': title, 'size': each.size, 'nonzeros': each.nonzeros, 'fill': max(fill, 0),
-             'bins': each.bins, 'cells': each.cells.tolist()} for title, each, fill in (
-                 ('H, poses in the order of time, then biases', whole, 0),
-                 ('R, in the order of elimination', factor, factor.nonzeros - upper))]
 
 
 def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]:

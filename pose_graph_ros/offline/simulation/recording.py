@@ -139,7 +139,13 @@ def record(way: Course) -> Recording:
         return poses
 
     poses = absolute(way, POSES, Trajectory(truth.stamps_ns, to_map(truth.poses)))
-    closures, missing = _closures(way)
+    none, missing = np.empty(0, dtype=np.int64), 0
+    closures = Measured(none.reshape(0, 2), np.empty((0, 3)), none)
+    if setup.closures is not None:
+        ends, measured = _true_closures(streams['closures'], way.motion, setup.closures)
+        found = streams['rate'].random(len(ends)) < setup.closures.rate
+        closures, missing = sensors.with_false(
+            streams['false'], way.motion, setup.closures, ends[found], measured[found])
     every = {
         ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
         settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
@@ -174,18 +180,6 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
         stamps, values = np.empty(0, dtype=np.int64), np.empty((0, 2 if topic == FIXES else 3))
     return sensors.moved(streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
                          setup.jumps_of(topic))
-
-
-def _closures(way: Course) -> tuple[Measured, int]:
-    """Return closures, and how many groups of false ones are missing."""
-    closures = way.setup.closures
-    if closures is None:
-        none = np.empty(0, dtype=np.int64)
-        return Measured(none.reshape(0, 2), np.empty((0, 3)), none), 0
-    ends, poses = _true_closures(way.streams['closures'], way.motion, closures)
-    found = way.streams['rate'].random(len(ends)) < closures.rate
-    return sensors.with_false(
-        way.streams['false'], way.motion, closures, ends[found], poses[found])
 
 
 def _true_closures(
