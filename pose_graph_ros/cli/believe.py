@@ -30,7 +30,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.special import gammainc, gammaincc
 
 from pose_graph_ros.cli.arguments import METHODS
-from pose_graph_ros.cli.solve_starts import Problem
+from pose_graph_ros.cli.solve import Problem
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import optimize, SAME_MINIMUM, Status, to_the_end
 from pose_graph_ros.core.batch.truncated import Choosing, CONFIG, Surrogate, TruncatedProblem
