@@ -108,6 +108,7 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
     wheels.add_argument('--odometry', dest='wheels.errors',
                         choices=[each.value for each in OdometryErrors],
+                        type=lambda text: next((e for e in OdometryErrors if e == text), text),
                         help='errors of two wheels, or a random walk as the node assumes it '
                              '(default: wheels; a graph always has the latter)')
     wheels.add_argument('--wheel-scale', dest='wheels.scale', metavar='LEFT,RIGHT',
