@@ -1,10 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Choose the topics of a bag that feed the sources, and read them, for player and replay alike.
-
-Planar poses can be read of any topic of odometry, poses, or poses with covariance.
-"""
+"""Choose the topics of a bag that feed the sources, and read them, for player and replay alike."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -14,19 +10,14 @@ import re
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import (
     CLOSURES,
-    GLOBAL_POSE,
     Kind,
     KNOWN_SOURCES,
     MessageReader,
     ODOMETRY,
     Source,
 )
-from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.measurements import Answer
-from pose_graph_ros.core.quantities import StampNs
 
 logger = logging.getLogger(__name__)
 
@@ -186,22 +177,3 @@ def reader_of(bag: Bag, values: Mapping[str, Any]) -> MessageReader:
     for message in read_static_frames(bag):
         reader.frames.receive(message.decode())
     return reader
-
-
-POSE = 'geometry_msgs/msg/PoseStamped'
-POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)
-
-
-def poses_on(bag: Bag, topic: str, span: Span) -> Iterator[tuple[StampNs, FloatArray]]:
-    """
-    Yield stamps and valid poses, (3,), of a topic with one of `POSE_TYPES`.
-
-    Invalid messages are ignored.
-    """
-    bare = bag.topics[topic].type == POSE
-    for bag_message in bag.messages([topic], span):
-        with suppress(MessageError):
-            message = bag_message.decode()
-            pose = planar_pose(message.pose if bare else message.pose.pose)
-            if not isinstance(pose, Answer):
-                yield stamp_ns(message), pose

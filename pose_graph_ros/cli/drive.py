@@ -12,6 +12,7 @@ its map may begin elsewhere, as where only a part of a recording is replayed.
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,9 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.sources import MessageReader
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
+from pose_graph_ros.adapters.sources import GLOBAL_POSE, MessageReader, ODOMETRY
 from pose_graph_ros.core import measurements as kinds
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
@@ -34,6 +36,8 @@ from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometryS
 from pose_graph_ros.core.quantities import StampNs
 
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
+POSE = 'geometry_msgs/msg/PoseStamped'
+POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
 STATES = (State.BELIEVED.value, State.WEAKLY_BELIEVED.value, State.WAITING.value,
           State.DOUBTED.value, 'refused', 'held out')
 BELIEVED, WEAKLY_BELIEVED, WAITING, DOUBTED, REFUSED, HELD_OUT = range(len(STATES))
@@ -363,6 +367,10 @@ def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
     poses = Samples()
-    for stamp, pose in poses_on(bag, topic, span):
-        poses.add(stamp, pose)
+    for bag_message in bag.messages([topic], span):
+        with suppress(MessageError):
+            message = bag_message.decode()
+            pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
+            if not isinstance(pose, Answer):
+                poses.add(stamp_ns(message), pose)
     return poses.path()
