@@ -124,27 +124,6 @@ def constraints(graph: Graph) -> Constraints:
         factors.weight, jacobian[:, free], priors[free][:, free], used)
 
 
-class _Projection:
-    """P for certain covariances of the constraints."""
-
-    def __init__(self, data: Constraints, covariances: FloatArray) -> None:
-        self._weights = inverse(covariances, data.measured)
-        self._data = data
-        n = len(covariances)
-        blocks = bsr_array((self._weights, np.arange(n), np.arange(n + 1)))
-        self._weighted = (blocks @ data.jacobian).tocsr()
-        hessian = data.jacobian.T @ self._weighted + data.prior
-        self._solver = splu(hessian.tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
-                            options={'SymmetricMode': True})
-
-    def __call__(self, values: FloatArray, right: FloatArray | None = None) -> FloatArray:
-        """Return P v of C vectors, (M, 3, C), with what is added to the step's right-hand side."""
-        flat = values.reshape(-1, values.shape[2])
-        step = self._weighted.T @ flat
-        step = self._solver.solve(step if right is None else step + right[:, None])
-        return np.asarray(self._weights @ values - (self._weighted @ step).reshape(values.shape))
-
-
 def restricted_likelihood(
     data: Constraints, components: FloatArray, fixed: FloatArray,
 ) -> Found | None:
@@ -194,7 +173,18 @@ def _statistics(
     signs: FloatArray, *, right: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return tr(P V_k), the information on the logarithms of sigmas, and squared residuals."""
-    project, n = _Projection(data, total), len(roots)
+    n, weights, ends = len(roots), inverse(total, data.measured), np.arange(len(total) + 1)
+    weighted = (bsr_array((weights, ends[:-1], ends)) @ data.jacobian).tocsr()
+    hessian = data.jacobian.T @ weighted + data.prior
+    solver = splu(hessian.tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                  options={'SymmetricMode': True})
+
+    def project(values: FloatArray, right: FloatArray | None = None) -> FloatArray:
+        """Return P v of C vectors, (M, 3, C), with what is added to the step's right-hand side."""
+        step = weighted.T @ values.reshape(-1, values.shape[2])
+        step = solver.solve(step if right is None else step + right[:, None])
+        return np.asarray(weights @ values - (weighted @ step).reshape(values.shape))
+
     residuals = project(data.errors[:, :, None], right)[:, :, 0]
     traces, squares, products = np.zeros(n), np.zeros(n), np.zeros((n, n))
     there = [np.flatnonzero(np.any(each != 0.0, axis=(1, 2))) for each in roots]
