@@ -47,11 +47,17 @@ CORE = {
 CORE['core.io'] = set(CORE)
 # What only tools use, and the packages of `core` that each may import.
 OFFLINE = {
-    'offline.certificate': {'core.batch', 'core.geometry', 'core.graph', 'core.sparse'},
-    'offline.drawing': {'core.geometry', 'core.graph', 'core.elimination'},
-    'offline.residuals': {
+    'offline.chordal_objective': {'core.batch', 'core.geometry', 'core.graph', 'core.sparse'},
+    'offline.certify': {'core.geometry', 'core.sparse', 'offline.chordal_objective'},
+    'offline.graph_views': {'core.geometry', 'core.graph'},
+    'offline.pattern': {
+        'core.geometry', 'core.graph', 'core.elimination', 'offline.graph_views'},
+    'offline.source_residuals': {
         'core.geometry', 'core.graph', 'core.odometry', 'core.smoother', 'core.sources',
-        'core.disagreement', 'core.parts'},
+        'core.disagreement'},
+    'offline.variance_components': {
+        'core.geometry', 'core.graph', 'core.odometry', 'core.sources', 'core.parts',
+        'offline.source_residuals'},
     'offline.simulation': {'core.geometry', 'core.graph'},
     'offline.noise': {
         'core.batch', 'core.belief', 'core.geometry', 'core.sources', 'core.parts'},

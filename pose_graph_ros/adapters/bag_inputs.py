@@ -1,10 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Choose the topics of a bag that feed the sources, and read them, for player and replay alike.
-
-Planar poses can be read of any topic of odometry, poses, or poses with covariance.
-"""
+"""Choose the topics of a bag that feed the sources, and read them, for player and replay alike."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -14,17 +10,14 @@ import re
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import (
     CLOSURES,
-    GLOBAL_POSE,
     Kind,
     KNOWN_SOURCES,
     MessageReader,
     ODOMETRY,
     Source,
 )
-from pose_graph_ros.core.geometry.se2 import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -98,12 +91,20 @@ def choose_inputs(
             chosen[name] = topic
         elif name not in chosen:
             logger.warning('%s: no topic %s for %s', reader.path, topic, name)
-    topics = {name: _checked(reader, name, kinds[name], topic) for name, topic in chosen.items()}
+    topics = dict(chosen)
+    for name, topic in chosen.items():
+        option, wanted_type = (
+            f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'), kinds[name].message_type
+        info = reader.topics.get(topic)
+        if info is None:
+            raise BagError(
+                f'{reader.path}: no topic {topic} ({option}); the bag has {reader.describe()}')
+        if info.type != wanted_type:
+            raise BagError(f'{reader.path}: {option} {topic} is of type {info.type}, '
+                           f'expected {wanted_type}')
     for name in ('odom', 'fix', CLOSURES, 'global_pose', 'imu', 'gyro'):
-        if name in topics or name not in kinds or name in named:
-            continue
-        guess = _guess(reader, name, kinds, topics, asked=asked, truth=truth)
-        if guess is not None:
+        if name not in topics and name in kinds and name not in named and (guess := _guess(
+                reader, name, kinds, topics, asked=asked, truth=truth)) is not None:
             topics[name] = guess
     ordered = {name: topics[name] for name in kinds if name in topics}
     inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out, span)
@@ -116,19 +117,6 @@ def choose_inputs(
 
 def _option(name: str) -> str:
     return name.replace('_', '-')
-
-
-def _checked(reader: Bag, name: str, kind: Kind, topic: str) -> str:
-    """Return a topic that was asked for, if the bag has it and it is of the type of the source."""
-    option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
-    info = reader.topics.get(topic)
-    if info is None:
-        raise BagError(
-            f'{reader.path}: no topic {topic} ({option}); the bag has {reader.describe()}')
-    if info.type != kind.message_type:
-        raise BagError(f'{reader.path}: {option} {topic} is of type {info.type}, '
-                       f'expected {kind.message_type}')
-    return topic
 
 
 def _guess(
@@ -189,25 +177,3 @@ def reader_of(bag: Bag, values: Mapping[str, Any]) -> MessageReader:
     for message in read_static_frames(bag):
         reader.frames.receive(message.decode())
     return reader
-
-
-POSE = 'geometry_msgs/msg/PoseStamped'
-POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)
-
-
-class BagPose(NamedTuple):
-    """A planar pose of a message."""
-
-    stamp_ns: int
-    pose: FloatArray  # shape (3,) [m, m, rad]
-
-
-def poses_on(bag: Bag, topic: str, span: Span = WHOLE) -> Iterator[BagPose]:
-    """Yield the valid poses on a topic with one of `POSE_TYPES`; invalid messages are ignored."""
-    bare = bag.topics[topic].type == POSE
-    for bag_message in bag.messages([topic], span):
-        with suppress(MessageError):
-            message = bag_message.decode()
-            pose = planar_pose(message.pose if bare else message.pose.pose)
-            if pose is not None:
-                yield BagPose(stamp_ns(message), pose)

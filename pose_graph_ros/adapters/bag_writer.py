@@ -9,34 +9,21 @@ import shutil
 import tempfile
 from typing import Any, Final, Self
 
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag1,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces
+from rosbags.interfaces import Connection, ConnectionExtRosbag1, Qos, QosDurability
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-from pose_graph_ros.adapters.bags import (
-    BAG_FILE_SUFFIXES,
-    BagError,
-    BagMessage,
-    MessageError,
-    one_line,
-    own_types,
-)
+from pose_graph_ros.adapters import bags
+from pose_graph_ros.adapters.bags import BagError, BagMessage, MessageError
 from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
 HEADER = 'std_msgs/msg/Header'
-FOREVER = QosTime(9223372036, 854775807)  # the "infinite" duration of rmw, 2^63 - 1 ns
+# the "infinite" duration of rmw, 2^63 - 1 ns
+FOREVER = interfaces.QosTime(9223372036, 854775807)
 Convert = Callable[[bytes], bytes | memoryview]
 """From a message of ROS 1 to CDR."""
 
@@ -57,8 +44,14 @@ class BagWriter:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not overwrite:
             raise BagError(f'{folder}: exists already, not overwritten')
-        if self.folder.exists() and not _is_nothing_but_a_bag(self.folder):
-            raise BagError(f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
+        if self.folder.exists():
+            metadata, suffixes = self.folder / 'metadata.yaml', (*bags.BAG_FILE_SUFFIXES, '.zstd')
+            if not metadata.is_file() or (
+                    b'rosbag2_bagfile_information' not in metadata.read_bytes()) or not all(
+                        each == metadata or (each.is_file() and each.suffix in suffixes)
+                        for each in self.folder.iterdir()):
+                raise BagError(
+                    f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
         self._latched = {STATIC_TRANSFORMS, *latched}
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[tuple[str, str], Connection] = {}
@@ -70,7 +63,7 @@ class BagWriter:
             self._scratch = Path(tempfile.mkdtemp(
                 prefix=f'.{self.folder.name}-', dir=self.folder.parent))
         except OSError as error:
-            raise BagError(f'{folder}: cannot be written: {one_line(error)}') from error
+            raise BagError(f'{folder}: cannot be written: {bags.one_line(error)}') from error
         self._writer = Writer(
             self._scratch / self.folder.name, version=BAG_VERSION,
             storage_plugin=StoragePlugin.MCAP)
@@ -104,7 +97,7 @@ class BagWriter:
                 message = self._types.serialize_cdr(message, type_name)
             except Exception as error:  # generated code on a foreign object
                 raise BagError(
-                    f'{self.folder}: {topic}: no valid {type_name}: {one_line(error)}',
+                    f'{self.folder}: {topic}: no valid {type_name}: {bags.one_line(error)}',
                 ) from error
         self._writer.write(self._connections[key], recorded_ns, message)
 
@@ -124,14 +117,14 @@ class BagWriter:
             except Exception as error:  # generated code can raise anything on invalid bytes
                 raise MessageError(
                     f'{message.topic}: message recorded at {message.recorded_ns} ns is no '
-                    f'{message.type}: {one_line(error)}') from error
+                    f'{message.type}: {bags.one_line(error)}') from error
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
                 self._connect(key, types, _qos(
                     latched=message.topic in self._latched or bool(source.ext.latching)))
             else:
-                self._connect(key, own_types(source) or self._types,
+                self._connect(key, bags.own_types(source) or self._types,
                               *source.ext.offered_qos_profiles, digest=source.digest)
         self._writer.write(self._connections[key], message.recorded_ns, data)
 
@@ -149,8 +142,9 @@ def _qos(*, latched: bool) -> Qos:
     depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
                          else (10, QosDurability.VOLATILE))
     return Qos(
-        QosHistory.KEEP_LAST, depth, QosReliability.RELIABLE, durability, FOREVER, FOREVER,
-        QosLiveliness.AUTOMATIC, FOREVER, avoid_ros_namespace_conventions=False)
+        interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE, durability,
+        FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
+        avoid_ros_namespace_conventions=False)
 
 
 def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Convert]:
@@ -161,7 +155,7 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
     """
     from rosbags.convert import converter  # noqa: PLC0415  (needed for few bags)
 
-    own = own_types(source) or get_typestore(Stores.ROS1_NOETIC)
+    own = bags.own_types(source) or get_typestore(Stores.ROS1_NOETIC)
     name, types = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype), jazzy
     if name not in jazzy.fielddefs:
         types = get_typestore(Stores.EMPTY)
@@ -175,12 +169,3 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
 def message_types() -> dict[str, Any]:
     """Return the classes of the ROS 2 Jazzy messages by name of the type."""
     return dict(get_typestore(Stores.ROS2_JAZZY).types)
-
-
-def _is_nothing_but_a_bag(folder: Path) -> bool:
-    """Tell whether a folder holds the metadata and files of a rosbag2, and no other files."""
-    metadata = folder / 'metadata.yaml'
-    if not metadata.is_file() or b'rosbag2_bagfile_information' not in metadata.read_bytes():
-        return False
-    suffixes = (*BAG_FILE_SUFFIXES, '.zstd')
-    return all(p == metadata or (p.is_file() and p.suffix in suffixes) for p in folder.iterdir())

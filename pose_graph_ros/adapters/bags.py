@@ -12,7 +12,6 @@ short or damaged is read as far as it goes, with a warning (`damaged_bags`).
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-import copy
 from dataclasses import dataclass, field
 from functools import partial
 import glob
@@ -110,7 +109,7 @@ class Bag:
             self._stack = stack.pop_all()
         self._parts = sorted(parts, key=lambda part: part[1].start_time)
         self._decoders: dict[tuple[Path, str], Callable[[bytes], Any]] = {}
-        self.watch: Watch = lambda messages, _: messages
+        self.watch: Watch = lambda messages, _: messages    # all messages pass it
         self.path = ', '.join(str(path) for path, _ in self._parts)
         connections = sorted((c for _, reader in parts for c in reader.connections), key=_absolute)
         self.topics = {}
@@ -145,12 +144,6 @@ class Bag:
             heapq.merge(*parts, key=lambda message: message.recorded_ns),
             round(share * sum(self.topics[topic].count for topic in topics))))
 
-    def watched(self, watch: Watch) -> Self:
-        """Return the same bag, whose messages pass what is told about how many they are."""
-        seen = copy.copy(self)
-        seen.watch = watch
-        return seen
-
     def describe(self) -> str:
         """Return the topics with their types on one line, for error messages."""
         return ', '.join(
@@ -167,10 +160,18 @@ class Bag:
         last_ns: int | None = None
         try:
             for connection, recorded_ns, raw in reader.messages(connections, *span):
-                topic, last_ns = _absolute(connection), recorded_ns
+                topic, last_ns, kind = _absolute(connection), recorded_ns, connection.msgtype
                 seen[topic] += 1
-                yield BagMessage(topic, connection.msgtype, recorded_ns, bytes(raw), connection,
-                                 self._decoder(path, reader, connection))
+                if (path, kind) not in self._decoders:
+                    # by the definition in the bag, else by the standard one
+                    is_ros1 = isinstance(reader, Rosbag1Reader)
+                    types = own_types(connection) or get_typestore(
+                        Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+                    self._decoders[path, kind] = partial(
+                        types.deserialize_ros1 if is_ros1 else types.deserialize_cdr,
+                        typename=kind)
+                yield BagMessage(topic, kind, recorded_ns, bytes(raw), connection,
+                                 self._decoders[path, kind])
         except Exception as error:  # the parsers can raise anything on a damaged file
             text = f'damaged after {seen.total()} messages: {one_line(error)}'
             with ExitStack() as stack:
@@ -189,31 +190,14 @@ class Bag:
                     logger.warning('%s: %s should have %d messages, %d were found',
                                    path, topic, count, seen[topic])
 
-    def _decoder(
-        self, path: Path, reader: Reader, connection: Connection,
-    ) -> Callable[[bytes], Any]:
-        """Return the decoder of a type, by its definition in the bag, else by the standard one."""
-        key = path, connection.msgtype
-        if key not in self._decoders:
-            is_ros1 = isinstance(reader, Rosbag1Reader)
-            types = own_types(connection) or get_typestore(
-                Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-            decode = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-            self._decoders[key] = partial(decode, typename=connection.msgtype)
-        return self._decoders[key]
 
-
-def open_bag(path: str | Path) -> Bag:
+def open_bag(*paths: str | Path) -> Bag:
     """
     Open a rosbag2 folder (sqlite3 or mcap, also compressed), an .mcap, a .db3 or a .bag file.
 
-    Raises `BagError` for a path that is no bag, or a bag that is damaged or not supported.
+    Several follow each other, in any order. Raises `BagError` for a path that is no bag, or a bag
+    that is damaged or not supported.
     """
-    return open_bags([path])
-
-
-def open_bags(paths: Sequence[str | Path]) -> Bag:
-    """Open bags that follow each other, in any order; raises `BagError` as `open_bag` does."""
     return Bag([Path(path) for path in paths])
 
 

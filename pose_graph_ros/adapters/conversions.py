@@ -58,12 +58,14 @@ def yaw_of(q: Message) -> float | None:
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
 
 
-def planar_pose(pose: Message) -> FloatArray | None:
-    """Return (x, y, yaw) of a Pose, shape (3,); None if it is not finite or has no rotation."""
-    position, yaw = pose.position, yaw_of(pose.orientation)
-    if yaw is None or not (math.isfinite(position.x) and math.isfinite(position.y)):
-        return None
-    return np.array((position.x, position.y, wrap_one(yaw)))
+def planar_pose(pose: Message) -> FloatArray | Answer:
+    """Return (x, y, yaw) of a Pose, shape (3,), unless it is not finite or has no rotation."""
+    p, q = pose.position, pose.orientation
+    yaw = yaw_of(q)
+    if yaw is None or not (math.isfinite(p.x) and math.isfinite(p.y)):
+        return rejected('not_finite', f'position ({p.x}, {p.y}), quaternion ({q.x}, {q.y}, {q.z}, '
+                                      f'{q.w})')
+    return np.array((p.x, p.y, wrap_one(yaw)))
 
 
 def odometry_sample(
@@ -75,8 +77,8 @@ def odometry_sample(
     The covariance of its pose is accumulated over the drive, so it is not used.
     """
     pose = planar_pose(message.pose.pose)
-    if pose is None:
-        return _bad_pose(message.pose.pose)
+    if isinstance(pose, Answer):
+        return pose
     x, y, _ = pose.tolist()
     if max(abs(x), abs(y)) > LARGEST_COORDINATE:
         return rejected('too_large', f'odometry pose {pose.tolist()}')
@@ -112,9 +114,7 @@ def global_pose(message: Message, source: 'Source', by: Surroundings) -> GlobalP
     return pose_in(message, (by.map_frame,), source.time_offset_ns)
 
 
-def pose_in(
-    message: Message, frames: Sequence[str], offset_ns: int = 0,
-) -> GlobalPose | Answer:
+def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> GlobalPose | Answer:
     """
     Return the pose in a PoseWithCovarianceStamped, or the reason for rejecting it.
 
@@ -125,9 +125,8 @@ def pose_in(
         return rejected('wrong_frame', f'expected frame {" or ".join(map(repr, frames))}, got '
                                        f'{named!r}')
     pose = planar_pose(message.pose.pose)
-    if pose is None:
-        return _bad_pose(message.pose.pose)
-    return GlobalPose(stamp_ns(message, offset_ns), pose, _planar(message.pose.covariance))
+    return pose if isinstance(pose, Answer) else GlobalPose(
+        stamp_ns(message, offset_ns), pose, _planar(message.pose.covariance))
 
 
 def heading(message: Message, source: 'Source', by: Surroundings) -> HeadingOnly | Answer:
@@ -145,9 +144,7 @@ def heading(message: Message, source: 'Source', by: Surroundings) -> HeadingOnly
                        float(message.orientation_covariance[8]))
 
 
-def loop_closure(
-    message: Message, source: 'Source', _by: Surroundings,
-) -> LoopClosure | Answer:
+def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> LoopClosure | Answer:
     """
     Return the loop closure in a PoseWithCovarianceStamped, or the reason for rejecting it.
 
@@ -155,8 +152,8 @@ def loop_closure(
     stamp [s], such as `@1695.250000000`.
     """
     pose = planar_pose(message.pose.pose)
-    if pose is None:
-        return _bad_pose(message.pose.pose)
+    if isinstance(pose, Answer):
+        return pose
     offset_ns = source.time_offset_ns
     named, stamp = message.header.frame_id, stamp_ns(message, offset_ns)
     cov = _planar(message.pose.covariance)
@@ -188,7 +185,7 @@ def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
     stamp = stamp_ns(message, source.time_offset_ns)
     if stamp <= 0:
         return rejected('zero_stamp', 'a fix without a stamp')
-    if by.datum.is_awaited:
+    if by.datum.waits and by.datum.plane is None:
         return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
     cov = np.zeros((2, 2))
     if message.position_covariance_type != 0:
@@ -258,7 +255,12 @@ def twist_odometry(
             return rejected('wrong_frame', (
                 f'expected frame {by.base_frame!r} or one with a transform to it on '
                 f'/tf_static, got {frame(message.header.frame_id)!r}'))
-        twist = _at_base(twist, *found)
+        # from that of the sensor at its place in the robot's frame
+        (x, y, rate), (rotation, place) = twist, found
+        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+        c, s = math.cos(yaw), math.sin(yaw)
+        twist = (c * x - s * y + rate * float(place[1]),
+                 s * x + c * y - rate * float(place[0]), rate)
     stamp = stamp_ns(message, source.time_offset_ns)
     whole = by.twists.get(source.name, IntegratedTwist()).then(stamp, twist)
     by.twists[source.name] = whole
@@ -266,19 +268,5 @@ def twist_odometry(
                           twist_variance(message.twist.covariance), twist)
 
 
-def _at_base(twist: Pose, rotation: FloatArray, place: FloatArray) -> Pose:
-    """Return the twist of the robot from that of a sensor at a place in its frame."""
-    x, y, rate = twist
-    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
-    c, s = math.cos(yaw), math.sin(yaw)
-    return (c * x - s * y + rate * float(place[1]), s * x + c * y - rate * float(place[0]), rate)
-
-
 def _planar(covariance_6x6: Message) -> FloatArray:
     return np.asarray(covariance_6x6, dtype=float).reshape(6, 6)[PLANAR]
-
-
-def _bad_pose(pose: Message) -> Answer:
-    p, q = pose.position, pose.orientation
-    return rejected('not_finite', f'position ({p.x}, {p.y}), quaternion ({q.x}, {q.y}, {q.z}, '
-                                  f'{q.w})')

@@ -136,7 +136,14 @@ class _Sqlite:
         for end in ('', '-wal', '-journal'):
             with suppress(FileNotFoundError):
                 shutil.copyfile(path.with_name(path.name + end), copy.with_name(copy.name + end))
-        _pad(copy)
+        # make a file that was cut short as long as its head says, else SQLite does not open it
+        with copy.open('r+b') as file:
+            head = file.read(32)
+            page = int.from_bytes(head[16:18], 'big')
+            length = int.from_bytes(head[28:32], 'big') * (65536 if page == 1 else page)
+            size = copy.stat().st_size
+            if size < length <= 1000 * max(size, 1):    # else the head is wrong
+                file.truncate(length)   # the rest takes no room on the disk
         self._database = sqlite3.connect(copy)
         self._database.text_factory = lambda text: text.decode(errors='replace')
 
@@ -147,7 +154,17 @@ class _Sqlite:
 
     def messages(self) -> Iterator[_Message]:
         """Yield all messages; where rows cannot be read, the next ones are looked for."""
-        topics = self._topics()
+        definitions, topics = dict[str, str](), dict[int, Connection]()
+        with suppress(sqlite3.Error):   # older ones have none
+            definitions = dict(self._database.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions'))
+        for number, name, of_type, form, profiles in self._database.execute(
+                'SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics'):
+            qualities: list[Qos] = []
+            with suppress(Exception):   # the parser can raise anything
+                qualities = metadata.parse_qos(profiles)
+            topics[number] = self._connect(
+                name, of_type, form, definitions.get(of_type, ''), qualities)
         last, step = 0, 1
         while step < 2**40:
             try:
@@ -170,31 +187,6 @@ class _Sqlite:
                 self.n_damaged += step == 1
                 last, step = last + step, 2 * step
         self.complete = self.n_damaged == 0
-
-    def _topics(self) -> dict[int, Connection]:
-        definitions, found = dict[str, str](), dict[int, Connection]()
-        with suppress(sqlite3.Error):   # older ones have none
-            definitions = dict(self._database.execute(
-                'SELECT topic_type, encoded_message_definition FROM message_definitions'))
-        for number, name, of_type, form, profiles in self._database.execute(
-                'SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics'):
-            qualities: list[Qos] = []
-            with suppress(Exception):   # the parser can raise anything
-                qualities = metadata.parse_qos(profiles)
-            found[number] = self._connect(
-                name, of_type, form, definitions.get(of_type, ''), qualities)
-        return found
-
-
-def _pad(path: Path) -> None:
-    """Make a file that was cut short as long as its head says, else SQLite does not open it."""
-    with path.open('r+b') as file:
-        head = file.read(32)
-        page = int.from_bytes(head[16:18], 'big')
-        length = int.from_bytes(head[28:32], 'big') * (65536 if page == 1 else page)
-        size = path.stat().st_size
-        if size < length <= 1000 * max(size, 1):    # else the head is wrong
-            file.truncate(length)   # the rest takes no room on the disk
 
 
 def repair(path: Path, reason: str, copy: Path) -> bool:

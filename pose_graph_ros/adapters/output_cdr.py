@@ -91,9 +91,7 @@ def _position_and_quaternion(pose: FloatArray) -> tuple[float, ...]:
     return x, y, 0.0, 0.0, 0.0, math.sin(theta / 2.0), math.cos(theta / 2.0)
 
 
-def transform_cdr(
-    stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str,
-) -> bytes:
+def transform_cdr(stamp_ns: int, T_map_odom: FloatArray, map_frame: str, odom_frame: str) -> bytes:
     """Return a serialised tf2_msgs/TFMessage with the transform from map to odom."""
     return _head(stamp_ns, map_frame, odom_frame, count=_LENGTH.pack(1)) + _POSE.pack(
         *_position_and_quaternion(T_map_odom))
@@ -137,21 +135,17 @@ class CdrStream:
     """A stream of CDR: the position of each number is a multiple of its size."""
 
     def __init__(self) -> None:
-        self._data = bytearray()
+        self.data = bytearray()
 
     def add(self, code: str, *numbers: npt.ArrayLike) -> None:
         """Add numbers, or an array, as a type of NumPy."""
         array = np.asarray(numbers, dtype=code)
-        self._data += bytes(-len(self._data) % array.itemsize) + array.tobytes()
+        self.data += bytes(-len(self.data) % array.itemsize) + array.tobytes()
 
     def add_text(self, text: str) -> None:
         """Add a string."""
         name = text.encode() + b'\0'
-        self._data += bytes(-len(self._data) % 4) + _LENGTH.pack(len(name)) + name
-
-    def message(self) -> bytes:
-        """Return the message, with the bytes that tell the encoding in front."""
-        return CDR + bytes(self._data)
+        self.data += bytes(-len(self.data) % 4) + _LENGTH.pack(len(name)) + name
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +202,7 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
         kind, size, points, point_colours = drawn[number]
         _add_marker(
             stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
-    return stream.message()
+    return CDR + bytes(stream.data)
 
 
 def colours(sigmas: FloatArray) -> Colours:
@@ -231,9 +225,7 @@ def _dashed(lines: Lines) -> Lines:
     return Lines(points.reshape(-1, 2, 2), np.repeat(lines.sigmas, LOOK.dashes))
 
 
-def _plain(
-    points: FloatArray, colour: tuple[float, ...],
-) -> tuple[FloatArray, Colours]:
+def _plain(points: FloatArray, colour: tuple[float, ...]) -> tuple[FloatArray, Colours]:
     """Return points, shape (..., 2), as one array, and the same colour for each of them."""
     points = points.reshape(-1, 2)
     return points, np.tile(np.array(colour, dtype=np.float32), (len(points), 1))

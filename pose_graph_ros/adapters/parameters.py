@@ -18,22 +18,10 @@ from typing import Any, cast
 
 import yaml
 
+from pose_graph_ros.adapters import parameter_table as table, sources
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.parameter_table import (
-    Change,
-    DEFAULT_SOURCES,
-    OF_ALL,
-    Parameter,
-    PARAMETERS,
-    Value,
-)
-from pose_graph_ros.adapters.sources import (
-    backend_config,
-    KINDS,
-    KNOWN_SOURCES,
-    source_names,
-    TYPE,
-)
+from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
+from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE
 from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -54,33 +42,32 @@ _TAKEN = {'solver', 'worker', 'received', 'alignment', 'window', 'thinning', 'ou
 
 def type_parameter(source: str) -> Parameter:
     """Return the parameter with the kind of a source, on which its other parameters depend."""
-    return _of_source(TYPE, source)
+    kind = KNOWN_SOURCES[source][0].name if source in KNOWN_SOURCES else ''
+    return replace(TYPE, name=f'{source}.{TYPE.name}', default=kind)
 
 
 def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
     """Return all parameters of a source with their full names, if it has a kind."""
-    checked_value(type_parameter(source), kind)
-    return tuple(_of_source(parameter, source)
-                 for parameter in (TYPE, *OF_ALL, *KINDS[kind].parameters))
-
-
-def _of_source(parameter: Parameter, source: str) -> Parameter:
-    kind, topic = KNOWN_SOURCES.get(source, (None, source))
-    own = {'type': '' if kind is None else kind.name, 'topic': topic}
-    return replace(parameter, name=f'{source}.{parameter.name}',
-                   default=own.get(parameter.name, parameter.default))
+    of_type = type_parameter(source)
+    checked_value(of_type, kind)
+    _, topic = KNOWN_SOURCES.get(source, (None, source))
+    return of_type, *(
+        replace(each, name=f'{source}.{each.name}',
+                default=topic if each.name == 'topic' else each.default)
+        for each in (*OF_ALL, *KINDS[kind].parameters))
 
 
 def listed_sources(given: Mapping[str, Any]) -> list[str]:
     """Return the names of all sources; raises `ConfigError` for equal or bad names."""
-    names = checked_value(PARAMETERS[0], given.get('sources', list(DEFAULT_SOURCES)))
+    names: list[str] = checked_value(
+        PARAMETERS[0], given.get('sources', list(table.DEFAULT_SOURCES)))
     for name in names:
         if _NAME.fullmatch(name) is None or name in _TAKEN:
             raise ConfigError(f'parameter sources: {name!r} cannot be the name of a source; '
                               'expected letters, digits and _, and no reserved name')
     if len(set(names)) < len(names):
         raise ConfigError(f'parameter sources: expected different names, got {list(names)}')
-    return source_names(names)
+    return sources.source_names(names)
 
 
 def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
@@ -198,25 +185,20 @@ def changed(
         if name not in parameters:
             raise unknown(name, parameters)
         parameter = parameters[name]
-        good = checked_value(
-            parameter, [] if value is None and parameter.default == [] else value)
-        if good != new[name]:
-            _require_changeable(parameter, configured=configured)
-            new[name] = good
+        good = checked_value(parameter, [] if value is None and parameter.default == [] else value)
+        if good == new[name]:
+            continue
+        if parameter.change is Change.START:
+            raise ConfigError(f'parameter {name} is read at the start: give it in a parameter '
+                              f'file or by -p {name}:=..., and start the node again')
+        if parameter.change is Change.UNCONFIGURED and configured:
+            raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
+                              'lifecycle set` it to deactivate and cleanup, change it, and '
+                              'configure it again')
+        new[name] = good
     new = checked(new)
     require_together(new)
     return new
-
-
-def _require_changeable(parameter: Parameter, *, configured: bool) -> None:
-    name = parameter.name
-    if parameter.change is Change.START:
-        raise ConfigError(f'parameter {name} is read at the start: give it in a parameter file '
-                          f'or by -p {name}:=..., and start the node again')
-    if parameter.change is Change.UNCONFIGURED and configured:
-        raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
-                          'lifecycle set` it to deactivate and cleanup, change it, and configure '
-                          'it again')
 
 
 def require_together(values: Mapping[str, Any]) -> None:
@@ -229,7 +211,7 @@ def require_together(values: Mapping[str, Any]) -> None:
         raise ConfigError(f'parameters {", ".join(FRAMES)}: expected three different names, got '
                           f'{", ".join(map(repr, frames))}')
     datum_of(values)
-    backend_config(values)
+    sources.backend_config(values)
 
 
 def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
@@ -242,7 +224,10 @@ def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
         except (OSError, ValueError, yaml.YAMLError):
             continue  # what rcl cannot read ends the node
         sections = list(_sections(content))
-        if not any(_matches(section, node) for section in sections):
+        # with wildcards as rcl matches them
+        patterns = [re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(r'/\*', r'/\w+')
+                    for section in sections]
+        if not any(re.fullmatch(pattern, node) for pattern in patterns):
             yield (f'{name} has no effect: it has parameters for '
                    f'{", ".join(sections) or "no node"}, and none for {node}: begin it with '
                    f'{node} or /**')
@@ -256,12 +241,6 @@ def _sections(content: Any, name: str = '') -> Iterator[str]:
                 yield name
             else:
                 yield from _sections(inner, f'{name}/{str(key).strip("/")}')
-
-
-def _matches(section: str, node: str) -> bool:
-    """Match a name with wildcards as rcl does."""
-    pattern = re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(r'/\*', r'/\w+')
-    return re.fullmatch(pattern, node) is not None
 
 
 # --- the tables as text
@@ -291,9 +270,7 @@ def as_yaml() -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _entry(
-    parameter: Parameter, leaf: str, indent: str, commented: set[str],
-) -> Iterator[str]:
+def _entry(parameter: Parameter, leaf: str, indent: str, commented: set[str]) -> Iterator[str]:
     """Return the lines of one parameter; a comment in `commented` is not repeated."""
     facts = '; '.join(fact for fact in (
         parameter.unit, _range(parameter), parameter.change.value) if fact != '')

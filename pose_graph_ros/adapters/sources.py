@@ -123,42 +123,35 @@ class Source:
     # places of beacons in the map by name, as far as they are known [m]
     beacons: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    @property
-    def needs_frame(self) -> bool:
-        """Whether the frame_id of its messages matters, and no parameter stands for it."""
-        return self.mounting == 'tf' and not any(self.lever_arm)
-
 
 def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
     """Return the sources by the checked parameters, odometry in the order of preference."""
-    return tuple(_source(name, _own(values, name)) for name in source_names(values['sources']))
+    found = []
+    for name in source_names(values['sources']):
+        own = _own(values, name)
+        given = _same(own, Source)
+        places: dict[str, tuple[float, float]] = {}
+        for text in given.get('beacons', ()):
+            try:
+                beacon, x, y = text.split()
+                places[beacon] = float(x), float(y)
+                good = all(abs(each) < 1e7 for each in places[beacon])
+            except ValueError:
+                good = False
+            if not good:
+                raise ConfigError(f'parameter {name}.beacons: expected name, x and y, such as '
+                                  f'"anchor_1 12.5 -3.0", got {text!r}')
+        if 'beacons' in given:
+            given['beacons'] = places
+        found.append(Source(name, KINDS[own['type']], time_offset_ns=round(
+            own['time_offset'] * NANOSECONDS), **given))
+    return tuple(found)
 
 
 def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return the parameters of a source by their names without its own."""
     return {name.removeprefix(f'{source}.'): value for name, value in values.items()
             if name.startswith(f'{source}.')}
-
-
-def _source(name: str, own: Mapping[str, Any]) -> Source:
-    given = _same(own, Source)
-    if 'beacons' in given:
-        given['beacons'] = dict(_beacon(name, text) for text in given['beacons'])
-    return Source(name, KINDS[own['type']],
-                  time_offset_ns=round(own['time_offset'] * NANOSECONDS), **given)
-
-
-def _beacon(source: str, text: str) -> tuple[str, tuple[float, float]]:
-    """Return name and place of a beacon by the parameter `beacons`."""
-    try:
-        name, x, y = text.split()
-        place = float(x), float(y)
-    except ValueError:
-        place = math.nan, math.nan
-    if not all(abs(each) < 1e7 for each in place):
-        raise ConfigError(f'parameter {source}.beacons: expected name, x and y, such as '
-                          f'"anchor_1 12.5 -3.0", got {text!r}')
-    return name, place
 
 
 def source_names(listed: list[str]) -> list[str]:
@@ -192,7 +185,19 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
                     gyros[source.name] = GyroSource(
                         config.RateNoise(own['noise']), **_same(own, GyroSource))
                 case MeasurementSource() as settings:
-                    measurements[source.name] = _measurement_source(own, settings)
+                    policy, loss = settings.covariance, config.Loss(own['robust_loss'])
+                    floors = own.get('sigma_floor', (policy.position_floor, policy.heading_floor))
+                    measurements[source.name] = replace(
+                        settings, covariance=replace(
+                            policy, override=tuple(own['covariance_override']),
+                            scale=own['covariance_scale'], position_floor=floors[0],
+                            heading_floor=floors[1],
+                            heading=config.Heading(own.get('heading', 'auto'))),
+                        robust=config.Robust(own['robust']), loss=loss,
+                        # for Tukey's loss that for 95 % of the accuracy of least squares [sigma]
+                        rejection_threshold=(5.0 if loss is config.Loss.TUKEY
+                                             else settings.rejection_threshold),
+                        correlation_time=own.get('correlation_time', 0.0))
         except ConfigError as error:
             setting, _, rest = str(error).partition(': ')
             raise ConfigError(
@@ -210,28 +215,10 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
-def _same(
-    own: Mapping[str, Any], settings: type, but: Collection[str] = (),
-) -> dict[str, Any]:
+def _same(own: Mapping[str, Any], settings: type, but: Collection[str] = ()) -> dict[str, Any]:
     """Return the parameters that are named as the settings that they are."""
-    given = {each.name: own[each.name] for each in fields(settings)
-             if each.name in own and each.name not in but}
-    return {name: tuple(value) if isinstance(value, list) else value
-            for name, value in given.items()}
-
-
-def _measurement_source(own: Mapping[str, Any], default: MeasurementSource) -> MeasurementSource:
-    policy, loss = default.covariance, config.Loss(own['robust_loss'])
-    floors = own.get('sigma_floor', (policy.position_floor, policy.heading_floor))
-    return replace(
-        default, covariance=replace(
-            policy, override=tuple(own['covariance_override']), scale=own['covariance_scale'],
-            position_floor=floors[0], heading_floor=floors[1],
-            heading=config.Heading(own.get('heading', 'auto'))),
-        robust=config.Robust(own['robust']), loss=loss,
-        # for Tukey's loss that for 95 % of the accuracy of least squares [sigma]
-        rejection_threshold=(5.0 if loss is config.Loss.TUKEY else default.rejection_threshold),
-        correlation_time=own.get('correlation_time', 0.0))
+    names = [each.name for each in fields(settings) if each.name in own and each.name not in but]
+    return {name: tuple(own[name]) if isinstance(own[name], list) else own[name] for name in names}
 
 
 class MessageReader:

@@ -44,29 +44,24 @@ class Datum:
         self.is_of_graph = False  # whether the datum comes from a loaded graph
         self.plane = TangentPlane(given[0], given[1], yaw=self.yaw) if self.is_given else None
         self.altitude = math.nan  # of the newest fix in the graph that has one [m]
-        self._waits = wait
+        self.waits = wait  # whether fixes are refused without a plane, until a call of `renew`
         # a plane lies on the ellipsoid until an altitude is known; east and north do not change
         self._to_lift = self.is_given
         # fixes are placed by the thread of the engine
         self._lock = threading.Lock()
-
-    @property
-    def is_awaited(self) -> bool:
-        """Whether fixes are refused until a call of `renew`."""
-        return self._waits and self.plane is None
 
     def keep(self, origin: MapOrigin) -> None:
         """Use the datum of a loaded graph from now on."""
         with self._lock:
             self.plane, self.yaw, self.altitude = (
                 TangentPlane(*origin), origin.yaw, origin.altitude)
-            self._waits = self._to_lift = False
+            self.waits = self._to_lift = False
             self.is_of_graph = True
 
     def renew(self) -> None:
         """Make the next fix that is used the datum."""
         with self._lock:
-            self.plane, self._waits, self._to_lift = None, False, False
+            self.plane, self.waits, self._to_lift = None, False, False
 
     def place(self, latitude: float, longitude: float, altitude: float) -> FloatArray:
         """
@@ -135,7 +130,12 @@ class StaticFrames:
             if (parent in ('', child) or child == '' or not 1e-6 < norm < math.inf
                     or not np.all(np.abs(translation) < 1e3)):
                 continue
-            rotation = _rotation(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
+            x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+            # SciPy's would make each start 0.3 s longer
+            rotation = np.array([
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])
             self._frames[child] = parent, rotation, translation
 
     def transform(self, name: str, base: str) -> tuple[FloatArray, FloatArray] | None:
@@ -158,14 +158,6 @@ class StaticFrames:
                 break
             chain[name] = rotation, translation
         return chain
-
-
-def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
-    """Return the matrix of a unit quaternion; SciPy's would make each start 0.3 s longer."""
-    return np.array([
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]])
 
 
 class IntegratedTwist(NamedTuple):

@@ -1,27 +1,38 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Which loop closures of a graph from a file to believe; part of the tool `pose-graph solve`."""
+"""
+Which loop closures of a graph from a file to believe, and the factor on their sigmas.
+
+This is a part of the tool `pose-graph solve`. The factor is what residuals of those that are
+believed show. That of one in the graph has the covariance `s^2 R - C`, with R the claimed one, s
+the factor and `C = J P J^T` its part that the estimate has followed. So `e^T R^-1 e / s^2` is
+expected to be its redundancy, `r = 3 - tr(R^-1 C) / s^2`, and s^2 is the sum of all squares over
+that of the redundancies, the estimate of a variance component by restricted maximum likelihood
+(K.-R. Koch, "Parameter estimation and hypothesis testing in linear models", 1999, section 3.6). A
+square counts up to where 99 % of them are, so that one wrong closure does not decide.
+
+Closures of one place often share an error, as the same view is recognised again. So they are one
+constraint: their mean, weighted by information, with the sum of the informations. If errors are
+independent, it shows the same s, and else a larger one, with which the group counts as what it is.
+Its C is taken to be the mean of those of its closures, a little too large.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+import math
 import sys
 from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.special import gammainc, gammaincc
 
 from pose_graph_ros.cli.arguments import METHODS
-from pose_graph_ros.cli.closure_scale import give_scale
-from pose_graph_ros.cli.solve_starts import Problem
-from pose_graph_ros.core.batch.optimizer import (
-    optimize,
-    optimize_from_linear_start,
-    SAME_MINIMUM,
-    Status,
-    to_the_end,
-)
+from pose_graph_ros.cli.solve import Problem
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import optimize, SAME_MINIMUM, Status, to_the_end
 from pose_graph_ros.core.batch.truncated import Choosing, CONFIG, Surrogate, TruncatedProblem
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
@@ -29,10 +40,19 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.error_functions import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.closure_search import best
-from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward
+from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward, GATE
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import short
+from pose_graph_ros.core.smoother.covariances import innovations
 
+ROUNDS = 6  # of solving and learning
+LEAST_SHOWN = 10  # closures, or sum of their redundancies, that show anything
+PRIOR_CLOSURES = 10.0  # that a factor of 1 is believed as much as
+PLACE_LENGTH = 2.0  # closures with both ends in one such stretch are of one place [m]
+LARGEST_SCALE = 10.0
+# What is left of the mean of chi2 with three degrees of freedom that counts up to `GATE`.
+LEFT = float(gammainc(2.5, GATE / 2.0) + GATE / 3.0 * gammaincc(1.5, GATE / 2.0))
 TRIES = 5  # sets of closures that are tried to join parts that no odometry joins
 
 
@@ -76,13 +96,22 @@ def believe(
     best, rows = None, closures
     for k in range(TRIES if n_parts > 1 else 1):
         known = _joining(edges, closures, part.astype(np.int64), k)
-        problem = _from_odometry(graph, softened, closures[~np.isin(closures, known)])
-        choice = None if problem is None else to_the_end(
-            SELECTIONS[method](problem))
-        if problem is not None and choice is not None and (
-                best is None or choice.cost < best.cost):
+        unsure = closures[~np.isin(closures, known)]
+        # the start that all other constraints give
+        copy = _filled(graph, softened)
+        copy.apply(GraphUpdate(remove=unsure.tolist()))
+        if optimizer.optimize_from_linear_start(copy, SolverConfig()).status is Status.FAILED:
+            continue
+        problem = TruncatedProblem(copy, unsure, start=copy.poses.copy())
+        choice = to_the_end(SELECTIONS[method](problem))
+        if choice is not None and (best is None or choice.cost < best.cost):
             best, rows = choice, problem.ids
-    plain = _minimum_of_all(graph, edges, closures)
+    plain, copy = None, _filled(graph, edges)
+    problem = TruncatedProblem(copy, closures, graph.poses.copy())
+    # so many edges between random nodes that it is nearly dense are never right
+    if (problem.factorisation(np.ones(len(closures))) <= BELIEF.most_numbers * graph.n_nodes
+            and optimizer.optimize_from_linear_start(copy, CONFIG).status is not Status.FAILED):
+        plain = copy.poses.copy()
     starts = [poses for poses in (plain, graph.poses.copy() if given else None)
               if poses is not None]
     for start in starts:
@@ -100,8 +129,7 @@ def believe(
     optimize(copy, CONFIG)
     result = BelievedEdges(closures, believed, n_parts, copy.poses.copy(), scale, np.inf, None)
     # who asks for more than the usual sigmas wants to believe what costs more by those of the file
-    return _not_worse(
-        result, graph, edges, starts if np.all(sigmas <= FLOORS) else [], plain)
+    return _not_worse(result, graph, edges, starts if np.all(sigmas <= FLOORS) else [], plain)
 
 
 def _not_worse(
@@ -129,30 +157,6 @@ def _filled(graph: Graph, edges: Factors) -> Graph:
     copy = Graph()
     copy.fill(graph.rows()._replace(factors=edges))
     return copy
-
-
-def _minimum_of_all(graph: Graph, edges: Factors, closures: IntArray) -> FloatArray | None:
-    """
-    Return the poses of a minimum of chi2 with all closures from a linear start, shape (N, 3).
-
-    None if there is none, or if so many edges between random nodes make the factorisation nearly
-    dense, which right ones never do.
-    """
-    copy = _filled(graph, edges)
-    problem = TruncatedProblem(copy, closures, graph.poses.copy())
-    if (problem.factorisation(np.ones(len(closures))) > BELIEF.most_numbers * graph.n_nodes
-            or optimize_from_linear_start(copy, CONFIG).status is Status.FAILED):
-        return None
-    return copy.poses.copy()
-
-
-def _from_odometry(graph: Graph, edges: Factors, closures: IntArray) -> TruncatedProblem | None:
-    """Return the problem with the start that all other constraints give."""
-    copy = _filled(graph, edges)
-    copy.apply(GraphUpdate(remove=closures.tolist()))
-    if optimize_from_linear_start(copy, SolverConfig()).status is Status.FAILED:
-        return None
-    return TruncatedProblem(copy, closures, start=copy.poses.copy())
 
 
 SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
@@ -227,3 +231,72 @@ def doubt(
     return doubted, decision | {
         'closures': len(beliefs.closures), 'doubted': len(doubted), 'scale': beliefs.scale,
         'truncated_cost': beliefs.cost, 'truncated_cost_of_all': beliefs.cost_of_all}, lines
+
+
+# --- the factor on the sigmas of closures
+
+def give_scale(graph: Graph, closures: IntArray) -> float:
+    """
+    Return the factor on the sigmas of closures, with which the graph is optimised in place.
+
+    All of them are believed; their weights are set to 1 / factor^2. Where odometry does not join
+    all nodes, nobody knows which closures are neighbours, and the factor is 1.
+    """
+    chain, scale = OdometryChain(), 1.0
+    chain.extend(graph)
+    if len(chain) < graph.n_nodes or len(closures) == 0:
+        return scale
+    edges = graph.factors_at(closures)
+    stretch = np.floor(np.column_stack(
+        [chain.travel(nodes) for nodes in (edges.j, edges.i)]) / PLACE_LENGTH)
+    group = np.unique(stretch, axis=0, return_inverse=True)[1].ravel()  # those of one place
+    for _ in range(ROUNDS):
+        if optimize(graph, CONFIG).status is Status.FAILED:
+            break
+        errors, covariances = innovations(graph.memory.head, edges)
+        shown = residual_scale(errors, covariances, edges.information, group, scale)
+        if shown <= scale:
+            break
+        scale = shown
+        graph.apply(GraphUpdate(weigh=dict.fromkeys(closures.tolist(), scale**-2.0)))
+    return scale
+
+
+def residual_scale(
+    errors: FloatArray, covariances: FloatArray, information: FloatArray, group: IntArray,
+    scale: float,
+) -> float:
+    """
+    Return the factor on the sigmas of a source, at least 1, given the present one.
+
+    Errors are the residuals of believed closures, shape (M, 3), covariances their C with the
+    closures in the graph, information what is claimed; `group` numbers closures of one place from
+    0.
+    """
+    size = np.bincount(group)
+    total, common = np.zeros((len(size), 3, 3)), np.zeros((len(size), 3, 3))
+    weighted = np.zeros((len(size), 3))
+    np.add.at(total, group, information)
+    np.add.at(common, group, covariances)
+    np.add.at(weighted, group, np.einsum('mij,mj->mi', information, errors))
+    # what no closure of a group measures stays at 0
+    largest = np.max(np.abs(total), axis=(1, 2))[:, None, None]
+    mean = np.linalg.solve(total + 1e-12 * largest * np.eye(3), weighted[:, :, None])[:, :, 0]
+    common /= size[:, None, None]
+    trace = np.einsum('mij,mji->m', total, common)
+    rank = np.count_nonzero(np.einsum('mii->mi', total) > 0.0, axis=1)
+    redundancy = np.maximum(rank - trace / scale**2, 0.0) / 3.0
+    n = float(np.sum(redundancy))
+    if n < LEAST_SHOWN:
+        return scale
+    squares = np.einsum('mi,mij,mj->m', mean, total, mean)
+    shown = math.sqrt(float(np.sum(squares)) / (3.0 * n))
+    for _ in range(50):
+        # from above, as the sum of what counts shrinks with its limits
+        counted = np.minimum(squares, GATE * shown**2 * redundancy)
+        shown, before = math.sqrt(float(np.sum(counted)) / (3.0 * LEFT * n)), shown
+        if shown > 0.99 * before:
+            break
+    # if n closures show it
+    return min(max(math.exp(
+        math.log(max(shown, 1e-3)) * n / (n + PRIOR_CLOSURES)), 1.0), LARGEST_SCALE)

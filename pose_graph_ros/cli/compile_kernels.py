@@ -28,16 +28,12 @@ def execute(_: argparse.Namespace) -> int:
         print(f'compiled in {seconds:.1f} s, but not kept: the next start compiles again',
               file=sys.stderr)
         return 1
-    print(f'{"loaded" if complete else "compiled"} in {seconds:.1f} s; kept {_place()}')
-    return 0
-
-
-def _place() -> str:
-    """Return where the code is, and for whom."""
     folders = jit.cache_folders()
-    place = f'in {os.path.commonpath(folders)}'
+    whose = ', where only this user finds it; set NUMBA_CACHE_DIR for others'
     if numba.config.CACHE_DIR:
-        return f'{place} (NUMBA_CACHE_DIR)'
-    if all(folder.name == '__pycache__' for folder in folders):
-        return f'{place}, in each __pycache__'
-    return f'{place}, where only this user finds it; set NUMBA_CACHE_DIR for others'
+        whose = ' (NUMBA_CACHE_DIR)'
+    elif all(folder.name == '__pycache__' for folder in folders):
+        whose = ', in each __pycache__'
+    print(f'{"loaded" if complete else "compiled"} in {seconds:.1f} s; kept in '
+          f'{os.path.commonpath(folders)}{whose}')
+    return 0

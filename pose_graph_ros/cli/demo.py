@@ -46,6 +46,9 @@ from pose_graph_ros.offline.simulation.worlds import WORLDS
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
 DIAGNOSTICS, ODOMETRY = '/diagnostics', '/odometry/filtered'
+NO_ANSWERS = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 'left',
+              'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
+"""Ends of keys of the diagnostics that are not counts of messages by what was answered."""
 
 
 class DemoError(PoseGraphError):
@@ -56,10 +59,17 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     values = shared.parameter_values(options)
     options.out.mkdir(parents=True, exist_ok=True)
-    bag_path, wanted, truth, title = _bag(options)
+    bag_path, truth, wanted = options.bag, options.truth, shared.wanted_topics(options)
+    title = 'Simulated drive' if bag_path is None else bag_path.stem
+    if bag_path is None:
+        bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
+        print(f'simulating a drive (seed {options.seed})')
+        write_drive(record(course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])), bag_path,
+                    overwrite=True)
+        wanted = {source: topic or SIMULATED_TOPICS.get(source)
+                  for source, topic in wanted.items()}
     with open_bag(bag_path) as bag:
-        inputs = choose_inputs(
-            bag, source_list(values), wanted, options.hold_out, truth=truth)
+        inputs = choose_inputs(bag, source_list(values), wanted, options.hold_out, truth=truth)
     if bag_path.suffix == '.bag':
         raise BagError(f'{bag_path}: a ROS 1 bag cannot be played to a ROS 2 node; '
                        'pose-graph replay reads it')
@@ -74,11 +84,16 @@ def execute(options: argparse.Namespace) -> int:
     backend = PoseGraphBackend.restored(backend_config(values), saved)
     report = backend.optimize()
     diagnostics = _updates(options.out / RECORDED, recorder, int(backend.node_stamps_ns[-1]))
+    counts: dict[tuple[str, str], int] = {}  # of messages by source and answer
+    for key, value in diagnostics.items():
+        source, _, answer = key.rpartition('.')
+        if source in inputs.topics and answer not in NO_ANSWERS and value.isdecimal():
+            counts[source, answer] = int(value)
     with open_bag(bag_path) as bag:
         drive = drive_in(bag, inputs, values, backend, truth, origin=saved.datum)
     lines = write_results(Run(
-        title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds,
-        _counts(diagnostics, inputs), report, seconds), options.out, {
+        title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds, counts,
+        report, seconds), options.out, {
             'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
             'seconds': seconds, 'node': diagnostics})
     print('\n'.join([*lines, f'written to {options.out}/: path.tum, corrected/ (rosbag2), '
@@ -112,33 +127,6 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
     return values
 
 
-def _counts(values: Mapping[str, str], inputs: Inputs) -> dict[tuple[str, str], int]:
-    """Return the counts of messages by source and answer that the diagnostics have."""
-    others = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 'left',
-              'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
-    counts: dict[tuple[str, str], int] = {}
-    for key, value in values.items():
-        source, _, answer = key.rpartition('.')
-        if source in inputs.topics and answer not in others and value.isdecimal():
-            counts[source, answer] = int(value)
-    return counts
-
-
-def _bag(
-    options: argparse.Namespace,
-) -> tuple[Path, Mapping[str, str | None], str | None, str]:
-    """Return the bag to play, its topics, the topic of the truth, and the title of the picture."""
-    if options.bag is not None:
-        return options.bag, shared.wanted_topics(options), options.truth, options.bag.stem
-    path = options.out / 'simulated_drive'
-    print(f'simulating a drive (seed {options.seed})')
-    way = course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])
-    write_drive(record(way), path, overwrite=True)
-    wanted = {source: topic or SIMULATED_TOPICS.get(source)
-              for source, topic in shared.wanted_topics(options).items()}
-    return path, wanted, options.truth or '/ground_truth', 'Simulated drive'
-
-
 def _run(
     bag: Path, inputs: Inputs, values: Mapping[str, Any], options: argparse.Namespace,
 ) -> bool:
@@ -167,7 +155,12 @@ def _run(
                     {name: values[f'{name}.topic'] for name in inputs.topics}, rate=options.rate,
                     is_running=lambda: node.poll() is None)
             finally:
-                code = _stop(node)
+                node.send_signal(signal.SIGINT)  # nothing happens if it has ended
+                try:
+                    code = node.wait(15.0)
+                except subprocess.TimeoutExpired:
+                    node.kill()
+                    code = node.wait()
         finally:
             os.environ.clear()
             os.environ.update(before)
@@ -201,13 +194,3 @@ def isolated_environment(log: Path) -> Iterator[dict[str, str]]:
         env['ROS_LOG_DIR'] = str(log)
         env.pop('ROS_LOCALHOST_ONLY', None)
         yield env
-
-
-def _stop(node: 'subprocess.Popen[bytes]') -> int:
-    """Stop a process by SIGINT, as Ctrl-C does; return its exit code."""
-    node.send_signal(signal.SIGINT)  # nothing happens if it has ended
-    try:
-        return node.wait(15.0)
-    except subprocess.TimeoutExpired:
-        node.kill()
-        return node.wait()

@@ -27,9 +27,9 @@ from pose_graph_ros.cli.graph_input import read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.io.g2o import GraphFile
-from pose_graph_ros.offline.drawing import views
-from pose_graph_ros.offline.drawing.pattern import elimination_order, Pattern, pattern
-from pose_graph_ros.offline.drawing.views import Role, Sort
+from pose_graph_ros.offline import graph_views as views
+from pose_graph_ros.offline.graph_views import Role, Sort
+from pose_graph_ros.offline.pattern import elimination_order, Pattern, pattern
 
 N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
 INK, GREY = '#111111', '#7a828c'
@@ -129,12 +129,6 @@ def _fill(data: dict[str, Any]) -> str:
     return FILLS[data['role']] if data['role'] in FILLS else COLOURS[data['term'].sort]
 
 
-def _meaning(data: dict[str, Any]) -> str:
-    """Return what a vertex is, for the legend."""
-    role = data['role']
-    return str(role.value if role in FILLS else f'{role.value}: {data["term"].sort.value}')
-
-
 def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> dict[str, Any]:
     """Return what is drawn, for machines."""
     diagrams = []
@@ -194,10 +188,11 @@ def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None
     area = {node: (diameter * SIZES.get(data['role'], 1.0))**2 for node, data in vertices.items()}
     looks: dict[Any, list[int]] = defaultdict(list)
     for node, data in sorted(vertices.items(), key=lambda each: list(Role).index(each[1]['role'])):
-        opaque = 1.0 if 'term' not in data or data['term'].used else 0.5
-        looks[_meaning(data), _fill(data), area[node], data['role'], opaque].append(node)
+        opaque, role = 1.0 if 'term' not in data or data['term'].used else 0.5, data['role']
+        meaning = role.value if role in FILLS else f'{role.value}: {data["term"].sort.value}'
+        looks[meaning, _fill(data), area[node], role, opaque].append(node)
         if data.get('fixed', False):
-            looks['fixed (known): double border', _fill(data), 0.6 * area[node], data['role'],
+            looks['fixed (known): double border', _fill(data), 0.6 * area[node], role,
                   opaque].append(node)
     for (meaning, colour, size, role, opaque), nodes in looks.items():
         nx.draw_networkx_nodes(

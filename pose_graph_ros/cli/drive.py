@@ -12,6 +12,7 @@ its map may begin elsewhere, as where only a part of a recording is replayed.
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,35 +20,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, POSE_TYPES, poses_on, read_inputs, reader_of
+from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.sources import MessageReader
+from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
+from pose_graph_ros.adapters.sources import GLOBAL_POSE, MessageReader, ODOMETRY
+from pose_graph_ros.core import measurements as kinds
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.geometry.se2 import (
-    BoolArray,
-    Covariances,
-    FloatArray,
-    IntArray,
-    Points,
-    PoseVector,
-)
+from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import (
-    Answer,
-    Fix,
-    GlobalPose,
-    LoopClosure,
-    Measurement,
-    OdometrySample,
-    Position,
-)
+from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometrySample
 from pose_graph_ros.core.quantities import StampNs
 
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
+POSE = 'geometry_msgs/msg/PoseStamped'
+POSE_TYPES = (ODOMETRY.message_type, POSE, GLOBAL_POSE.message_type)  # that a truth can have
 STATES = (State.BELIEVED.value, State.WEAKLY_BELIEVED.value, State.WAITING.value,
           State.DOUBTED.value, 'refused', 'held out')
 BELIEVED, WEAKLY_BELIEVED, WAITING, DOUBTED, REFUSED, HELD_OUT = range(len(STATES))
@@ -105,8 +95,7 @@ class Drive:
             if np.any(inside):
                 odometry = self.odometry.at(stamps[inside])[:, :2]
                 pose = fit_motion(odometry, positions[inside])
-                return Trajectory(
-                    self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
+                return Trajectory(self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
         return self.odometry
 
     @cached_property
@@ -144,8 +133,7 @@ def place_truth(drive: Drive) -> Drive:
     pose = fit_motion(before, drive.corrected.at(truth.stamps_ns[inside])[:, :2])
     placed = Trajectory(truth.stamps_ns, se2.compose(pose, truth.poses))
     shift = np.mean(placed.poses[inside, :2] - before, axis=0)
-    return replace(drive, truth=placed, truth_moved=(
-        float(np.hypot(*shift)), abs(float(pose[2]))))
+    return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), abs(float(pose[2]))))
 
 
 def distances(
@@ -204,14 +192,6 @@ def consistency(drive: Drive, covariances: Covariances) -> dict[str, dict[str, A
     return found
 
 
-def consistency_lines(found: Mapping[str, dict[str, Any] | None]) -> list[str]:
-    """Return the NEES as text."""
-    return [f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
-        f'{each["mean"]:.4g}, expected {each["expected"]}, {each["interval"][0]:.4f} to '
-        f'{each["interval"][1]:.4f} if errors were independent; {100.0 * each["within"]:.1f} % '
-        f'below the 95 % quantile')) for name, each in found.items()]
-
-
 def format_table(rows: Sequence[ErrorRow]) -> str:
     """Return the rows as a plain text table of less than 80 columns."""
     if len(rows) == 0:
@@ -242,7 +222,7 @@ class Samples:
     def __init__(self) -> None:
         self._stamps, self._poses = array('q'), array('d')
 
-    def add(self, stamp_ns: StampNs, pose: PoseVector) -> None:
+    def add(self, stamp_ns: StampNs, pose: se2.PoseVector) -> None:
         """Add a sample."""
         self._stamps.append(stamp_ns)
         self._poses.extend(pose)
@@ -333,11 +313,11 @@ def collect_drive(
         match measurement:
             case Fix(stamp, _, _, lever_arm):
                 fixes.append(_Fix(source, stamp, measurement, lever_arm, held_out))
-            case GlobalPose(stamp, pose, _):
+            case kinds.GlobalPose(stamp, pose, _):
                 fixes.append(_Fix(source, stamp, pose[:2], np.zeros(2), held_out))
-            case Position(stamp, position, _, lever_arm):
+            case kinds.Position(stamp, position, _, lever_arm):
                 fixes.append(_Fix(source, stamp, position, lever_arm, held_out))
-            case LoopClosure(stamp, _, _, int(reference)):
+            case kinds.LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
             case OdometrySample(stamp, pose) if source == odometry_source:
                 odometry.add(stamp, pose)
@@ -354,32 +334,25 @@ def collect_drive(
     known = {(each.source, each.stamp_ns, each.reference_ns): STATES.index(each.state.value)
              for each in verdicts}
     judged = {each.source for each in verdicts}
+    states = np.array([known.get((each.source, each.stamp_ns, None), BELIEVED) for each in fixes],
+                      dtype=np.int64)
+    kept_out = np.array([each.held_out for each in fixes], dtype=bool)
+    sources = [each.source for each in fixes]
+    # those that the graph has not from its begin on are refused
+    lost = stamps >= int(backend.node_stamps_ns[estimate.n_frozen])
+    for source, added in backend.measured().items():
+        at = np.flatnonzero(
+            (np.array(sources, dtype=str) == source) & np.isin(stamps, added) & ~kept_out)
+        # of several with one stamp the first one was added
+        lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
     return Drive(
         odometry.path(), corrected, None, stamps, positions,
-        _fix_states(fixes, known, backend, int(backend.node_stamps_ns[estimate.n_frozen])),
-        [each.source for each in fixes],
+        np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
         np.array([known.get(key, REFUSED if (
             key[0] in judged if refused is None else key in refused) else BELIEVED)
             for key in loops], dtype=np.int64),
         [source for source, _, _ in loops], arrived_ns=arrived)
-
-
-def _fix_states(
-    fixes: Sequence[_Fix], known: Mapping[Key, int], backend: PoseGraphBackend, begin_ns: StampNs,
-) -> IntArray:
-    """Return the states of fixes; those that the graph has not from its begin on are refused."""
-    states = np.array([known.get((each.source, each.stamp_ns, None), BELIEVED) for each in fixes],
-                      dtype=np.int64)
-    held_out = np.array([each.held_out for each in fixes], dtype=bool)
-    stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
-    names = np.array([each.source for each in fixes], dtype=str)
-    refused = stamps >= begin_ns
-    for source, added in backend.measured().items():
-        at = np.flatnonzero((names == source) & np.isin(stamps, added) & ~held_out)
-        # of several with one stamp the first one was added
-        refused[at[np.unique(stamps[at], return_index=True)[1]]] = False
-    return np.where(held_out, HELD_OUT, np.where(refused, REFUSED, states))
 
 
 def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
@@ -394,6 +367,10 @@ def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
     poses = Samples()
-    for stamp, pose in poses_on(bag, topic, span):
-        poses.add(stamp, pose)
+    for bag_message in bag.messages([topic], span):
+        with suppress(MessageError):
+            message = bag_message.decode()
+            pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
+            if not isinstance(pose, Answer):
+                poses.add(stamp_ns(message), pose)
     return poses.path()

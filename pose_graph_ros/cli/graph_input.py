@@ -25,13 +25,17 @@ from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
+SAVED = b'{\n"sha256": "'  # begin of the .json file of a saved graph
 SECOND = 1_000_000_000
 
 
 def read(path: Path, edge2_order: str | None) -> GraphFile:
     """Return the graph in a file; warnings go to stderr. Raises FileFormatError."""
-    side = path if path.suffix == '.json' else path.with_suffix('.json')
-    if side == path or (side.is_file() and _begins_as_saved(side)):
+    side, begin = path if path.suffix == '.json' else path.with_suffix('.json'), b''
+    if side != path and side.is_file():
+        with side.open('rb') as file:
+            begin = file.read(len(SAVED))
+    if side == path or begin == SAVED:
         # what reads saved graphs takes longer to load than all else here
         from pose_graph_ros.core.io.graph_files import read_graph  # noqa: PLC0415
 
@@ -56,12 +60,6 @@ def read_file(path: Path, edge2_order: str | None) -> GraphFile:
     for line in lines:
         print(f'warning: {path}: {line}', file=sys.stderr)
     return file
-
-
-def _begins_as_saved(path: Path) -> bool:
-    begin = b'{\n"sha256": "'
-    with path.open('rb') as file:
-        return file.read(len(begin)) == begin
 
 
 def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
@@ -96,7 +94,19 @@ def read_measurements(
     """
     file = read_file(path, edge2)
     edges, n = file.graph.factors.edges, file.graph.n_nodes
-    stamps_ns = SECOND * np.arange(1, n + 1) if stamps is None else _read_stamps(stamps, n)
+    stamps_ns = SECOND * np.arange(1, n + 1)
+    if stamps is not None:
+        try:
+            words = [line.split()[0] for line in stamps.read_text(encoding='utf-8').splitlines()
+                     if line.strip() != '' and not line.startswith('#')]
+            stamps_ns = np.array([round(float(word) * SECOND) for word in words], dtype=np.int64)
+        except (OSError, ValueError, OverflowError) as error:
+            raise FileFormatError(f'{stamps}: expected a stamp [s] at the begin of each line '
+                                  f'({error})') from error
+        if len(stamps_ns) < n or np.any(np.diff(stamps_ns[:n]) <= 0):
+            raise FileFormatError(
+                f'{stamps}: expected {n} increasing stamps, got {len(stamps_ns)}')
+        stamps_ns = stamps_ns[:n]
     steps = np.flatnonzero(np.abs(edges.i - edges.j) == 1)
     # of several edges the first one in the file is odometry
     starts, first = np.unique(np.minimum(edges.i, edges.j)[steps], return_index=True)
@@ -108,24 +118,15 @@ def read_measurements(
     odometry = steps[first]
     closures = np.setdiff1d(np.arange(len(edges)), odometry)
     last = np.maximum(edges.i, edges.j)[closures].tolist()
+    others = edges.rows(closures)
     events: list[tuple[int, OdometrySample | LoopClosure]] = [
         *enumerate(_odometry(edges.rows(odometry), stamps_ns)),
-        *zip(last, _closures(edges.rows(closures), stamps_ns), strict=True)]
+        # covariances from the axes of the measured pose to those of the reference
+        *((when, LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
+                             reference_ns=int(stamps_ns[i])))
+          for when, i, j, mean, cov in zip(
+              last, others.i, others.j, others.mean, _covariances(others), strict=True))]
     return [each for _, each in sorted(events, key=itemgetter(0))]
-
-
-def _read_stamps(path: Path, n: int) -> IntArray:
-    """Return the first n stamps in a file [ns], shape (n,)."""
-    try:
-        words = [line.split()[0] for line in path.read_text(encoding='utf-8').splitlines()
-                 if line.strip() != '' and not line.startswith('#')]
-        stamps = np.array([round(float(word) * SECOND) for word in words], dtype=np.int64)
-    except (OSError, ValueError, OverflowError) as error:
-        raise FileFormatError(f'{path}: expected a stamp [s] at the begin of each line '
-                              f'({error})') from error
-    if len(stamps) < n or np.any(np.diff(stamps[:n]) <= 0):
-        raise FileFormatError(f'{path}: expected {n} increasing stamps, got {len(stamps)}')
-    return stamps[:n]
 
 
 def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
@@ -141,13 +142,6 @@ def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
             stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
             variances[step] / elapsed[step])
         pose = se2.compose(pose, motions[step])
-
-
-def _closures(edges: Factors, stamps_ns: IntArray) -> Iterator[LoopClosure]:
-    for i, j, mean, cov in zip(edges.i, edges.j, edges.mean, _covariances(edges), strict=True):
-        # from the axes of the measured pose to those of the reference
-        yield LoopClosure(int(stamps_ns[j]), mean, covariance.turned(cov, -float(mean[2])),
-                          reference_ns=int(stamps_ns[i]))
 
 
 def _covariances(edges: Factors) -> FloatArray:

@@ -52,23 +52,20 @@ def main(args: list[str] | None = None) -> int:
 
     def run() -> int:
         if chosen in parsers:
-            _declare(parsers[chosen], chosen)
+            # the description, the arguments and, behind these, the examples
+            tool, name = parsers[chosen], (
+                'simulation_options' if chosen == 'simulate' else 'arguments')
+            declare = getattr(importlib.import_module(f'pose_graph_ros.cli.{name}'),
+                              chosen.replace('-', '_'))
+            tool.description, examples, rest = textwrap.dedent(
+                declare.__doc__).strip().partition('examples:')
+            tool.epilog = examples + rest
+            tool.formatter_class = argparse.RawDescriptionHelpFormatter
+            declare(tool)
         options = parser.parse_args(words)
         module = importlib.import_module(f'pose_graph_ros.cli.{chosen.replace("-", "_")}')
         return int(module.execute(options))
     return guarded(run)
-
-
-def _declare(parser: argparse.ArgumentParser, tool: str) -> None:
-    """Add the description, the arguments and, behind these, the examples of a tool to a parser."""
-    name = 'simulation_options' if tool == 'simulate' else 'arguments'
-    declare = getattr(importlib.import_module(f'pose_graph_ros.cli.{name}'),
-                      tool.replace('-', '_'))
-    parser.description, examples, rest = textwrap.dedent(declare.__doc__).strip().partition(
-        'examples:')
-    parser.epilog = examples + rest
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    declare(parser)
 
 
 def guarded(run: Callable[[], int]) -> int:

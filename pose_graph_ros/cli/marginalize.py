@@ -11,42 +11,51 @@ import numpy as np
 from pose_graph_ros.cli.arguments import LANDMARKS
 from pose_graph_ros.cli.graph_input import read, rows_of
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.io.g2o import GraphFile, write_g2o
+from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.marginalization.marginalize import marginalize, standing_for
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     file = read(options.graph, options.edge2)
-    rows, ids = file.rows, file.ids
-    leaving = _leaving(options, file)
+    if options.nodes == LANDMARKS:
+        leaving = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)
+        if len(leaving) == 0:
+            raise ConfigError(f'{options.graph}: has no landmarks')
+    else:
+        leaving = rows_of(file.ids, options.nodes, '--nodes')
+    if not np.any(np.delete(file.rows.is_pose, leaving)):
+        raise ConfigError('--nodes: no pose would be left')
     graph = Graph()
-    graph.fill(rows)
+    graph.fill(file.rows)
     before = graph.energies().chi2
-    graph.apply(marginalize(graph, rows.node_ids[leaving]))
+    graph.apply(marginalize(graph, file.rows.node_ids[leaving]))
     sizes = [len(prior.nodes) for prior in graph.priors]
     if len(sizes) > 0 and not options.sparse:
         raise ConfigError(
             f'{options.graph}: without these nodes there are {len(sizes)} dense priors, the '
             f'largest one on {max(sizes)} nodes, which g2o does not have; --sparse puts edges in '
             'their place')
-    graph = _with_edges_for_priors(graph)
+    if len(sizes) > 0:
+        rows, without = graph.rows(), Graph()
+        without.fill(rows._replace(priors=()))
+        without.apply(GraphUpdate(factors=standing_for(rows)))
+        graph = without
     n_biases = int(np.count_nonzero(graph.is_bias))
     if n_biases > 0:
         print(f'warning: {n_biases} biases are left out of the g2o file; measurements with them '
               'are written as if their errors were white', file=sys.stderr)
-    write_g2o(graph, options.out, np.delete(ids, leaving))
+    write_g2o(graph, options.out, np.delete(file.ids, leaving))
     n_edges = len(graph.factors.edges)
     n_observed = graph.n_factors - n_edges
-    facts = {
-        'file': str(options.out), 'removed_nodes': len(leaving), 'hidden_nodes': graph.n_nodes,
-        'edges': n_edges, 'observed_nodes': n_observed, 'dense_priors': len(sizes),
-        'largest_dense_prior': max(sizes, default=0), 'chi2_before': before}
     if options.json:
-        print(json.dumps(facts, indent=2))
+        print(json.dumps({
+            'file': str(options.out), 'removed_nodes': len(leaving),
+            'hidden_nodes': graph.n_nodes, 'edges': n_edges, 'observed_nodes': n_observed,
+            'dense_priors': len(sizes), 'largest_dense_prior': max(sizes, default=0),
+            'chi2_before': before}, indent=2))
     else:
         print(f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {n_edges} '
               f'edges and {n_observed} observed nodes')
@@ -55,27 +64,3 @@ def execute(options: argparse.Namespace) -> int:
                   'nodes')
         print(f'written: {options.out}')
     return 0
-
-
-def _with_edges_for_priors(graph: Graph) -> Graph:
-    """Return a graph with edges and observed nodes in place of its dense priors."""
-    if graph.n_priors == 0:
-        return graph
-    rows = graph.rows()
-    without = Graph()
-    without.fill(rows._replace(priors=()))
-    without.apply(GraphUpdate(factors=standing_for(rows)))
-    return without
-
-
-def _leaving(options: argparse.Namespace, file: GraphFile) -> IntArray:
-    """Return the rows of the nodes that leave; raise ConfigError unless there are some."""
-    if options.nodes == LANDMARKS:
-        rows = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)
-        if len(rows) == 0:
-            raise ConfigError(f'{options.graph}: has no landmarks')
-    else:
-        rows = rows_of(file.ids, options.nodes, '--nodes')
-    if not np.any(np.delete(file.rows.is_pose, rows)):
-        raise ConfigError('--nodes: no pose would be left')
-    return rows

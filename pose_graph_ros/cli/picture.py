@@ -18,20 +18,10 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
 import numpy as np
 
-from pose_graph_ros.cli.drive import (
-    BELIEVED,
-    distances,
-    DOUBTED,
-    Drive,
-    extent,
-    REFUSED,
-    WAITING,
-    WEAKLY_BELIEVED,
-)
+from pose_graph_ros.cli import drive as drives
+from pose_graph_ros.cli.drive import distances, Drive, extent
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.se2 import Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 
@@ -39,10 +29,11 @@ from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 BLUE, ORANGE, VERMILION, GREEN, PURPLE = '#0072B2', '#E69F00', '#D55E00', '#009E73', '#B583A4'
 SKY, INK, GREY, GRID, SHADE = '#56B4E9', '#222222', '#666666', '#E2E2E2', '#F0F0F0'
 LOOPS = (  # states, name in the legend, colour, line, and order in depth
-    ((BELIEVED,), 'loop closures', GREEN, '-', 5),
-    ((WEAKLY_BELIEVED,), 'loop closures\nbelieved weakly', GREEN, '--', 5),
-    ((WAITING,), 'loop closures that wait,\nnot used', SKY, '--', 2),
-    ((DOUBTED, REFUSED), 'doubted or refused\nloop closures, not used', GREY, '--', 2))
+    ((drives.BELIEVED,), 'loop closures', GREEN, '-', 5),
+    ((drives.WEAKLY_BELIEVED,), 'loop closures\nbelieved weakly', GREEN, '--', 5),
+    ((drives.WAITING,), 'loop closures that wait,\nnot used', SKY, '--', 2),
+    ((drives.DOUBTED, drives.REFUSED), 'doubted or refused\nloop closures, not used', GREY, '--',
+     2))
 USED_FIXES: dict[str, Any] = {
     'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
@@ -73,8 +64,17 @@ def draw_drive(
     In the legend some names may be other ones.
     """
     paths = [drive.corrected, *([] if drive.truth is None else [drive.truth])]
-    low, high = _limits(np.concatenate([path.poses[:, :2] for path in paths]), np.concatenate(
-        (drive.placed_odometry.poses[:, :2], drive.fix_positions)))
+    near = np.concatenate([path.poses[:, :2] for path in paths])
+    stray = np.concatenate((drive.placed_odometry.poses[:, :2], drive.fix_positions))
+    if len(near) == 0:
+        near = stray if len(stray) else np.zeros((1, 2))
+    low, high = near.min(axis=0), near.max(axis=0)
+    margin = max(0.2 * float(np.max(high - low)), 5.0)
+    # what strays far from what must be in it is cut off
+    shown = np.concatenate((near, np.clip(stray, low - margin, high + margin)))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    pad = max(0.03 * float(np.max(high - low)), 1.0)
+    low, high = low - pad, high + pad
     wide, tall = (high - low).tolist()
     with rc_context(STYLE):
         is_tall = tall > 1.15 * wide
@@ -98,21 +98,8 @@ def draw_drive(
         figure.legend(handles, labels, loc='outside right upper', labelspacing=0.9,
                       alignment='left', title=_compared(drive)[1])
         _draw_errors(errors, drive)
-        figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold',
-                        parse_math=False)
+        figure.suptitle(title, x=0.01, ha='left', fontsize=18, fontweight='bold', parse_math=False)
         figure.savefig(file)
-
-
-def _limits(near: Points, stray: Points) -> tuple[Points, Points]:
-    """Return two corners of a map; what strays far from what must be in it is cut off."""
-    if len(near) == 0:
-        near = stray if len(stray) else np.zeros((1, 2))
-    low, high = near.min(axis=0), near.max(axis=0)
-    margin = max(0.2 * float(np.max(high - low)), 5.0)
-    shown = np.concatenate((near, np.clip(stray, low - margin, high + margin)))
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    pad = max(0.03 * float(np.max(high - low)), 1.0)
-    return low - pad, high + pad
 
 
 def _facts(drive: Drive) -> str:
@@ -121,7 +108,7 @@ def _facts(drive: Drive) -> str:
     numbers = {kind: int(np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()
                if kind != 'refused'}
     doubted, waiting = (int(np.sum(np.isin(drive.loop_states, states)))
-                        for states in ((DOUBTED, REFUSED), (WAITING,)))
+                        for states in ((drives.DOUBTED, drives.REFUSED), (drives.WAITING,)))
     parts = [f'{numbers.pop("used")} fixes used' + ''.join(
         f', {number} {kind}' for kind, number in numbers.items() if number > 0),
         f'{len(drive.loop_stamps_ns) - doubted - waiting} loop closures' + ''.join(
@@ -227,26 +214,21 @@ def _draw_errors(axes: Axes, drive: Drive) -> None:
         axes.set_ylim(0.0, max(1.15 * max(highest), 0.1))
     axes.set(xlabel='time [s]', ylabel='distance [m]')
     axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold')
-    for outage in _outages(drive, begin, end):
-        axes.axvspan(*outage, color=SHADE, zorder=0)
+    used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
+    used = used[(used > begin) & (used < end)]
+    if len(used) < 3:
+        return
+    # no fixes were used for 5 s and 10 median periods
+    edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
+    pauses = np.diff(edges)
+    for k in np.flatnonzero(pauses > max(5.0, 10.0 * float(np.median(pauses)))).tolist():
+        axes.axvspan(float(edges[k]), float(edges[k + 1]), color=SHADE, zorder=0)
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
 
 
 def thinned(points: np.ndarray) -> np.ndarray:
     """Return every n-th point, at most 20 000: more take hundreds of MB, and do not show."""
     return points[::max(-(-len(points) // 20_000), 1)]
-
-
-def _outages(drive: Drive, begin: StampNs, end: StampNs) -> list[tuple[float, float]]:
-    """Return when no fixes were used for 5 s and 10 median periods: begin and end [s]."""
-    used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
-    used = used[(used > begin) & (used < end)]
-    if len(used) < 3:
-        return []
-    edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
-    pauses = np.diff(edges)
-    long = pauses > max(5.0, 10.0 * float(np.median(pauses)))
-    return list(zip(edges[:-1][long].tolist(), edges[1:][long].tolist(), strict=True))
 
 
 def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str) -> None:
@@ -260,8 +242,7 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
         wrong = np.isin(np.arange(len(measured)), simulated.wrong)
     else:
         odometry = simulated.odometry
-        fixes, poses, closures = (
-            simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
+        fixes, poses, closures = (simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
         ends, group, measured = closures.stamps_ns, closures.wrong, poses.values[:, :2]
         if len(fixes.values) > 0:
             plane = TangentPlane(*fixes.values[0].tolist())
@@ -269,7 +250,8 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
         stamps = np.append(fixes.stamps_ns, poses.stamps_ns)
         wrong = np.append(fixes.wrong, poses.wrong) >= 0
     nothing = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    fix_states, loop_states = (np.where(false, drives.DOUBTED, drives.BELIEVED)
+                               for false in (wrong, group >= 0))
     draw_drive(Drive(
-        odometry, nothing, truth, stamps, measured, np.where(wrong, DOUBTED, BELIEVED),
-        [''] * len(stamps), ends, np.where(group >= 0, DOUBTED, BELIEVED), [''] * len(ends)),
-        file, title, SIMULATED)
+        odometry, nothing, truth, stamps, measured, fix_states, [''] * len(stamps), ends,
+        loop_states, [''] * len(ends)), file, title, SIMULATED)

@@ -48,14 +48,23 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError(f'--out {options.out}: the name must end in {" or ".join(PAGES)}')
     code, file = 0, _file(options)
     if file is None:
-        code, file = _replay(options), options.folder / FILE
+        if (options.folder / 'metadata.yaml').is_file():
+            raise BagError(f'--run {options.folder}: this is a bag; name another folder')
+        file, words = options.folder / FILE, argparse.Namespace(**vars(options) | {
+            'bags': options.runs, 'out': options.folder, 'json': False, 'export': Exports(),
+            'new_bag': None, 'live': False})
+        with redirect_stdout(io.StringIO()):
+            code = replay.execute(words)
     data = read_document(file)
     page = options.out or file.parent / 'report.html'
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(render(data), encoding='utf-8')
     if options.json:
-        print(json.dumps(_summary(data) | {'page': str(page), 'bytes': page.stat().st_size},
-                         indent=2))
+        # without its large tables
+        print(json.dumps({key: data[key] for key in SUMMARY} | {'sources': [
+            {key: value for key, value in source.items() if key not in ('series', 'histogram')}
+            for source in data['sources']], 'page': str(page), 'bytes': page.stat().st_size},
+            indent=2))
     else:
         for each in data['findings']:
             print(f'{each["level"]:8} {each["text"]}')
@@ -63,13 +72,6 @@ def execute(options: argparse.Namespace) -> int:
     if options.open:
         webbrowser.open(page.resolve().as_uri())
     return code
-
-
-def _summary(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return run.json without its large tables."""
-    return {key: data[key] for key in SUMMARY} | {'sources': [
-        {key: value for key, value in source.items() if key not in ('series', 'histogram')}
-        for source in data['sources']]}
 
 
 def _file(options: argparse.Namespace) -> Path | None:
@@ -95,17 +97,6 @@ def _file(options: argparse.Namespace) -> Path | None:
         option = {'begin': 'from'}.get(given[0], given[0]).replace('_', '-')
         raise ConfigError(f'--{option}: {first} has been run already; the option is for a bag')
     return file
-
-
-def _replay(options: argparse.Namespace) -> int:
-    """Replay bags or a g2o file into the folder of the run; return the exit code."""
-    if (options.folder / 'metadata.yaml').is_file():
-        raise BagError(f'--run {options.folder}: this is a bag; name another folder')
-    words = argparse.Namespace(**vars(options))
-    words.bags, words.out, words.json = options.runs, options.folder, False
-    words.export, words.new_bag, words.live = Exports(), None, False
-    with redirect_stdout(io.StringIO()):
-        return replay.execute(words)
 
 
 SCRIPTS = ('base', 'chart', 'paint', 'map', 'sections')

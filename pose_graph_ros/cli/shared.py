@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Iterable, Mapping
+from copy import copy
 import math
 from pathlib import Path
 import sys
@@ -31,7 +32,7 @@ def parameter_values(
     options: argparse.Namespace, usual: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
-    given = {**usual, **({} if options.params_file is None else _read_file(options.params_file))}
+    given = {**usual, **_read_file(options.params_file)}
     for text in options.param:
         name, separator, value = text.partition(':=')
         if separator == '':
@@ -53,8 +54,10 @@ def ros_arguments(options: argparse.Namespace) -> list[str]:
     return arguments
 
 
-def _read_file(path: Path) -> dict[str, Any]:
-    """Return the parameters for the node in a ROS 2 parameter file."""
+def _read_file(path: Path | None) -> dict[str, Any]:
+    """Return the parameters for the node in a ROS 2 parameter file, if there is one."""
+    if path is None:
+        return {}
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -81,24 +84,19 @@ def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None
             flat[prefix + name] = value
 
 
-def span_of(bag: Bag, options: argparse.Namespace) -> Span:
-    """Return the time of recording that the options ask for; raises `BagError` if it is empty."""
+def inputs_of(
+    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
+) -> Inputs:
+    """Return what is read of a bag by the options; raises `BagError` if that is nothing."""
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]
-    span, length = Span(*limits), (bag.end_ns - bag.start_ns) * 1e-9
+    length = (bag.end_ns - bag.start_ns) * 1e-9
     until = math.inf if options.until is None else options.until
     if (options.begin or 0.0) >= min(length, until):
         raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
                        f'recording is {max(length, 0.0):.3f} s long')
-    return span
-
-
-def inputs_of(
-    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
-) -> Inputs:
-    """Return what is read of a bag by the options."""
     return choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
-                         span_of(bag, options), truth=options.truth)
+                         Span(*limits), truth=options.truth)
 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
@@ -112,4 +110,6 @@ def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
 
 def watched_bag(bag: Bag, title: str) -> Bag:
     """Return a bag that shows on a terminal how far its messages have been read."""
-    return bag.watched(lambda messages, total: watched(messages, desc=title, total=total))
+    seen = copy(bag)
+    seen.watch = lambda messages, total: watched(messages, desc=title, total=total)
+    return seen

@@ -28,15 +28,8 @@ from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import g2o_text
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.quantities import Metres, StampsNs
-from pose_graph_ros.offline.simulation import settings
-from pose_graph_ros.offline.simulation.recording import (
-    Course,
-    course,
-    graph_of,
-    record,
-    Recording,
-    SimulatedGraph,
-)
+from pose_graph_ros.offline.simulation import recording, settings
+from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.sensors import velocities
 from pose_graph_ros.offline.simulation.worlds import PERIOD_S, WORLDS
 
@@ -69,21 +62,34 @@ def execute(options: argparse.Namespace) -> int:
     for path in written:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
-    way = course(WORLDS[options.world], options.seed,
-                 options.duration or settings.DURATIONS_S[options.world],
-                 lambda usual: changed(usual, options))
+    way = recording.course(
+        WORLDS[options.world], options.seed,
+        options.duration or settings.DURATIONS_S[options.world],
+        lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.truth.stamps_ns[-1] - settings.START_NS) / 1e9}
     files = dict[Path, bytes]()
     simulated: SimulatedGraph | Recording
     if is_graph:
-        simulated = graph_of(way, options.node_distance or settings.NODE_DISTANCES[options.world])
-        about |= _about_graph(way, simulated)
+        simulated = recording.graph_of(
+            way, options.node_distance or settings.NODE_DISTANCES[options.world])
+        n, loops, observed = len(simulated.truth), simulated.loops, simulated.observed
+        about |= {
+            'distance_m': float(way.motion.distance[-1]), 'nodes': n,
+            'edges': n - 1 + len(loops), 'observed_nodes': len(observed),
+            # the degrees of freedom of chi2 at the truth
+            'measured_numbers': 3 * len(simulated.edges) + int(np.sum(
+                np.diagonal(observed.information, 0, 1, 2) > 0.0)),
+            'chi2_of_the_truth': simulated.graph(simulated.truth.poses).energies().chi2,
+            **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
+                (loops.i, loops.j))),
+            'wrong_observed_nodes': observed.i[simulated.wrong].tolist(),
+            **_disturbances(way.setup)}
         for path, poses in ((options.out, simulated.start),
                             (beside['g2o'], simulated.truth.poses)):
             files[path] = g2o_text(simulated.graph(poses).rows()).encode()
     else:
-        simulated = record(way)
+        simulated = recording.record(way)
         about |= write_drive(simulated, options.out)
     text = json.dumps(about, indent=2)
     files[beside['json']] = f'{text}\n'.encode()
@@ -154,10 +160,8 @@ def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> d
 def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
     """Return the messages of all topics by stamp; of equally late ones the first is written."""
     setup, (odometry, gyro, fixes, poses, closures) = drive.setup, settings.TOPICS
-
-    def covariance(topic: str) -> FloatArray:
-        return np.diag(np.square(setup.sigmas(topic)))
-
+    covariances = {topic: np.diag(np.square(setup.sigmas(topic))) for topic in (poses, closures)
+                   if topic in setup.sensors}
     topics = {
         odometry: odometry_messages(
             odometry, 'odom', drive.odometry, ODOMETRY_VARIANCES,
@@ -165,19 +169,22 @@ def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
         settings.TRUTH: odometry_messages(
             settings.TRUTH, 'map', drive.truth, (0.0,) * 6)}
     if setup.gyro is not None:
-        topics[gyro] = rate_messages(
-            gyro, *drive.measured[gyro][:2],
-            setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S))
+        stamps_ns, values, _ = drive.measured[gyro]
+        sigma = setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S)
+        nothing, variances = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
+        # yaw rates in base_link [rad/s], and nothing else
+        topics[gyro] = ((gyro, _IMU, stamp, _TYPES[_IMU](
+            _header(stamp, 'base_link'), _of('Quaternion', 0.0, 0.0, 0.0, 1.0), nothing,
+            _of('Vector3', 0.0, 0.0, rate), variances, _of('Vector3', 0.0, 0.0, 0.0), nothing))
+            for stamp, rate in zip(stamps_ns.tolist(), values.tolist(), strict=True))
     if setup.fixes is not None:
-        topics[fixes] = fix_messages(
-            fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
+        topics[fixes] = fix_messages(fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
     if setup.poses is not None:
         stamps_ns, values, _ = drive.measured[poses]
-        topics[poses] = _poses(
-            poses, stamps_ns, ['map'] * len(values), values, covariance(poses))
+        topics[poses] = _poses(poses, stamps_ns, ['map'] * len(values), values, covariances[poses])
     if setup.closures is not None:
         topics[closures] = loop_closure_messages(
-            closures, *drive.measured[closures][:2], covariance(closures))
+            closures, *drive.measured[closures][:2], covariances[closures])
     return topics
 
 
@@ -198,25 +205,7 @@ def _delivered(
         yield topic, type_name, recorded, message
 
 
-def _about_graph(way: Course, simulated: SimulatedGraph) -> dict[str, Any]:
-    """Return what there is to say of a graph."""
-    n, loops, observed = len(simulated.truth), simulated.loops, simulated.observed
-    measured = np.diagonal(observed.information, 0, 1, 2) > 0.0
-    return {
-        'distance_m': float(way.motion.distance[-1]), 'nodes': n,
-        'edges': n - 1 + len(loops), 'observed_nodes': len(observed),
-        # the degrees of freedom of chi2 at the truth
-        'measured_numbers': 3 * len(simulated.edges) + int(np.sum(measured)),
-        'chi2_of_the_truth': simulated.graph(simulated.truth.poses).energies().chi2,
-        **_closures(simulated.group, simulated.missing_groups, 'ids', np.column_stack(
-            (loops.i, loops.j))),
-        'wrong_observed_nodes': observed.i[simulated.wrong].tolist(),
-        **_disturbances(way.setup)}
-
-
-def _closures(
-    group: IntArray, missing: int, what: str, ends: IntArray,
-) -> dict[str, Any]:
+def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:
     false = np.flatnonzero(group >= 0)
     return {'true_closures': int(np.sum(group < 0)),
             'false_closures': [{what: pair, 'group': number} for pair, number in zip(
@@ -226,18 +215,16 @@ def _closures(
 
 def _disturbances(setup: settings.Setup) -> dict[str, Any]:
     """Return what is disturbed, with times as stamps."""
-    def stamp(seconds: float) -> int:
-        return settings.START_NS + round(seconds * 1e9)
-
-    def end(jump: settings.Jump) -> int | None:
-        return stamp(jump.at_s + jump.seconds) if np.isfinite(jump.seconds) else None
+    def stamp(seconds: float) -> int | None:
+        return settings.START_NS + round(seconds * 1e9) if np.isfinite(seconds) else None
 
     return {
         'start_ns': settings.START_NS,
         'outages': [{'topic': each.topic, 'begin_ns': stamp(each.begin_s),
                      'end_ns': stamp(each.end_s)} for each in setup.outages],
-        'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s), 'end_ns': end(each),
-                   'step': each.step} for each in setup.jumps],
+        'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s),
+                   'end_ns': stamp(each.at_s + each.seconds), 'step': each.step}
+                  for each in setup.jumps],
         **{name: [asdict(each) for each in found] for name, found in (
             ('delays', setup.delays), ('clock_offsets', setup.offsets),
             ('duplicates', setup.duplicates), ('claimed_sigmas', setup.claims))}}
@@ -279,23 +266,11 @@ def fix_messages(
 
     Sigma is that of east and of north; that of the height is twice as large.
     """
-    status = _TYPES['sensor_msgs/msg/NavSatStatus']
-    covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
+    status, covariance = _TYPES['sensor_msgs/msg/NavSatStatus'], sigma**2 * np.diag((1., 1., 4.))
     for stamp, fix in zip(stamps_ns.tolist(), geodetic.tolist(), strict=True):
         yield topic, _FIX, stamp, _TYPES[_FIX](
             _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
-            covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
-
-
-def rate_messages(
-    topic: str, stamps_ns: StampsNs, rates: FloatArray, sigma: float,
-) -> Iterator[Message]:
-    """Return sensor_msgs/Imu messages of yaw rates in base_link [rad/s], and nothing else."""
-    none, covariance = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
-    for stamp, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
-        yield topic, _IMU, stamp, _TYPES[_IMU](
-            _header(stamp, 'base_link'), _of('Quaternion', 0.0, 0.0, 0.0, 1.0), none,
-            _of('Vector3', 0.0, 0.0, rate), covariance, _of('Vector3', 0.0, 0.0, 0.0), none)
+            covariance.ravel(), _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
 
 
 def loop_closure_messages(

@@ -16,13 +16,7 @@ from typing import Any
 from pose_graph_ros.cli.arguments import number
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.offline.simulation import settings
-from pose_graph_ros.offline.simulation.settings import (
-    DURATIONS_S,
-    Jump,
-    NODE_DISTANCES,
-    OdometryErrors,
-    Setup,
-)
+from pose_graph_ros.offline.simulation.settings import DURATIONS_S, Jump, OdometryErrors, Setup
 
 PICTURES = ('.png', '.pdf', '.svg')
 FALSE_SIZE = 4  # closures of a group of false ones
@@ -87,11 +81,16 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seed', metavar='N', type=number(0, whole=True), default=1,
                         help='(default: %(default)s)')
     _add_sensors(parser)
-    _add_disturbances(parser)
+    group = parser.add_argument_group(
+        'disturbances', 'each may be repeated; times are seconds since the start. The drive has '
+        'an outage and a jump\nof /gps/fix, which yours replace; "/gps/fix:none" removes them')
+    for option, (grammar, kind, _, text) in DISTURBANCES.items():
+        group.add_argument(f'--{option.replace("_", "-")}', metavar=grammar, action='append',
+                           type=_disturbance(grammar, kind), default=[], help=text)
     out = parser.add_argument_group('output')
     out.add_argument('--node-distance', metavar='M', type=number(0.01),
                      help='distance of the nodes of a graph [m] '
-                          f'(default: {_by_world(NODE_DISTANCES)})')
+                          f'(default: {_by_world(settings.NODE_DISTANCES)})')
     out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
     out.add_argument('--plot', metavar='FILE', type=Path,
                      help=f'draw a map; the name ends in {", ".join(PICTURES)}')
@@ -107,8 +106,9 @@ def _by_world(values: dict[str, float]) -> str:
 def _add_sensors(parser: argparse.ArgumentParser) -> None:
     """Add the options on sensors; `dest` is the sensor, with the fields of it that are set."""
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
-    wheels.add_argument('--odometry', dest='wheels.errors', type=_odometry,
+    wheels.add_argument('--odometry', dest='wheels.errors',
                         choices=[each.value for each in OdometryErrors],
+                        type=lambda text: next((e for e in OdometryErrors if e == text), text),
                         help='errors of two wheels, or a random walk as the node assumes it '
                              '(default: wheels; a graph always has the latter)')
     wheels.add_argument('--wheel-scale', dest='wheels.scale', metavar='LEFT,RIGHT',
@@ -163,15 +163,6 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
                             f'stretch was taken for another (default of SIZE: {FALSE_SIZE})')
 
 
-def _add_disturbances(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group(
-        'disturbances', 'each may be repeated; times are seconds since the start. The drive has '
-        'an outage and a jump\nof /gps/fix, which yours replace; "/gps/fix:none" removes them')
-    for option, (grammar, kind, _, text) in DISTURBANCES.items():
-        group.add_argument(f'--{option.replace("_", "-")}', metavar=grammar, action='append',
-                           type=_disturbance(grammar, kind), default=[], help=text)
-
-
 def changed(usual: Setup, options: argparse.Namespace) -> Setup:
     """Return what is simulated, by the usual of the world and the options; raises ConfigError."""
     given: dict[str, dict[str, Any]] = {
@@ -220,11 +211,6 @@ def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
             raise ConfigError(f'--outage {settings.ODOMETRY}: a graph cannot do without odometry')
 
 
-def _odometry(text: str) -> OdometryErrors | str:
-    """Return where errors come from; another word is none of the choices."""
-    return OdometryErrors(text) if text in [*OdometryErrors] else text
-
-
 def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:
     """Return what reads numbers with commas between them, and gives them in an order."""
     count = max(order) + 1
@@ -259,18 +245,15 @@ def _disturbance(grammar: str, kind: Callable[..., Any]) -> Callable[[str], Chan
         if words == ['none']:
             return topic, None
         try:
-            return topic, (_jump(topic, *words) if kind is Jump
-                           else kind(topic, *map(float, words)))
+            if kind is not Jump:
+                return topic, kind(topic, *map(float, words))
+            at, step, seconds = words if len(words) == 3 else (*words, 'inf')
+            dx, dy, *turn = (0.0, 0.0) if step == 'reset' else map(float, step.split(','))
+            heading, = turn or [0.0]
+            return topic, Jump(topic, float(at), None if step == 'reset' else (dx, dy, heading),
+                               float(seconds))
         except ConfigError as error:
             raise argparse.ArgumentTypeError(f'{text!r}: {error}') from error
         except (TypeError, ValueError):
             raise argparse.ArgumentTypeError(f'expected {grammar}, got {text!r}') from None
     return read
-
-
-def _jump(topic: str, at: str, step: str, seconds: str = 'inf') -> Jump:
-    if step == 'reset':
-        return Jump(topic, float(at), None, float(seconds))
-    dx, dy, *turn = map(float, step.split(','))
-    heading, = turn or [0.0]
-    return Jump(topic, float(at), (dx, dy, heading), float(seconds))

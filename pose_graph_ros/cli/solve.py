@@ -3,29 +3,37 @@
 """
 Optimise a g2o, TORO or iSAM file, and print the constraints with the largest energies.
 
-What takes long to load, such as compiled kernels, is imported where it is used.
+It is optimised from one or several starts, and the minimum is certified, which may lead to a
+better one. What takes long to load, such as compiled kernels, is imported where it is used.
 """
 # ruff: noqa: PLC0415
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 import json
 import math
 from pathlib import Path
+import re
 import sys
 import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.cli.arguments import METHODS
+from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
-from pose_graph_ros.cli.solve_starts import CONFIG, Problem, Solution, solve, with_certificate
-from pose_graph_ros.core.batch.levenberg_marquardt import Status
-from pose_graph_ros.core.exceptions import ConfigError, PoseGraphError
-from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
-from pose_graph_ros.core.graph.constraints import upper
-from pose_graph_ros.core.io.g2o import write_g2o
+from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
+from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, PlainOptimizer
+from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.exceptions import ConfigError, LinearSolveError, PoseGraphError
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors, upper
+from pose_graph_ros.core.graph.graph_update import GraphUpdate
+from pose_graph_ros.core.io.g2o import compose_missing, GraphFile, write_g2o
+from pose_graph_ros.core.sparse import components
+from pose_graph_ros.offline.certify import Certificate, certify, NearHessian, Verdict
+from pose_graph_ros.offline.chordal_objective import formulate, NotCoveredError
 
 if TYPE_CHECKING:
     from pose_graph_ros.core.graph.graph import Graph
@@ -33,10 +41,243 @@ if TYPE_CHECKING:
 N_LARGEST = 5  # edges, observed nodes, and names, that are printed
 COLUMNS = ('id', 'x', 'y', 'theta', 'cov_xx', 'cov_xy', 'cov_xtheta', 'cov_yy', 'cov_ytheta',
            'cov_thetatheta')
+CONFIG = SolverConfig(max_iterations=200)
+MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
-def _complete(options: argparse.Namespace) -> None:
-    """Complete the arguments: in `--robust FILE`, what follows the option is the file."""
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A graph at the lowest minimum that was found."""
+
+    result: BatchResult
+    start: str  # poses from which it was reached
+    determined: bool  # whether the constraints determine all poses
+    tried: tuple[tuple[str, BatchResult], ...] = ()  # all starts, if there were several
+    optimizer: PlainOptimizer | None = None  # what found it, if no compiled kernels were used
+
+
+class Problem:
+    """
+    A graph from a file that is to be optimised; parts that nothing holds have a fixed node.
+
+    With `plain` compiled kernels are not used if the graph is simple and not large: loading them
+    takes longer than to solve such a graph.
+    """
+
+    def __init__(self, file: GraphFile, *, plain: bool) -> None:
+        rows, edges, observed = file.rows, file.rows.factors.edges, file.rows.factors.observed
+        part = components(edges.i, edges.j, len(file.ids))
+        is_held = np.isin(part, part[rows.fixed]) | np.isin(part, part[observed.i])
+        is_first = (part == np.arange(len(part))) & ~is_held
+        self.ids, self.has_start = file.ids, file.has_start
+        self.held = np.flatnonzero(is_first)
+        """First nodes of the parts that had no fixed and no observed one."""
+        self._file = replace(file, rows=rows._replace(fixed=rows.fixed | is_first))
+        self.plain: PlainGraph | None = None  # the graph, if no kernels are used
+        if (plain and len(rows.poses) <= MOST_PLAIN_NODES and not np.all(rows.fixed)
+                and PlainGraph.is_covered(rows)):
+            self.plain = PlainGraph(self._file.rows)
+
+    @property
+    def graph(self) -> 'Graph | PlainGraph':
+        """The graph, with the best poses that were found."""
+        return self._file.graph if self.plain is None else self.plain
+
+    @property
+    def engine(self) -> 'Graph':
+        """The graph for the compiled kernels, at its present poses; it is used from now on."""
+        graph = self._file.graph
+        if self.plain is not None:
+            graph.set_poses(self.plain.poses)
+            self.plain = None
+        return graph
+
+
+def solve(problem: Problem, start: str) -> Solution:
+    """Return the result of optimising a graph in place."""
+    if start != 'best':
+        return _solve_from(problem, start, problem.graph.poses.copy())
+    present = problem.graph.poses.copy()
+    # poses that were composed from edges are those of odometry
+    names = [name for name in STARTS if name != 'best' and (name != 'file' or problem.has_start)]
+    found: list[tuple[Solution, FloatArray]] = []
+    for name in names:
+        solution = _solve_from(problem, name, present)
+        found.append((solution, problem.graph.poses.copy()))
+    best, poses = min(found, key=lambda each: (
+        each[0].result.status is Status.FAILED, each[0].result.chi2))
+    if best is not found[-1][0]:
+        best = resumed(problem, best, poses)
+    return replace(best, tried=tuple((each.start, each.result) for each, _ in found))
+
+
+def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
+    """
+    Return a solution after optimising from its poses again, so that the graph is factorised there.
+    """
+    again = _solve_from(problem, 'present', poses)
+    if again.result.status is not Status.CONVERGED:
+        return replace(again, start=solution.start)
+    return replace(solution, result=replace(solution.result, chi2=again.result.chi2))
+
+
+def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
+    if problem.plain is not None and start in {'chordal', 'present'}:
+        problem.plain.set_poses(poses)
+        plain = PlainOptimizer(problem.plain, CONFIG)
+        found = plain.optimize(Start.CHORDAL if start == 'chordal' else Start.PRESENT)
+        if found is not None:
+            return Solution(found, found.start.value, True, (), plain)
+    # loads the compiled kernels
+    from pose_graph_ros.core.batch import optimizer
+
+    graph = problem.engine
+    if start == 'odometry':
+        # composed from odometry if that joins all nodes, else from all edges
+        edges, poses, known = graph.factors.edges, graph.poses.copy(), graph.fixed.copy()
+        edges = edges.rows(edges.weight > 0.0)
+        steps = edges.rows(np.abs(edges.j - edges.i) == 1)
+        joins_all = len(np.unique(np.minimum(steps.i, steps.j))) == graph.n_nodes - 1
+        compose_missing(poses, known, steps if joins_all else edges)
+        poses[~graph.is_pose, 2] = 0.0
+    graph.set_poses(poses)
+    optimize = (optimizer.optimize_from_linear_start if start == 'chordal' else optimizer.optimize)
+    result, determined = _held_weakly(graph, optimize)
+    reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
+                    result.reason)
+    names = {'file': 'present poses', 'odometry': 'odometry'}
+    if result.status is Status.FAILED and start == 'chordal':
+        # the poses are those before, but all linear starts were tried
+        names[start] = Start.CHORDAL.value
+    return Solution(replace(result, reason=reason), names.get(start, result.start.value),
+                    determined)
+
+
+def _held_weakly(
+    graph: 'Graph', optimize: Callable[['Graph', SolverConfig], BatchResult],
+) -> tuple[BatchResult, bool]:
+    """
+    Optimise a graph; if poses are not determined, choose those near the present ones.
+
+    The result has the reason then. It is the minimum of chi2 with a weak prior on each node, which
+    is not added to the graph. Also return whether the poses are determined.
+    """
+    result = optimize(graph, CONFIG)
+    if result.status is not Status.FAILED or not np.isfinite(result.chi2):
+        return result, True
+    copy, n = type(graph)(), graph.n_nodes
+    copy.fill(graph.rows())
+    typical = np.einsum('mii->mi', graph.factors.weighted_information)
+    weak = 1e-7 * np.median(typical[typical > 0.0]) * (
+        np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
+    copy.apply(GraphUpdate(factors=Factors.on(
+        np.arange(n), None, graph.poses.copy(), weak,
+        [FactorKind.GLOBAL_POSE] * n)))
+    other = optimize(copy, CONFIG)
+    if other.status is Status.FAILED:
+        return result, False
+    graph.set_poses(copy.poses)
+    return replace(other, chi2=graph.energies().chi2,
+                   reason=f'{result.reason}; it is held near its start'), False
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What the certificate says of a solution."""
+
+    certificate: Certificate | None
+    reason: str  # why there is none; else empty
+    seconds: float
+    chi2: float  # of the solution, with the error (3.48)
+    bounds_chi2: bool = False  # whether the lower bound is one of chi2 as well
+    chi2_from_it: float | None = None  # reached from the minimum that it found, if tried
+
+    @property
+    def bound(self) -> float | None:
+        """Lower bound of chi2, if one was proved."""
+        if self.certificate is None or not self.bounds_chi2:
+            return None
+        return max(self.certificate.bound, 0.0)
+
+    def values(self) -> dict[str, Any]:
+        """Return the keys of `certificate` in the JSON output, as in docs/tools.md."""
+        made, bound = self.certificate, self.bound
+        return {
+            'verdict': (Verdict.NOT_ATTEMPTED if made is None else made.verdict).value,
+            'reason': self.reason, 'seconds': self.seconds,
+            **{key: None if made is None else getattr(made, name) for key, name in (
+                ('chi2', 'chi2'), ('gap', 'gap'), ('relative_gap', 'relative_gap'),
+                ('lambda_min', 'smallest'), ('rank', 'rank'))},
+            'lower_minimum': made is not None and made.is_lower,
+            'chi2_from_it': self.chi2_from_it, 'chi2_bound': bound,
+            'chi2_gap': None if bound is None else max(self.chi2 - bound, 0.0)}
+
+    def lines(self) -> list[str]:
+        """Return what is printed."""
+        made = self.certificate
+        if made is None:
+            return [f'certificate: not attempted, because {self.reason}']
+        took = f'{self.seconds:.3f} s'
+        if made.verdict is Verdict.CERTIFIED:
+            lines = [f'certificate: certified, {took}: the chordal objective, {made.chi2:.9g} at '
+                     f'its minimum, is nowhere lower by more than {made.gap:.2g}']
+        else:
+            lines = [f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
+                     f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum '
+                     f'found']
+        if made.is_lower:
+            lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
+        if self.chi2_from_it is not None:
+            lines.append(f'  from there, chi2 becomes {self.chi2_from_it:.9g}')
+        if self.bound is None:
+            lines.append('  this bounds no chi2, whose information depends on the direction; it '
+                         'only speaks for the headings')
+        else:
+            lines.append(f'  so no poses have a chi2 below {self.bound:.9g}; that found is '
+                         f'{max(self.chi2 - self.bound, 0.0):.2g} above this')
+        return lines
+
+
+def with_certificate(
+    problem: Problem, solution: Solution, *, eigenvalue: bool,
+) -> tuple[Solution, Report]:
+    """Return the certificate of a solution, and a better solution if it leads to one."""
+    begin, graph = time.monotonic(), problem.graph
+
+    def none(reason: str) -> tuple[Solution, Report]:
+        return solution, Report(None, reason, time.monotonic() - begin, solution.result.chi2)
+
+    if not solution.determined:
+        return none('the constraints do not determine the poses')
+    if solution.result.status is Status.FAILED:
+        return none(f'the optimisation failed: {solution.result.reason}')
+    try:
+        formulation = formulate(graph)
+        by = solution.optimizer
+        made = certify(formulation, graph.poses, eigenvalue=eigenvalue, hessian=(
+            None if by is None else NearHessian(by.places, by.heading_steps)))
+    except (NotCoveredError, LinearSolveError) as error:
+        return none(str(error))
+    found = None
+    if made.is_lower:
+        poses = graph.poses.copy()
+        graph.set_poses(made.poses)
+        other = solve(problem, 'present')
+        found = other.result.chi2
+        if other.result.is_better_than(solution.result):
+            solution = Solution(other.result, 'minimum of the chordal objective',
+                                other.determined, solution.tried)
+        else:
+            solution = resumed(problem, solution, poses)
+    return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2,
+                            formulation.below_chi2, found)
+
+
+# --- the tool
+
+def execute(options: argparse.Namespace) -> int:
+    """Run the tool; return the exit code."""
+    # in `--robust FILE`, what follows the option is the file
     if options.robust not in (None, *METHODS):
         if options.graph is not None:
             raise ConfigError(
@@ -47,22 +288,19 @@ def _complete(options: argparse.Namespace) -> None:
     for path in options.out:
         if not path.parent.is_dir():
             raise ConfigError(f'--out: there is no folder {path.parent} for {path.name}')
+    return _solve(options, (lambda _: None) if options.json else print)
 
 
-def execute(options: argparse.Namespace) -> int:
-    """Run the tool; return the exit code."""
-    _complete(options)
-
-    def say(line: str) -> None:
-        if not options.json:
-            print(line)
-
+def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+    """Solve, write and print the results; return the exit code."""
     file = read_file(options.graph, options.edge2)
     tables = [path for path in options.out if path.suffix == '.csv']
     which = options.marginals or ('all' if len(tables) > 0 else None)
     problem = Problem(file, plain=(
         options.robust is None and which is None and options.start == 'chordal'))
-    rows = None if which is None else _chosen(problem, which)
+    rows = None if which is None else np.arange(len(problem.ids)) if which == 'all' else (
+        np.array([problem.engine.newest_pose]) if which == 'newest'
+        else rows_of(problem.ids, which, '--marginals'))
     held, graph = problem.held, problem.graph
     before = graph.energies().chi2
     say(f'{graph.n_nodes} hidden nodes, {len(graph.factors.edges)} edges, '
@@ -89,28 +327,37 @@ def execute(options: argparse.Namespace) -> int:
     say('\n'.join([*_lines(problem, solution, seconds, doubted),
                    *([] if certificate is None else certificate.lines())]))
     table, error = ([], 0.0) if rows is None else _marginals(problem, solution, rows)
+    text = '\n'.join([','.join(COLUMNS), *(','.join(
+        '' if value is None else repr(value) for value in row.values()) for row in table), ''])
     for path in options.out:
         if path in tables:
-            path.write_text(_csv(table), encoding='ascii')
+            path.write_text(text, encoding='ascii')
         else:
             write_g2o(problem.graph, path, problem.ids)
     if options.json:
-        values = _values(problem, solution, doubted, file.ids[held]) | {
+        graph, result = problem.graph, solution.result
+        edges = graph.factors_at(doubted)
+        print(json.dumps(_finite({
+            'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
+            'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
+            'iterations': result.iterations, 'status': result.status.value,
+            'reason': result.reason, 'start': solution.start, 'starts': [
+                {'start': name, 'chi2': each.chi2, 'iterations': each.iterations,
+                 'status': each.status.value} for name, each in solution.tried],
+            'held': file.ids[held].tolist(),
+            'doubted': np.stack((problem.ids[edges.i], problem.ids[edges.j]), axis=1).tolist(),
             'chi2_start': before, 'seconds': seconds, 'edge2': file.edge2_order,
             'robust': decision,
-            'certificate': None if certificate is None else certificate.values()}
-        if rows is not None:
-            values |= {'marginals_relative_error': error,
-                       **({} if len(tables) > 0 else {'marginals': table})}
-        print(json.dumps(_finite(values), indent=2, allow_nan=False))
+            'certificate': None if certificate is None else certificate.values(),
+            **({} if rows is None else {'marginals_relative_error': error}),
+            **({} if rows is None or len(tables) > 0 else {'marginals': table})}),
+            indent=2, allow_nan=False))
     elif rows is not None and len(tables) == 0:
-        print(_csv(table), end='')
+        print(text, end='')
     return 0 if solution.result.status is Status.CONVERGED else 1
 
 
-def _lines(
-    problem: Problem, solution: Solution, seconds: float, doubted: IntArray,
-) -> list[str]:
+def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArray) -> list[str]:
     """Return chi2 with how it was reached, and the largest energies."""
     graph, ids, result = problem.graph, problem.ids, solution.result
     energies, factors = graph.energies().factors, graph.factors
@@ -128,23 +375,6 @@ def _lines(
           for k in order[~is_edge][:N_LARGEST])]
 
 
-def _values(
-    problem: Problem, solution: Solution, doubted: IntArray, held: IntArray,
-) -> dict[str, Any]:
-    """Return most of the JSON output."""
-    graph, ids, result = problem.graph, problem.ids, solution.result
-    edges = graph.factors_at(doubted)
-    return {
-        'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
-        'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
-        'iterations': result.iterations, 'status': result.status.value, 'reason': result.reason,
-        'start': solution.start, 'starts': [
-            {'start': name, 'chi2': each.chi2, 'iterations': each.iterations,
-             'status': each.status.value} for name, each in solution.tried],
-        'held': held.tolist(),
-        'doubted': np.stack((ids[edges.i], ids[edges.j]), axis=1).tolist()}
-
-
 def _finite(value: Any) -> Any:
     """Return values for JSON, which has no infinity: None in its place."""
     if isinstance(value, dict):
@@ -152,20 +382,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _chosen(problem: Problem, which: str) -> IntArray:
-    """Return the rows of the nodes whose marginals are asked for."""
-    if which == 'all':
-        return np.arange(len(problem.ids))
-    if which == 'newest':
-        return np.array([problem.engine.newest_pose])
-    return rows_of(problem.ids, which, '--marginals')
-
-
-def _csv(table: Iterable[Mapping[str, float | None]]) -> str:
-    return '\n'.join([','.join(COLUMNS), *(','.join(
-        '' if value is None else repr(value) for value in row.values()) for row in table), ''])
 
 
 def _marginals(
@@ -193,19 +409,8 @@ def _marginals(
         if not graph.is_pose[row]:
             values = [None if k in {2, 5, 7, 8} else value for k, value in enumerate(values)]
         table.append(dict(zip(COLUMNS, [int(problem.ids[row]), *values], strict=True)))
-    error = float(np.finfo(float).eps) * _condition(graph, covariances)
-    if error > 1e-6:
-        print(f'warning: by rounding, covariances may be off by {error:.1g} of themselves',
-              file=sys.stderr)
-    return table, error
-
-
-def _condition(graph: 'Graph', covariances: Covariances) -> float:
-    """
-    Return a bound of the condition number of H with a diagonal of ones.
-
-    The trace of its inverse, each variance times what constraints add to H there.
-    """
+    # a bound of the condition number of H with a diagonal of ones: the trace of its inverse, each
+    # variance times what constraints add to H there
     added, factors = np.zeros((graph.n_nodes, 3)), graph.factors_by_row
     information = factors.weighted_information
     position = information[:, 0, 0] + information[:, 1, 1]
@@ -213,4 +418,9 @@ def _condition(graph: 'Graph', covariances: Covariances) -> float:
     by_factor = np.column_stack((position, position, information[:, 2, 2] + arm * position))
     for ends in (factors.i, factors.j):
         np.add.at(added, ends[ends >= 0], by_factor[ends >= 0])
-    return max(float(np.sum(added * np.einsum('mii->mi', covariances))), 1.0)
+    error = float(np.finfo(float).eps) * max(
+        float(np.sum(added * np.einsum('mii->mi', covariances))), 1.0)
+    if error > 1e-6:
+        print(f'warning: by rounding, covariances may be off by {error:.1g} of themselves',
+              file=sys.stderr)
+    return table, error

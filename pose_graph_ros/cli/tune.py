@@ -1,22 +1,343 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Estimate the noise of odometry and of what measures in the map; write a parameter file."""
+"""
+Estimate the noise of odometry and of what measures in the map; write a parameter file.
+
+All measurements of a drive are used, and it is found out how well that does on stretches held out.
+For each part of the drive in turn the engine runs with all others, with the settings before and
+with those that this run shows. So the estimate in the file is from all measurements, and the
+errors in the table are those of estimates that are made in the same way, at fixes that took no
+part in these.
+"""
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import Enum
+from itertools import islice
 import json
+import math
 import os
 import sys
 import time
 from typing import Any
 
-from pose_graph_ros.adapters.bags import BagError, open_bags
-from pose_graph_ros.cli import shared
-from pose_graph_ros.cli.drive import read_truth
-from pose_graph_ros.cli.tuned_parameters import interval, yaml_text
-from pose_graph_ros.cli.tuning import Outcome, Tuning, Verdict
+import numpy as np
 
+from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
+from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
+from pose_graph_ros.adapters.parameters import checked
+from pose_graph_ros.adapters.sources import backend_config, IMU
+from pose_graph_ros.cli import shared, tuned_parameters
+from pose_graph_ros.cli.drive import distances, read_truth
+from pose_graph_ros.cli.replay import measurements_of, run_measurements
+from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
+from pose_graph_ros.core import measurements
+from pose_graph_ros.core.backend import PoseGraphBackend
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.judgement.texts import short, states_by_stamps
+from pose_graph_ros.core.judgement.verdicts import State
+from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
+from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
+from pose_graph_ros.core.sources.kinds import validate
+from pose_graph_ros.core.sources.validation import Validated
+from pose_graph_ros.offline import noise
+from pose_graph_ros.offline.noise import Errors, Found, Noise, Summary
+from pose_graph_ros.offline.source_residuals import RowFit, ScaleFit
+from pose_graph_ros.offline.variance_components import analyse
+
+Key = tuple[str, StampNs]  # source and stamp of a measurement
+LEAST = 20  # measurements of a source whose noise is estimated
+IN_MEMORY = 1_000_000  # measurements, of 700 bytes each
+OF_CLOSURES = Claims(is_constant=False, is_scalable=True, sigma=0.0, sigma_heading=0.0)
+NOT_SHOWN = Found(1.0, 0.0, math.inf, kept=True)
+
+
+class Verdict(Enum):
+    """What came of a tuning."""
+
+    BETTER = 'held-out errors are lower after tuning'
+    SAME = 'nothing to change: this drive does not prove any other noise'
+    WORSE = 'held-out errors are not lower after tuning'
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of a tuning."""
+
+    tuned: Sequence[Tuned]
+    verdict: Verdict
+    before: Summary
+    after: Summary
+    to_truth: Sequence[Metres]  # rms of the paths before and after; empty if it is not known
+    folds: int
+    stretch: Seconds  # length of those that were held out
+    measured: str  # how much was
+    n_doubted: int
+
+
+class Tuning:
+    """Tunes with the measurements of a bag, the first million, all fixes in the same map."""
+
+    def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
+        self._inputs, self._values = inputs, values
+        self._step, self._steps = 0, 0
+        self._path = bag.path
+        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
+        self._measurements = list(islice(stream, IN_MEMORY))
+        self.is_cut = next(stream, None) is not None  # whether the bag has more
+        start = min((each.stamp_ns for _, each in self._measurements
+                     if isinstance(each, OdometrySample)), default=0)
+        # the first fix that odometry covers is placed first
+        for k in sorted(range(len(self._measurements)),
+                        key=lambda k: self._measurements[k][1].stamp_ns < start):
+            name, fix = self._measurements[k]
+            if isinstance(fix, measurements.Fix):
+                self._measurements[k] = name, fix.placed()
+        counts = Counter(name for name, each in self._measurements
+                         if isinstance(each, OdometrySample))
+        self._odometries = [name for name in inputs.odometry if counts[name] > 1]
+        if len(self._odometries) == 0:
+            topics = ' or '.join(inputs.topics[name] for name in inputs.odometry)
+            raise BagError(f'{self._path}: no usable odometry on {topics}')
+        stamps = [each.stamp_ns for name, each in self._measurements
+                  if name == self._odometries[0]]
+        self._start_ns, self._duration = min(stamps), (max(stamps) - min(stamps)) * 1e-9
+        self._sources = {name: some for name, some in self._valid(values).items()
+                         if len(some) >= LEAST}
+        self._closures: list[tuple[str, LoopClosure]] = []
+        if all(isinstance(each, HeadingOnly) for some in self._sources.values() for each in some):
+            self._sources, self._closures = {}, [
+                (name, each) for name, each in self._measurements
+                if isinstance(each, LoopClosure)]
+            if len(self._closures) < LEAST:
+                topics = ', '.join(f'{topic} ({source})'
+                                   for source, topic in inputs.topics.items())
+                raise BagError(
+                    f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
+                    f'poses or loop closures are needed; used are {topics}')
+
+    def tune(
+        self, folds: int, truth: Trajectory | None, stretch: Seconds | None = None,
+    ) -> Outcome:
+        """Return the parameters that are the most likely, and how well these do."""
+        if stretch is not None and stretch > self._duration / folds:
+            raise BagError(
+                f'{self._path}: expected stretches of at most {short(self._duration / folds)} s, '
+                f'as it lasts {short(self._duration)} s in {folds} parts, got {short(stretch)}')
+        # what the settings before say is not looked for by the engine: it shows in other runs
+        self._looking = {**self._values, **{
+            f'{name}.correlation_time': -1.0 for name in self._sources
+            if self._values[f'{name}.correlation_time'] > 0.0}}
+        self._is_shown_before = self._looking == self._values and len(self._odometries) == 1
+        more = 0 if self._is_shown_before else len(self._odometries)
+        self._steps = 2 + more + (2 + more) * folds
+        runs = self._runs('all')[1]
+        tuned, tau = self._estimate(runs, frozenset())
+        after = self._run(checked({**self._values, **changed(tuned)}),
+                          'all, with the settings after')
+        doubted = frozenset(
+            (source, stamp) for (source, stamp, reference), state
+            in states_by_stamps(after.verdicts()).items()
+            if state is State.DOUBTED and reference is None)
+        if len(doubted) > 0:
+            tuned, tau = self._estimate(runs, doubted)
+        period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
+                      for some in self._sources.values()), default=1.0)
+        if stretch is None:
+            stretch = noise.stretch_length(self._duration, period, tau, folds)
+        tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
+        one, other = noise.comparable(*zip(*(
+            pair for errors, _ in tried for pair in errors), strict=True))
+        verdict = Verdict.SAME
+        if len(changed(tuned)) > 0:
+            verdict = Verdict.BETTER if noise.is_better(
+                one, other, self._start_ns, stretch) else Verdict.WORSE
+        errors = [] if truth is None else np.sqrt(np.mean(np.square(
+            [to_truth for _, to_truth in tried]), axis=0)).tolist()
+        measured = [f'{len(some)} of {name}' for name, some in self._sources.items()] or [
+            f'{len(self._closures)} closures']
+        return Outcome(tuned, verdict, noise.error_summary(one), noise.error_summary(other),
+                       errors, folds, stretch,
+                       f'{self._duration:.0f} s of odometry, {", ".join(measured)}', len(doubted))
+
+    def _valid(self, values: Mapping[str, Any]) -> dict[str, list[Absolute]]:
+        """Return the valid measurements in the map of each source by stamp, by some parameters."""
+        config, found = backend_config(values), {}
+        for name in self._inputs.of(lambda kind: kind.in_map or kind is IMU):
+            valid = []
+            for of, each in self._measurements:
+                if of == name and isinstance(each, Absolute):
+                    one = validate(each, config.measurement_source(name, type(each)).covariance)
+                    if isinstance(one, Validated) and isinstance(one.measurement, Absolute):
+                        valid.append(one.measurement)
+            found[name] = sorted(valid, key=lambda each: each.stamp_ns)
+        return found
+
+    def _run(
+        self, values: Mapping[str, Any], text: str, without: Collection[Key] = (),
+        odometry: str = '',
+    ) -> PoseGraphBackend:
+        """Run the engine, as a step that is shown, without some measurements or other odometry."""
+        self._step += 1
+        _show(f'step {self._step} of {self._steps}: {text}')
+        backend, _ = run_measurements((
+            (name, each) for name, each in self._measurements
+            if odometry in ('', name) or not isinstance(each, OdometrySample)
+            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
+        return backend
+
+    def _runs(
+        self, text: str, left_out: Collection[Key] = (),
+    ) -> tuple[PoseGraphBackend, list[PoseGraphBackend]]:
+        """Return a run with the settings before, and those that show the noise of odometries."""
+        before = self._run(self._values, f'{text}, with the settings before', left_out)
+        return before, [before] if self._is_shown_before else [
+            self._run(self._looking, f'{text}, by {name}', left_out, name)
+            for name in self._odometries]
+
+    def _estimate(
+        self, runs: Sequence[PoseGraphBackend], without: Collection[Key],
+    ) -> tuple[list[Tuned], Seconds]:
+        """Return what runs show, but for some measurements, and the longest time constant."""
+        tuned, longest = list[Tuned](), 0.0
+        for name, run in zip(self._odometries, runs, strict=True):
+            parts, by_residuals = run.parts, dict[str, ScaleFit]()
+            if len(self._closures) > 0 or any(
+                    len(_heading_variances(some)) > 0 for some in self._sources.values()):
+                by_residuals |= analyse(parts).fits
+            found: dict[str, Noise] = {}
+            for source, some in self._sources.items():
+                is_placed = not all(isinstance(each, HeadingOnly) for each in some)
+                shown = noise.noise_of(parts, source, {
+                    stamp for of, stamp in without if of == source}) if is_placed else None
+                if shown is not None:
+                    found[source] = shown
+            proven = {source: each.proven for source, each in found.items()}
+            if len(found) > 0:
+                way, turn = noise.proven_odometry(found.values())
+            else:
+                way, turn = (NOT_SHOWN if one is None else one.proven(one.high) for one in (
+                    _of_residuals(by_residuals.get(name), axis) for axis in (0, 2)))
+            tuned += tuned_parameters.odometry_parameters(name, way, turn, self._values)
+            if run is not runs[0]:
+                continue
+            longest = max((0.0 if each.tau is None else each.tau.value
+                           for each in found.values()), default=0.0)
+            for source, some in self._sources.items():
+                tuned += tuned_parameters.source_parameters(
+                    source, self._claims(source, some), self._values, size=proven.get(source),
+                    heading=_of_residuals(by_residuals.get(source), 2))
+            for source in dict.fromkeys(of for of, _ in self._closures):
+                size = None if source not in by_residuals else _found(by_residuals[source])
+                if size is not None:
+                    # their constraints share noise of odometry up to the hidden nodes
+                    tuned += tuned_parameters.source_parameters(
+                        source, OF_CLOSURES, self._values,
+                        size=size.written(max(size.value, 1.0)))
+        return tuned, longest
+
+    def _claims(self, name: str, some: Sequence[Absolute]) -> Claims:
+        policy = backend_config(self._values).measurement_source(name, type(some[0])).covariance
+        repaired = any(isinstance(one := validate(each, policy), Validated)
+                       and len(one.repairs) > 0 for of, each in self._measurements
+                       if of == name and isinstance(each, Absolute))
+        positions = np.array([0.5 * np.trace(each.covariance[:2, :2]) for each in some
+                              if not isinstance(each, HeadingOnly)])
+        headings = _heading_variances(some)
+        inside = len(positions) == 0 or bool(
+            np.min(positions) > 1.01 * policy.position_floor**2
+            and np.max(positions) < 0.99 * policy.position_ceiling**2)
+        return Claims(
+            all(np.ptp(each) < 0.05 * np.min(each) for each in (positions, headings)
+                if len(each) > 0),
+            inside and not repaired and len(policy.override) == 0,
+            *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0
+              for each in (positions, headings)))
+
+    def _fold(
+        self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
+        truth: Trajectory | None,
+    ) -> tuple[list[tuple[Errors, Errors]], list[Metres]]:
+        """
+        Return errors of the paths before and after at a part that is held out, and to the truth.
+
+        The former are at the same positions, which are not doubted.
+        """
+        every = [(name, each.stamp_ns) for name, some in self._sources.items() for each in some
+                 if not isinstance(each, HeadingOnly)]
+        every += [(name, each.stamp_ns) for name, each in self._closures]
+        left_out = {key for key in every if int(
+            (key[1] - self._start_ns) * 1e-9 / stretch) % folds == k}
+        text = f'part {k + 1} of {folds} held out'
+        before, runs = self._runs(text, left_out)
+        values = checked({**self._values, **changed(self._estimate(runs, doubted)[0])})
+        after = self._run(values, f'{text}, with the settings after', left_out)
+        tried = (self._values, before), (values, after)
+        pairs = []
+        for errors in zip(*(self._errors(*each, left_out - doubted) for each in tried),
+                          strict=True):
+            common = np.intersect1d(*(each.stamps_ns for each in errors))
+            one, other = (each.rows(np.isin(each.stamps_ns, common)) for each in errors)
+            pairs.append((one, other))
+        return pairs, [] if truth is None else [
+            float(np.sqrt(np.mean(np.square(distances(
+                self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
+            for _, backend in tried]
+
+    def _path_of(self, backend: PoseGraphBackend) -> tuple[Trajectory, Covariances]:
+        estimate = backend.estimate()
+        if estimate is None:
+            raise BagError(f'{self._path}: the odometry makes no path')
+        return estimate.path, backend.path_covariances(estimate)
+
+    def _errors(
+        self, values: Mapping[str, Any], backend: PoseGraphBackend, held: Collection[Key],
+    ) -> list[Errors]:
+        """Return the errors of a path at what was held out of each source, and at closures."""
+        reports, valid, (path, covariances) = (
+            backend.reports(), self._valid(values), self._path_of(backend))
+        found = []
+        for name in self._sources:
+            in_use = reports[name].in_use if name in reports else None
+            found.append(noise.errors_at(
+                path, covariances,
+                [each for each in valid[name] if (name, each.stamp_ns) in held
+                 and not isinstance(each, HeadingOnly)],
+                1.0 if in_use is None else in_use.correlated + in_use.white))
+        closures = [each for name, each in self._closures
+                    if (name, each.stamp_ns) in held and each.reference_ns is not None]
+        stamps = np.array([(each.reference_ns, each.stamp_ns) for each in closures],
+                          dtype=np.int64).reshape(-1, 2)
+        inside = np.all(path.covers(stamps), axis=1)
+        ends = path.at(stamps[inside])
+        poses = np.array([each.pose for each in closures]).reshape(-1, 3)[inside]
+        errors = poses[:, :2] - se2.between(ends[:, 0], ends[:, 1])[:, :2]
+        # the covariances of these are not known
+        return [*found, Errors(stamps[inside, 1], errors, np.full((len(errors), 2, 2), np.nan))]
+
+
+def _heading_variances(some: Sequence[Absolute]) -> FloatArray:
+    return np.array([each.variance if isinstance(each, HeadingOnly) else each.covariance[2, 2]
+                     for each in some if isinstance(each, HeadingOnly | measurements.GlobalPose)])
+
+
+def _of_residuals(found: ScaleFit | None, axis: int) -> Found | None:
+    """Return the noise of a coordinate that residuals show; None if they show nothing."""
+    rows = [] if found is None else [row for row in found.rows if row.coordinate == axis]
+    return _found(rows[0]) if len(rows) > 0 else None
+
+
+def _found(of: RowFit | ScaleFit) -> Found | None:
+    if math.isnan(of.ratio):
+        return None
+    return Found(of.ratio**2, of.low**2, of.high**2, kept=of.low <= 1.0 <= of.high)
+
+
+# --- the tool
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
@@ -29,10 +350,10 @@ def execute(options: argparse.Namespace) -> int:
     where = options.out if options.out.exists() else options.out.resolve().parent
     if not os.access(where, os.W_OK):
         raise BagError(f'{options.out}: cannot be written: no permission')
-    with open_bags(options.bags) as bag:
+    with open_bag(*options.bags) as bag:
         inputs = shared.inputs_of(bag, options, values)
         truth = None if options.truth is None else read_truth(bag, options.truth)
-        tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values, _show)
+        tuning = Tuning(shared.watched_bag(bag, 'reading'), inputs, values)
     try:
         outcome = tuning.tune(options.folds, truth, options.stretch)
     finally:
@@ -41,9 +362,20 @@ def execute(options: argparse.Namespace) -> int:
     headline = [f'Noise by `pose-graph tune {names}`', *_notes(outcome, tuning)]
     is_better = outcome.verdict is Verdict.BETTER
     if is_better:
-        options.out.write_text(yaml_text(outcome.tuned, headline), encoding='utf-8')
+        options.out.write_text(
+            tuned_parameters.yaml_text(outcome.tuned, headline), encoding='utf-8')
     if options.json:
-        print(json.dumps(_facts(options, outcome, tuning, time.monotonic() - start), indent=2))
+        print(json.dumps({
+            'bags': [str(each) for each in options.bags],
+            'file': str(options.out) if is_better else None,
+            'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
+            'parameters': [_plain(asdict(each)) | {'changed': each.changes}
+                           for each in outcome.tuned],
+            'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
+            'to_truth': _plain(dict(zip(
+                ('before', 'after'), outcome.to_truth, strict=False))) or None,
+            'folds': outcome.folds, 'stretch_s': outcome.stretch, 'doubted': outcome.n_doubted,
+            'is_cut': tuning.is_cut, 'seconds': time.monotonic() - start}, indent=2))
     else:
         print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         print('\n'.join(_lines(outcome, tuning)))
@@ -94,23 +426,6 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return '[' + ', '.join(map(_value, value)) + ']' if len(value) > 0 else 'unset'
     return f'{value:.4g}' if isinstance(value, int | float) else str(value)
-
-
-def _facts(
-    options: argparse.Namespace, outcome: Outcome, tuning: Tuning, seconds: float,
-) -> dict[str, Any]:
-    """Return the results as plain values for JSON."""
-    return {
-        'bags': [str(each) for each in options.bags],
-        'file': str(options.out) if outcome.verdict is Verdict.BETTER else None,
-        'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
-        'parameters': [_plain(asdict(each)) | {'changed': each.changes}
-                       for each in outcome.tuned],
-        'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
-        'to_truth': _plain(dict(zip(
-            ('before', 'after'), outcome.to_truth, strict=False))) or None,
-        'folds': outcome.folds, 'stretch_s': outcome.stretch, 'doubted': outcome.n_doubted,
-        'is_cut': tuning.is_cut, 'seconds': seconds}
 
 
 def _plain(facts: Mapping[str, Any]) -> dict[str, Any]:

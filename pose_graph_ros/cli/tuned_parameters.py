@@ -32,11 +32,6 @@ class Tuned:
         """Whether it has another value than before."""
         return bool(self.after != self.before)
 
-    @property
-    def source(self) -> str:
-        """Name of the source."""
-        return self.name.partition('.')[0]
-
 
 def odometry_parameters(
     source: str, way: Found, turn: Found, values: Mapping[str, Any],
@@ -90,7 +85,7 @@ def source_parameters(
         of = claims.sigma if size is not None else claims.sigma_heading
         kept = leading.kept and (heading is None or heading.kept)
         yield Tuned(override, values[override],
-                    values[override] if kept else [_rounded(each) for each in sigmas],
+                    values[override] if kept else [float(f'{each:.3g}') for each in sigmas],
                     of * math.sqrt(leading.low), of * math.sqrt(leading.high),
                     _kept_note(leading) if kept else 'of position and heading'
                     if claims.is_scalable else 'instead of covariances that are not valid')
@@ -107,7 +102,7 @@ def _one(
                         for factor in (found.low, found.value, found.high))
     note = _kept_note(found) if found.kept else (
         'the data tell this one only roughly' if found.is_wide else '')
-    return Tuned(name, before, before if found.kept else _rounded(after), low, high, note)
+    return Tuned(name, before, before if found.kept else float(f'{after:.3g}'), low, high, note)
 
 
 def _kept_note(found: Found) -> str:
@@ -122,8 +117,8 @@ def changed(tuned: Iterable[Tuned]) -> dict[str, Any]:
 def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
     """Return a parameter file with what changes, and comments."""
     lines = [*(f'# {line}'.rstrip() for line in headline), '/**:', '  ros__parameters:']
-    for source in dict.fromkeys(each.source for each in tuned):
-        own = [each for each in tuned if each.source == source]
+    for source in dict.fromkeys(each.name.partition('.')[0] for each in tuned):
+        own = [each for each in tuned if each.name.startswith(f'{source}.')]
         if not any(each.changes for each in own):
             lines += [f'    # {each.name}: {_text(each.before)}, {_why(each)}' for each in own]
             continue
@@ -146,13 +141,8 @@ def interval(tuned: Tuned) -> str:
 
 
 def _why(tuned: Tuned) -> str:
-    parts = [f'95 %: {interval(tuned)}'] if interval(tuned) != '' else []
-    return '; '.join([*parts, *([tuned.note.strip('; ')] if tuned.note else [])])
-
-
-def _rounded(value: float) -> float:
-    """Return a value with some digits."""
-    return float(f'{value:.3g}')
+    shown = interval(tuned)
+    return '; '.join(filter(None, (shown and f'95 %: {shown}', tuned.note.strip('; '))))
 
 
 def _number(value: float) -> str:

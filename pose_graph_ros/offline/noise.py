@@ -16,7 +16,7 @@ its interval. The path depends on ratios of noise: where a source keeps more tha
 odometry keeps as much more.
 
 How far what was held out is from a path shows in metres and in sigmas how good that is. Held out
-are whole stretches of a drive (`fold_of`): single measurements share their slow errors
+are whole stretches of a drive (`stretch_length`): single measurements share their slow errors
 with their neighbours, so that a path which follows these errors would look good.
 """
 
@@ -28,18 +28,8 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from pose_graph_ros.core.batch.optimizer import to_the_end
-from pose_graph_ros.core.belief.learning import (
-    claimed,
-    descend,
-    Known,
-    Minimum,
-    most_likely,
-    moved,
-    NO_SLOW,
-    Posterior,
-    TURN,
-    WAY,
-)
+from pose_graph_ros.core.belief import learning
+from pose_graph_ros.core.belief.learning import Minimum, Posterior, TURN, WAY
 from pose_graph_ros.core.belief.rows import Records
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
@@ -69,7 +59,7 @@ STEP = 0.25
 # Axes of the source in a point.
 WHITE, SLOW, TAU = 2, 3, 4
 # What nothing is known of but odometry and one source.
-ALL_UNKNOWN = Known(claimed(1), odometry=True, sources=(0,))
+ALL_UNKNOWN = learning.Known(learning.claimed(1), odometry=True, sources=(0,))
 LEAST_POSITIONS = 20
 # Time in which slow errors of a receiver change: satellites, ionosphere, reflections [s].
 CHANGE = 300.0
@@ -120,8 +110,7 @@ class Noise(NamedTuple):
         if self.tau is not None and (
                 self.tau.is_wide or self.seconds < KNOWN_FROM * self.tau.value):
             return self.size.written(1.0)
-        return self.size.written(
-            max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
+        return self.size.written(max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
 
     @property
     def excess(self) -> float:
@@ -129,9 +118,7 @@ class Noise(NamedTuple):
         return max(self.proven.value / self.size.value, 1.0)
 
 
-def noise_of(
-    parts: Parts, source: str, without: Collection[StampNs] = (),
-) -> Noise | None:
+def noise_of(parts: Parts, source: str, without: Collection[StampNs] = ()) -> Noise | None:
     """
     Return the noise by the positions of a source in an engine, but for some stamps [ns].
 
@@ -157,14 +144,14 @@ def fitted(rows: Records) -> Noise:
     # claims may be wrong by more than the search goes: it begins with the best of some multiples
     posterior = Posterior(rows, used, known)
     multiple = min(MULTIPLES, key=lambda exponent: to_the_end(
-        posterior.value(moved(known.point, {WHITE: exponent}))))
+        posterior.value(learning.moved(known.point, {WHITE: exponent}))))
     scaled = rows.copy()
     scaled['noise'] *= 2.0**multiple
     scaled['slow'] *= 2.0**multiple
     posterior = Posterior(
         scaled, used, known, spread=CLAIM_SPREAD, least_white=SMALLEST, finest=FINEST)
-    likely = best = to_the_end(most_likely(posterior))[-1]
-    is_slow = best.point[SLOW] > NO_SLOW
+    likely = best = to_the_end(learning.most_likely(posterior))[-1]
+    is_slow = best.point[SLOW] > learning.NO_SLOW
     kept: tuple[int, ...] = ()
     axes = (WAY, TURN) if is_slow else (WAY, TURN, WHITE)
     while len(kept) < len(axes):
@@ -199,8 +186,9 @@ def _at(
 ) -> Minimum:
     """Return the minimum near a point with another exponent on an axis."""
     free = [other for other, at in enumerate(best.point)
-            if other not in fixed and not (other >= SLOW and best.point[SLOW] == NO_SLOW)]
-    return to_the_end(descend(posterior, [moved(best.point, {axis: exponent})], free))
+            if other not in fixed and not (other >= SLOW and best.point[SLOW] == learning.NO_SLOW)]
+    start = learning.moved(best.point, {axis: exponent})
+    return to_the_end(learning.descend(posterior, [start], free))
 
 
 def _interval(
@@ -300,11 +288,13 @@ class Summary(NamedTuple):
     """Of the errors, by their autocorrelation [s]; 0 if there is none."""
 
 
-def joined_errors(parts: Sequence[Errors]) -> Errors:
-    """Return the errors of several folds, by stamp."""
-    columns: Any = map(np.concatenate, zip(*parts, strict=True))
-    together = Errors(*columns)
-    return together.rows(np.argsort(together.stamps_ns, kind='stable'))
+def comparable(*of_paths: Sequence[Errors]) -> list[Errors]:
+    """Return the errors of each path in all folds, by stamp, but for those far from all paths."""
+    columns: Any = [map(np.concatenate, zip(*parts, strict=True)) for parts in of_paths]
+    joined = [Errors(*each) for each in columns]
+    joined = [each.rows(np.argsort(each.stamps_ns, kind='stable')) for each in joined]
+    far = np.all([each.distances > WRONG * np.median(each.distances) for each in joined], axis=0)
+    return [each.rows(~far) for each in joined]
 
 
 def stretch_length(duration: float, period: float, tau: float, folds: int) -> float:
@@ -316,11 +306,6 @@ def stretch_length(duration: float, period: float, tau: float, folds: int) -> fl
     """
     wanted = max(SHORTEST, min(IN_TAU * tau, LONGEST), IN_PERIODS * period)
     return min(wanted, duration / (LEAST_STRETCHES * folds))
-
-
-def fold_of(stamps_ns: IntArray, start_ns: int, stretch: float, folds: int) -> IntArray:
-    """Return in which fold measurements are held out, (M,); the first begins at `start_ns`."""
-    return np.asarray(((stamps_ns - start_ns) * 1e-9 / stretch).astype(np.int64) % folds)
 
 
 def errors_at(
@@ -351,12 +336,6 @@ def errors_at(
     spread = jacobian @ covariances[np.minimum(after, len(path) - 1)] @ np.swapaxes(jacobian, 1, 2)
     own = factor * np.array([each.covariance[:2, :2] for each in chosen])
     return Errors(stamps, positions - poses[:, :2] - arms, spread + own)
-
-
-def far_from_all(parts: Sequence[Errors]) -> BoolArray:
-    """Return which positions are far from all paths, shape (K,); the same ones in all parts."""
-    far = [each.distances > WRONG * np.median(each.distances) for each in parts]
-    return np.asarray(np.all(far, axis=0))
 
 
 def is_better(before: Errors, after: Errors, start_ns: int, stretch: float) -> bool:

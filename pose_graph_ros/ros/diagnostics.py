@@ -42,12 +42,6 @@ if TYPE_CHECKING:
 
 def values(session: 'Session') -> dict[str, object]:
     """Return all values of the diagnostics by key."""
-    return {**_state(session), **_inputs(session), **_fits(session),
-            **total_values(session.worker.status.verdicts)}
-
-
-def _state(session: 'Session') -> dict[str, object]:
-    """Return the counts by source and reason, and the state of graph and solver."""
     worker, rejected = session.worker, session.input.rejected
     status, estimate = worker.status, worker.estimate
     found: dict[str, object] = {
@@ -89,7 +83,7 @@ def _state(session: 'Session') -> dict[str, object]:
         found[f'largest_energy.{rank}'] = f'{largest.name}: {short(largest.energy, 4)}' + (
             '' if largest.unweighted == largest.energy else
             f', without its loss {short(largest.unweighted, 4)}')
-    return found
+    return found | _of_sources(session) | total_values(status.verdicts)
 
 
 class Searches:
@@ -132,8 +126,8 @@ def memory() -> int:
         return 0
 
 
-def _inputs(session: 'Session') -> dict[str, object]:
-    """Return what is noticed of each source, the lever arms of antennas, and the datum."""
+def _of_sources(session: 'Session') -> dict[str, object]:
+    """Return what is noticed of each source, lever arms, the datum, and how well each fits."""
     reader, now = session.input.reader, time.monotonic()
     found: dict[str, object] = {}
     for name, arrivals in session.input.arrivals.items():
@@ -152,12 +146,6 @@ def _inputs(session: 'Session') -> dict[str, object]:
     plane = reader.datum.plane
     found['datum'] = 'none' if plane is None else (
         f'[{plane.latitude:.9f}, {plane.longitude:.9f}, {plane.yaw:.6f}]')
-    return found
-
-
-def _fits(session: 'Session') -> dict[str, object]:
-    """Return how well the measurements of each source fit the estimate."""
-    found: dict[str, object] = {}
     for name, report in session.worker.status.sources.items():
         # 1 if the sigmas are right, less if the estimate depends on this source alone
         found[f'{name}.squared_residual'] = f'{short(report.energy, 4)}'
@@ -196,7 +184,7 @@ def concerns(session: 'Session') -> Iterator[Concern]:
     """Yield all that applies to the node, the most urgent first."""
     worker, received = session.worker, session.input
     estimate, report = worker.estimate, worker.status.report
-    if not worker.alive:
+    if not worker.thread.is_alive():
         yield Concern(ERROR, 'the worker thread has ended: restart the node')
     if report is not None and report.status is Status.FAILED:
         names = ', '.join(worker.status.set_aside) or 'the newest measurements'
@@ -234,7 +222,10 @@ def concerns(session: 'Session') -> Iterator[Concern]:
 def _missing_input(session: 'Session') -> Iterator[Concern]:
     """Yield what is to be said if odometry, or all messages of a source, do not get in."""
     estimate, received = session.worker.estimate, session.input
-    odometry, refused = session.odometry_topics, received.refused
+    odometry, refused = {
+        name: session.node.resolve_topic_name(source.topic)
+        for name, source in received.reader.sources.items() if source.kind.is_odometry
+    }, received.refused
     if estimate is None or (session.is_loaded and not any(
             session.worker.status.counts[name, 'accepted'] > 0 for name in odometry)):
         why = '; '.join(refused[name] for name in odometry if name in refused) or (
@@ -299,24 +290,27 @@ def doubts(session: 'Session') -> Iterator[str]:
     topics: defaultdict[str, list[Source]] = defaultdict(list)
     for source in session.input.reader.sources.values():
         topics[session.node.resolve_topic_name(source.topic)].append(source)
+    node = session.node
     for topic, users in topics.items():
-        yield from _shared(topic, users)
+        # but for sources that use other parts of the same messages
+        parts = {source.kind.part for source in users}
+        if len(users) > 1 and (len(parts) < len(users) or '' in parts):
+            names = ' and '.join(source.name for source in users)
+            yield (f'{names} listen to the same topic, {topic}, so that its messages count '
+                   f'{len(users)} times: set {users[-1].name}.topic')
         if time.monotonic() - session.activated_at > EXPECTED.quiet:
             for source in users:
                 yield from _unpublished(session, topic, source)
     for source in session.input.reader.sources.values():
         yield from _frames(session, source)
     for name, (default, *_) in OUTPUTS.items():
-        yield from _published_by_others(session, name, default)
-
-
-def _shared(topic: str, users: list[Source]) -> Iterator[str]:
-    """Yield a doubt, but for sources that use other parts of the same messages."""
-    parts = {source.kind.part for source in users}
-    if len(users) > 1 and (len(parts) < len(users) or '' in parts):
-        names = ' and '.join(source.name for source in users)
-        yield (f'{names} listen to the same topic, {topic}, so that its messages count '
-               f'{len(users)} times: set {users[-1].name}.topic')
+        topic = session.values[f'outputs.{name}']
+        if default.startswith('/') or node.count_publishers(topic) < 2:
+            continue    # /diagnostics is for all
+        others = other_publishers(node, topic)
+        if len(others) > 0:
+            yield (f'{node.resolve_topic_name(topic)} is published by {" and ".join(others)} as '
+                   f'well: give one of them another topic, of this node {moved(node, name)}')
 
 
 def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str]:
@@ -357,17 +351,7 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
             elif found != expected:
                 yield (f'{name} has the {what} {found!r}, but the parameter {parameter} is '
                        f'{expected!r}: set it, else {consequence}')
-    elif parent == '' and source.needs_frame and source.kind.without_frame != '':
+    elif parent == '' and source.kind.without_frame != '' and not (
+            source.mounting != 'tf' or any(source.lever_arm)):  # no parameter stands for it
         yield f'{name} has no frame_id: ' + source.kind.without_frame.format(
             base=out.base_frame, map=out.map_frame, name=name)
-
-
-def _published_by_others(session: 'Session', name: str, default: str) -> Iterator[str]:
-    node, topic = session.node, session.values[f'outputs.{name}']
-    if default.startswith('/') or node.count_publishers(topic) < 2:  # /diagnostics is for all
-        return
-    others = other_publishers(node, topic)
-    if len(others) > 0:
-        resolved = node.resolve_topic_name(topic)
-        yield (f'{resolved} is published by {" and ".join(others)} as well: give one of them '
-               f'another topic, of this node {moved(node, name)}')

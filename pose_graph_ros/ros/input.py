@@ -22,12 +22,7 @@ from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import MessageReader
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.se2 import between_one
-from pose_graph_ros.core.measurements import (
-    Answer,
-    Measurement,
-    OdometrySample,
-    rejected,
-)
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
 from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS, TimeKeeper
 from pose_graph_ros.core.quantities import Seconds, StampNs
@@ -187,11 +182,6 @@ class ReceivedMessage(NamedTuple):
     measurement: OdometrySample | Measurement
     refusal: Answer | None = None  # why it is not used, by its stamp
 
-    @property
-    def stamp_ns(self) -> int:
-        """Its stamp, with the offset of its source [ns]."""
-        return self.measurement.stamp_ns
-
 
 class Decision(NamedTuple):
     """What is to be done after a message has come."""
@@ -261,7 +251,8 @@ class TimeJumps:
     def _is_old(self, received: ReceivedMessage) -> bool:
         if self._drained is None:
             return False
-        if received.source not in self._drained and received.stamp_ns > self._old_above_ns:
+        if received.source not in self._drained and (
+                received.measurement.stamp_ns > self._old_above_ns):
             return True
         self._drained.add(received.source)
         self._n_new += isinstance(received.measurement, OdometrySample)
@@ -405,22 +396,19 @@ class PoseContinuity:
         elapsed_ns = sample.stamp_ns - self._stamp_ns
         # far behind, the stamp before was wrong: it lay in the future
         if elapsed_ns > 0 or elapsed_ns < -FAR_NS:
-            self._add(sample, elapsed_ns)
+            x, y, theta = sample.pose.tolist()
+            motion = between_one(self._pose, (x, y, theta))
+            step = math.hypot(motion[0], motion[1]), abs(motion[2])
+            begins = self._stamp_ns == 0 or elapsed_ns < 0
+            if begins:
+                jumped = self._stamp_ns == 0 and self._resumes
+            else:
+                jumped = elapsed_ns > FAR_NS or is_jump(
+                    self._window.speeds, step, elapsed_ns * 1e-9, sample.speed, self.maximum_speed)
+            self._stamp_ns, self._pose = sample.stamp_ns, (x, y, theta)
+            if begins or jumped:
+                self._window = SpeedWindow(self._window.speeds, sample.stamp_ns, self._pose)
+                self._jump_ns = sample.stamp_ns if jumped else 0
+            else:
+                self._window = self._window.moved(sample.stamp_ns, self._pose, step)
         return estimate is not None and estimate.stamp_ns >= self._jump_ns
-
-    def _add(self, sample: OdometrySample, elapsed_ns: int) -> None:
-        x, y, theta = sample.pose.tolist()
-        motion = between_one(self._pose, (x, y, theta))
-        step = math.hypot(motion[0], motion[1]), abs(motion[2])
-        begins = self._stamp_ns == 0 or elapsed_ns < 0
-        if begins:
-            jumped = self._stamp_ns == 0 and self._resumes
-        else:
-            jumped = elapsed_ns > FAR_NS or is_jump(
-                self._window.speeds, step, elapsed_ns * 1e-9, sample.speed, self.maximum_speed)
-        self._stamp_ns, self._pose = sample.stamp_ns, (x, y, theta)
-        if begins or jumped:
-            self._window = SpeedWindow(self._window.speeds, sample.stamp_ns, self._pose)
-            self._jump_ns = sample.stamp_ns if jumped else 0
-        else:
-            self._window = self._window.moved(sample.stamp_ns, self._pose, step)

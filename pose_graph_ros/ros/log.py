@@ -52,17 +52,33 @@ class NodeLog(logging.Handler):
             if hasattr(record, 'way') or (
                     record.levelno >= logging.WARNING and not hasattr(record, 'is_answer')):
                 left_out = self._repeated(record)
-            if left_out >= 0:
-                more = f' ({left_out} more like it before)' if left_out > 0 else ''
-                self._log(record.levelno, self.format(record) + more)
+            if left_out < 0:
+                return
+            text = self.format(record) + (
+                f' ({left_out} more like it before)' if left_out > 0 else '')
+            # a line for each level: rclpy lets no line of code change its level
+            if record.levelno >= logging.CRITICAL:
+                self._logger.fatal(text)
+            elif record.levelno >= logging.ERROR:
+                self._logger.error(text)
+            elif record.levelno >= logging.WARNING:
+                self._logger.warning(text)
+            elif record.levelno >= logging.INFO:
+                self._logger.info(text)
+            else:
+                self._logger.debug(text)
         except Exception:
             self.handleError(record)
 
     def _repeated(self, record: logging.LogRecord) -> int:
         """Return how many records like this one were left out; -1 if this one is to be, too."""
-        key = getattr(record, 'way', None) or (
-            record.levelno, record.pathname, record.lineno, NUMBER.sub('', record.getMessage()),
-            _raised_at(record))
+        key = getattr(record, 'way', None)
+        if key is None:
+            key = record.levelno, record.pathname, record.lineno, NUMBER.sub(
+                '', record.getMessage())
+            if record.exc_info and record.exc_info[2] is not None:
+                raised = traceback.extract_tb(record.exc_info[2])[-1]
+                key += raised.filename, raised.lineno
         now = time.monotonic()
         if now - self._logged.get(key, -math.inf) < REPEAT_PERIOD:
             self._left_out[key] += 1
@@ -73,19 +89,6 @@ class NodeLog(logging.Handler):
         self._logged[key] = now
         return self._left_out.pop(key, 0)
 
-    def _log(self, level: int, text: str) -> None:
-        # a line for each level: rclpy lets no line of code change its level
-        if level >= logging.CRITICAL:
-            self._logger.fatal(text)
-        elif level >= logging.ERROR:
-            self._logger.error(text)
-        elif level >= logging.WARNING:
-            self._logger.warning(text)
-        elif level >= logging.INFO:
-            self._logger.info(text)
-        else:
-            self._logger.debug(text)
-
     def close(self) -> None:
         """Pass on no more records."""
         root = logging.getLogger()
@@ -93,14 +96,6 @@ class NodeLog(logging.Handler):
         if not any(isinstance(handler, NodeLog) for handler in root.handlers):
             logging.getLogger(PACKAGE).setLevel(logging.NOTSET)
         super().close()
-
-
-def _raised_at(record: logging.LogRecord) -> tuple[str, int | None] | None:
-    """Return file and line where the exception of a record was raised."""
-    if not record.exc_info or record.exc_info[2] is None:
-        return None
-    raised = traceback.extract_tb(record.exc_info[2])[-1]
-    return raised.filename, raised.lineno
 
 
 def verdict_lines(
@@ -126,13 +121,9 @@ def verdict_lines(
             ways.setdefault((change.source, change.kind, *way), []).append(change)
     for (source, kind, level, words), found in ways.items():
         how = words.format('is' if len(found) == 1 else 'are')
-        yield (level, f'{source}: {number_of(len(found), kind)} {how}: {_which(found)}',
+        which = joined([change.id for change in found])
+        if kind is Judged.FIX and len(found) > 1:
+            stamps = [change.stamp_ns for change in found]
+            which = f'from {seconds(min(stamps))} to {seconds(max(stamps))}'
+        yield (level, f'{source}: {number_of(len(found), kind)} {how}: {which}',
                (source, kind, words))
-
-
-def _which(changes: Sequence[Change]) -> str:
-    """Return the ids of constraints; of many fixes, their first and last stamp."""
-    stamps = [change.stamp_ns for change in changes]
-    if changes[0].kind is Judged.FIX and len(changes) > 1:
-        return f'from {seconds(min(stamps))} to {seconds(max(stamps))}'
-    return joined([change.id for change in changes])

@@ -10,23 +10,8 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParam
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 
+from pose_graph_ros.adapters import parameters as rules
 from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
-from pose_graph_ros.adapters.parameters import (
-    all_parameters,
-    changed,
-    checked,
-    constraints,
-    is_own,
-    is_same,
-    listed_sources,
-    NOTHING,
-    plain,
-    require_together,
-    source_parameters,
-    type_parameter,
-    unknown,
-    without_effect,
-)
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.ros.log import NodeLog
@@ -54,9 +39,21 @@ class PoseGraphNode(LifecycleNode):
         self.failure = ''  # why the last transition failed
         self._session: Session | None = None
         self._offered: Services | None = None
-        self._given = self._declared()  # the node's own parameters that have a value
-        self._own = {parameter.name: parameter for parameter in all_parameters(self._given)}
-        self._warn_of_unknown()
+        self._given = self._declare(PARAMETERS)  # the node's own parameters that have a value
+        for source in rules.listed_sources(self._given):
+            kind = self._declare([rules.type_parameter(source)])[f'{source}.type']
+            self._given |= self._declare(rules.source_parameters(source, kind))
+        self._own = {parameter.name: parameter for parameter in rules.all_parameters(self._given)}
+        # rclpy does not warn of unknown parameters, as a file may be for several nodes;
+        # pose_graph.yaml has defaults of sources that `sources` may leave out
+        usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
+                 for parameter in rules.source_parameters(source, kind.name)}
+        for name, value in sorted(self._overrides.items()):
+            # those of rclpy are declared, or will be with the publishers and subscriptions
+            if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
+                    rules.is_own(name, self._own)) and (
+                    name not in usual or not rules.is_same(rules.plain(value), usual[name])):
+                logger.warning('%s', rules.unknown(name, self._own))
 
     def destroy_node(self) -> None:
         """Destroy the node; what is logged from now on goes elsewhere."""
@@ -67,7 +64,7 @@ class PoseGraphNode(LifecycleNode):
 
     def begin(self, arguments: Sequence[str]) -> None:
         """Tell of parameter files in the arguments that are for others; start by `autostart`."""
-        for sentence in without_effect(arguments, self.get_fully_qualified_name()):
+        for sentence in rules.without_effect(arguments, self.get_fully_qualified_name()):
             logger.warning('%s', sentence)
         if self.get_parameter('autostart').value:
             self.start()
@@ -99,9 +96,7 @@ class PoseGraphNode(LifecycleNode):
 
     on_shutdown = on_error = on_cleanup
 
-    def _transition(
-        self, change: Callable[[], None], done: str = '',
-    ) -> TransitionCallbackReturn:
+    def _transition(self, change: Callable[[], None], done: str = '') -> TransitionCallbackReturn:
         """Change the state, and log that; if it fails, keep the reason, which rclpy does not."""
         try:
             change()
@@ -124,8 +119,8 @@ class PoseGraphNode(LifecycleNode):
         return self._session
 
     def _configure(self) -> None:
-        values = checked(self._given)
-        require_together(values)
+        values = rules.checked(self._given)
+        rules.require_together(values)
         check_topics(self, values, self._overrides)
         self._session = Session(self, values)
         self._offered = Services(self, self._session)
@@ -149,44 +144,32 @@ class PoseGraphNode(LifecycleNode):
             return []
         return super().declare_parameters(namespace, parameters, ignore_override)
 
-    def _declared(self) -> dict[str, Any]:
-        """Declare all parameters and return those that are set."""
-        given = self._declare(PARAMETERS)
-        for source in listed_sources(given):
-            kind = self._declare([type_parameter(source)])[f'{source}.type']
-            given |= self._declare(source_parameters(source, kind))
-        return given
-
     def _declare(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
+        """Declare parameters and return those that are set."""
         given: dict[str, Any] = {}
         for parameter in parameters:
             if not self.has_parameter(parameter.name):
-                # an array without a value has no type yet; numbers may be given as 5 for 5.0
+                descriptor = ParameterDescriptor(
+                    description=f'{parameter.description} [{parameter.unit}]'.removesuffix(' []'),
+                    additional_constraints=rules.constraints(parameter),
+                    read_only=parameter.change is Change.START,
+                    # numbers may be given as 5 for 5.0
+                    dynamic_typing=not isinstance(parameter.default, bool | str))
+                if parameter.smallest is not None and parameter.largest is not None:
+                    descriptor.floating_point_range = [FloatingPointRange(
+                        from_value=parameter.smallest, to_value=parameter.largest)]
+                # an array without a value has no type yet
                 default = None if parameter.default == [] else parameter.default
-                self.declare_parameter(parameter.name, default, _descriptor(parameter))
+                self.declare_parameter(parameter.name, default, descriptor)
             value = self.get_parameter(parameter.name).value
             is_list = isinstance(parameter.default, list)
-            if value is not None and not (is_list and value in NOTHING):
-                given[parameter.name] = plain(value)
+            if value is not None and not (is_list and value in rules.NOTHING):
+                given[parameter.name] = rules.plain(value)
             elif is_list and parameter.default != [] and parameter.name in self._overrides:
                 given[parameter.name] = []  # so rcl hands over [], which is not the default
         return given
 
-    def _warn_of_unknown(self) -> None:
-        """Warn of unknown parameters: rclpy does not, as a file may be for several nodes."""
-        # pose_graph.yaml has defaults of sources that `sources` may leave out
-        usual = {parameter.name: parameter.default for source, (kind, _) in KNOWN_SOURCES.items()
-                 for parameter in source_parameters(source, kind.name)}
-        for name, value in sorted(self._overrides.items()):
-            # those of rclpy are declared, or will be with the publishers and subscriptions
-            if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
-                    is_own(name, self._own)) and (
-                    name not in usual or not is_same(plain(value), usual[name])):
-                logger.warning('%s', unknown(name, self._own))
-
-    def set_parameters_atomically(
-        self, parameter_list: list[RosParameter],
-    ) -> SetParametersResult:
+    def set_parameters_atomically(self, parameter_list: list[RosParameter]) -> SetParametersResult:
         """
         Set several parameters, all or none, as the services for parameters do.
 
@@ -197,10 +180,10 @@ class PoseGraphNode(LifecycleNode):
         for parameter in parameter_list:
             name = parameter.name
             if not self.has_parameter(name):
-                return _refused(unknown(name, self._own))
+                return _refused(rules.unknown(name, self._own))
             value = self._plain(name, parameter.value)
             refused_by_rclpy = value == [] or self.describe_parameter(name).read_only
-            if not refused_by_rclpy or not is_same(
+            if not refused_by_rclpy or not rules.is_same(
                     value, self._plain(name, self.get_parameter(name).value)):
                 # without a value rclpy would undeclare it
                 changes.append(parameter if value != [] else RosParameter(
@@ -209,7 +192,7 @@ class PoseGraphNode(LifecycleNode):
         if len(changes) == 0:
             return SetParametersResult(successful=True)
         try:
-            given = changed(self._given, own, configured=self._session is not None)
+            given = rules.changed(self._given, own, configured=self._session is not None)
         except ConfigError as error:
             return _refused(error)
         result = super().set_parameters_atomically(changes)
@@ -231,20 +214,8 @@ class PoseGraphNode(LifecycleNode):
     def _plain(self, name: str, value: Any) -> Any:
         """Return a value of a parameter with its arrays as lists, also where it is unset."""
         can_be_unset = name in self._own and self._own[name].default == []
-        return [] if can_be_unset and value in NOTHING else plain(value)
+        return [] if can_be_unset and value in rules.NOTHING else rules.plain(value)
 
 
 def _refused(reason: object) -> SetParametersResult:
     return SetParametersResult(successful=False, reason=str(reason))
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        description=f'{parameter.description} [{parameter.unit}]'.removesuffix(' []'),
-        additional_constraints=constraints(parameter),
-        read_only=parameter.change is Change.START,
-        dynamic_typing=not isinstance(parameter.default, bool | str))
-    if parameter.smallest is not None and parameter.largest is not None:
-        descriptor.floating_point_range = [FloatingPointRange(
-            from_value=parameter.smallest, to_value=parameter.largest)]
-    return descriptor

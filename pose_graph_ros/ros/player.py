@@ -28,12 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from pose_graph_ros.adapters.bag_inputs import (
-    Inputs,
-    read_inputs,
-    read_static_frames,
-    STATIC_FRAMES,
-)
+from pose_graph_ros.adapters import bag_inputs
 from pose_graph_ros.adapters.bag_writer import BagWriter
 from pose_graph_ros.adapters.bags import MessageError, open_bag
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
@@ -73,7 +68,7 @@ class Player(Node):
     """Publishes a bag and records the node's outputs."""
 
     def __init__(
-        self, inputs: Inputs, topics: Mapping[str, str], context: Context,
+        self, inputs: bag_inputs.Inputs, topics: Mapping[str, str], context: Context,
         is_running: Callable[[], bool],
     ) -> None:
         super().__init__('pose_graph_player', context=context)
@@ -84,11 +79,12 @@ class Player(Node):
             message_class(kind.message_type), topics[source], RELIABLE)
             for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
-            TFMessage, STATIC_FRAMES[0], STATIC)
+            TFMessage, bag_inputs.STATIC_FRAMES[0], STATIC)
         # topic, type, time of arrival [ns] and bytes of the node's messages
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
+        self.n_poses = 0  # of the newest path
         outputs = {name: OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
         if TFMessage is not None:
             outputs['tf'] = '/tf', TF_TYPE
@@ -113,11 +109,6 @@ class Player(Node):
                 return
             self.diagnostics = {value.key: value.value for value in own[0].values}
         self._recorded.append(received)
-
-    @property
-    def n_poses(self) -> int:
-        """Number of poses of the newest path."""
-        return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
 
     @property
     def processed(self) -> int:
@@ -153,7 +144,7 @@ class Player(Node):
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
             if self._static is not None:
-                for frames in read_static_frames(reader):
+                for frames in bag_inputs.read_static_frames(reader):
                     self._static.publish(frames.raw)
             # the other side of a match may learn of it a little later
             settled = time.monotonic() + 0.5
@@ -161,7 +152,7 @@ class Player(Node):
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
             start = first_ns = None
             progress = tqdm(total=total, disable=None, unit=' messages')     # on a terminal
-            for source, message, held_out in read_inputs(reader, self._inputs):
+            for source, message, held_out in bag_inputs.read_inputs(reader, self._inputs):
                 if held_out:
                     published['held_out'] += 1
                     continue
@@ -209,19 +200,18 @@ class Player(Node):
         self._spin_until(is_last, PATIENCE.answer, 'no path came after the optimisation')
         return bool(response.success), str(response.message)
 
-    def save_graph(self) -> None:
-        """Have the node save its graph."""
-        answer = self._call(self._save, 'saving the graph')
-        if not answer.success:
-            raise PlayError(f'~/save_graph: {answer.message}')
-
     def _call(self, service: Client, what: str) -> Trigger.Response:
         asked = service.call_async(Trigger.Request())
         self._spin_until(asked.done, PATIENCE.answer, f'no answer to {what}')
         return asked.result()
 
     def write(self, folder: Path) -> None:
-        """Write a rosbag2 of all; of path and verdicts the last message."""
+        """Have the node save its graph, and write a rosbag2 of all that it has published."""
+        answer = self._call(self._save, 'saving the graph')
+        if not answer.success:
+            raise PlayError(f'~/save_graph: {answer.message}')
+        path = deserialize_message(self._newest['path'][-1], PathMessage)
+        self.n_poses = len(path.poses)
         newest = list(self._newest.values())
         with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
             for message in (*self._recorded, *newest):
@@ -229,7 +219,7 @@ class Player(Node):
 
 
 def play(
-    bag: Path, out: Path, inputs: Inputs, topics: Mapping[str, str], *, rate: float,
+    bag: Path, out: Path, inputs: bag_inputs.Inputs, topics: Mapping[str, str], *, rate: float,
     is_running: Callable[[], bool],
 ) -> bool:
     """
@@ -243,7 +233,6 @@ def play(
         player = Player(inputs, topics, context, is_running)
         published = player.play(bag, rate)
         success, answer = player.request_final_optimization()
-        player.save_graph()
         player.write(out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '

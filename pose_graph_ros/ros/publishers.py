@@ -27,37 +27,25 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.output_cdr import (
-    markers_cdr,
-    odometry_cdr,
-    path_cdr,
-    stamped_pose_cdr,
-    UNKNOWN_VARIANCE,
-)
+from pose_graph_ros.adapters.output_cdr import UNKNOWN_VARIANCE
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
+from pose_graph_ros.adapters.parameters import FRAMES
 from pose_graph_ros.adapters.sources import JUDGE, source_list
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.estimate import Estimate, predict, Prediction
+from pose_graph_ros.core.estimate import Estimate, predict
 from pose_graph_ros.core.geometry import covariance as cov
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
-from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.quantities import Metres, NANOSECONDS, Seconds, StampNs
-from pose_graph_ros.ros.transforms import (
-    message_class,
-    Slew,
-    TF_QOS,
-    TF_TYPE,
-    TFMessage,
-    TOPIC,
-    TransformPublisher,
-)
+from pose_graph_ros.core.quantities import NANOSECONDS, Seconds, StampNs
+from pose_graph_ros.ros import transforms
+from pose_graph_ros.ros.transforms import Slew, TFMessage, TransformPublisher
 from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
@@ -80,24 +68,14 @@ class View:
 
     def forget(self) -> None:
         """Let the next message have any stamp, at once."""
-        self.stamp_ns = 0
-        self._at = -math.inf
+        self.stamp_ns, self.at = 0, -math.inf
         self.shown: object = None
 
     def is_due(self, state: object, period: Seconds) -> bool:
         """Tell whether to publish what is new, if a state is given, wanted, and not too soon."""
         return ((state is None or state != self.shown)
-                and time.monotonic() - self._at >= period
+                and time.monotonic() - self.at >= period
                 and bool(self.publisher.get_subscription_count() > 0))
-
-    def publish(
-        self, state: object, stamp_ns: StampNs, message_at: Callable[[StampNs], object],
-    ) -> None:
-        """Publish a message, with a stamp that is newer than that of the one before."""
-        self.shown, self._at = state, time.monotonic()
-        # with the same newest odometry: 1 ns keeps the stamps increasing
-        self.stamp_ns = max(stamp_ns, self.stamp_ns + 1)
-        self.publisher.publish(message_at(self.stamp_ns))
 
 
 class Publishers:
@@ -105,9 +83,8 @@ class Publishers:
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node = node
-        self.map_frame = frame(values['map_frame'])
-        self.odom_frame = frame(values['odom_frame'])
-        self.base_frame = frame(values['base_link_frame'])
+        self.frames = tuple(frame(values[name]) for name in FRAMES)
+        self.map_frame, self.odom_frame, self.base_frame = self.frames
         self._publishers = {
             name: self._publisher(type_name, values[f'outputs.{name}'],
                                   LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
@@ -128,7 +105,8 @@ class Publishers:
 
     def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
-            message_class(type_name), topic, copy(qos),  # rclpy writes the overrides into it
+            transforms.message_class(type_name), topic,
+            copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def configure(self, values: Mapping[str, Any]) -> None:
@@ -138,9 +116,9 @@ class Publishers:
                 'tf2_msgs is not installed: the transform from map to odom is not published',
                 once=True)
         elif values['publish_tf'] and self.transforms is None:
+            publisher = self._publisher(transforms.TF_TYPE, transforms.TOPIC, transforms.TF_QOS)
             self.transforms = TransformPublisher(
-                self._node, self._publisher(TF_TYPE, TOPIC, TF_QOS), self.map_frame,
-                self.odom_frame)
+                self._node, publisher, self.map_frame, self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
@@ -167,31 +145,38 @@ class Publishers:
         if len(wanted) == 0:
             return
         prediction = predict(estimate, sample)
-        if self._is_unplaced(estimate):
-            prediction = prediction._replace(covariance=UNPLACED)
+        is_local = estimate.alignment is AlignmentState.LOCAL
+        if is_local:
+            # without a source that is to tell where odometry lies, that is the map
+            self._awaits_map = self._awaits_map or any(
+                self._node.count_publishers(topic) > 0 for topic in self._map_topics)
+            if self._awaits_map:
+                prediction = prediction._replace(covariance=UNPLACED)
         if self._odometry in wanted:
-            self._odometry.publish(odometry_cdr(
+            self._odometry.publish(output_cdr.odometry_cdr(
                 stamp, prediction, odometry, self.map_frame, self.base_frame))
         if self._pose in wanted:
-            self._pose.publish(stamped_pose_cdr(stamp, prediction, self.map_frame))
+            self._pose.publish(output_cdr.stamped_pose_cdr(stamp, prediction, self.map_frame))
         # before the first measurement in the map, its place on the Earth is unknown
-        if (self._fix in wanted and plane is not None
-                and estimate.alignment is not AlignmentState.LOCAL):
-            self._fix.publish(fix_message(
-                stamp, prediction, plane, datum.altitude, self.base_frame))
+        if self._fix in wanted and plane is not None and not is_local:
+            altitude = datum.altitude
+            latitude, longitude, _ = plane.to_geodetic(
+                prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
+            # in east and north
+            covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
+            turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
+            covariance[:2, :2] = 0.5 * (turned + turned.T)
+            self._fix.publish(NavSatFix(
+                header=_header(stamp, self.base_frame),
+                status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
+                longitude=float(longitude), altitude=float(altitude),
+                position_covariance=covariance.ravel(),
+                position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN))
 
     def _holds(self, estimate: Estimate) -> bool:
         """Tell whether nothing is to be published of an estimate, as it is not in the map yet."""
         return (self._waits and len(self._map_topics) > 0
                 and estimate.alignment is not AlignmentState.ALIGNED)
-
-    def _is_unplaced(self, estimate: Estimate) -> bool:
-        """Tell whether a source is to tell where odometry lies; without one, that is the map."""
-        if estimate.alignment is not AlignmentState.LOCAL:
-            return False
-        self._awaits_map = self._awaits_map or any(
-            self._node.count_publishers(topic) > 0 for topic in self._map_topics)
-        return self._awaits_map
 
     def jump(self) -> None:
         """Let the next transform be published without limits: the robot was put elsewhere."""
@@ -213,23 +198,27 @@ class Publishers:
         def publish(view: View, state: object, message_at: Callable[[StampNs], object]) -> None:
             with self._lock:
                 if graph == self.graph:
-                    view.publish(state, estimate.stamp_ns, message_at)
+                    view.shown, view.at = state, time.monotonic()
+                    # with the same newest odometry: 1 ns keeps the stamps increasing
+                    view.stamp_ns = max(estimate.stamp_ns, view.stamp_ns + 1)
+                    view.publisher.publish(message_at(view.stamp_ns))
 
         is_due = estimate is not self.path.shown and self.path.is_due(None, self._path_period)
         if (is_due or at_once) and not self._holds(estimate):
             newest = backend.estimate()
             assert newest is not None
             path = thinned(newest.path, newest.n_frozen)
-            publish(self.path, estimate, lambda at: path_cdr(path, at, self.map_frame))
+            publish(self.path, estimate, lambda at: output_cdr.path_cdr(path, at, self.map_frame))
         period = max(2.0 * self._path_period, 0.1)
         if self.markers.is_due(None, period) and (view := backend.view()) is not None:
-            publish(self.markers, None, lambda at: markers_cdr(view, at, self.map_frame))
+            publish(self.markers, None,
+                    lambda at: output_cdr.markers_cdr(view, at, self.map_frame))
         state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
         if self.verdicts.is_due(state, 0.0 if at_once else period):
             # of those that are believed, the newest of each source
             verdicts = backend.verdicts(50)
             publish(self.verdicts, state, lambda at: verdicts_message(
-                verdicts, status.verdicts, self._header(at)))
+                verdicts, status.verdicts, _header(at, self.map_frame)))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""
@@ -244,11 +233,8 @@ class Publishers:
                         markers=[Marker(header=header, action=Marker.DELETEALL)])),
                     (self.verdicts, lambda header: verdicts_message([], {}, header))):
                 if view.stamp_ns > 0:
-                    view.publisher.publish(empty(self._header(view.stamp_ns + 1)))
+                    view.publisher.publish(empty(_header(view.stamp_ns + 1, self.map_frame)))
                 view.forget()
-
-    def _header(self, stamp_ns: StampNs) -> Header:
-        return Header(stamp=time_message(stamp_ns), frame_id=self.map_frame)
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
@@ -302,24 +288,6 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
     return Trajectory(path.stamps_ns[kept], path.poses[kept])
 
 
-def time_message(stamp_ns: int) -> Time:
-    """Return a stamp [ns] as a message."""
+def _header(stamp_ns: StampNs, frame_id: str) -> Header:
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
-    return Time(sec=seconds, nanosec=nanoseconds)
-
-
-def fix_message(
-    stamp_ns: int, prediction: Prediction, plane: TangentPlane, altitude: Metres, base_frame: str,
-) -> NavSatFix:
-    """Return the robot's position on the Earth, its covariance in east and north."""
-    latitude, longitude, _ = plane.to_geodetic(
-        prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
-    covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
-    turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
-    covariance[:2, :2] = 0.5 * (turned + turned.T)
-    return NavSatFix(
-        header=Header(stamp=time_message(stamp_ns), frame_id=base_frame),
-        status=NavSatStatus(status=NavSatStatus.STATUS_FIX), latitude=float(latitude),
-        longitude=float(longitude), altitude=float(altitude),
-        position_covariance=covariance.ravel(),
-        position_covariance_type=NavSatFix.COVARIANCE_TYPE_KNOWN)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)

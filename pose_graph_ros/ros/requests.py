@@ -6,7 +6,7 @@ What a person asks for: poses that are set, decisions on constraints, files of t
 Imports no rclpy.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import logging
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from pose_graph_ros.adapters.conversions import frame, Message, pose_in
 from pose_graph_ros.adapters.sources import JUDGE, SET_POSE
 from pose_graph_ros.adapters.surroundings import datum_of
+from pose_graph_ros.core import measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate
@@ -25,13 +26,7 @@ from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph
 from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
 from pose_graph_ros.core.judgement.verdicts import Decision
-from pose_graph_ros.core.measurements import (
-    Answer,
-    AnswerStatus,
-    GlobalPose,
-    rejected,
-    value_defect,
-)
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, GlobalPose, rejected
 from pose_graph_ros.ros.log import ANSWER
 from pose_graph_ros.ros.worker import Worker
 
@@ -45,29 +40,29 @@ NEWEST, FIRST = 2**62, 1
 class SetPoseInput:
     """Keeps the newest pose that was set until there is odometry that it can be applied to."""
 
-    def __init__(self, map_frame: str, odom_frame: str, base_frame: str) -> None:
-        self._frames = (map_frame, odom_frame, base_frame)
-        self._waiting: tuple[str, GlobalPose] | None = None     # and the frame that it is in
+    def __init__(self, frames: Sequence[str]) -> None:
+        self._frames = frames  # of map, odometry and robot
+        self.waiting: tuple[str, GlobalPose] | None = None     # and the frame that it is in
 
     def receive(self, message: Message, *, early: bool = False) -> Answer | None:
         """Return why a message cannot be used; None if it can and is kept for `pop`."""
         given = pose_in(message, self._frames)
         if isinstance(given, Answer):
             return given
-        if (broken := value_defect(given.pose)) is not None:
+        if (broken := measurements.value_defect(given.pose)) is not None:
             return rejected(broken, f'pose {given.pose.tolist()}')
         cov, variance = given.covariance, np.diagonal(given.covariance)
         if not (np.all(np.isfinite(cov)) and np.all(variance > 0.0)
                 and np.all(variance <= covariance.LARGEST_VARIANCE)):
             cov = np.diag((0.5, 0.5, 0.26)) ** 2    # what RViz sends [m, m, rad]
         stamp = FIRST if early else given.stamp_ns
-        self._waiting = frame(message.header.frame_id), GlobalPose(
+        self.waiting = frame(message.header.frame_id), GlobalPose(
             stamp if stamp > 0 else NEWEST, given.pose, cov)
         return None
 
     def pop(self, estimate: Estimate) -> GlobalPose | None:
         """Remove and return the pose, transformed to the map by an estimate; None for none."""
-        waiting, self._waiting = self._waiting, None
+        waiting, self.waiting = self.waiting, None
         if waiting is None:
             return None
         named, given = waiting
@@ -79,10 +74,6 @@ class SetPoseInput:
         turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
         return GlobalPose(given.stamp_ns, se2.compose(T_map_frame, given.pose),
                           turn @ given.covariance @ turn.T)
-
-    def forget(self) -> None:
-        """Discard the pose."""
-        self._waiting = None
 
 
 def decide(message: Message, worker: Worker) -> None:

@@ -90,21 +90,6 @@ class Services:
             return response
         return answer
 
-    def _among_callbacks(self, act: Callable[[], None]) -> None:
-        """Do something in the thread of the node's callbacks, and wait until it is done."""
-        done: Future[None] = Future()
-
-        def call() -> None:
-            try:
-                act()
-            except BaseException as error:
-                done.set_exception(error)
-            else:
-                done.set_result(None)
-        assert self._node.executor is not None, 'a node that is served is spun'
-        self._node.executor.create_task(call)
-        done.result()
-
     def _require_present(self, worker: Worker) -> None:
         """Raise `CancelledError` if a worker's graph is no longer that of the node."""
         if self._closed or self._session.worker is not worker:
@@ -202,17 +187,26 @@ class Services:
         # wait until the worker has prepared the kernels, which reading needs
         worker.call(lambda _: None).result()
         saved, backend = restored(path, backend_config(session.values))
+        done: Future[None] = Future()
 
         def replace() -> None:
-            # in the meantime a datum or parameters may have been set
-            self._require_present(worker)
-            datum = session.input.reader.datum
-            origin = None if datum.plane is None else datum.plane.origin
-            refusal = site_refusal(saved, *((origin, None) if datum.is_given else (None, origin)))
-            if refusal is not None:
-                raise FileFormatError(refusal)
-            backend.configure(backend_config(session.values))
-            session.load(saved, backend, str(path))
-        self._among_callbacks(replace)
+            try:
+                # in the meantime a datum or parameters may have been set
+                self._require_present(worker)
+                datum = session.input.reader.datum
+                origin = None if datum.plane is None else datum.plane.origin
+                refusal = site_refusal(
+                    saved, *((origin, None) if datum.is_given else (None, origin)))
+                if refusal is not None:
+                    raise FileFormatError(refusal)
+                backend.configure(backend_config(session.values))
+                session.load(saved, backend, str(path))
+            except BaseException as error:
+                done.set_exception(error)
+            else:
+                done.set_result(None)
+        assert self._node.executor is not None, 'a node that is served is spun'
+        self._node.executor.create_task(replace)    # in the thread of the node's callbacks
+        done.result()
         return (f'{len(saved.nodes.ids)} hidden nodes from {path}, datum '
                 f'{"none" if saved.datum is None else saved.datum}')

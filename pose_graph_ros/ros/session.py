@@ -25,19 +25,13 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import (
-    backend_config,
-    CLOCK_JUMP_NS,
-    SET_POSE,
-    Source,
-)
+from pose_graph_ros.adapters.sources import backend_config, CLOCK_JUMP_NS, SET_POSE, Source
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros import diagnostics
-from pose_graph_ros.ros.diagnostics import concerns
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
 from pose_graph_ros.ros.publishers import Publishers
@@ -60,8 +54,7 @@ class Session:
         self._config = backend_config(values)
         initial = initial_graph(values)
         self.input, self.out = Input(values), Publishers(node, values)
-        self._set_pose_input = SetPoseInput(
-            self.out.map_frame, self.out.odom_frame, self.out.base_frame)
+        self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
         self._told: dict[str, str] = {}  # what is logged and not over, by its text without numbers
@@ -97,7 +90,7 @@ class Session:
         graph = self.out.graph
         self.worker = worker = Worker(
             backend, lambda backend: self.out.publish_views(worker, graph, backend), prepare)
-        self.worker.start()
+        worker.thread.start()
         if resumes:
             self.worker.request_update()
 
@@ -121,23 +114,26 @@ class Session:
     def activate(self) -> None:
         """Create the subscriptions and start the timers."""
         sources = self.input.reader.sources.values()
-        callbacks = {
+        callbacks: dict[str, Callable[[Any], None]] = {
             'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
             JUDGE_TOPIC: lambda message: decide(message, self.worker),
             STATIC_TOPIC: self.input.reader.frames.receive}
         in_frames = any(source.kind.in_frames for source in sources)
-        for topic, given in INPUTS.items():
-            if topic != STATIC_TOPIC or in_frames:
-                self._subscribe(topic, *given, callbacks[topic])
-        for source in sources:
-            self._subscribe(
-                source.topic, source.kind.message_type,
-                CLOSURE_QOS if source.kind.is_rare else SENSOR_QOS,
-                partial(self._on_message, source))
+        wanted: list[tuple[str, str, QoSProfile, Callable[[Any], None]]] = [
+            (topic, *given, callbacks[topic]) for topic, given in INPUTS.items()
+            if topic != STATIC_TOPIC or in_frames]
+        wanted += [(source.topic, source.kind.message_type,
+                    CLOSURE_QOS if source.kind.is_rare else SENSOR_QOS,
+                    partial(self._on_message, source)) for source in sources]
+        for topic, kind, qos, callback in wanted:
+            self._subscriptions.append(self.node.create_subscription(
+                message_class(kind), topic, guarded(callback, lambda: self.active),
+                copy(qos),  # rclpy writes the overrides into it
+                qos_overriding_options=QoSOverridingOptions.with_default_policies()))
         self._watch_time()
-        for arrivals in self.input.arrivals.values():
-            arrivals.resume(time.monotonic())
         self.active, self.activated_at = True, time.monotonic()
+        for arrivals in self.input.arrivals.values():
+            arrivals.resume(self.activated_at)
         logger.info('ready, listening to %s', ', '.join(
             self.node.resolve_topic_name(source.topic) for source in sources))
 
@@ -175,14 +171,6 @@ class Session:
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
         if self.active:
             self._watch_time()
-
-    def _subscribe(
-        self, topic: str, type_name: str, qos: QoSProfile, callback: Callable[[Any], None],
-    ) -> None:
-        self._subscriptions.append(self.node.create_subscription(
-            message_class(type_name), topic, guarded(callback, lambda: self.active),
-            copy(qos),  # rclpy writes the overrides into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies()))
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
         timer, period_ns = self._timers.get(name), round(period * NANOSECONDS)
@@ -287,7 +275,7 @@ class Session:
         self.worker.stop(0.0)  # the result of a running solve is discarded
         self.out.start_new_graph()
         self.input.start_new_graph(self.values)
-        self._set_pose_input.forget()
+        self._set_pose_input.waiting = None
         self.n_resets, self.reset_reason = self.n_resets + 1, reason
         self._begin(backend, (lambda _: None) if prepared else self._warm_up, resumes=resumes)
 
@@ -325,12 +313,6 @@ class Session:
             return report
         return worker.call(job, 'the full optimisation')
 
-    @property
-    def odometry_topics(self) -> dict[str, str]:
-        """Resolved topics of all odometry sources, by source."""
-        return {name: self.node.resolve_topic_name(self.input.reader.sources[name].topic)
-                for name in self._config.odometry}
-
     def publish_diagnostics(self) -> None:
         """Publish the state of the node."""
         status = self.worker.status
@@ -339,7 +321,7 @@ class Session:
             self.out.transforms.check_for_others()
         self.searches.update(self.worker)
         # in this order: the sentence is then at least as new as the values beside it
-        values, found = diagnostics.values(self), [*concerns(self)]
+        values, found = diagnostics.values(self), [*diagnostics.concerns(self)]
         self.out.publish_diagnostics(found[0].level, found[0].sentence, values)
         if self.active:
             present = {NUMBER.sub('', each.text): each.text for each in found if each.logged}

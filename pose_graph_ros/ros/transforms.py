@@ -57,9 +57,7 @@ def other_publishers(node: Node, topic: str) -> list[str]:
 class TransformPublisher:
     """Publishes the transform from map to odom, each with a newer stamp than the one before."""
 
-    def __init__(
-        self, node: Node, publisher: Publisher, map_frame: str, odom_frame: str,
-    ) -> None:
+    def __init__(self, node: Node, publisher: Publisher, map_frame: str, odom_frame: str) -> None:
         self._node, self._publisher = node, publisher
         self._map_frame, self._odom_frame = map_frame, odom_frame
         self._newest_ns, self._aligned, self.slew = 0, False, Slew()
@@ -78,8 +76,7 @@ class TransformPublisher:
             # the map frame itself has moved, which is no correction of the pose
             self._aligned = not self._aligned
             self.slew = Slew()
-        T_map_odom = self.slew.limited(
-            sample.stamp_ns, estimate.T_map_odom, sample.pose, *limits)
+        T_map_odom = self.slew.limited(sample.stamp_ns, estimate.T_map_odom, sample.pose, *limits)
         at_ns = sample.stamp_ns + offset_ns
         if at_ns <= self._newest_ns:
             return

@@ -90,16 +90,7 @@ class Worker:
         self._jumps: Counter[str] = Counter()  # of odometries, that were told
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
-        self._thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    @property
-    def alive(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread.is_alive()
+        self.thread = threading.Thread(target=self._run, name='pose graph', daemon=True)
 
     def stop(self, timeout: float) -> bool:
         """Make the thread end, wait for it at most a time [s], and return whether it has ended."""
@@ -107,8 +98,8 @@ class Worker:
             self._stopping = True
             self._backend.interrupt_refinement()
             self._condition.notify()
-        self._thread.join(timeout)
-        return not self._thread.is_alive()
+        self.thread.join(timeout)
+        return not self.thread.is_alive()
 
     def post(self, source: str, measurement: OdometrySample | Measurement) -> bool:
         """Return whether a measurement was handed over: not if the inbox is full."""
@@ -188,9 +179,17 @@ class Worker:
         for source, measurement in batch:
             if self._stopping:
                 return
-            self._add(source, measurement)
-        if wanted:
-            self.is_optimal = False
+            try:
+                if isinstance(measurement, OdometrySample):
+                    self._backend.add_odometry(measurement, source)
+                else:
+                    self._backend.add_measurement(measurement, source)
+            except Exception as error:
+                key = source, 'internal_error'
+                self._backend.counts[key] += 1
+                self._backend.refusals[key] = f'{type(error).__name__}: {error}'
+                logger.exception('a measurement of %s could not be added', source)
+        self.is_optimal = self.is_optimal and not wanted
         report = self._update(self._backend.update) if wanted else None
         # after a jump of the odometry the old estimate cannot be propagated
         stale = self._revision != self._backend.revision
@@ -240,17 +239,6 @@ class Worker:
         reason = 'refused_job' if isinstance(error, PoseGraphError) else 'internal_error'
         self._backend.counts['worker', reason] += 1
         self._report(None, processed)
-
-    def _add(self, source: str, measurement: OdometrySample | Measurement) -> None:
-        try:
-            if isinstance(measurement, OdometrySample):
-                self._backend.add_odometry(measurement, source)
-            else:
-                self._backend.add_measurement(measurement, source)
-        except Exception as error:
-            self._backend.counts[source, 'internal_error'] += 1
-            self._backend.refusals[source, 'internal_error'] = f'{type(error).__name__}: {error}'
-            logger.exception('a measurement of %s could not be added', source)
 
     def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
         start = time.monotonic()

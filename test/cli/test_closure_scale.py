@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from pose_graph_ros.cli.closure_scale import give_scale, residual_scale
+from pose_graph_ros.cli.believe import give_scale, residual_scale
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors

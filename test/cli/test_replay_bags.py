@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionMode
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs
-from pose_graph_ros.adapters.bags import open_bags
+from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.main import main
@@ -47,7 +47,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *words: object) -> str:
 def path_of(*bags: Path) -> list[bytes]:
     """Return stamps and poses of the path of the engine that a replay fills."""
     values = checked({})
-    with open_bags(bags) as bag:
+    with open_bag(*bags) as bag:
         estimate = run(
             bag, choose_inputs(bag, source_list(values), {}), values).backend.estimate()
     assert estimate is not None
@@ -115,7 +115,7 @@ def test_wrong_bags_are_one_line_that_names_them(tmp_path, capsys) -> None:
 def test_a_terminal_sees_how_far_a_bag_is_read(tmp_path, capsys, monkeypatch) -> None:
     write_bag(tmp_path / 'bag', drive())
     monkeypatch.setattr('pose_graph_ros.cli.shared.DELAY', 0.0)
-    with open_bags([tmp_path / 'bag']) as bag:
+    with open_bag(tmp_path / 'bag') as bag:
         plain = [message.raw for message in bag.messages(['/odom'])]
         assert [each.raw for each in watched_bag(bag, 'reading').messages(['/odom'])] == plain
         assert capsys.readouterr().err == ''

@@ -16,7 +16,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, GYRO, LOOP_CLOSURE, ODOMETRY
 from pose_graph_ros.cli.drive import collect_drive, place_truth
 from pose_graph_ros.cli.replay import run_measurements
-from pose_graph_ros.cli.run import MOST_UPDATES, places, Recorder, Run, thinned, Update
+from pose_graph_ros.cli.run import MOST_UPDATES, Recorder, Run, thinned, Update
 from pose_graph_ros.cli.run.document import document
 from pose_graph_ros.cli.run.findings import MOST_SILENCES, silences, silent
 
@@ -91,7 +91,7 @@ def test_times_and_places_are_those_of_the_run() -> None:
 
 def test_of_very_many_measurements_those_that_are_not_believed_stay(monkeypatch) -> None:
     whole = run_of(false_closures=5)
-    monkeypatch.setattr(places, 'MOST_OF_SOURCE', 16)
+    monkeypatch.setattr('pose_graph_ros.cli.run.document.MOST_OF_SOURCE', 16)
     part = run_of(('frequency', 10.0), false_closures=5)
     assert list(problems(part)) == []
     for name in ('fixes', 'closures'):

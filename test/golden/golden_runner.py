@@ -25,7 +25,7 @@ from public_data import PUBLIC
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, reader_of
-from pose_graph_ros.adapters.bags import Bag, open_bags
+from pose_graph_ros.adapters.bags import Bag, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli.main import main
@@ -129,7 +129,7 @@ def driven(drive: Drive, path: Path, truth: Trajectory | None) -> Record:
     values = checked(drive.values)
     backend, online = drive.backend(), list[Any]()
     deeds, update_ns, start_ns = sorted(drive.deeds.items()), 0, 0
-    with open_bags([path]) as bag:
+    with open_bag(path) as bag:
         inputs = choose_inputs(bag, source_list(values), {}, truth='/ground_truth')
         digest = input_hash(bag, list(inputs.topics.values()))
         for source, each in drive.stream(

@@ -100,7 +100,7 @@ def test_what_fails_is_answered_and_a_transition_leaves_the_node_unconfigured(
     monkeypatch.setattr(managed.session.out, 'configure', fail)
     result = node.set_parameters_atomically([Parameter('odom.maximum_speed', value=4.0)])
     assert (result.successful, result.reason) == (False, 'failed: MemoryError: no memory')
-    assert managed.session.worker.alive
+    assert managed.session.worker.thread.is_alive()
 
 
 @pytest.mark.parametrize('managed', [
@@ -376,7 +376,7 @@ def test_a_cleanup_waits_for_no_file_and_each_request_is_answered(
         clean_up()
     managed.wait(answer.done, 'it answers')
     assert (answer.result().success, answer.result().message) == (False, CLOSED)
-    assert not session.worker.alive
+    assert not session.worker.thread.is_alive()
 
 
 def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(

@@ -27,7 +27,7 @@ def message(
     ('map', np.zeros(3)), ('', np.zeros(3)), ('/map', np.zeros(3)),
     ('odom', ESTIMATE.T_map_odom), ('base_link', ESTIMATE.T_map_base)])
 def test_a_pose_is_read_in_its_frame(frame: str, origin: np.ndarray) -> None:
-    setting = SetPoseInput('map', 'odom', 'base_link')
+    setting = SetPoseInput(('map', 'odom', 'base_link'))
     assert setting.receive(message(frame, 1.0, 2.0, 0.5, variances=(0.04, 0.01, 0.01))) is None
     pose = setting.pop(ESTIMATE)
     assert pose is not None
@@ -43,7 +43,7 @@ def test_a_pose_is_read_in_its_frame(frame: str, origin: np.ndarray) -> None:
 def test_without_a_covariance_that_is_one_it_is_rvizs(
     variances: tuple[float, float, float],
 ) -> None:
-    setting = SetPoseInput('map', 'odom', 'base_link')
+    setting = SetPoseInput(('map', 'odom', 'base_link'))
     assert setting.receive(message('map', 1.0, 2.0, 0.5, variances=variances, sec=0)) is None
     pose = setting.pop(ESTIMATE)
     assert pose is not None
@@ -55,7 +55,7 @@ def test_without_a_covariance_that_is_one_it_is_rvizs(
     ('elsewhere', 1.0, 'wrong_frame'), ('map', math.nan, 'not_finite'),
     ('map', 1e30, 'too_large')])
 def test_what_cannot_be_read_is_refused(frame: str, x: float, reason: str) -> None:
-    setting = SetPoseInput('map', 'odom', 'base_link')
+    setting = SetPoseInput(('map', 'odom', 'base_link'))
     answer = setting.receive(message(frame, x, 0.0, 0.0, variances=(1.0, 1.0, 1.0)))
     assert answer is not None
     assert answer.reason == reason

@@ -188,11 +188,11 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
     session = active.session
     final = session.optimize()
     active.wait(final.done, 'it is optimised')
-    worker = Space(alive=True, prepared=True, is_optimal=False, status=session.worker.status,
-                   estimate=session.worker.estimate)
+    worker = Space(thread=session.worker.thread, prepared=True, is_optimal=False,
+                   status=session.worker.status, estimate=session.worker.estimate)
     received = Space(paused=False, posted=7, silent=[], quiet=0.0, refused={},
                      arrivals={'fix': Space(wrong='')}, reader=Space(sources={}))
-    seen = Space(worker=worker, active=True, input=received, odometry_topics={},
+    seen = Space(worker=worker, active=True, input=received,
                  is_loaded=False, compiling=False, values=session.values,
                  node=Space(count_publishers=lambda _: 0),
                  searches=Space(contradiction=None),
@@ -226,7 +226,7 @@ def test_the_most_urgent_state_is_said_with_what_to_do(active: Robot) -> None:
             (seen, {'active': False}, OK, 'Inactive'),
             (worker, lambda: status(report=UpdateReport(Status.FAILED, 'singular', 0, 0, 0.0)),
              ERROR, 'solver failed'),
-            (worker, {'alive': False}, ERROR, 'restart')):
+            (worker, {'thread': Space(is_alive=lambda: False)}, ERROR, 'restart')):
         vars(owner).update(changes() if callable(changes) else changes)
         level, text = health(seen)
         assert level == expected

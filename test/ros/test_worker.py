@@ -39,7 +39,7 @@ def start() -> Iterator[Start]:
     def made(backend: PoseGraphBackend | None = None, **given: object) -> Worker:
         worker = Worker(backend or PoseGraphBackend(), **{'on_estimate': lambda _: None} | given)
         workers.append(worker)
-        worker.start()
+        worker.thread.start()
         return worker
     yield made
     assert all(worker.stop(PATIENCE) for worker in workers)
@@ -138,7 +138,7 @@ def test_nothing_is_begun_after_the_worker_was_stopped(start: Start) -> None:
         worker.post('odom', sample(step))
     worker.request_update()
     job = worker.call(begun.append)
-    worker.start()
+    worker.thread.start()
     assert running.wait(PATIENCE)
     assert not worker.stop(0.0)
     release.set()

@@ -12,14 +12,18 @@ of H, and sentences on what a person must know. Read first `document`, then `fin
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+import math
 from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.drive import Drive
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import Covariances
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, Measurement
@@ -112,3 +116,38 @@ class Run:
             return self.backend.path_covariances(self.estimate)
         except ValueError as error:
             raise NoCovariancesError(f'there are no covariances: {error}') from error
+
+
+def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
+    """Return values as a list for JSON, None for those that are not finite."""
+    array = np.round(np.asarray(values, dtype=np.float64), digits) + 0.0
+    as_objects = array.astype(object)
+    as_objects[~np.isfinite(array)] = None
+    return list(as_objects.tolist())
+
+
+def number(value: float | None, digits: int = 4) -> float | None:
+    """Return a number with some significant digits; None if it is not finite."""
+    return None if value is None or not math.isfinite(value) else float(f'{value:.{digits}g}')
+
+
+@dataclass(slots=True)
+class Frame:
+    """Where times and places of run.json begin, and the texts that its tables refer to."""
+
+    start_ns: StampNs
+    offset: FloatArray  # (2,) [m]
+    texts: dict[str, int] = field(default_factory=dict)  # with their numbers, which are in order
+
+    def seconds(self, stamps_ns: IntArray) -> list[float]:
+        """Return stamps as seconds since the start."""
+        return rounded((np.asarray(stamps_ns) - self.start_ns) * 1e-9)
+
+    def places(self, points: Points, digits: int = 2) -> tuple[list[float], list[float]]:
+        """Return x and y of points relative to the offset."""
+        moved = np.asarray(points).reshape(-1, 2) - self.offset
+        return rounded(moved[:, 0], digits), rounded(moved[:, 1], digits)
+
+    def text(self, text: str) -> int:
+        """Return the number of a text; -1 for an empty one."""
+        return -1 if text == '' else self.texts.setdefault(text, len(self.texts))

@@ -6,7 +6,7 @@ The results of a run, of a replay as of a demo: files in a folder, and lines for
 What the page of `pose-graph report` shows is the JSON object in run.json, see docs/tools.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 import json
 import math
@@ -15,29 +15,27 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.cli.drive import (
-    consistency,
-    consistency_lines,
-    extent,
-    format_table,
-    STATES,
-    summary,
-)
-from pose_graph_ros.cli.run import places, Run, thinned
+from pose_graph_ros.cli import drive as drives
+from pose_graph_ros.cli.drive import BELIEVED, distances, Drive, extent, HELD_OUT, REFUSED
+from pose_graph_ros.cli.run import Frame, number, rounded, Run, thinned
 from pose_graph_ros.cli.run.findings import findings
-from pose_graph_ros.cli.run.places import number, rounded
 from pose_graph_ros.cli.run.sources import analyse, source_entry, springs
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import Covariances, IntArray
+from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io.path_files import write_tum
-from pose_graph_ros.core.judgement.texts import as_json, is_notable, ORDER, short, totals_text
-from pose_graph_ros.core.judgement.verdicts import Judged, SourceVerdicts, Verdict
+from pose_graph_ros.core.judgement import texts
+from pose_graph_ros.core.judgement.texts import Key, sentence, short
+from pose_graph_ros.core.judgement.verdicts import Judged, Verdict
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
-from pose_graph_ros.offline.drawing import pattern as patterns
-from pose_graph_ros.offline.drawing.pattern import BinnedPattern
-from pose_graph_ros.offline.residuals import variance_components
+from pose_graph_ros.offline import pattern as patterns, variance_components
+from pose_graph_ros.offline.source_residuals import spread
 
+REFUSED_SOMEHOW = 'Refused; the counts of its source say why.'
+MOST_POSES = 10_000  # of a path
+MOST_OF_SOURCE = 20_000  # fixes or loop closures; half are kept for those not believed
 VERSION = 1
 FILE = 'run.json'
 KEYS = (
@@ -71,43 +69,43 @@ def read_document(path: Path) -> dict[str, Any]:
 def document(run: Run) -> dict[str, Any]:
     """Return the JSON object of a run."""
     drive, path = run.drive, run.drive.corrected
-    frame = places.Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
+    frame = Frame(run.start_ns, np.round(path.poses[0, :2], 3) + 0.0)
     verdicts = {(each.source, each.stamp_ns, each.reference_ns): each for each in run.verdicts}
-    errors = places.errors(drive, run.covariances, frame)
+    errors = _errors(drive, run.covariances, frame)
     analysis = variance_components.analyse(run.backend.parts)
     analyses = analyse(run, analysis)
-    lines, at_ns = places.lines(drive, frame)
+    lines, at_ns = _lines(drive, frame)
+    start, updates = np.datetime64(run.start_ns, 'ns'), None
+    whole, factor = (of(run.backend.graph) for of in (patterns.hessian, patterns.factor))
+    upper = (whole.nonzeros + whole.size) // 2
+    if len(run.recorder.updates) > 0:
+        stamps, nodes, milliseconds, chi2 = zip(*thinned(run.recorder.updates), strict=True)
+        updates = {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
+                   'ms': rounded(milliseconds, 2), 'chi2': [number(each, 6) for each in chi2],
+                   'count': run.recorder.n_updates,
+                   'period': number(1e3 / float(run.values['frequency']))}
     return {
         'version': VERSION, 'title': run.title, 'subtitle': run.subtitle,
-        'start': _utc(run.start_ns), 'start_ns': str(run.start_ns),
+        # before, stamps count from any beginning
+        'start': None if start < np.datetime64('2000') else f'{start.astype("datetime64[ms]")}Z',
+        'start_ns': str(run.start_ns),
         'duration': round(extent(path)[0], 3),
         'axes': list(drive.map_axes), 'offset': rounded(frame.offset),
         'facts': _facts(run), 'findings': findings(run, analyses, errors), 'lines': lines,
-        'ellipses': places.ellipses(path, run.covariances, frame),
-        'fixes': places.fixes(drive, verdicts, at_ns, frame),
-        'closures': places.closures(drive, verdicts, run.recorder.refused, frame),
-        'states': list(STATES), 'errors': errors,
+        'ellipses': _ellipses(path, run.covariances, frame),
+        'fixes': _fixes(drive, verdicts, at_ns, frame),
+        'closures': _closures(drive, verdicts, run.recorder.refused, frame),
+        'states': list(drives.STATES), 'errors': errors,
         'error_table': [asdict(row) | {name: number(getattr(row, name), 5) for name in (
             'median', 'rms', 'p95', 'maximum')} for row in drive.rows],
         'sources': [source_entry(each, frame) for each in analyses.values()],
         'springs': springs(run, analysis.residuals, frame),
-        'updates': _updates(run, frame), 'sparsity': _sparsity(run.backend.graph),
+        'updates': updates, 'sparsity': [
+            {'title': title, 'size': each.size, 'nonzeros': each.nonzeros, 'fill': max(fill, 0),
+             'bins': each.bins, 'cells': each.cells.tolist()} for title, each, fill in (
+                 ('H, poses in the order of time, then biases', whole, 0),
+                 ('R, in the order of elimination', factor, factor.nonzeros - upper))],
         'texts': list(frame.texts)}
-
-
-def write_document(run: Run, folder: Path) -> dict[str, Any]:
-    """Return the JSON object of a run, after writing it into a folder as run.json."""
-    data = document(run)
-    text = json.dumps(data, allow_nan=False, separators=(',', ':'), ensure_ascii=False)
-    (folder / FILE).write_text(text + '\n', encoding='utf-8')
-    return data
-
-
-def _utc(stamp_ns: int) -> str | None:
-    """Return a stamp as a time of day with milliseconds; None if it is not of this epoch."""
-    stamp = np.datetime64(stamp_ns, 'ns')
-    # before, stamps count from any beginning
-    return None if stamp < np.datetime64('2000') else f'{stamp.astype("datetime64[ms]")}Z'
 
 
 def _facts(run: Run) -> list[dict[str, str]]:
@@ -115,9 +113,17 @@ def _facts(run: Run) -> list[dict[str, str]]:
     estimate, drive = run.estimate, run.drive
     duration, travelled = extent(drive.corrected)
     longest = max((each.milliseconds for each in run.recorder.updates), default=None)
-    freedom = _freedom(run.backend.graph)
+    graph = run.backend.graph
+    information = graph.factors_by_row.information[graph.weights > 0.0]
+    # measured coordinates with a weight, less unknowns
+    freedom = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0)) - int(
+        np.sum(graph.dimension[~graph.fixed]))
+    minutes, seconds = divmod(round(duration), 60)
+    clock = f'{duration:.1f} s' if duration < 120.0 else f'{minutes} min {seconds:02d} s' if (
+        minutes < 60) else f'{minutes // 60} h {minutes % 60:02d} min'
+    metres = f'{travelled:.1f} m' if travelled < 1000.0 else f'{1e-3 * travelled:.2f} km'
     facts = [
-        ('duration', _clock(duration), ''), ('distance', _metres(travelled), 'of the path'),
+        ('duration', clock, ''), ('distance', metres, 'of the path'),
         ('hidden nodes', str(estimate.n_hidden), '' if estimate.n_frozen == 0 else
          f'{estimate.n_frozen} of them have left the window'),
         ('edges', str(estimate.n_edges), 'between poses'),
@@ -138,48 +144,6 @@ def _facts(run: Run) -> list[dict[str, str]]:
     return [{'label': label, 'value': value, 'note': note} for label, value, note in facts]
 
 
-def _freedom(graph: Graph) -> int:
-    """Return the number of measured coordinates with a weight, less that of unknowns."""
-    information = graph.factors_by_row.information[graph.weights > 0.0]
-    measured = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0))
-    return measured - int(np.sum(graph.dimension[~graph.fixed]))
-
-
-def _clock(seconds: float) -> str:
-    if seconds < 120.0:
-        return f'{seconds:.1f} s'
-    minutes, rest = divmod(round(seconds), 60)
-    return f'{minutes} min {rest:02d} s' if minutes < 60 else (
-        f'{minutes // 60} h {minutes % 60:02d} min')
-
-
-def _metres(metres: float) -> str:
-    return f'{metres:.1f} m' if metres < 1000.0 else f'{1e-3 * metres:.2f} km'
-
-
-def _updates(run: Run, frame: places.Frame) -> dict[str, Any] | None:
-    """Return the updates as columns; None if none was recorded."""
-    if len(run.recorder.updates) == 0:
-        return None
-    stamps, nodes, milliseconds, chi2 = zip(*thinned(run.recorder.updates), strict=True)
-    return {'t': frame.seconds(np.array(stamps)), 'nodes': list(nodes),
-            'ms': rounded(milliseconds, 2), 'chi2': [number(each, 6) for each in chi2],
-            'count': run.recorder.n_updates,
-            'period': number(1e3 / float(run.values['frequency']))}
-
-
-def _sparsity(graph: Graph) -> list[dict[str, Any]]:
-    """Return the patterns of H and of its factor."""
-    def entry(title: str, pattern: BinnedPattern, fill: int) -> dict[str, Any]:
-        return {'title': title, 'size': pattern.size, 'nonzeros': pattern.nonzeros,
-                'fill': max(fill, 0), 'bins': pattern.bins, 'cells': pattern.cells.tolist()}
-
-    whole, factor = patterns.hessian(graph), patterns.factor(graph)
-    upper = (whole.nonzeros + whole.size) // 2
-    return [entry('H, poses in the order of time, then biases', whole, 0),
-            entry('R, in the order of elimination', factor, factor.nonzeros - upper)]
-
-
 def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]:
     """Return what people want to know, after writing path, picture, summary.json and run.json."""
     # matplotlib takes half a second to load, and wrong input needs none of it
@@ -192,9 +156,16 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
     totals = backend.verdict_totals()
     counts = {'.'.join(key): count for key, count in sorted(run.counts.items())}
     calibrations = {source: each._asdict() for source, each in backend.calibrations().items()}
-    nees = {} if drive.truth is None or report.status is Status.FAILED else consistency(
+    nees = {} if drive.truth is None or report.status is Status.FAILED else drives.consistency(
         drive, run.covariances)
-    text = json.dumps(summary(drive, {
+    # counts of each source, and all closures and all that is not believed
+    judged = {
+        'sources': {source: {
+            'states': {state.value: each.counts.get(state, 0) for state in texts.ORDER},
+            'forgotten': each.n_forgotten} for source, each in totals.items()},
+        'constraints': [texts.as_json(each) for each in run.verdicts
+                        if each.kind is Judged.LOOP_CLOSURE or texts.is_notable(each)]}
+    text = json.dumps(drives.summary(drive, {
         **facts, **{f'nees_{name}': each for name, each in nees.items()},
         **({'calibrations': calibrations} if len(calibrations) > 0 else {}),
         'alignment': estimate.alignment.value,
@@ -202,10 +173,11 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
         'thinned_nodes': estimate.n_thinned, 'edges': estimate.n_edges,
         'observed_nodes': estimate.n_observed, 'biases': estimate.n_biases,
         'chi2': estimate.chi2, 'odometry_errors': estimate.odometry_errors._asdict(),
-        'status': report.status.value, 'counts': counts,
-        'judged': _judgement(totals, run.verdicts)}), indent=2)
+        'status': report.status.value, 'counts': counts, 'judged': judged}), indent=2)
     (folder / 'summary.json').write_text(text + '\n', encoding='utf-8')
-    told = write_document(run, folder)
+    told = document(run)
+    text = json.dumps(told, allow_nan=False, separators=(',', ':'), ensure_ascii=False)
+    (folder / FILE).write_text(text + '\n', encoding='utf-8')
     lines = [f'{estimate.n_hidden} hidden nodes, {estimate.n_edges} edges, {estimate.n_observed} '
              f'observed nodes in {run.seconds:.2f} s; {report.status.value}, chi2 '
              f'{report.chi2:.6g}; {estimate.alignment.value}']
@@ -220,23 +192,156 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
             f'{estimate.primary}: noise of the way {short(math.sqrt(errors.way), 3)} times, of '
             f'turns {short(math.sqrt(errors.turn), 3)} times what it claims',
             ' and '.join(corrected)))))
-    lines += [f'{source}: {totals_text(of_source)}' for source, of_source in totals.items()]
+    lines += [f'{source}: {texts.totals_text(each)}' for source, each in totals.items()]
     lines += [f'{each["level"]:8} {each["text"]}' for each in told['findings']]
     if 'new_bag' in facts:
         lines.append('new bag: {original} messages copied, {left_out} left out, {corrected} poses '
                      'of odometry corrected'.format(**facts['new_bag']))
     return [*lines, 'counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()),
-            '', format_table(drive.rows), *consistency_lines(nees), '']
+            '', drives.format_table(drive.rows), *(
+                f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
+                    f'{each["mean"]:.4g}, expected {each["expected"]}, '
+                    f'{each["interval"][0]:.4f} to {each["interval"][1]:.4f} if errors were '
+                    f'independent; {100.0 * each["within"]:.1f} % below the 95 % quantile'))
+                for name, each in nees.items()), '']
 
 
-def _judgement(
-    totals: Mapping[str, SourceVerdicts], verdicts: Sequence[Verdict],
-) -> dict[str, object]:
-    """Return counts of each source, and all closures and all that is not believed."""
-    return {
-        'sources': {source: {
-            'states': {state.value: each.counts.get(state, 0) for state in ORDER},
-            'forgotten': each.n_forgotten}
-            for source, each in totals.items()},
-        'constraints': [as_json(each) for each in verdicts
-                        if each.kind is Judged.LOOP_CLOSURE or is_notable(each)]}
+# --- the map
+
+def _lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
+    """Return the paths, and the stamps of the poses of the corrected one [ns]."""
+    def places(path: Trajectory | None) -> dict[str, Any] | None:
+        return None if path is None else dict(zip('xy', frame.places(
+            path.poses[spread(len(path), MOST_POSES), :2]), strict=True))
+
+    path = drive.corrected
+    some = spread(len(path), MOST_POSES)
+    return {'corrected': {'t': frame.seconds(path.stamps_ns[some]), **(places(path) or {}),
+                          'theta': rounded(path.poses[some, 2])},
+            'odometry': places(drive.placed_odometry),
+            'truth': places(drive.truth)}, path.stamps_ns[some]
+
+
+def _ellipses(path: Trajectory, covariances: Covariances, frame: Frame) -> dict[str, Any]:
+    """Return some 200 covariances of positions along a path, in map axes; NaN where unknown."""
+    known = np.flatnonzero(np.all(np.isfinite(covariances), axis=(1, 2)))
+    if len(known) == 0:
+        return {name: [] for name in ('x', 'y', 'xx', 'xy', 'yy')}
+    # evenly along the path and in time, so that stops and fast stretches both have some
+    steps = np.hypot(*np.diff(path.poses[known, :2], axis=0).T)
+    travelled = np.concatenate(([0.0], np.cumsum(steps)))
+    times = (path.stamps_ns[known] - path.stamps_ns[known[0]]) * 1e-9
+    measure = sum(each / max(each[-1], 1e-9) for each in (travelled, times))
+    at = np.unique(np.searchsorted(measure, np.linspace(0.0, measure[-1], 200)))
+    some = known[np.clip(at, 0, len(known) - 1)]
+    x, y = frame.places(path.poses[some, :2])
+    return {'x': x, 'y': y,
+            **{name: [number(value) for value in covariances[some, row, column].tolist()]
+               for name, row, column in (('xx', 0, 0), ('xy', 0, 1), ('yy', 1, 1))}}
+
+
+def _by_source(sources: Sequence[str], stamps: IntArray) -> Iterator[tuple[str, IntArray]]:
+    """Yield sources with the rows of their measurements, by stamp."""
+    for source in dict.fromkeys(sources):
+        rows = np.flatnonzero(np.asarray(sources) == source)
+        yield source, rows[np.argsort(stamps[rows], kind='stable')]
+
+
+def _judged(
+    keys: Sequence[Key], states: IntArray, verdicts: Mapping[Key, Verdict],
+    reasons: Mapping[Key, str], frame: Frame,
+) -> dict[str, Any]:
+    """Return the columns of what is believed, and why not."""
+    found = [verdicts.get(key) for key in keys]
+    whys = []
+    for key, state, each in zip(keys, states.tolist(), found, strict=True):
+        # of fixes nearly all are believed, for the same reason
+        silent = state == HELD_OUT or (state == BELIEVED and key[2] is None)
+        whys.append(reasons.get(key, REFUSED_SOMEHOW) if state == REFUSED
+                    else '' if silent or each is None else sentence(each, frame.start_ns))
+    return {'state': states.tolist(), 'why': [frame.text(why) for why in whys],
+            'id': ['' if each is None else each.id for each in found],
+            # when they were judged [sigma]
+            'd': rounded([np.nan if each is None else each.distance for each in found], 2)}
+
+
+def _fixes(
+    drive: Drive, verdicts: Mapping[Key, Verdict], at_ns: IntArray, frame: Frame,
+) -> list[dict[str, Any]]:
+    """Return the fixes and global poses of each source; `at_ns` are stamps of the path."""
+    found = []
+    for source, every in _by_source(drive.fix_sources, drive.fix_stamps_ns):
+        rows = every[_shown(drive.fix_states[every])]
+        stamps = drive.fix_stamps_ns[rows]
+        x, y = frame.places(drive.fix_positions[rows])
+        # the nearest pose of the path, -1 outside of it
+        after = np.clip(np.searchsorted(at_ns, stamps), 0, len(at_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        nearer = np.abs(at_ns[before] - stamps) < np.abs(at_ns[after] - stamps)
+        inside = (stamps >= at_ns[0] - 1_000_000) & (stamps <= at_ns[-1] + 1_000_000)
+        nearest = np.where(inside, np.where(nearer, before, after), -1)
+        found.append({
+            'source': source, 'left_out': len(every) - len(rows), 't': frame.seconds(stamps),
+            'x': x, 'y': y, 'at': nearest.tolist(), **_judged(
+                [(source, stamp, None) for stamp in stamps.tolist()], drive.fix_states[rows],
+                verdicts, {}, frame)})
+    return found
+
+
+def _closures(
+    drive: Drive, verdicts: Mapping[Key, Verdict], reasons: Mapping[Key, str], frame: Frame,
+) -> list[dict[str, Any]]:
+    """Return the loop closures of each source, in the order of their later ends."""
+    path, found = drive.corrected, []
+    for source, every in _by_source(drive.loop_sources, drive.loop_stamps_ns[:, 1]):
+        rows = every[_shown(drive.loop_states[every])]
+        stamps = drive.loop_stamps_ns[rows]
+        ends = np.sort(stamps, axis=1)
+        places = path.at(np.clip(ends, *path.stamps_ns[[0, -1]]))[:, :, :2]
+        (x0, y0), (x1, y1) = frame.places(places[:, 0]), frame.places(places[:, 1])
+        found.append({
+            'source': source, 'left_out': len(every) - len(rows),
+            't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
+            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, **_judged(
+                [(source, later, earlier) for earlier, later in stamps.tolist()],
+                drive.loop_states[rows], verdicts, reasons, frame)})
+    return found
+
+
+def _errors(drive: Drive, covariances: Covariances, frame: Frame) -> dict[str, Any] | None:
+    """
+    Return the errors of the path over time; None without a truth and fixes that are held out.
+
+    Covariances are those of the corrected path, NaN where unknown.
+    """
+    path, truth, odometry = drive.corrected, drive.truth, drive.placed_odometry
+    if truth is not None:
+        against, stamps, places = 'truth', truth.stamps_ns, truth.poses
+    else:
+        order = np.argsort(drive.fix_stamps_ns, kind='stable')
+        order = order[drive.fix_states[order] == HELD_OUT]
+        against, stamps, places = (
+            'held-out fixes', drive.fix_stamps_ns[order], drive.fix_positions[order])
+    inside = np.flatnonzero(path.covers(stamps))
+    if len(inside) == 0:
+        return None
+    some = inside[spread(len(inside), 2000)]
+    stamps, places = stamps[some], places[some]
+    _, far = distances(path, stamps, places[:, :2])
+    by_odometry = np.full(len(stamps), np.nan)
+    by_odometry[odometry.covers(stamps)] = distances(odometry, stamps, places[:, :2])[1]
+    sigma = np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1])
+    at = np.clip(np.searchsorted(path.stamps_ns, stamps), 0, len(path) - 1)
+    return {'against': against, 't': frame.seconds(stamps), 'position': rounded(far),
+            'heading': None if truth is None else rounded(
+                se2.wrap(path.at(stamps)[:, 2] - places[:, 2]), 4),
+            'sigma': None if not np.any(np.isfinite(sigma)) else rounded(sigma[at]),
+            'odometry': rounded(by_odometry)}
+
+
+def _shown(states: IntArray) -> IntArray:
+    """Return which measurements of a source are in run.json: of very many, only some."""
+    believed = np.isin(states, (BELIEVED, HELD_OUT))
+    others, rest = np.flatnonzero(~believed), np.flatnonzero(believed)
+    others = others[spread(len(others), MOST_OF_SOURCE // 2)]
+    return np.sort(np.append(others, rest[spread(len(rest), MOST_OF_SOURCE - len(others))]))

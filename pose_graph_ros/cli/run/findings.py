@@ -44,8 +44,13 @@ def findings(
     run: Run, analyses: Mapping[str, SourceAnalysis], errors: Mapping[str, Any] | None,
 ) -> list[dict[str, Any]]:
     """Return all findings for run.json, the worst first; `errors` are those over time in it."""
-    found = [*_whole(run), *_covariances(run, analyses), *_measurements(run),
-             *_disagreements(run), *_updates(run), *_path(run, errors)]
+    found = [*_whole(run), *_covariances(run, analyses)]
+    for source in sorted({each.source for each in run.verdicts}):
+        own = [each for each in run.verdicts if each.source == source]
+        found += [*_stretches(run, source, own), *_closures(run, source, own),
+                  *_odometry(run, source, own)]
+    found += [*silences(run.drive.arrived_ns, run.kinds, run.start_ns), *_refusals(run),
+              *_others(run), *_path(run, errors)]
     if all(each.level == 'good' for each in found):
         found.append(Finding('good', 'nothing was found that needs a person', 'map'))
     found.sort(key=lambda each: LEVELS.index(each.level))
@@ -99,8 +104,8 @@ def _covariances(run: Run, analyses: Mapping[str, SourceAnalysis]) -> Iterator[F
             yield Finding(level, f'{source}: {text}', anchor)
 
 
-def _disagreements(run: Run) -> Iterator[Finding]:
-    """Yield which sources contradict the others."""
+def _others(run: Run) -> Iterator[Finding]:
+    """Yield which sources contradict the others, and what concerns the times of updates."""
     found = run.backend.disagreement()
     if found is not None:
         yield Finding('warning', found.text, f'source-{found.source}')
@@ -109,13 +114,8 @@ def _disagreements(run: Run) -> Iterator[Finding]:
                 found is None or found.source != source):
             yield Finding('warning', f'of {source} and odometry one is wrong: {each.reason}',
                           f'source-{source}')
-
-
-def _updates(run: Run) -> Iterator[Finding]:
-    """Yield what concerns the times of updates."""
-    updates = run.recorder.updates
     period = 1e3 / float(run.values['frequency'])
-    slow = [each for each in updates if each.milliseconds > period]
+    slow = [each for each in run.recorder.updates if each.milliseconds > period]
     worst = max(slow, key=lambda each: each.milliseconds, default=None)
     # a single one may be the machine's fault
     if worst is not None and (len(slow) > 2 or worst.milliseconds > 5.0 * period):
@@ -141,9 +141,12 @@ def _path(run: Run, errors: Mapping[str, Any] | None) -> Iterator[Finding]:
         far_off, turn = run.drive.truth_moved
         text += (', each where it fits best (the truth was moved by '
                  f'{short(far_off)} m and {short(math.degrees(turn))} deg)')
+    aligned, ratio = run.estimate.alignment is AlignmentState.ALIGNED, 0.0
+    sigma = np.array([np.nan if each is None else each for each in errors['sigma'] or ()])
+    known = np.isfinite(sigma) & (sigma > 0.0)
     # else the covariances are those to the first pose, which is no better known than the others
-    aligned = run.estimate.alignment is AlignmentState.ALIGNED
-    ratio = _to_claimed(errors, far) if aligned else 0.0
+    if aligned and errors['against'] == 'truth' and np.any(known):
+        ratio = math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
     # errors of a path are few independent ones, as they go on for minutes
     overconfident = ratio > 2.5
     if overconfident:
@@ -153,26 +156,6 @@ def _path(run: Run, errors: Mapping[str, Any] | None) -> Iterator[Finding]:
     better = alone is None or float(short(rms)) < float(short(alone))
     yield Finding('warning' if worse else 'good' if better and not overconfident
                   else 'notice', text, 'errors')
-
-
-def _to_claimed(errors: Mapping[str, Any], far: FloatArray) -> float:
-    """Return the ratio of the errors of a path, shape (N,) [m], to what it claims; 0 unknown."""
-    sigma = np.array([np.nan if each is None else each for each in errors['sigma'] or ()])
-    known = np.isfinite(sigma) & (sigma > 0.0)
-    if errors['against'] != 'truth' or not np.any(known):
-        return 0.0
-    return math.sqrt(float(np.mean((far[known] / sigma[known])**2)))
-
-
-def _measurements(run: Run) -> Iterator[Finding]:
-    """Yield what is doubted or refused, where and why, and what is missing."""
-    for source in sorted({each.source for each in run.verdicts}):
-        own = [each for each in run.verdicts if each.source == source]
-        yield from _stretches(run, source, own)
-        yield from _closures(run, source, own)
-        yield from _odometry(run, source, own)
-    yield from silences(run.drive.arrived_ns, run.kinds, run.start_ns)
-    yield from _refusals(run)
 
 
 def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
@@ -207,8 +190,7 @@ def _closures(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
     of_all = f'of {number_of(len(every), Judged.LOOP_CLOSURE)}'
     doubted = [each for each in every if each.state is State.DOUBTED]
     if len(doubted) > 0:
-        worst = max(doubted, key=lambda each: np.nan_to_num(
-            each.distance, nan=-1.0, posinf=-1.0))
+        worst = max(doubted, key=lambda each: np.nan_to_num(each.distance, nan=-1.0, posinf=-1.0))
         far = f', {worst.distance:.1f} sigma' if np.isfinite(worst.distance) else ''
         yield Finding(
             'warning' if len(doubted) >= MANY else 'notice', f'{source}: {len(doubted)} {of_all} '

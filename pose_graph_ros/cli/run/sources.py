@@ -9,22 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, GYRO, Kind, LOOP_CLOSURE, ODOMETRY
-from pose_graph_ros.cli.run import Run
-from pose_graph_ros.cli.run.places import Frame, number, rounded
+from pose_graph_ros.cli.run import Frame, number, rounded, Run
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
-from pose_graph_ros.offline.residuals.source_residuals import (
-    RowFit,
-    ScaleFit,
-    SourceResiduals,
-    spread,
-    Whiteness,
-    whiteness,
-)
-from pose_graph_ros.offline.residuals.variance_components import Analysis
+from pose_graph_ros.offline import source_residuals
+from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, Whiteness
+from pose_graph_ros.offline.variance_components import Analysis
 
 WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong
 _NAMES = {'map': ('x', 'y', 'heading'), 'edge': ('along', 'across', 'heading')}
@@ -48,12 +41,6 @@ class SourceAnalysis(NamedTuple):
         used = self.residuals.scale[self.residuals.used]
         return float(np.median(used)) if len(used) > 0 else 1.0
 
-    @property
-    def is_wrong(self) -> bool:
-        """Whether the claimed covariances are surely much too small or too large."""
-        return bool(self.fit.low > WRONG or (self.fit.high < 1.0 / WRONG and not self.correlated
-                                             and len(self.suspects) == 0))
-
 
 def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
     """Return the analysis of each source."""
@@ -69,7 +56,7 @@ def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
             advice = f'{source}.covariance_scale to {short(factor)}'
         found[source] = SourceAnalysis(
             each, run.kinds.get(source, guesses[each.kind]), fit,
-            whiteness(each), None if report is None else report.in_use,
+            source_residuals.whiteness(each), None if report is None else report.in_use,
             source in analysis.correlated, tuple(sorted(analysis.correlated - {source})), advice)
     return found
 
@@ -86,18 +73,22 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
     names = _NAMES['map' if residuals.kind == 'map' else 'edge']
-    some = spread(len(used.ids), 2000)
+    some = source_residuals.spread(len(used.ids), 2000)
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
     values = normalised[np.isfinite(normalised)]
+    white = analysis.whiteness
     return {
         'name': residuals.source, 'kind': analysis.kind.name,
         'count': len(residuals.ids), 'used': len(used.ids),
-        'rows': [_row(row, names) for row in found.rows],
+        'rows': [{'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
+                  'count': row.n, **{name: number(getattr(row, name)) for name in (
+                      'sigma', 'expected', 'found', 'ratio', 'low', 'high')}}
+                 for row in found.rows],
         'energy': {'expected': number(found.energy_expected),
                    'found': number(found.energy_found),
                    'quantile95_share': number(found.within)},
-        'ratio': number(found.ratio), 'low': number(found.low), 'high': number(found.high),
-        'redundancy': number(found.redundancy), 'independent': number(found.independent),
+        **{name: number(getattr(found, name)) for name in (
+            'ratio', 'low', 'high', 'redundancy', 'independent')},
         'verdict': verdict(analysis)[1],
         'unused': {'count': len(unused.ids),
                    'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
@@ -106,26 +97,12 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
                 np.clip(values, edges[0] + 1e-9, edges[-1] - 1e-9), edges)[0].tolist()},
         'series': {'t': frame.seconds(used.stamps_ns[some]),
                    'rows': [rounded(normalised[some, row], 2) for row in expected]},
-        'autocorrelation': _autocorrelation(analysis),
+        'autocorrelation': None if white is None else {
+            'lag': rounded(white.lags), 'value': rounded(white.values),
+            'band': number(white.band), 'time': number(white.tau) if white.tau > 0.0 else None,
+            'fitted': rounded(white.fitted) if white.tau > 0.0 else None,
+            'in_use': None if analysis.in_use is None else number(analysis.in_use.tau)},
         'scale': number(analysis.scale)}
-
-
-def _row(row: RowFit, names: tuple[str, str, str]) -> dict[str, Any]:
-    """Return what one coordinate shows."""
-    return {'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
-            'count': row.n, 'sigma': number(row.sigma),
-            'expected': number(row.expected), 'found': number(row.found),
-            'ratio': number(row.ratio), 'low': number(row.low), 'high': number(row.high)}
-
-
-def _autocorrelation(analysis: SourceAnalysis) -> dict[str, Any] | None:
-    found = analysis.whiteness
-    if found is None:
-        return None
-    return {'lag': rounded(found.lags), 'value': rounded(found.values),
-            'band': number(found.band), 'time': number(found.tau) if found.tau > 0.0 else None,
-            'fitted': rounded(found.fitted) if found.tau > 0.0 else None,
-            'in_use': None if analysis.in_use is None else number(analysis.in_use.tau)}
 
 
 def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
@@ -141,7 +118,9 @@ def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
                     f'{short(fit.independent)} independent ones')
     share = f'{short(fit.ratio)} times' if fit.ratio > 1.0 else f'{short(100.0 * fit.ratio)} % of'
     text = f'{claim(analysis)}, {share} the sigma ({short(fit.low)} to {short(fit.high)})'
-    if analysis.is_wrong:
+    # whether they are surely much too small or too large
+    if fit.low > WRONG or (fit.high < 1.0 / WRONG and not analysis.correlated
+                           and len(analysis.suspects) == 0):
         level, why = _wrong(analysis)
         return level, f'{text}{why}'
     if analysis.correlated:
@@ -209,22 +188,19 @@ def springs(
             # from where the estimate has it to where it was measured
             node = each.nodes[0]
             ends = [*ends, place(stamps[node], path.poses[node, :2] + residual[:2])]
+        name = each.name
+        if each.stamp_ns >= 0:  # with the time since the start of the drive
+            what, _, rest = name.partition(' at ')
+            seconds = (each.stamp_ns - frame.start_ns) * 1e-9
+            name = f'{what} at {seconds:.1f} s{rest.partition(" s")[2]}'
         found.append({
             'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
-            'name': names.get(each.number, _name(each, frame.start_ns)),
+            'name': names.get(each.number, name),
             'energy': number(each.energy), 'expected': number(
                 expected if math.isfinite(expected) else float(each.freedom)),
             'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,
             'text': _text(each, here if len(each.nodes) < 2 else ends, residual)})
     return found
-
-
-def _name(each: ConstraintEnergy, start_ns: int) -> str:
-    """Return the name of a constraint, with the time since the start of the drive [ns]."""
-    if each.stamp_ns < 0:
-        return each.name
-    what, _, rest = each.name.partition(' at ')
-    return f'{what} at {(each.stamp_ns - start_ns) * 1e-9:.1f} s{rest.partition(" s")[2]}'
 
 
 def _text(

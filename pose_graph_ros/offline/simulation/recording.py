@@ -27,26 +27,14 @@ from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.quantities import Metres, Seconds
-from pose_graph_ros.offline.simulation import sensors
+from pose_graph_ros.offline.simulation import sensors, settings
 from pose_graph_ros.offline.simulation.sensors import Measured
-from pose_graph_ros.offline.simulation.settings import (
-    CLOSURES,
-    Closures,
-    FIXES,
-    GYRO,
-    Jump,
-    ODOMETRY,
-    POSES,
-    Setup,
-    START_NS,
-    TOPICS,
-    TRUTH,
-)
+from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, ODOMETRY, POSES, Setup
 from pose_graph_ros.offline.simulation.worlds import Motion, PERIOD_S, World
 
 CITY = TangentPlane(50.7271, 7.0866, 61.0)  # worlds are on the plane that touches the Earth here
 STREAMS = ('world', 'gyro', 'odometry', 'fixes', 'poses', 'closures', 'rate', 'jumps',
-           'pose jumps', 'false', 'truth', *TOPICS)
+           'pose jumps', 'false', 'truth', *settings.TOPICS)
 """Who draws random numbers of its own; the place in this list is a part of its seed."""
 
 
@@ -138,21 +126,39 @@ def record(way: Course) -> Recording:
     fixes = absolute(way, FIXES, truth)
     fixes = fixes._replace(values=CITY.to_geodetic(fixes.values))
     heard = fixes.rows(sensors.heard(fixes.stamps_ns, FIXES, setup.outages)).values
-    to_map = _fixed_map(heard[0]) if len(heard) > 0 else _map(truth, odometry.poses[0])
+    # from the world to the frame in which odometry begins, or to the plane that touches the Earth
+    # at the first fix
+    begin = se2.compose(odometry.poses[0], se2.inverse(truth.poses[0]))
+    plane = None if len(heard) == 0 else TangentPlane(*heard[0].tolist())
+
+    def to_map(poses: FloatArray) -> FloatArray:
+        if plane is None:
+            return se2.compose(begin, poses)
+        poses = poses.copy()
+        poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
+        return poses
+
     poses = absolute(way, POSES, Trajectory(truth.stamps_ns, to_map(truth.poses)))
-    closures, missing = _closures(way)
+    none, missing = np.empty(0, dtype=np.int64), 0
+    closures = Measured(none.reshape(0, 2), np.empty((0, 3)), none)
+    if setup.closures is not None:
+        ends, measured = _true_closures(streams['closures'], way.motion, setup.closures)
+        found = streams['rate'].random(len(ends)) < setup.closures.rate
+        closures, missing = sensors.with_false(
+            streams['false'], way.motion, setup.closures, ends[found], measured[found])
     every = {
         ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
-        GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
+        settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
         FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)), CLOSURES: closures}
     kept = {topic: each.rows(sensors.heard(each.later_ns, topic, setup.outages))
             for topic, each in every.items()}
     arrivals = {topic: sensors.arrivals(streams[topic], topic, each.later_ns, setup)
                 for topic, each in kept.items()}
     stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
-    arrivals[TRUTH] = sensors.arrivals(np.random.default_rng(0), TRUTH, stamps, setup)
+    arrivals[settings.TRUTH] = sensors.arrivals(
+        np.random.default_rng(0), settings.TRUTH, stamps, setup)
     ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
-                        if each.topic == topic) for topic in TOPICS}
+                        if each.topic == topic) for topic in settings.TOPICS}
     return Recording(
         setup, float(way.motion.distance[-1]), Trajectory(stamps, to_map(truth.at(stamps))),
         {topic: each._replace(stamps_ns=each.stamps_ns + ahead[topic])
@@ -167,58 +173,32 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
     if topic == FIXES and setup.fixes is not None:
         stamps, values = sensors.positions(streams['fixes'], truth, setup.fixes)
     elif topic == POSES and setup.poses is not None:
-        stamps, values = sensors.global_poses(streams['poses'], truth, setup.poses)
+        stamps = sensors.jittered_stamps(streams['poses'], truth, setup.poses.period_s)
+        values = se2.wrapped(truth.at(stamps) + np.array(
+            setup.poses.sigmas) * streams['poses'].standard_normal((len(stamps), 3)))
     else:
         stamps, values = np.empty(0, dtype=np.int64), np.empty((0, 2 if topic == FIXES else 3))
     return sensors.moved(streams['jumps' if topic == FIXES else 'pose jumps'], stamps, values,
                          setup.jumps_of(topic))
 
 
-def _map(truth: Trajectory, origin: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what moves poses of the world to the frame in which odometry begins."""
-    moved = se2.compose(origin, se2.inverse(truth.poses[0]))
-    return lambda poses: se2.compose(moved, poses)
-
-
-def _fixed_map(fix: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what moves poses of the world to the plane that touches the Earth at a fix."""
-    plane = TangentPlane(*fix.tolist())
-
-    def to_map(poses: FloatArray) -> FloatArray:
-        poses = poses.copy()
-        poses[:, :2] = plane.to_map(*CITY.to_geodetic(poses[:, :2]).T)
-        return poses
-    return to_map
-
-
-def _closures(way: Course) -> tuple[Measured, int]:
-    """Return closures, and how many groups of false ones are missing."""
-    settings = way.setup.closures
-    if settings is None:
-        none = np.empty(0, dtype=np.int64)
-        return Measured(none.reshape(0, 2), np.empty((0, 3)), none), 0
-    ends, poses = _true_closures(way.streams['closures'], way.motion, settings)
-    found = way.streams['rate'].random(len(ends)) < settings.rate
-    return sensors.with_false(
-        way.streams['false'], way.motion, settings, ends[found], poses[found])
-
-
 def _true_closures(
-    generator: np.random.Generator, path: Motion, settings: Closures,
+    generator: np.random.Generator, path: Motion, closures: settings.Closures,
 ) -> tuple[IntArray, FloatArray]:
     """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
     stamps = path.truth.stamps_ns
     # by distance, so that a vehicle at rest is at one place only
     places = np.unique(np.searchsorted(
-        path.distance, np.arange(0.0, path.distance[-1], settings.place_distance)))
-    places = places[stamps[places] >= stamps[0] + settings.first_s * 1e9]
-    old, new = sensors.revisits(generator, path, places, settings)
+        path.distance, np.arange(0.0, path.distance[-1], closures.place_distance)))
+    places = places[stamps[places] >= stamps[0] + closures.first_s * 1e9]
+    old, new = sensors.revisits(generator, path, places, closures)
     # stamps of a camera, which is not synchronised with the other sensors
     ends = stamps[places[np.column_stack((old, new))]]
     ends += generator.integers(1, round(PERIOD_S * 1e9), ends.shape)
     ends = np.minimum(ends, stamps[-1])
     poses = path.truth.at(ends)
-    return ends, sensors.closure_poses(generator, poses[:, 0], poses[:, 1], settings)
+    noise = generator.normal(0.0, closures.sigmas, (len(ends), 3))
+    return ends, se2.compose(se2.between(poses[:, 0], poses[:, 1]), noise)
 
 
 # --- a graph
@@ -271,8 +251,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
         poses = se2.between(poses[0], poses)
     truth = Trajectory(way.motion.truth.stamps_ns[at], poses)
     odometry = odometry_edges(streams['odometry'], truth, setup.jumps_of(ODOMETRY))
-    loops, group, missing = _loop_edges(
-        way, Motion(truth, way.motion.distance[at]), node_distance)
+    loops, group, missing = _loop_edges(way, Motion(truth, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
     return SimulatedGraph(
@@ -282,7 +261,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
 
 
 def odometry_edges(
-    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[Jump] = (),
+    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
 ) -> Factors:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
@@ -292,7 +271,7 @@ def odometry_edges(
         if jump.step is None:
             raise ConfigError(f'jump of {ODOMETRY}: in a graph it cannot begin again, expected '
                               'DX,DY')
-        k = int(np.searchsorted(truth.stamps_ns, START_NS + round(jump.at_s * 1e9))) - 1
+        k = int(np.searchsorted(truth.stamps_ns, settings.START_NS + round(jump.at_s * 1e9))) - 1
         if 0 <= k < n:
             mean[k] = se2.compose(mean[k], np.array(jump.step))
     information = np.zeros((n, 3, 3))
@@ -311,20 +290,20 @@ def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
 
 def _loop_edges(way: Course, path: Motion, node_distance: float) -> tuple[Factors, IntArray, int]:
     """Return loop closures, the group of each, and how many groups are missing."""
-    settings, streams, truth = way.setup.closures, way.streams, path.truth
-    if settings is None:
+    closures, streams, truth = way.setup.closures, way.streams, path.truth
+    if closures is None:
         return Factors(), np.empty(0, dtype=np.int64), 0
-    settings = replace(settings, first_s=0.0)
+    closures = replace(closures, first_s=0.0)
     # so that no two closures of a group have the same ends
-    spacing = max(settings.false.spacing, 1.5 * node_distance)
-    settings = replace(settings, false=replace(settings.false, spacing=spacing))
-    old, new = sensors.revisits(streams['closures'], path, np.arange(len(truth)), settings)
-    found = streams['rate'].random(len(old)) < settings.rate
+    spacing = max(closures.false.spacing, 1.5 * node_distance)
+    closures = replace(closures, false=replace(closures.false, spacing=spacing))
+    old, new = sensors.revisits(streams['closures'], path, np.arange(len(truth)), closures)
+    found = streams['rate'].random(len(old)) < closures.rate
     old, new = old[found], new[found]
-    poses = sensors.closure_poses(
-        streams['closures'], truth.poses[old], truth.poses[new], settings)
+    noise = streams['closures'].normal(0.0, closures.sigmas, (len(new), 3))
+    poses = se2.compose(se2.between(truth.poses[old], truth.poses[new]), noise)
     every, missing = sensors.with_false(
-        streams['false'], path, settings, truth.stamps_ns[np.column_stack((old, new))], poses)
+        streams['false'], path, closures, truth.stamps_ns[np.column_stack((old, new))], poses)
     every = every.rows(sensors.heard(every.later_ns, CLOSURES, way.setup.outages))
     ends = np.searchsorted(truth.stamps_ns, every.stamps_ns)
     information = np.diag(np.array(way.setup.sigmas(CLOSURES))**-2)

@@ -20,22 +20,10 @@ from scipy.spatial import KDTree
 
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.simulation.settings import (
-    Closures,
-    Fixes,
-    GlobalPoses,
-    Gyro,
-    Jump,
-    LATENCY_S,
-    ODOMETRY,
-    OdometryErrors,
-    Outage,
-    Setup,
-    START_NS,
-    Wheels,
-)
+from pose_graph_ros.offline.simulation import settings
+from pose_graph_ros.offline.simulation.settings import Closures, Setup, START_NS, Wheels
 from pose_graph_ros.offline.simulation.worlds import gauss_markov, Motion, PERIOD_S
 
 ODOMETRY_PERIOD_S = 0.05
@@ -78,14 +66,13 @@ def jittered_stamps(
     span = truth.stamps_ns[-1] - truth.stamps_ns[0]
     ticks = np.arange(generator.uniform(0.2, 0.8), span * 1e-9 / period_s - 0.2)
     ticks += np.clip(generator.normal(0.0, 0.01, len(ticks)), -0.1, 0.1)
-    stamps: IntArray = truth.stamps_ns[0] + np.round(ticks * period_s * 1e9).astype(np.int64)
-    return stamps
+    return np.asarray(truth.stamps_ns[0] + np.round(ticks * period_s * 1e9).astype(np.int64))
 
 
 def odometry(generator: np.random.Generator, truth: Trajectory, wheels: Wheels) -> Trajectory:
     """Return `T_odom_base` by odometry."""
     steps = se2.between(truth.poses[:-1], truth.poses[1:])
-    measured = (_by_wheels if wheels.errors is OdometryErrors.WHEELS else _by_model)(
+    measured = (_by_wheels if wheels.errors is settings.OdometryErrors.WHEELS else _by_model)(
         generator, steps, wheels)
     x, y, turned = (0.0, 0.0, -truth.poses[0, 2]) if wheels.start is None else wheels.start
     heading = se2.wrap(truth.poses[0, 2] + turned) + np.concatenate((
@@ -154,7 +141,9 @@ def velocities(path: Trajectory) -> FloatArray:
     return np.concatenate((rates[:1], rates))
 
 
-def yaw_rates(generator: np.random.Generator, heading: FloatArray, gyro: Gyro) -> FloatArray:
+def yaw_rates(
+    generator: np.random.Generator, heading: FloatArray, gyro: settings.Gyro,
+) -> FloatArray:
     """Return yaw rates, (R,) [rad/s], given true headings every `PERIOD_S`, not wrapped [rad]."""
     n = len(heading)
     walk = np.cumsum(generator.normal(0.0, gyro.bias_walk * np.sqrt(PERIOD_S), n))
@@ -164,7 +153,7 @@ def yaw_rates(generator: np.random.Generator, heading: FloatArray, gyro: Gyro) -
 
 
 def positions(
-    generator: np.random.Generator, truth: Trajectory, fixes: Fixes,
+    generator: np.random.Generator, truth: Trajectory, fixes: settings.Fixes,
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of fixes, shape (M,), and their positions, shape (M, 2) [m]."""
     stamps = jittered_stamps(generator, truth, fixes.period_s)
@@ -173,15 +162,6 @@ def positions(
                      fixes.period_s / fixes.correlation_s)
         + generator.normal(0.0, fixes.white, len(stamps)) for _ in range(2)])
     return stamps, truth.at(stamps)[:, :2] + errors
-
-
-def global_poses(
-    generator: np.random.Generator, truth: Trajectory, poses: GlobalPoses,
-) -> tuple[IntArray, FloatArray]:
-    """Return the stamps of global poses, shape (M,), and the poses, shape (M, 3) [m, m, rad]."""
-    stamps = jittered_stamps(generator, truth, poses.period_s)
-    return stamps, se2.wrapped(
-        truth.at(stamps) + np.array(poses.sigmas) * generator.standard_normal((len(stamps), 3)))
 
 
 def revisits(
@@ -200,36 +180,28 @@ def revisits(
     old, new = old[good], new[good]
     # one random pair of each stretch of the path
     order = generator.permutation(len(new))
-    _, first = np.unique(
-        path.distance[places[new[order]]] // closures.spacing, return_index=True)
+    _, first = np.unique(path.distance[places[new[order]]] // closures.spacing, return_index=True)
     return old[order[first]], new[order[first]]
 
 
-def closure_poses(
-    generator: np.random.Generator, old: Poses, new: Poses, closures: Closures,
-) -> FloatArray:
-    """Return what true closures measure: the later pose in the earlier one, with noise."""
-    noise = generator.normal(0.0, closures.sigmas, (len(new), 3))
-    return se2.compose(se2.between(old, new), noise)
-
-
-def false_pairs(
-    generator: np.random.Generator, path: Motion, sizes: list[int], closures: Closures,
-) -> tuple[IntArray, IntArray]:
+def with_false(
+    generator: np.random.Generator, path: Motion, closures: Closures, ends: IntArray,
+    poses: FloatArray,
+) -> tuple[Measured, int]:
     """
-    Return the ends of false closures, shape (F, 2), and the number of the group of each, (F,).
+    Return true closures and false ones by their later ends, and how many groups are missing.
 
-    There are fewer groups than asked where the path has too few places that are apart and driven
-    in the same direction.
+    In: the stamps of the true ones, shape (L, 2), and the measured poses, shape (L, 3). Groups are
+    missing where the path has too few places that are apart and driven in the same direction.
     """
-    false = closures.false
+    false, sizes = closures.false, closures.false.sizes(len(ends))
     begin = max(1, int(np.searchsorted(
         path.truth.stamps_ns, path.truth.stamps_ns[0] + round(false.from_s * 1e9))))
     stretch = max(sizes, default=1) * false.spacing
     last = int(np.searchsorted(path.distance, path.distance[-1] - stretch))
     first = int(np.searchsorted(
         path.truth.stamps_ns, path.truth.stamps_ns[0] + round(closures.first_s * 1e9)))
-    pairs, groups, k = list[tuple[int, int]](), list[int](), 0
+    found, of, k = list[tuple[int, int]](), list[int](), 0
     for _ in range(TRIES * -(-len(sizes) // TRIED) if last > begin else 0):
         if k == len(sizes):
             break
@@ -242,49 +214,24 @@ def false_pairs(
         alike = np.abs(se2.wrap(places[1, :, 2] - places[0, :, 2])) < closures.angle
         if np.all(away > false.min_distance) and np.all(alike) and first <= at[0, 0] and (
                 at[0, -1] < at[1, 0]):
-            pairs += list(zip(*at.tolist(), strict=True))
-            groups += [k] * sizes[k]
+            found += list(zip(*at.tolist(), strict=True))
+            of += [k] * sizes[k]
             k += 1
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2), np.array(groups, dtype=np.int64)
-
-
-def false_poses(
-    generator: np.random.Generator, path: Motion, pairs: IntArray, groups: IntArray,
-    closures: Closures,
-) -> FloatArray:
-    """
-    Return what false closures measure, shape (F, 3): nearly one place.
-
-    Those of a group agree with each other as true ones would, unless they are `loose`. Pairs are
-    indices of poses, shape (F, 2); the numbers of their groups are in order.
-    """
-    looks = generator.normal(
+    # the ends of false closures, and the number of the group of each, in order
+    pairs, groups = np.array(found, dtype=np.int64).reshape(-1, 2), np.array(of, dtype=np.int64)
+    # what they measure is nearly one place
+    seen = generator.normal(
         0.0, (0.5 * closures.radius, 0.25 * closures.radius, 0.05), (len(pairs), 3))
-    if closures.false.loose:
-        return np.asarray(looks)
-    _, first, group = np.unique(groups, return_index=True, return_inverse=True)
-    old, new = path.truth.poses[pairs].transpose(1, 0, 2)
-    # both stretches are laid upon one another at the first closure of the group
-    lead = first[group]
-    moved = se2.compose(se2.inverse(se2.between(old[lead], old)), looks[lead])
-    return se2.compose(se2.compose(moved, se2.between(new[lead], new)),
-                       generator.normal(0.0, closures.sigmas, (len(pairs), 3)))
-
-
-def with_false(
-    generator: np.random.Generator, path: Motion, closures: Closures, ends: IntArray,
-    poses: FloatArray,
-) -> tuple[Measured, int]:
-    """
-    Return true closures and false ones by their later ends, and how many groups are missing.
-
-    In: the stamps of the true ones, shape (L, 2), and the measured poses, shape (L, 3).
-    """
-    sizes = closures.false.sizes(len(ends))
-    pairs, groups = false_pairs(generator, path, sizes, closures)
-    false = false_poses(generator, path, pairs, groups, closures)
+    if not false.loose:
+        # those of a group agree with each other as true ones would: both stretches are laid upon
+        # one another at its first closure
+        _, leads, group = np.unique(groups, return_index=True, return_inverse=True)
+        (starts, stops), lead = path.truth.poses[pairs].transpose(1, 0, 2), leads[group]
+        laid = se2.compose(se2.inverse(se2.between(starts[lead], starts)), seen[lead])
+        seen = se2.compose(se2.compose(laid, se2.between(stops[lead], stops)),
+                           generator.normal(0.0, closures.sigmas, (len(pairs), 3)))
     every = Measured(np.concatenate((ends, path.truth.stamps_ns[pairs])),
-                     np.concatenate((poses, false)), np.append(np.full(len(ends), -1), groups))
+                     np.concatenate((poses, seen)), np.append(np.full(len(ends), -1), groups))
     return (every.rows(np.argsort(every.later_ns, kind='stable')),
             len(sizes) - len(np.unique(groups)))
 
@@ -292,7 +239,7 @@ def with_false(
 def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
     """Return odometry with its jumps, in the order of their times."""
     poses = odometry.poses.copy()
-    for jump in sorted(setup.jumps_of(ODOMETRY), key=lambda each: each.at_s):
+    for jump in sorted(setup.jumps_of(settings.ODOMETRY), key=lambda each: each.at_s):
         k = int(np.searchsorted(odometry.stamps_ns, START_NS + round(jump.at_s * 1e9)))
         if k == len(poses):
             continue
@@ -303,7 +250,8 @@ def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
 
 
 def moved(
-    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray, jumps: list[Jump],
+    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray,
+    jumps: list[settings.Jump],
 ) -> Measured:
     """Return fixes or global poses, shape (M, 2 or 3), with jumps."""
     time = (stamps_ns - START_NS) * 1e-9
@@ -317,7 +265,7 @@ def moved(
     return Measured(stamps_ns, values, wrong)
 
 
-def heard(stamps_ns: IntArray, topic: str, outages: Iterable[Outage]) -> BoolArray:
+def heard(stamps_ns: IntArray, topic: str, outages: Iterable[settings.Outage]) -> BoolArray:
     """Return which measurements of a topic are in no outage, shape (M,)."""
     time = (stamps_ns - START_NS) * 1e-9
     kept = np.ones(len(stamps_ns), dtype=bool)
@@ -335,7 +283,7 @@ def arrivals(
     """
     n = len(stamps_ns)
     late, again = generator.random(n), generator.random((2, n))
-    seconds = np.full(n, LATENCY_S[topic])
+    seconds = np.full(n, settings.LATENCY_S[topic])
     for delay in setup.delays:
         if delay.topic == topic:
             seconds = delay.seconds + delay.jitter_s * late

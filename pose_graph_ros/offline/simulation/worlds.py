@@ -27,17 +27,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Metres
-from pose_graph_ros.offline.simulation.settings import (
-    Closures,
-    FalseClosures,
-    FIXES,
-    Fixes,
-    Jump,
-    Outage,
-    Setup,
-    START_NS,
-    Wheels,
-)
+from pose_graph_ros.offline.simulation import settings
+from pose_graph_ros.offline.simulation.settings import Closures, FalseClosures, FIXES, Setup
 
 PERIOD_S = 0.01  # sample period of the motion [s]
 MARGIN_S = 5.0  # by which paths last longer than the motion, whose end is smoothed [s]
@@ -95,7 +86,7 @@ def follow(
     distance = gaussian_filter1d(np.interp(time, knots, np.repeat(length, 2)), 0.25 / PERIOD_S)
     time, distance = time[time <= duration_s], distance[time <= duration_s]
     poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
-    stamps: IntArray = START_NS + np.round(time * 1e9).astype(np.int64)
+    stamps: IntArray = settings.START_NS + np.round(time * 1e9).astype(np.int64)
     return Motion(Trajectory(stamps, poses), distance), arrival
 
 
@@ -175,27 +166,6 @@ def _middle(a: IntArray, b: IntArray) -> tuple[int, int]:
     return int(a[0] + b[0]), int(a[1] + b[1])
 
 
-def aisle_corners(
-    rng: np.random.Generator, length: Metres, aisles: int, spacing: Metres, depth: Metres,
-) -> FloatArray:
-    """
-    Return the corners of a way through the aisles of a hall in random order, shape (K, 2) [m].
-
-    Aisle k leads from (k spacing, 0) to (k spacing, depth). At both ends a lane joins all aisles.
-    The robot drives each aisle from end to end and then changes to any other.
-    """
-    aisle, y, driven = int(rng.integers(aisles)), 0.0, 0.0
-    corners = [(aisle * spacing, y)]
-    while driven <= length:
-        y = depth - y
-        corners.append((aisle * spacing, y))
-        other = (aisle + int(rng.integers(1, aisles))) % aisles
-        driven += depth + spacing * abs(other - aisle)
-        aisle = other
-        corners.append((aisle * spacing, y))
-    return np.array(corners)
-
-
 def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, FloatArray]:
     """
     Return points along straight lines with right-angled turns, and where the corners are on it.
@@ -259,7 +229,7 @@ CAR = Limits(speed=7.2, acceleration=1.4, lateral_acceleration=2.0)
 
 # Of the drive: the outage of fixes, from the second lap on [s], and reflected signals (multipath).
 OUTAGE_S = (-40.0, 30.0)
-REFLECTED = Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
+REFLECTED = settings.Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +247,14 @@ class World:
 def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
     """Return a drive along the circuit, at random within the lane, with random waits at lights."""
     heading, stops, lap_length = _circuit(duration_s)
-    path = wandering(generator, _streets(heading), CIRCUIT_STEP, LANE_SIGMA)
+    # on straight streets, and then along bent ones
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
+    grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
+    bent = grid + np.column_stack((
+        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
+        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
+    path = wandering(generator, bent @ se2.rotation(STREET_BEARING).T, CIRCUIT_STEP, LANE_SIGMA)
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))
     motion, arrival = follow(path, stops, waits, CAR, duration_s)
     lap = round(lap_length / CIRCUIT_STEP)
@@ -316,45 +293,38 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     return heading, np.round(stops / CIRCUIT_STEP).astype(np.int64), lap_length
 
 
-def _streets(heading: FloatArray) -> FloatArray:
-    """Return the path along bent streets, shape (N, 2), with headings on straight ones."""
-    middle = 0.5 * (heading[1:] + heading[:-1])
-    steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
-    grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
-    bent = grid + np.column_stack((
-        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
-        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
-    return np.asarray(bent @ se2.rotation(STREET_BEARING).T)
-
-
 def _drive_setup(motion: Motion) -> Setup:
     outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
     return Setup(
-        wheels=Wheels(start=(3.2, -1.4, -2.0)), fixes=Fixes(),
+        wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
         closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
-        outages=(Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
+        outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
         jumps=(REFLECTED,))
 
 
 def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
-    length = (duration_s + MARGIN_S) * FORKLIFT.speed
-    corners = aisle_corners(generator, length + 2.0 * AISLE_DEPTH, AISLES, AISLE_SPACING,
-                            AISLE_DEPTH)
-    points, middles = rounded(corners, ROBOT_TURN, PATH_STEP)
+    """
+    Return a drive through the aisles of a hall in random order.
+
+    Aisle k leads from (k spacing, 0) to (k spacing, depth). At both ends a lane joins all aisles.
+    The robot drives each aisle from end to end and then changes to any other.
+    """
+    length = (duration_s + MARGIN_S) * FORKLIFT.speed + 2.0 * AISLE_DEPTH
+    aisle, y, driven = int(generator.integers(AISLES)), 0.0, 0.0
+    corners = [(aisle * AISLE_SPACING, y)]
+    while driven <= length:
+        y = AISLE_DEPTH - y
+        corners.append((aisle * AISLE_SPACING, y))
+        other = (aisle + int(generator.integers(1, AISLES))) % AISLES
+        driven += AISLE_DEPTH + AISLE_SPACING * abs(other - aisle)
+        aisle = other
+        corners.append((aisle * AISLE_SPACING, y))
+    points, middles = rounded(np.array(corners), ROBOT_TURN, PATH_STEP)
     path = wandering(generator, points, PATH_STEP, ASIDE)
     picks = middles[1:-1][generator.random(len(middles) - 2) < PICKS]
     stops = np.unique(np.round(picks / PATH_STEP).astype(np.int64))
     waits = np.append(REST_S, generator.uniform(*PICK_S, len(stops)))
     return follow(path, stops, waits, FORKLIFT, duration_s)[0]
-
-
-def _hall_setup(_motion: Motion) -> Setup:
-    return Setup(
-        wheels=Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
-        closures=Closures(
-            sigmas=(0.05, 0.05, 0.01), spacing=5.0, radius=1.0, min_distance=20.0,
-            place_distance=1.0, first_s=REST_S,
-            false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))
 
 
 def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
@@ -369,17 +339,18 @@ def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
     return follow(path, stops, np.array([REST_S]), CART, duration_s)[0]
 
 
-def _grid_setup(_motion: Motion) -> Setup:
-    return Setup(
-        wheels=Wheels(track_width=0.8),
+WORLDS = {
+    'drive': World(drive_circuit, _drive_setup, one_stream=True),
+    'hall': World(_hall, lambda _: Setup(
+        wheels=settings.Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
+        closures=Closures(
+            sigmas=(0.05, 0.05, 0.01), spacing=5.0, radius=1.0, min_distance=20.0,
+            place_distance=1.0, first_s=REST_S,
+            false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))),
+    'grid': World(_grid, lambda _: Setup(
+        wheels=settings.Wheels(track_width=0.8),
         closures=Closures(
             rate=0.5, sigmas=(0.1, 0.1, 0.02), spacing=1.0, radius=1.5, min_distance=10.0,
             first_s=REST_S,
-            false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0)))
-
-
-WORLDS = {
-    'drive': World(drive_circuit, _drive_setup, one_stream=True),
-    'hall': World(_hall, _hall_setup),
-    'grid': World(_grid, _grid_setup),
+            false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0)))),
 }

@@ -13,14 +13,13 @@ from typing import Any, NamedTuple
 
 import networkx as nx
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_array, eye_array
 
 from pose_graph_ros.core.elimination.ordering import minimum_degree
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.tables import N_CLIQUES
-from pose_graph_ros.offline.drawing.views import hidden, markov_random_field, terms
+from pose_graph_ros.offline.graph_views import hidden, markov_random_field, terms
 
 MOST_BINS = 120
 
@@ -118,7 +117,14 @@ def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
         cliques[field].tolist() for field in ('n_frontal', 'n_separator', 'members'))
     nodes = memory['pool_i']
     place, n = np.full(graph.n_nodes, -1), 0
-    order = _children_first(cliques)
+    # all cliques with frontal nodes, each after those below it
+    rows = np.flatnonzero(cliques['n_frontal'] > 0).tolist()
+    tree = nx.DiGraph()
+    tree.add_nodes_from(rows)
+    tree.add_edges_from((parent, row) for row, parent in zip(
+        rows, cliques['parent'][rows].tolist(), strict=True) if parent >= 0)
+    roots = [row for row in rows if tree.in_degree(row) == 0]
+    order = [row for root in roots[::-1] for row in nx.dfs_preorder_nodes(tree, root)][::-1]
     for c in order:
         own = nodes[first[c]:first[c] + frontal[c]]
         own = own[~fixed[own]]
@@ -130,21 +136,10 @@ def factor(graph: Graph, most_bins: int = MOST_BINS) -> BinnedPattern:
             at = place[nodes[first[c]:first[c] + frontal[c] + separator[c]]]
             own, rest = at[:frontal[c]], at[frontal[c]:]
             own, rest = np.sort(own[own >= 0]), rest[rest >= 0]
-            rows, columns = np.triu_indices(len(own))
-            yield np.column_stack((own[rows], own[columns]))
+            above, columns = np.triu_indices(len(own))
+            yield np.column_stack((own[above], own[columns]))
             yield np.column_stack((np.repeat(own, len(rest)), np.tile(rest, len(own))))
     return _binned(blocks(), n, most_bins)
-
-
-def _children_first(cliques: npt.NDArray[Any]) -> list[int]:
-    """Return the rows of all cliques with frontal nodes, each after those below it."""
-    rows = np.flatnonzero(cliques['n_frontal'] > 0).tolist()
-    tree = nx.DiGraph()
-    tree.add_nodes_from(rows)
-    tree.add_edges_from((parent, row) for row, parent in zip(
-        rows, cliques['parent'][rows].tolist(), strict=True) if parent >= 0)
-    roots = [row for row in rows if tree.in_degree(row) == 0]
-    return [row for root in roots[::-1] for row in nx.dfs_preorder_nodes(tree, root)][::-1]
 
 
 def _binned(blocks: Iterable[IntArray], size: int, most_bins: int) -> BinnedPattern:

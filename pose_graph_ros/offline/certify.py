@@ -4,7 +4,7 @@
 Whether a minimum is the global one, and if not, a lower one.
 
 1. The headings of the given poses are moved to the near minimum of the objective of
-   `objective`, positions eliminated.
+   `chordal_objective`, positions eliminated.
 2. The certificate matrix of this minimum proves a lower bound (`examined`). If it is f, but for
    the gap that rounding needs, the minimum is global.
 3. Else headings become rows of one number more (the Riemannian staircase: N. Boumal,
@@ -45,7 +45,7 @@ import numpy as np
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.sparse import BlockFactors
-from pose_graph_ros.offline.certificate.objective import Formulation, QuadraticForm
+from pose_graph_ros.offline.chordal_objective import Formulation, QuadraticForm
 
 Operator = Callable[[ComplexArray], ComplexArray]
 Preconditioner = Callable[[ComplexArray, ComplexArray], ComplexArray]
@@ -123,12 +123,6 @@ class NearHessian(NamedTuple):
     # from derivatives of chi2 by the headings of these, (F,), to their part of a Gauss-Newton step
     solve: Callable[[FloatArray], FloatArray]
 
-    def order(self, formulation: Formulation) -> IntArray:
-        """Return the place of each unknown of the objective, the map last."""
-        places = np.full(formulation.n_unknowns, len(self.places))
-        places[1:] = self.places
-        return places
-
     def precondition(self, y: ComplexArray, v: ComplexArray) -> ComplexArray:
         """Return a change of headings that are angles, given the derivatives by them."""
         change = np.zeros_like(v)
@@ -145,7 +139,9 @@ def certify(
 
     Raises LinearSolveError if the objective does not determine the positions or headings.
     """
-    form = QuadraticForm(formulation, None if hessian is None else hessian.order(formulation))
+    # the map is the last that is eliminated
+    form = QuadraticForm(formulation, None if hessian is None else np.concatenate(
+        ([len(hessian.places)], hessian.places)))
     if form.n == 1:
         cost = form.cost(np.ones((1, 1), dtype=np.complex128))
         return Certificate(Verdict.CERTIFIED, cost, cost, 0.0, None, 1, poses.copy())
@@ -157,11 +153,15 @@ def certify(
         return Certificate(Verdict.CERTIFIED, cost, near, cost, None, 1,
                            formulation.poses(form.positions(z)[:, 0], z[:, 0]))
     spectrum = examined(form, z, eigenvalue=eigenvalue)
-    bound, rank = spectrum.bound, 1
+    bound, y = spectrum.bound, z
     if not spectrum.positive:
-        y, rank, above = _staircase(form, z, spectrum)
+        above = spectrum    # a minimum over rows of more numbers
+        while (not above.positive and y.shape[1] < TUNING.max_rank
+               and above.direction is not None):
+            y = minimized(form, _escaped(form, y, above.direction))
+            above = examined(form, y)
+            bound = max(bound, above.bound)
         other = minimized(form, rounded(y))
-        bound = max(bound, above)
         if form.cost(other) < near - TUNING.lower * max(near, 1.0):
             z, cost = other, form.cost(other)
             spectrum = examined(form, z, eigenvalue=eigenvalue)
@@ -170,21 +170,7 @@ def certify(
     certified = gap <= TUNING.gap * max(cost, 1.0)
     return Certificate(
         Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED, cost, near, gap,
-        spectrum.smallest, rank,
-        formulation.poses(form.positions(z)[:, 0], z[:, 0]))
-
-
-def _staircase(
-    form: QuadraticForm, y: ComplexArray, spectrum: Spectrum,
-) -> tuple[ComplexArray, int, float]:
-    """Return rows at a minimum over rows of more numbers, how many, and the best bound."""
-    bound = spectrum.bound
-    while (not spectrum.positive and y.shape[1] < TUNING.max_rank
-           and spectrum.direction is not None):
-        y = minimized(form, _escaped(form, y, spectrum.direction))
-        spectrum = examined(form, y)
-        bound = max(bound, spectrum.bound)
-    return y, y.shape[1], bound
+        spectrum.smallest, y.shape[1], formulation.poses(form.positions(z)[:, 0], z[:, 0]))
 
 
 def _escaped(form: QuadraticForm, y: ComplexArray, direction: ComplexArray) -> ComplexArray:
@@ -308,7 +294,17 @@ def minimized(
     """
     cost, radius = form.cost(y), np.inf
     product = form.product(y)
-    precondition = precondition or _preconditioner(form, multipliers(y, product))
+    if precondition is None:
+        # v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite
+        damping = 1e-12 * form.diagonal   # makes it definite
+        factors = form.factors(damping - multipliers(y, product), turned=False)
+        if not factors.is_positive:
+            factors = form.factors(damping, turned=False)
+
+        def precondition(_: ComplexArray, v: ComplexArray) -> ComplexArray:
+            out = form.inverse(factors, v)
+            out[0] = 0.0
+            return out
     for _ in range(300):
         diagonal = multipliers(y, product)[:, None]
         tangent = _projection(y)
@@ -341,20 +337,6 @@ def _projection(y: ComplexArray) -> Operator:
         v[0] = 0.0
         return v
     return tangent
-
-
-def _preconditioner(form: QuadraticForm, diagonal: FloatArray) -> Preconditioner:
-    """Return v -> (Q - L)^-1 v with row 0 held, or with Q alone if that is not definite."""
-    damping = 1e-12 * form.diagonal   # makes it definite
-    factors = form.factors(damping - diagonal, turned=False)
-    if not factors.is_positive:
-        factors = form.factors(damping, turned=False)
-
-    def solve(_: ComplexArray, v: ComplexArray) -> ComplexArray:
-        out = form.inverse(factors, v)
-        out[0] = 0.0
-        return out
-    return solve
 
 
 def _step(

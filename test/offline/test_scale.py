@@ -10,8 +10,8 @@ import pytest
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.replay import run_measurements
-from pose_graph_ros.offline.residuals.source_residuals import fit, SourceResiduals, whiteness
-from pose_graph_ros.offline.residuals.variance_components import analyse, Analysis
+from pose_graph_ros.offline.source_residuals import fit, SourceResiduals, whiteness
+from pose_graph_ros.offline.variance_components import analyse, Analysis
 
 
 def made(errors: np.ndarray, sigma: float, taken: float = 0.0) -> SourceResiduals:

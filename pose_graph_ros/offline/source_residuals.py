@@ -51,21 +51,12 @@ from scipy.special import chdtri
 
 from pose_graph_ros.core.disagreement import edges_by_source
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import (
-    BoolArray,
-    Covariances,
-    FloatArray,
-    IntArray,
-    Poses,
-)
+from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
+from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.quantities import StampsNs
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.bias import CorrelatedErrors, STRETCH
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_report import autocovariances, estimate
 
@@ -124,37 +115,34 @@ class SourceResiduals(NamedTuple):
         return np.asarray(np.sqrt(np.einsum('mi,mij,mj->m', self.errors, joint, self.errors)))
 
 
-def scales_in_use(graph: Graph, reweighting: Reweighting) -> FloatArray:
-    """
-    Return the factors on the claimed sigmas that a graph uses, without those of a robust loss.
-
-    They are by row.
-    """
-    weights, saved = graph.weights, reweighting.saved()
-    rows = graph.factor_rows(saved.rows)
-    weights[rows[rows >= 0]] = saved.shares[rows >= 0]
-    return np.asarray(np.where(weights > 0.0, weights, 1.0)**-0.5)
-
-
-def collect(
-    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder, scales: FloatArray,
-) -> dict[str, SourceResiduals]:
+def collect(parts: Parts) -> dict[str, SourceResiduals]:
     """
     Return the residuals of each source that has constraints in the graph.
 
     Raises ValueError if edits of the graph wait for the solver.
     """
+    smoother, nodes, factors = parts.smoother, parts.nodes, parts.factors
     graph, covariances = smoother.graph, smoother.covariances()
+    # the factors on claimed sigmas that the graph uses, without those of a robust loss
+    weights, saved = graph.weights, parts.reweighting.saved()
+    rows = graph.factor_rows(saved.rows)
+    weights[rows[rows >= 0]] = saved.shares[rows >= 0]
+    scales = np.where(weights > 0.0, weights, 1.0)**-0.5
     found: dict[str, SourceResiduals] = {}
     for source, (stamps, ids) in factors.held().items():
-        residuals = _residuals(graph, (source, 'map'), ids, stamps, scales)
-        biased = graph.factors_at(ids).j >= 0
+        residuals, table = _residuals(graph, (source, 'map'), ids, stamps, scales), (
+            graph.factors_at(ids))
+        # J P J^T of measurements of points of the robot, in map axes
+        rows = graph.node_rows(table.i)
+        arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])
+        J = np.tile(np.eye(3), (len(rows), 1, 1))
+        J[:, 0, 2], J[:, 1, 2] = -arms[:, 1], arms[:, 0]
         errors = factors.errors_in_use(source)
         # the variance of correlated errors, in units of the claimed one
         total = 1.0 if errors is None else errors.correlated + errors.white
         found[source] = residuals._replace(
-            taken=_taken(graph, ids, covariances),
-            scale=np.where(biased, np.sqrt(total), 1.0) * residuals.scale)
+            taken=J @ covariances[rows] @ np.swapaxes(J, 1, 2),
+            scale=np.where(table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
     for name, ids in edges_by_source(graph, nodes, factors).items():
         if name[0] not in found:
             edges = graph.factors_at(ids)
@@ -191,16 +179,6 @@ def _residuals(
     return SourceResiduals(
         *name, stamps_ns, errors, measured, claimed * scale[:, None, None]**2,
         np.full((len(ids), 3, 3), np.nan), table.weight > 0.0, scale, ids)
-
-
-def _taken(graph: Graph, ids: IntArray, covariances: FloatArray) -> FloatArray:
-    """Return J P J^T of measurements of points of the robot, in map axes, shape (K, 3, 3)."""
-    table = graph.factors_at(ids)
-    rows = graph.node_rows(table.i)
-    arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])
-    J = np.tile(np.eye(3), (len(rows), 1, 1))
-    J[:, 0, 2], J[:, 1, 2] = -arms[:, 1], arms[:, 0]
-    return J @ covariances[rows] @ np.swapaxes(J, 1, 2)
 
 
 def spread(n: int, most: int) -> IntArray:
@@ -286,20 +264,16 @@ def _row(
     measured = used.measured[:, row]
     sigma = used.sigmas[measured, row]
     values = used.errors[measured, row] / sigma
-    left = float(np.mean(_left(known)[known.measured[:, row], row]))
+    there = known.measured[:, row]
+    claimed, taken = (each[there, row, row] for each in (known.covariances, known.taken))
+    # variances of residuals in units of those of measurements; with a diagonal R these shares add
+    # up to the redundancy
+    left = float(np.mean(np.clip(1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0)))
     independent = _independent(values, left, used.stamps_ns[measured], errors)
     return RowFit(
         row, len(values), float(np.sqrt(np.mean(sigma**2))), math.sqrt(left),
         float(np.sqrt(np.mean(values**2))), independent,
         *_ratio(values**2, np.ones(len(values)), left, independent))
-
-
-def _left(residuals: SourceResiduals) -> FloatArray:
-    """Return the variances of residuals in units of those of measurements, shape (M, 3)."""
-    claimed, taken = (np.diagonal(each, axis1=1, axis2=2)
-                      for each in (residuals.covariances, residuals.taken))
-    # with a diagonal R these shares add up to the redundancy
-    return np.asarray(np.clip(1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0))
 
 
 def _ratio(

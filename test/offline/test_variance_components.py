@@ -12,8 +12,8 @@ from pose_graph_ros.cli.replay import CLOSURES
 from pose_graph_ros.cli.run.document import read_document
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.offline.residuals import variance_components as vc
-from pose_graph_ros.offline.residuals.source_residuals import inverse
+from pose_graph_ros.offline import variance_components as vc
+from pose_graph_ros.offline.source_residuals import inverse
 
 
 def laps(seed: int, times: tuple[float, float]) -> vc.Constraints:

@@ -12,8 +12,7 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import Prior
 from pose_graph_ros.core.marginalization.marginalize import equations
-from pose_graph_ros.offline.drawing.pattern import elimination_order, filled, pattern
-from pose_graph_ros.offline.drawing.views import (
+from pose_graph_ros.offline.graph_views import (
     bayesian_network,
     factor_graph,
     factors,
@@ -27,6 +26,7 @@ from pose_graph_ros.offline.drawing.views import (
     time_slices,
     VIEWS,
 )
+from pose_graph_ros.offline.pattern import elimination_order, filled, pattern
 
 seeds = st.integers(0, 2**31)
 

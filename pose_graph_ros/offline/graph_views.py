@@ -33,11 +33,7 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import (
-    FactorKind,
-    Factors,
-    NodeKind,
-)
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors, NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 
 
@@ -96,19 +92,11 @@ def factor_graph(rows: GraphRows, ids: IntArray | None = None) -> Any:
     kinds = [NodeKind(kind) for kind in rows.node_kind.tolist()]
     sizes = (np.where(rows.node_kind == NodeKind.LANDMARK, 2, 3) if rows.dimension is None
              else rows.dimension)
-    for row, (kind, number) in enumerate(zip(
+    for node, (node_kind, number) in enumerate(zip(
             kinds, (rows.node_ids if ids is None else ids).tolist(), strict=True)):
-        letter, role = HIDDEN[kind]
-        graph.add_node(row, name=f'{letter}{number}', role=role, fixed=bool(rows.fixed[row]),
-                       size=int(sizes[row]), pose=rows.poses[row].copy())
-    for n, term in enumerate(_terms(rows, kinds)):
-        factor = graph.number_of_nodes()
-        graph.add_node(factor, name=f'f{n}', role=Role.FACTOR, term=term)
-        graph.add_edges_from((factor, node) for node in term.nodes)
-    return graph
-
-
-def _terms(rows: GraphRows, kinds: list[NodeKind]) -> list[Term]:
+        letter, role = HIDDEN[node_kind]
+        graph.add_node(node, name=f'{letter}{number}', role=role, fixed=bool(rows.fixed[node]),
+                       size=int(sizes[node]), pose=rows.poses[node].copy())
     factors = rows.factors.renumbered(rows.rows_of)
     found, measured = [], set()
     stepped = set(factors.i[factors.kind == FactorKind.ODOMETRY].tolist())
@@ -126,9 +114,12 @@ def _terms(rows: GraphRows, kinds: list[NodeKind]) -> list[Term]:
             measured.add(place)
         if j >= 0 or used or place not in measured:
             found.append(Term(sort, tuple(node for node in (i, j, k) if node >= 0), used))
-    found += [Term(Sort.PRIOR, tuple(rows.rows_of(prior.nodes).tolist()))
-              for prior in rows.priors]
-    return found
+    found += [Term(Sort.PRIOR, tuple(rows.rows_of(prior.nodes).tolist())) for prior in rows.priors]
+    for n, term in enumerate(found):
+        factor = graph.number_of_nodes()
+        graph.add_node(factor, name=f'f{n}', role=Role.FACTOR, term=term)
+        graph.add_edges_from((factor, node) for node in term.nodes)
+    return graph
 
 
 def terms(graph: Any) -> list[Term]:

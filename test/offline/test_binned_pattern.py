@@ -8,7 +8,7 @@ import numpy as np
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.offline.drawing.pattern import BinnedPattern, factor, filled, hessian
+from pose_graph_ros.offline.pattern import BinnedPattern, factor, filled, hessian
 
 
 def graph_of(correlation_time: float) -> Graph:

@@ -11,8 +11,8 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.offline.certificate.certify import certify, examined, minimized, Verdict
-from pose_graph_ros.offline.certificate.objective import (
+from pose_graph_ros.offline.certify import certify, examined, minimized, Verdict
+from pose_graph_ros.offline.chordal_objective import (
     formulate,
     Formulation,
     NotCoveredError,

@@ -100,11 +100,13 @@ def formulate(graph: Constrained) -> Formulation:
     factors = factors.rows(factors.weight > 0.0)
     poses, fixed = graph.poses, graph.fixed
     information = factors.weighted_information
+    xx, yy, xy = information[:, 0, 0], information[:, 1, 1], information[:, 0, 1]
+    kappa = np.maximum(information[:, 2, 2], 0.0)
     with np.errstate(over='ignore', invalid='ignore'):
-        kappa, tau = _kappa_tau(information)
+        trace = xx + yy
+        tau = np.maximum(2.0 * (xx * yy - xy * xy) / np.where(trace > 0.0, trace, 1.0), 0.0)
     terms = Terms.of_factors(factors, len(poses))
-    places = np.concatenate((
-        complex_of(poses[fixed]), terms.arm_i[(factors.j < 0) & (tau > 0.0)]))
+    places = np.concatenate((complex_of(poses[fixed]), terms.arm_i[(factors.j < 0) & (tau > 0.0)]))
     origin = complex(np.mean(places)) if len(places) > 0 else 0j
     # of all nodes, and of the map behind them: unknown, its heading and position as far as known
     number = np.append(np.where(fixed, 0, np.cumsum(~fixed)), 0)
@@ -115,40 +117,22 @@ def formulate(graph: Constrained) -> Formulation:
     # squares of longer distances may overflow
     if not (np.all(np.isfinite(tau)) and np.all(np.abs(arm_i) < 1e100)):
         raise NotCoveredError('the numbers are too large')
-    form = Formulation(
-        number[terms.i], number[terms.j], own[terms.i] * terms.turn * own[terms.j].conj(),
-        arm_i, arm_j, kappa, tau, number[:-1], poses.copy(),
-        _is_below(information, kappa, tau), origin)
-    _check_held(form)
-    return form
-
-
-def _kappa_tau(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the weights of heading and position, shape (M,) each; see the top of the module."""
-    xx, yy, xy = information[:, 0, 0], information[:, 1, 1], information[:, 0, 1]
-    trace = xx + yy
-    tau = 2.0 * (xx * yy - xy * xy) / np.where(trace > 0.0, trace, 1.0)
-    return np.maximum(information[:, 2, 2], 0.0), np.maximum(tau, 0.0)
-
-
-def _is_below(information: FloatArray, kappa: FloatArray, tau: FloatArray) -> bool:
-    """Tell whether `diag(tau, tau, kappa)` is nowhere above the information."""
+    # diag(tau, tau, kappa) is nowhere above the information, as far as the six numbers of a file
+    # tell
     rest = information.copy()
     rest[:, (0, 1, 2), (0, 1, 2)] -= np.stack((tau, tau, kappa), axis=1)
-    # as far as the six numbers of a file tell
     least = np.sqrt(np.maximum(np.einsum('mii->mi', information), np.finfo(float).tiny))
     scaled = rest / least[:, :, None] / least[:, None, :]
-    return bool(np.min(np.linalg.eigvalsh(scaled), initial=0.0) > -1e-9)
-
-
-def _check_held(form: Formulation) -> None:
-    """Raise NotCoveredError unless constraints on positions join all unknowns to the map."""
-    joining = form.tau > 0.0
-    part = components(form.i[joining], form.j[joining], form.n_unknowns)
+    is_below = bool(np.min(np.linalg.eigvalsh(scaled), initial=0.0) > -1e-9)
+    form = Formulation(
+        number[terms.i], number[terms.j], own[terms.i] * terms.turn * own[terms.j].conj(),
+        arm_i, arm_j, kappa, tau, number[:-1], poses.copy(), is_below, origin)
+    part = components(form.i[tau > 0.0], form.j[tau > 0.0], form.n_unknowns)
     if np.any(part != 0):
         raise NotCoveredError(
             f'constraints on positions join {int(np.sum(part != 0))} nodes to nothing fixed '
             f'and nothing observed')
+    return form
 
 
 class QuadraticForm:
@@ -205,23 +189,20 @@ class QuadraticForm:
 
     def positions(self, z: ComplexArray) -> ComplexArray:
         """Return the best positions, shape (n, r), for headings of this shape; 0 of the map."""
-        return self._positions(self._of_headings(z))
+        return self._solved(z)[0]
 
-    def _positions(self, of_headings: ComplexArray) -> ComplexArray:
+    def _solved(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return the best positions, and what headings add to the residuals, shape (M, 2, r)."""
+        (i, j), (by_i, by_j) = self._ends, self._by[:, :, :, 1:]
+        of_headings = np.asarray(by_i * z[i, None] + by_j * z[j, None])
         right = self._nodes.gathered(self._by_t, of_headings[:, :1])[:, 0]
         # a complex column as two real ones
         solved = self._laplacian.solve(-np.ascontiguousarray(right).view(np.float64))
-        return np.ascontiguousarray(solved).view(np.complex128)
-
-    def _of_headings(self, z: ComplexArray) -> ComplexArray:
-        """Return what headings add to the residuals, shape (M, 2, r)."""
-        (i, j), (by_i, by_j) = self._ends, self._by[:, :, :, 1:]
-        return np.asarray(by_i * z[i, None] + by_j * z[j, None])
+        return np.ascontiguousarray(solved).view(np.complex128), of_headings
 
     def residuals(self, z: ComplexArray) -> ComplexArray:
         """Return the whitened residuals of positions and headings, shape (M, 2, r)."""
-        residuals, (i, j) = self._of_headings(z), self._ends
-        t = self._positions(residuals)
+        (t, residuals), (i, j) = self._solved(z), self._ends
         residuals[:, 0] += self._by_t[1][:, 0] * (t[j] - t[i])
         return residuals
 

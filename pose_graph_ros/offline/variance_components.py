@@ -22,7 +22,7 @@ graph has as a bias keep their covariances, and what their residuals at the esti
 such errors are taken for independent, nothing is known of the others either.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -32,24 +32,13 @@ from scipy.sparse.linalg import splu
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.error_functions import errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
-from pose_graph_ros.offline.residuals.source_residuals import (
-    bounded,
-    collect,
-    fit,
-    inverse,
-    LEAST_INDEPENDENT,
-    ScaleFit,
-    scales_in_use,
-    SourceResiduals,
-    whiteness,
-)
+from pose_graph_ros.offline import source_residuals
+from pose_graph_ros.offline.source_residuals import inverse, ScaleFit, SourceResiduals
 
 # Random signs for each trace: its error is half of that of the squares that it is compared to.
 PROBES = 4
@@ -86,7 +75,7 @@ class Found(NamedTuple):
             return math.nan, math.nan, math.nan, 0.0
         variance = float(share @ self.covariance[np.ix_(k, k)] @ share) / total**2
         independent = 0.5 / variance
-        if independent < LEAST_INDEPENDENT:
+        if independent < source_residuals.LEAST_INDEPENDENT:
             return math.nan, math.nan, math.nan, independent
         ratio, width = math.sqrt(total / count), math.exp(1.96 * math.sqrt(variance))
         return ratio, ratio / width, ratio * width, independent
@@ -105,66 +94,34 @@ def constraints(graph: Graph) -> Constraints:
     poses = graph.poses
     used = np.flatnonzero(graph.weights > 0.0)
     factors = graph.factors_by_row.rows(used)
-    error, values, columns = _linearized(poses, factors)
-    n = 3 * len(error)
-    size = 3 * len(poses)
-    jacobian = csr_array((values.reshape(n, 9).ravel(), columns.reshape(n, 9).ravel(),
-                          np.arange(0, 9 * n + 1, 9)), shape=(n, size))
-    free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
-    return Constraints(
-        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
-        factors.weight, jacobian[:, free], _prior(graph, size)[free][:, free], used)
-
-
-def _linearized(poses: FloatArray, table: Factors) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return errors with their derivatives by the nodes of the ends, and the columns of these."""
-    n, error = len(poses), errors(poses, table)
+    error = errors(poses, factors)
+    # derivatives by the nodes of the ends, and their columns
     values, columns = [], []
     for name in 'ijk':
-        ends = getattr(table, name)
+        ends = getattr(factors, name)
         for k in range(3):
             step = np.zeros(3)
             step[k] = 1e-5   # m or rad
             moved = np.concatenate((poses, poses + step, poses - step))
-            after, before = (errors(moved, table.replaced(**{
-                name: np.where(ends < 0, ends, ends + part * n)})) for part in (1, 2))
+            after, before = (errors(moved, factors.replaced(**{
+                name: np.where(ends < 0, ends, ends + part * len(poses))})) for part in (1, 2))
             change = after - before
             change[:, 2] = se2.wrap(change[:, 2])
             values.append(change / 2e-5)
             columns.append(np.tile(3 * np.maximum(ends, 0)[:, None] + k, (1, 3)))
-    return error, np.stack(values, axis=2), np.stack(columns, axis=2)
-
-
-def _prior(graph: Graph, size: int) -> csr_array:
-    """Return the information of the dense priors of a graph, shape (size, size)."""
-    total = csr_array((size, size))
+    n, size = 3 * len(error), 3 * len(poses)
+    jacobian = csr_array((np.stack(values, axis=2).ravel(), np.stack(columns, axis=2).ravel(),
+                          np.arange(0, 9 * n + 1, 9)), shape=(n, size))
+    priors = csr_array((size, size))
     for prior in graph.priors:
         at = (3 * graph.node_rows(prior.nodes)[:, None] + np.arange(3)).ravel()
-        i, j = np.meshgrid(at, at, indexing='ij')
-        total = total + csr_array((prior.information.ravel(), (i.ravel(), j.ravel())),
-                                  shape=(size, size))
-    return total
-
-
-class _Projection:
-    """P for certain covariances of the constraints."""
-
-    def __init__(self, data: Constraints, covariances: FloatArray) -> None:
-        self._weights = inverse(covariances, data.measured)
-        self._data = data
-        n = len(covariances)
-        blocks = bsr_array((self._weights, np.arange(n), np.arange(n + 1)))
-        self._weighted = (blocks @ data.jacobian).tocsr()
-        hessian = data.jacobian.T @ self._weighted + data.prior
-        self._solver = splu(hessian.tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
-                            options={'SymmetricMode': True})
-
-    def __call__(self, values: FloatArray, right: FloatArray | None = None) -> FloatArray:
-        """Return P v of C vectors, (M, 3, C), with what is added to the step's right-hand side."""
-        flat = values.reshape(-1, values.shape[2])
-        step = self._weighted.T @ flat
-        step = self._solver.solve(step if right is None else step + right[:, None])
-        return np.asarray(self._weights @ values - (self._weighted @ step).reshape(values.shape))
+        row, column = np.meshgrid(at, at, indexing='ij')
+        priors = priors + csr_array((prior.information.ravel(), (row.ravel(), column.ravel())),
+                                    shape=(size, size))
+    free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
+    return Constraints(
+        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
+        factors.weight, jacobian[:, free], priors[free][:, free], used)
 
 
 def restricted_likelihood(
@@ -216,7 +173,18 @@ def _statistics(
     signs: FloatArray, *, right: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return tr(P V_k), the information on the logarithms of sigmas, and squared residuals."""
-    project, n = _Projection(data, total), len(roots)
+    n, weights, ends = len(roots), inverse(total, data.measured), np.arange(len(total) + 1)
+    weighted = (bsr_array((weights, ends[:-1], ends)) @ data.jacobian).tocsr()
+    hessian = data.jacobian.T @ weighted + data.prior
+    solver = splu(hessian.tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                  options={'SymmetricMode': True})
+
+    def project(values: FloatArray, right: FloatArray | None = None) -> FloatArray:
+        """Return P v of C vectors, (M, 3, C), with what is added to the step's right-hand side."""
+        step = weighted.T @ values.reshape(-1, values.shape[2])
+        step = solver.solve(step if right is None else step + right[:, None])
+        return np.asarray(weights @ values - (weighted @ step).reshape(values.shape))
+
     residuals = project(data.errors[:, :, None], right)[:, :, 0]
     traces, squares, products = np.zeros(n), np.zeros(n), np.zeros((n, n))
     there = [np.flatnonzero(np.any(each != 0.0, axis=(1, 2))) for each in roots]
@@ -233,7 +201,7 @@ def _statistics(
                 traces[k] = np.sum(spread * signs[rows]) / PROBES
         energies = np.sum(np.einsum('mij,mj->mi', back[k], residuals[rows])**2, axis=1)
         freedom = ranks[k, rows]
-        squares[k] = np.sum(bounded(
+        squares[k] = np.sum(source_residuals.bounded(
             energies, traces[k] / np.sum(freedom) * freedom, freedom))
     return traces, products + products.T, squares
 
@@ -254,20 +222,19 @@ def analyse(parts: Parts) -> Analysis:
 
     All edits of the engine have been solved for.
     """
-    smoother, nodes, factors = parts.smoother, parts.nodes, parts.factors
-    residuals = collect(smoother, nodes, factors, scales_in_use(parts.graph, parts.reweighting))
+    residuals, nodes = source_residuals.collect(parts), parts.nodes
     if nodes.primary in residuals:
         # its edges have the noise that was found, and a ratio is one to what is claimed
         of_odometry = residuals[nodes.primary]
         residuals[nodes.primary] = of_odometry._replace(
             scale=of_odometry.scale * nodes.errors.mean_sigma)
-    fits = {source: fit(each, factors.errors_in_use(source))
+    fits = {source: source_residuals.fit(each, parts.factors.errors_in_use(source))
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
     correlated = frozenset(
         source for source, each in white.items() if each.kind == 'map'
-        and (found := whiteness(each)) is not None and found.tau > 0.0)
+        and (found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
     if len(correlated) == 0:
         fits |= _together(parts, fits, white)
     return Analysis(residuals, fits, correlated)
@@ -286,10 +253,18 @@ def _together(
     place = np.full(graph.n_factors, -1)
     place[data.rows] = np.arange(len(data.rows))
     own, shares = claimed.copy(), {source: np.zeros_like(claimed) for source in sources}
-    for source, row, motion in _motions(graph, nodes, parts.judge.closures()):
+    # what odometry adds to loop closures
+    ids, stamps_ns = parts.judge.closures()
+    for k, mean, (stamp, other) in zip(place[graph.factor_rows(ids)].tolist(), graph.factors_at(
+            ids).mean, stamps_ns.tolist(), strict=True):
+        reference, attachment = attach(nodes, other), attach(nodes, stamp)
+        if isinstance(reference, Answer) or isinstance(attachment, Answer):
+            continue
+        source = nodes.primary_at(stamp)
+        pose = se2.compose(se2.compose(se2.inverse(reference.motion), mean), attachment.motion)
+        motion = closure_covariance(np.zeros((3, 3)), pose, reference, attachment)
         # of a graph that was loaded, less is known of what odometry has added
-        if (k := place[row]) >= 0 and source in shares and (
-                np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0):
+        if k >= 0 and source in shares and np.linalg.eigvalsh(claimed[k] - motion)[0] > 0.0:
             shares[source][k], own[k] = motion, claimed[k] - motion
     fixed = claimed / data.weight[:, None, None]
     rows = {source: place[graph.factor_rows(each.ids)][each.used]
@@ -307,25 +282,6 @@ def _together(
         {kind: k for k, (name, kind) in enumerate(components) if name == source},
         in_use=nodes.errors.mean_sigma if source == nodes.primary else 1.0)
         for source, at in rows.items() if len(at) > 0}
-
-
-def _motions(
-    graph: Graph, nodes: HiddenNodes, closures: tuple[IntArray, IntArray],
-) -> Iterator[tuple[str, int, FloatArray]]:
-    """
-    Yield source, row of the edge, and covariance of what odometry adds to loop closures.
-
-    These are given by the ids of their edges, and stamps of each and of its other end [ns].
-    """
-    ids, stamps_ns = closures
-    for row, mean, (stamp, other) in zip(graph.factor_rows(ids).tolist(), graph.factors_at(
-            ids).mean, stamps_ns.tolist(), strict=True):
-        reference, attachment = attach(nodes, other), attach(nodes, stamp)
-        if isinstance(reference, Answer) or isinstance(attachment, Answer):
-            continue
-        pose = se2.compose(se2.compose(se2.inverse(reference.motion), mean), attachment.motion)
-        yield nodes.primary_at(stamp), row, closure_covariance(
-            np.zeros((3, 3)), pose, reference, attachment)
 
 
 def _with_factors(

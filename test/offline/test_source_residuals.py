@@ -12,7 +12,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.offline.residuals.variance_components import analyse
+from pose_graph_ros.offline.variance_components import analyse
 
 STEP = 1e-6
 
