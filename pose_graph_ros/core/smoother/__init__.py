@@ -9,6 +9,6 @@ the linearization error is within a budget: `tree_update` eliminates the affecte
 Bayes tree again, `back_substitution` solves as far as values change, and `relinearization` selects
 the constraints to linearize again. `chain` appends a node to a chain in constant time, and
 `forgetting` takes nodes out. `trial` lets the batch optimiser work on copies: the whole graph if a
-step diverges, or one with other weights, part by part. `covariances` and `sparse_inverse` compute
-marginal covariances from the tree, and those of the errors of new constraints.
+step diverges, or one with other weights, part by part. `covariances` computes marginal covariances
+from the tree, and those of the errors of new constraints.
 """

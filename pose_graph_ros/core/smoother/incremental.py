@@ -33,7 +33,6 @@ from pose_graph_ros.core.smoother import (
     trial,
 )
 from pose_graph_ros.core.smoother.covariances import Innovations, innovations
-from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 from pose_graph_ros.core.smoother.trial import Trial
 
 # Reason of an update that has failed because it must not fall back to the batch optimiser.
@@ -281,11 +280,13 @@ class IncrementalSmoother:
 
     def newest_covariance(self) -> Covariance:
         """Return the covariance of the newest pose in map axes."""
-        covariance = np.empty((3, 3))
-        if not covariances.newest_covariance(self._memory.head, covariance):
+        head = self._memory.head
+        if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
             # raises an error with the cause
             return self.covariance(self.graph.newest_pose)
-        return covariance
+        out = np.empty((3, 3))
+        covariances.node_covariance(head, head[tb.NEWEST], out)
+        return out
 
     def covariance(self, node: int) -> Covariance:
         """
@@ -300,16 +301,17 @@ class IncrementalSmoother:
 
     def joint_covariance(self, i: int, j: int) -> FloatArray:
         """Return the joint covariance, (6, 6), of two hidden nodes; raises as `covariance`."""
-        rows = self._eliminated([i, j])
-        out = np.zeros((6, 6))
-        covariances.pair_covariance(self._memory.head, *rows, out)
+        row_i, row_j = self._eliminated([i, j])
+        out = np.empty((6, 6))
+        covariances.write_covariance(
+            self._memory.head, row_i, np.eye(6, 3), row_j, np.eye(6, 3, -3), out)
         return out
 
     def covariances(self) -> Covariances:
         """Return those of all hidden nodes; raises as `covariance`."""
         self._require_solved()
         out = np.zeros((self.graph.n_nodes, 3, 3))
-        all_covariances(self._memory.head, out)
+        covariances.all_covariances(self._memory.head, out)
         return out
 
     def innovations(self, edges: Factors) -> Innovations:

@@ -16,7 +16,6 @@ call of `refine` does one iteration, and the graph is valid after each.
 
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
 from pose_graph_ros.core.graph import tables as tb, transaction_log
-from pose_graph_ros.core.graph.rows import touch
 from pose_graph_ros.core.smoother import relinearization, tree_update
 from pose_graph_ros.core.smoother.tree_update import (
     DIVERGED,
@@ -37,23 +36,6 @@ SHARE = 1e-13
 
 
 @kernel
-def _has_diverged(head, out_of_iterations):  # type: ignore[no-untyped-def]
-    """
-    Tell whether the iterations have diverged.
-
-    That is so if the squared linearization error is large, in sigma^2 and against chi2 (a false
-    constraint raises chi2 and all linearization errors with it), and either no iteration remains,
-    the last one has not halved the error, or it is so large that another can only increase it.
-    """
-    scalars = tb.scalars(head)[0]
-    error2, before = scalars.error2_sum, scalars.error2_before
-    scalars.error2_before = error2
-    if error2 <= 1.0 or error2 <= 1e-3 * scalars.chi2:
-        return False
-    return out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6
-
-
-@kernel
 def _reset_counters(head):  # type: ignore[no-untyped-def]
     head[tb.N_RELINEARIZED] = head[tb.N_ELIMINATED] = 0
     head[tb.N_VISITED] = head[tb.N_ITERATIONS] = 0
@@ -68,6 +50,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     UNFINISHED: linearization errors above the budget wait for the next update. After MORE_MEMORY
     the step is entered again as RESUMED (AFTER_BATCH if it was that before).
     """
+    scalars = tb.scalars(head)[0]
     if entered == FIRST:
         _reset_counters(head)
     head[tb.N_TURNED] = 0   # cliques that were listed in the last update may have been replaced
@@ -80,11 +63,19 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         code = tree_update.eliminate(head)
         if code != DONE:
             return code
-        settled = relinearization.solve(head)
+        error2 = relinearization.solve_and_check(head)
+        settled = error2 <= relinearization.budget(head)
         if settled:
+            relinearization.forget_waiting(head)
             break
+        # The iterations have diverged if the error is large, in sigma^2 and against chi2 (a false
+        # constraint raises chi2 and all linearization errors with it), and either no iteration
+        # remains, the last one has not halved it, or another can only increase it.
         out_of_iterations = head[tb.N_ITERATIONS] >= max_iterations
-        if _has_diverged(head, out_of_iterations) and entered != AFTER_BATCH:
+        before, scalars.error2_before = scalars.error2_before, error2
+        small = error2 <= 1.0 or error2 <= 1e-3 * scalars.chi2
+        if entered != AFTER_BATCH and not small and (
+                out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6):
             return DIVERGED
         if out_of_iterations:
             break
@@ -92,55 +83,21 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     return DONE if settled else UNFINISHED
 
 
-@kernel
-def _touch_clique(head, c):  # type: ignore[no-untyped-def]
-    pool_i, cliques = tb.pool_i(head), tb.cliques(head)
-    v = pool_i[cliques[c].members]
-    transaction_log.log_node(head, v)
-    touch(head, v)
-    head[tb.N_RELINEARIZED] += 1
-
-
-@kernel
-def _touch_waiting(head):  # type: ignore[no-untyped-def]
-    """Touch the cliques of waiting constraints and turned frames; eliminating linearizes them."""
-    factors, work_i = tb.factors(head), tb.work_i(head)
-    turned = work_i[2 * head[tb.NODE_ROOM]:]
-    for n in range(head[tb.N_TURNED]):
-        _touch_clique(head, tb.cliques(head)[turned[n]].parent)
-    for n in range(head[tb.N_WAITING]):
-        e = tb.waiting(head)[n]
-        transaction_log.log_factor(head, e)
-        relinearization.set_waits(head, e, 0)
-        _touch_clique(head, factors[e].owner)
-    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
-
-
-@kernel
-def _solve(head):  # type: ignore[no-untyped-def]
-    """Solve for the cliques that have changed since the last refinement, and check them."""
-    head[tb.SINCE] = head[tb.REFINED]
-    relinearization.solve_and_check(head)
-
-
-@kernel
-def _solve_from_the_root(head):  # type: ignore[no-untyped-def]
-    nodes, cliques, work_i = tb.nodes(head), tb.cliques(head), tb.work_i(head)
-    c = nodes[head[tb.NEWEST]].clique
-    while cliques[c].parent >= 0:
-        c = cliques[c].parent
-    work_i[0] = c
-    head[tb.N_ROOTS] = 1
-    head[tb.ITERATION] += 1
-    _solve(head)
-
-
 @kernel(allocates=True)
 def _iterate(head):  # type: ignore[no-untyped-def]
     """Linearize what waits again, eliminate it and what is above it, and solve."""
-    scalars = tb.scalars(head)[0]
+    scalars, factors, cliques = tb.scalars(head)[0], tb.factors(head), tb.cliques(head)
+    turned = tb.work_i(head)[2 * head[tb.NODE_ROOM]:]
     chi2, error2 = scalars.chi2, scalars.error2_sum
-    _touch_waiting(head)
+    # eliminating the cliques linearizes the constraints in them
+    for n in range(head[tb.N_TURNED]):
+        relinearization.touch_clique(head, cliques[turned[n]].parent)
+    for n in range(head[tb.N_WAITING]):
+        e = tb.waiting(head)[n]
+        transaction_log.log_factor(head, e)
+        factors[e].waits = 0
+        relinearization.touch_clique(head, factors[e].owner)
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
     if head[tb.N_TOUCHED] == 0:
         return DONE      # many errors, each of them negligible
     marked, affected = tree_update.mark(head)
@@ -149,8 +106,8 @@ def _iterate(head):  # type: ignore[no-untyped-def]
     if code != DONE:
         return code
     tree_update.forget_touched(head)
-    head[tb.N_ELIMINATED] = len(affected)
-    _solve(head)
+    head[tb.N_ELIMINATED], head[tb.SINCE] = len(affected), head[tb.REFINED]
+    relinearization.solve_and_check(head)
     # Gauss-Newton goes uphill, by at most 0.1 sigma^2, where it swings a soft mode
     if not scalars.chi2 <= scalars.lowest + 0.1 or head[tb.ROUND] >= 20:
         return DIVERGED
@@ -159,26 +116,6 @@ def _iterate(head):  # type: ignore[no-untyped-def]
     least = 1e-11 * max(chi2, 1.0)  # rounding errors, which cannot be reduced any further
     stalls = abs(scalars.chi2 - chi2) <= least and scalars.error2_sum > 0.5 * error2
     return DONE if stalls or scalars.error2_sum <= ENOUGH else UNFINISHED
-
-
-@kernel(allocates=True)
-def _refine(head):  # type: ignore[no-untyped-def]
-    scalars = tb.scalars(head)[0]
-    if head[tb.LISTED] != head[tb.UPDATE] - 1:
-        head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
-        _solve_from_the_root(head)
-        head[tb.ROUND], scalars.lowest = 0, scalars.chi2
-    if head[tb.INTERRUPT] != 0:
-        return INTERRUPTED
-    code = _iterate(head) if scalars.error2_sum > ENOUGH else DONE
-    if head[tb.INTERRUPT] != 0 and code != MORE_MEMORY:
-        return INTERRUPTED
-    if code == DONE:
-        relinearization.forget_waiting(head)
-        head[tb.REFINED] = head[tb.ITERATION] + 1
-    elif code == UNFINISHED:
-        head[tb.LISTED] = head[tb.UPDATE]
-    return code
 
 
 @kernel(signature=(tb.HEAD,), allocates=True)
@@ -190,13 +127,34 @@ def refine(head):  # type: ignore[no-untyped-def]
     minimum. After all but the first two the caller has to roll back what `transaction_log.begin`
     has begun. The graph must have no touched nodes.
     """
-    scalars = tb.scalars(head)[0]
+    scalars, cliques = tb.scalars(head)[0], tb.cliques(head)
     alpha, share = scalars.alpha, scalars.share
-    scalars.alpha, scalars.share = ALPHA, SHARE
+    scalars.alpha, scalars.share = ALPHA, SHARE     # a rollback restores them, too
     _reset_counters(head)
-    code = _refine(head)
+    if head[tb.LISTED] != head[tb.UPDATE] - 1:
+        head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
+        # from the root down, for the cliques that have changed since the last refinement
+        c = tb.nodes(head)[head[tb.NEWEST]].clique
+        while cliques[c].parent >= 0:
+            c = cliques[c].parent
+        tb.work_i(head)[0] = c
+        head[tb.N_ROOTS], head[tb.SINCE] = 1, head[tb.REFINED]
+        head[tb.ITERATION] += 1
+        relinearization.solve_and_check(head)
+        head[tb.ROUND], scalars.lowest = 0, scalars.chi2
+    if head[tb.INTERRUPT] != 0:
+        return INTERRUPTED
+    code = _iterate(head) if scalars.error2_sum > ENOUGH else DONE
+    if head[tb.INTERRUPT] != 0 and code != MORE_MEMORY:
+        return INTERRUPTED
+    if code == DONE:
+        relinearization.forget_waiting(head)
+        head[tb.REFINED] = head[tb.ITERATION] + 1
+    elif code == UNFINISHED:
+        head[tb.LISTED] = head[tb.UPDATE]
+    else:
+        return code
     scalars.alpha, scalars.share = alpha, share
-    if code in (DONE, UNFINISHED):
-        scalars.largest_move = transaction_log.largest_move(head)
-        transaction_log.commit(head)
+    scalars.largest_move = transaction_log.largest_move(head)
+    transaction_log.commit(head)
     return code

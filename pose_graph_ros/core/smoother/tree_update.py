@@ -88,7 +88,12 @@ def mark(head):  # type: ignore[no-untyped-def]
 @kernel(allocates=True, inline='always')    # callees compile once
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     """Replace the marked cliques: their nodes are ordered and eliminated anew."""
-    n_leaving = _leaving_first(head, affected)
+    nodes, tree = tb.nodes(head), tb.cliques(head)
+    n_leaving = 0   # the nodes that are about to leave come first
+    for k in range(len(affected)):
+        if nodes[affected[k]].touched == ORDERED_FIRST:
+            affected[n_leaving], affected[k] = affected[k], affected[n_leaving]
+            n_leaving += 1
     n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
     cliques = in_postorder(
@@ -98,7 +103,18 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
     need_f, need_i, largest = required_memory(cliques)
     if lacks_memory(head, head[tb.POOL_F_END] + need_f, head[tb.POOL_I_END] + need_i, largest):
         return MORE_MEMORY
-    _push_drift_down(head, marked, orphans)
+    # to each orphan goes the drift of all cliques above it, which are about to be dropped
+    drifting = False
+    for k in range(len(marked)):
+        drifting = drifting or tree[marked[k]].drift > 0.0
+    for k in range(len(orphans) if drifting else 0):
+        drift, c = 0.0, tree[orphans[k]].parent
+        while c >= 0:
+            drift += tree[c].drift
+            c = tree[c].parent
+        if drift > 0.0:
+            transaction_log.log_clique(head, orphans[k])
+            tree[orphans[k]].drift += drift
     for k in range(len(marked)):
         transaction_log.drop_clique(head, marked[k])
     rows = plant(head, cliques, orphans)
@@ -109,18 +125,6 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             return BAD_PIVOT
     _find_roots(head, rows)
     return DONE
-
-
-@kernel
-def _leaving_first(head, affected):  # type: ignore[no-untyped-def]
-    """Move the nodes that are about to leave to the front of the list; return their number."""
-    nodes = tb.nodes(head)
-    n = 0
-    for k in range(len(affected)):
-        if nodes[affected[k]].touched == ORDERED_FIRST:
-            affected[n], affected[k] = affected[k], affected[n]
-            n += 1
-    return n
 
 
 @kernel(allocates=True)
@@ -135,25 +139,6 @@ def _loose_priors(head):  # type: ignore[no-untyped-def]
     for k in range(n):
         loose[k], c = c, cliques[c].sibling
     return loose
-
-
-@kernel
-def _push_drift_down(head, marked, orphans):  # type: ignore[no-untyped-def]
-    """Add to each orphan the drift of all cliques above it, which are about to be dropped."""
-    cliques = tb.cliques(head)
-    drifting = False
-    for k in range(len(marked)):
-        drifting = drifting or cliques[marked[k]].drift > 0.0
-    if not drifting:
-        return
-    for k in range(len(orphans)):
-        drift, c = 0.0, cliques[orphans[k]].parent
-        while c >= 0:
-            drift += cliques[c].drift
-            c = cliques[c].parent
-        if drift > 0.0:
-            transaction_log.log_clique(head, orphans[k])
-            cliques[orphans[k]].drift += drift
 
 
 @kernel(inline='always')
