@@ -23,7 +23,7 @@ from pose_graph_ros.core.elimination.assembly import (
     LINEARIZED,
     POSITIONS,
 )
-from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
+from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
@@ -38,25 +38,21 @@ def put_poses(memory: tb.Memory, poses: Poses) -> None:
         rows[field] = 0.0
 
 
-@kernel(signature=(tb.HEAD,))
-def linearize(head):  # type: ignore[no-untyped-def]
-    """Make the poses the references and linearize all factors there."""
-    for v in range(head[tb.N_NODES]):
-        factors.refer_to_pose(tb.nodes(head)[v])
-    for e in range(head[tb.N_FACTORS]):
-        if tb.factors(head)[e].weight > 0.0:
-            factors.linearize(head, e)
-
-
 @kernel(signature=(tb.HEAD, NUMBER, INTEGER))
 def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    `terms` says what constraints add; see `assembly`. Return False if a node is not determined,
+    `terms` says what constraints add; see `assembly`. For LINEARIZED the poses become the
+    references, and all factors are linearized there. Return False if a node is not determined,
     which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)[0]
+    for v in range(head[tb.N_NODES] if terms == LINEARIZED else 0):
+        factors.refer_to_pose(tb.nodes(head)[v])
+    for e in range(head[tb.N_FACTORS] if terms == LINEARIZED else 0):
+        if tb.factors(head)[e].weight > 0.0:
+            factors.linearize(head, e)
     scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
@@ -66,14 +62,6 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
             break
     scalars.damping = 0.0
     return bad < 0
-
-
-@kernel
-def _update_pose(f):  # type: ignore[no-untyped-def]
-    """Set the pose of a node, given as its row, to reference plus solution."""
-    f.pose[0] = f.reference[0] + f.delta[0]
-    f.pose[1] = f.reference[1] + f.delta[1]
-    f.pose[2] = factors.wrap(f.reference[2] + f.delta[2])
 
 
 @kernel(forceinline=True)
@@ -110,10 +98,7 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
     largest = 0.0
     for c in range(n_cliques - 1, n_priors - 1, -1):
         members, n_frontal, values, x = _clique(head, c, right)
-        if chord:
-            backward_rows(values, 3 * n_frontal, len(x), x)
-        else:
-            solve_rows(values, 3 * n_frontal, len(x), x)
+        backward_rows(values, 3 * n_frontal, len(x), x, not chord)
         for k in range(n_frontal):
             v = members[k]
             f = nodes[v]
@@ -124,16 +109,11 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
             for m in range(3):
                 right[v, m] = x[3 * k + m]
                 f.delta[m] += right[v, m]
-                largest = _larger(largest, right[v, m])
-            _update_pose(f)
+                if not abs(right[v, m]) <= largest:     # also if it is NaN
+                    largest = abs(right[v, m])
+                f.pose[m] = f.reference[m] + f.delta[m]
+            f.pose[2] = factors.wrap(f.pose[2])
     return largest
-
-
-@kernel
-def _larger(largest, number):  # type: ignore[no-untyped-def]
-    """Return the larger of `largest` and the magnitude of a number, NaN if one of them is NaN."""
-    number = abs(number)
-    return largest if number <= largest else number
 
 
 @kernel(signature=(tb.HEAD, ROWS))
@@ -143,7 +123,8 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
 
     `right`, shape (N, 3), receives -b: half the gradient of chi2, with negative sign.
     """
-    nodes = tb.nodes(head)
+    nodes, cliques = tb.nodes(head), tb.cliques(head)
+    pool_i, work = tb.pool_i(head), tb.work_f(head)
     right[:] = 0.0
     chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_FACTORS]):
@@ -152,41 +133,24 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             chi2 += energy
             gradient_sum += size
             cancelled += terms
-    energy, size, terms = _add_priors(head, right)
-    chi2 += energy
-    gradient_sum += size
-    cancelled += terms
-    for v in range(head[tb.N_NODES]):
-        reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
-    # rounding of a sum of many numbers, and of coordinates
-    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (
-        reach * gradient_sum + cancelled)
-
-
-@kernel
-def _add_priors(head, right):  # type: ignore[no-untyped-def]
-    """
-    Add the priors to -b, shape (N, 3).
-
-    Return their energies, the sum of the magnitudes of their gradients by a position, and that of
-    the terms that cancel each other in their energies.
-    """
-    cliques, pool_i, work = tb.cliques(head), tb.pool_i(head), tb.work_f(head)
-    energies = gradients = cancelled = 0.0
     for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
         if not prior_rows.is_prior(head, c):
             continue
         row = cliques[c]
         n = row.n_separator
-        energies += prior_rows.gradient(head, c, work)
+        chi2 += prior_rows.gradient(head, c, work)
         d, g = work[:3 * n], work[3 * n:6 * n]
         for k in range(n):
             v = pool_i[row.members + k]
-            gradients += abs(g[3 * k]) + abs(g[3 * k + 1])
+            gradient_sum += abs(g[3 * k]) + abs(g[3 * k + 1])
             for m in range(3):
                 right[v, m] -= g[3 * k + m]
                 cancelled += abs(d[3 * k + m] * g[3 * k + m])
-    return energies, gradients, cancelled
+    for v in range(head[tb.N_NODES]):
+        reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
+    # rounding of a sum of many numbers, and of coordinates
+    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (
+        reach * gradient_sum + cancelled)
 
 
 @kernel(signature=(tb.HEAD,))
@@ -251,7 +215,6 @@ class CompiledSystem:
     def step(self, damping: float, *, chord: bool) -> float:
         if chord:
             return float(step(self._head, self._right, True))
-        linearize(self._head)
         if not eliminate(self._head, damping, LINEARIZED):
             return math.inf
         return float(step(self._head, np.zeros_like(self._right), False))

@@ -198,8 +198,14 @@ def plant(graph: Graph, analysis: symbolic.Analysis) -> None:
 
 def loose_nodes(graph: Graph, cliques: symbolic.Cliques) -> IntArray:
     """Return ids of nodes in parts without a fixed or observed node or an anchored prior."""
-    part = symbolic.trees(cliques, graph.n_nodes)
-    held = np.zeros(len(cliques.n_frontal), dtype=bool)
+    # the root of the tree of cliques, a part of the graph, that each node is in
+    n = len(cliques.n_frontal)
+    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
+    while np.any(root[root] != root):
+        root = root[root]
+    part = np.empty(graph.n_nodes, dtype=np.int64)
+    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
+    held = np.zeros(n, dtype=bool)
     held[part[graph.fixed]] = True
     ends = graph.factor_records['ends']
     holds = (ends[:, 1] < 0) & (graph.weights > 0.0)

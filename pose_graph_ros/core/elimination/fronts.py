@@ -85,37 +85,6 @@ def _subtract_6(front, k, i, ld):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _factorize_3(front, k, ld, least):  # type: ignore[no-untyped-def]
-    """Factorise rows k to k + 2; return the first of them with a bad pivot, or -1."""
-    p, q, r = k * ld, (k + 1) * ld, (k + 2) * ld
-    # the 3x3 block on the diagonal first: it gives all factors for the rest of the rows
-    pivot = front[p + k]
-    if not pivot > least[k]:
-        return k
-    f = 1.0 / math.sqrt(pivot)
-    b, d = front[p + k + 1] * f, front[p + k + 2] * f
-    pivot = front[q + k + 1] - b * b
-    if not pivot > least[k + 1]:
-        return k + 1
-    g = 1.0 / math.sqrt(pivot)
-    e = (front[q + k + 2] - b * d) * g
-    pivot = front[r + k + 2] - d * d - e * e
-    if not pivot > least[k + 2]:
-        return k + 2
-    h = 1.0 / math.sqrt(pivot)
-    vf, vg, vh, vb, vd, ve = spread(f), spread(g), spread(h), spread(b), spread(d), spread(e)
-    for c in range(k // WIDTH * WIDTH, ld, WIDTH):
-        x = times(load(front, p + c), vf)
-        y = times(fnmadd(load(front, q + c), vb, x), vg)
-        z = times(fnmadd(fnmadd(load(front, r + c), vd, x), ve, y), vh)
-        store(front, p + c, x)
-        store(front, q + c, y)
-        store(front, r + c, z)
-    front[p + k], front[q + k + 1], front[r + k + 2] = f, g, h
-    return -1
-
-
-@kernel
 def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
     """
     Return the first row with a bad pivot, or -1, after factorising the first rows of a front.
@@ -123,23 +92,39 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
     They are replaced by rows of R; the other ones of all n rows, of `ld = padded(n)` numbers,
     become the update matrix. Each pivot must be above its `least`.
     """
-    k = 0
-    while k < rows:
-        bad = _factorize_3(front, k, ld, least)
-        if bad >= 0:
-            return bad
-        if k + 6 <= rows:
-            _subtract_3(front, k, k + 3, ld)
-            bad = _factorize_3(front, k + 3, ld, least)
-            if bad >= 0:
-                return bad
-            for i in range(k + 6, n, 3):
-                _subtract_6(front, k, i, ld)
-            k += 6
-        else:
+    for k in range(0, rows, 3):
+        p, q, r = k * ld, (k + 1) * ld, (k + 2) * ld
+        # the 3x3 block on the diagonal first: it gives all factors for the rest of the rows
+        pivot = front[p + k]
+        if not pivot > least[k]:
+            return k
+        f = 1.0 / math.sqrt(pivot)
+        b, d = front[p + k + 1] * f, front[p + k + 2] * f
+        pivot = front[q + k + 1] - b * b
+        if not pivot > least[k + 1]:
+            return k + 1
+        g = 1.0 / math.sqrt(pivot)
+        e = (front[q + k + 2] - b * d) * g
+        pivot = front[r + k + 2] - d * d - e * e
+        if not pivot > least[k + 2]:
+            return k + 2
+        h = 1.0 / math.sqrt(pivot)
+        vf, vg, vh, vb, vd, ve = spread(f), spread(g), spread(h), spread(b), spread(d), spread(e)
+        for c in range(k // WIDTH * WIDTH, ld, WIDTH):
+            x = times(load(front, p + c), vf)
+            y = times(fnmadd(load(front, q + c), vb, x), vg)
+            z = times(fnmadd(fnmadd(load(front, r + c), vd, x), ve, y), vh)
+            store(front, p + c, x)
+            store(front, q + c, y)
+            store(front, r + c, z)
+        front[p + k], front[q + k + 1], front[r + k + 2] = f, g, h
+        # from all others six rows are subtracted at once, those of the next node need these three
+        if k % 6 == 3:
             for i in range(k + 3, n, 3):
+                _subtract_6(front, k - 3, i, ld)
+        else:
+            for i in range(k + 3, k + 6 if k + 6 <= rows else n, 3):
                 _subtract_3(front, k, i, ld)
-            k += 3
     return -1
 
 
@@ -171,35 +156,22 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=_FAST)
-def _backward_block(values, k, n, x, a, b, c):  # type: ignore[no-untyped-def]
-    """Solve rows k to k + 2 of R for the right-hand sides a, b, c."""
-    r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
-                  values[row_start(k + 2, n):])
-    for m in range(k + 3, n):
-        a -= r0[m] * x[m]
-        b -= r1[m] * x[m]
-        c -= r2[m] * x[m]
-    c *= r2[k + 2]
-    b = (b - r1[k + 2] * c) * r1[k + 1]
-    x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
-    x[k + 1], x[k + 2] = b, c
-
-
-@kernel
-def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
+def backward_rows(values, rows, n, x, stored):  # type: ignore[no-untyped-def]
     """
-    Solve `R x = y` for the frontal nodes of a clique, with y given in the frontal part of x.
+    Solve `R x = y` for the frontal nodes of a clique.
 
-    Values are as for `forward_rows`; behind y, x has the solution of the separator.
+    Values are as for `forward_rows`; x has the solution of the separator, and before it y, unless
+    y is the right-hand side that is stored with R.
     """
     for k in range(rows - 3, -1, -3):
-        _backward_block(values, k, n, x, x[k], x[k + 1], x[k + 2])
-
-
-@kernel
-def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
-    """Solve as `backward_rows`, with y the right-hand side column of R."""
-    for k in range(rows - 3, -1, -3):
-        at = row_start(k, n) + n
-        _backward_block(
-            values, k, n, x, values[at], values[at + n - k], values[at + 2 * (n - k) - 1])
+        r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
+                      values[row_start(k + 2, n):])
+        a, b, c = (r0[n], r1[n], r2[n]) if stored else (x[k], x[k + 1], x[k + 2])
+        for m in range(k + 3, n):
+            a -= r0[m] * x[m]
+            b -= r1[m] * x[m]
+            c -= r2[m] * x[m]
+        c *= r2[k + 2]
+        b = (b - r1[k + 2] * c) * r1[k + 1]
+        x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
+        x[k + 1], x[k + 2] = b, c

@@ -60,9 +60,19 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         relinearization.relinearize(head)
         if head[tb.N_TOUCHED] == 0:
             break
-        code = tree_update.eliminate(head)
+        # all cliques from the touched nodes up to the roots are eliminated again
+        marked, affected = tree_update.mark(head)
+        head[tb.ITERATION] += 1
+        head[tb.SINCE] = head[tb.ITERATION]
+        if head[tb.STRUCTURE] != 0:
+            code = tree_update.rebuild(head, marked, affected)
+        else:
+            code = tree_update.refresh(head, marked, False)
         if code != DONE:
             return code
+        head[tb.STRUCTURE] = 0
+        tree_update.forget_touched(head)
+        head[tb.N_ELIMINATED] += len(affected)
         error2 = relinearization.solve_and_check(head)
         settled = error2 <= relinearization.budget(head)
         if settled:
