@@ -25,7 +25,6 @@ from pose_graph_ros.core.elimination.assembly import (
 )
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
@@ -195,61 +194,41 @@ class CompiledSystem:
         self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
         # -b, which a chord step overwrites
         self._right = np.zeros((len(self._rows), 3))
-        self.keep_poses()
 
-    def keep_poses(self) -> None:
-        self._best = self._rows['pose'].copy()
+    @property
+    def poses(self) -> Poses:
+        return np.array(self._rows['pose'])
 
-    def restore_poses(self) -> None:
-        put_poses(self._memory, self._best)
-
-    def halve_step(self) -> None:
-        step = self._rows['pose'] - self._best
-        step[:, 2] = se2.wrap(step[:, 2])
-        put_poses(self._memory, se2.wrapped(self._best + 0.5 * step))
+    def set_poses(self, poses: Poses) -> None:
+        put_poses(self._memory, poses)
 
     def evaluate(self) -> tuple[float, float]:
         chi2, rounding = evaluate(self._head, self._right)
         return chi2, rounding
 
-    def step(self, damping: float, *, chord: bool) -> float:
+    def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         if chord:
-            return float(step(self._head, self._right, True))
+            return float(step(self._head, self._right, True)), 0.0
         if not eliminate(self._head, damping, LINEARIZED):
-            return math.inf
-        return float(step(self._head, np.zeros_like(self._right), False))
-
-    def decrease(self) -> float:
-        return float(np.sum(self._right * self._rows['delta']))
-
-    def settle(self) -> None:
-        settle(self._head)
+            return math.inf, 0.0
+        length = float(step(self._head, np.zeros_like(self._right), False))
+        return length, float(np.sum(self._right * self._rows['delta']))
 
 
-class CompiledChordal:
-    """The `ChordalSystem` of `linear_starts` for a graph in tables; changes its poses."""
-
-    def __init__(self, memory: tb.Memory) -> None:
-        self._head = memory.head
-        self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
-        self._fixed = self._rows['fixed'] != 0
-
-    def headings(self, known: ComplexArray) -> ComplexArray:
-        return self._solved(HEADINGS, known)
-
-    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
-        self._rows['pose'][~self._fixed, 2] = np.angle(u[:-1])[~self._fixed]
-        return self._solved(POSITIONS, known)
-
-    def _solved(self, terms: int, known: ComplexArray) -> ComplexArray:
-        rows, fixed = self._rows, self._fixed
-        # the unknowns are the solutions of the nodes
-        delta = rows['delta']
-        for field in ('reference', 'delta', 'seen', 'checked_turn'):
-            rows[field] = 0.0
-        delta[fixed, 0] = known.real[:-1][fixed]
-        delta[fixed, 1] = known.imag[:-1][fixed]
-        if not eliminate(self._head, 0.0, terms):
-            raise LinearSolveError('chordal start: singular')
-        step(self._head, np.zeros((len(rows), 3)), False)
-        return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])
+def solve_chordal(
+    memory: tb.Memory, known: ComplexArray, headings: ComplexArray | None,
+) -> ComplexArray:
+    """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
+    rows = memory['nodes'][:memory.head[tb.N_NODES]]
+    fixed = rows['fixed'] != 0
+    if headings is not None:
+        rows['pose'][~fixed, 2] = np.angle(headings[:-1])[~fixed]
+    # the unknowns are the solutions of the nodes
+    delta = rows['delta']
+    for field in ('reference', 'delta', 'seen', 'checked_turn'):
+        rows[field] = 0.0
+    delta[fixed, 0], delta[fixed, 1] = known.real[:-1][fixed], known.imag[:-1][fixed]
+    if not eliminate(memory.head, 0.0, HEADINGS if headings is None else POSITIONS):
+        raise LinearSolveError('chordal start: singular')
+    step(memory.head, np.zeros((len(rows), 3)), False)
+    return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])

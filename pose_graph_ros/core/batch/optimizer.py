@@ -10,6 +10,7 @@ poses, with which the incremental smoother can continue.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -28,26 +29,14 @@ from pose_graph_ros.core.batch.levenberg_marquardt import (
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
 
 __all__ = [
-    'SAME_MINIMUM',
-    'TRUSTED_ITERATIONS',
-    'BatchResult',
-    'Optimization',
-    'Solve',
-    'Start',
-    'Status',
-    'chi2_of',
-    'in_parts',
-    'optimize',
-    'optimize_from_linear_start',
-    'optimize_from_two_starts',
-    'plant',
-    'to_the_end',
-]
+    'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Solve', 'Start',
+    'Status', 'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start',
+    'optimize_from_two_starts', 'plant', 'to_the_end']
 
 Solve = Callable[[Graph, SolverConfig], BatchResult]
 """Function that optimises a graph in place, such as `optimize`."""
@@ -157,7 +146,7 @@ def _is_observed(graph: Graph) -> bool:
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     if start is Start.CHORDAL:
-        return linear_starts.chordal(graph, gauss_newton.CompiledChordal(graph.memory))
+        return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory))
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT and not _is_observed(graph):
@@ -176,7 +165,21 @@ def _prepare(graph: Graph, chi2: float) -> BatchResult | None:
     if np.all(graph.fixed):
         return BatchResult(Status.CONVERGED, '', 0, chi2)
     analysis = symbolic.analyse(graph.memory.head)
-    loose = loose_nodes(graph, analysis.cliques)
+    # the root of the tree of cliques, a part of the graph, that each node is in
+    cliques, n = analysis.cliques, len(analysis.cliques.n_frontal)
+    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
+    while np.any(root[root] != root):
+        root = root[root]
+    part = np.empty(graph.n_nodes, dtype=np.int64)
+    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
+    # parts with a fixed or an observed node or an anchored prior
+    held = np.zeros(n, dtype=bool)
+    held[part[graph.fixed]] = True
+    ends = graph.factor_records['ends']
+    held[part[ends[(ends[:, 1] < 0) & (graph.weights > 0.0), 0]]] = True
+    for prior in graph.priors if graph.n_priors > 0 else ():
+        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
+    loose = graph.node_ids[~held[part]]
     if len(loose) > 0:
         return _failed(
             f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
@@ -196,25 +199,6 @@ def plant(graph: Graph, analysis: symbolic.Analysis) -> None:
     symbolic.plant_all(memory.head, analysis.cliques)
 
 
-def loose_nodes(graph: Graph, cliques: symbolic.Cliques) -> IntArray:
-    """Return ids of nodes in parts without a fixed or observed node or an anchored prior."""
-    # the root of the tree of cliques, a part of the graph, that each node is in
-    n = len(cliques.n_frontal)
-    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
-    while np.any(root[root] != root):
-        root = root[root]
-    part = np.empty(graph.n_nodes, dtype=np.int64)
-    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
-    held = np.zeros(n, dtype=bool)
-    held[part[graph.fixed]] = True
-    ends = graph.factor_records['ends']
-    holds = (ends[:, 1] < 0) & (graph.weights > 0.0)
-    held[part[ends[holds, 0]]] = True
-    for prior in graph.priors if graph.n_priors > 0 else ():
-        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
-    return graph.node_ids[~held[part]]
-
-
 def chi2_of(graph: Graph) -> float:
     """Return the energy of all constraints, in time proportional to the size of the graph."""
     return float(gauss_newton.evaluate(graph.memory.head, np.empty((graph.n_nodes, 3)))[0])
@@ -226,6 +210,7 @@ def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
     if result.status is Status.FAILED:
         node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
+    gauss_newton.settle(graph.memory.head)
     return result
 
 
