@@ -7,7 +7,7 @@ A clique is visited if it was built in this iteration, or if a node of its separ
 more than the wildfire threshold (M. Kaess et al., "iSAM2", IJRR 2012) since its solution was last
 passed to the cliques below. The threshold is `alpha` times the sigma that the node's own
 constraints give it. Nodes that have turned, and cliques whose frames have turned, are listed for
-`relinearization`, which checks their linearization errors.
+`step`, which checks their linearization errors.
 
 The error of a constraint between two poses does not change with a common motion of both. So if the
 separator of a clique that is not anchored has moved as a rigid body, that motion is applied to the

@@ -15,21 +15,11 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.graph import (
-    pools,
-    prior_rows,
-    tables as tb,
-    transaction_log,
-)
+from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import unlink
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
-from pose_graph_ros.core.smoother.tree_update import (
-    DONE,
-    lacks_memory,
-    MORE_MEMORY,
-    ORDERED_FIRST,
-)
+from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_MEMORY, ORDERED_FIRST
 
 # States of cliques: whether all nodes at and below them leave.
 _UNKNOWN, _WHOLE, _MIXED = range(3)

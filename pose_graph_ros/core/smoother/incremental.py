@@ -12,14 +12,7 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import (
-    Covariance,
-    Covariances,
-    FloatArray,
-    IntArray,
-    Poses,
-    PoseVector,
-)
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -178,7 +171,7 @@ class IncrementalSmoother:
         self._memory.head[tb.INTERRUPT] = 1
 
     def extend(
-        self, mean: PoseVector, information: FloatArray, weight: float = 1.0,
+        self, mean: se2.PoseVector, information: FloatArray, weight: float = 1.0,
     ) -> UpdateResult:
         """
         Return the result of appending a hidden node to the newest pose by an odometry edge.
@@ -262,7 +255,7 @@ class IncrementalSmoother:
                 head[tb.INTERRUPT] = 0
         return rows
 
-    def newest_covariance(self) -> Covariance:
+    def newest_covariance(self) -> se2.Covariance:
         """Return the covariance of the newest pose in map axes."""
         head = self._memory.head
         if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
@@ -272,7 +265,7 @@ class IncrementalSmoother:
         covariances.node_covariance(head, head[tb.NEWEST], out)
         return out
 
-    def covariance(self, node: int) -> Covariance:
+    def covariance(self, node: int) -> se2.Covariance:
         """
         Return the covariance of a hidden node in map axes.
 
@@ -291,7 +284,7 @@ class IncrementalSmoother:
             self._memory.head, row_i, np.eye(6, 3), row_j, np.eye(6, 3, -3), out)
         return out
 
-    def covariances(self) -> Covariances:
+    def covariances(self) -> se2.Covariances:
         """Return those of all hidden nodes; raises as `covariance`."""
         self._require_solved()
         out = np.zeros((self.graph.n_nodes, 3, 3))

@@ -14,12 +14,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination.assembly import eliminate_clique, RELINEARIZED, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
-from pose_graph_ros.core.elimination.symbolic import (
-    in_postorder,
-    newest_last,
-    plant,
-    structure,
-)
+from pose_graph_ros.core.elimination.symbolic import in_postorder, newest_last, plant, structure
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 
 # Return codes of the kernels of all modules here. UNFINISHED: what remains can wait for another
