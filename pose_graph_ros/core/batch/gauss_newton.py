@@ -148,8 +148,7 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
     for v in range(head[tb.N_NODES]):
         reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
     # rounding of a sum of many numbers, and of coordinates
-    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (
-        reach * gradient_sum + cancelled)
+    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (reach * gradient_sum + cancelled)
 
 
 @kernel(signature=(tb.HEAD,))

@@ -139,8 +139,7 @@ class NodeSystem:
         for end, each in zip(self._ends, by, strict=True):
             values = np.ascontiguousarray(np.einsum('mrk,mr...->mk...', each.conj(), weighted))
             # bincount takes one column of real numbers
-            columns = values.reshape(
-                len(values), math.prod(values.shape[1:])).view(np.float64).T
+            columns = values.reshape(len(values), math.prod(values.shape[1:])).view(np.float64).T
             total = total + np.stack([np.bincount(end, column, self._n) for column in columns],
                                      axis=1).view(values.dtype).reshape(-1, *values.shape[1:])
         return np.asarray(total[self.free])

@@ -98,8 +98,7 @@ def _from_starts(
         except LinearSolveError:
             continue
         yield
-        result = replace(
-            (yield from _minimize(graph, few, chi2_of(graph))), start=start)
+        result = replace((yield from _minimize(graph, few, chi2_of(graph))), start=start)
         if result.is_better_than(best):
             best, best_poses = result, graph.poses.copy()
         if is_trusted(result, chi2):
@@ -164,9 +163,9 @@ def _prepare(graph: Graph, chi2: float) -> BatchResult | None:
         return _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
         return BatchResult(Status.CONVERGED, '', 0, chi2)
-    analysis = symbolic.analyse(graph.memory.head)
+    cliques = symbolic.analyse(graph.memory.head)
     # the root of the tree of cliques, a part of the graph, that each node is in
-    cliques, n = analysis.cliques, len(analysis.cliques.n_frontal)
+    n = len(cliques.n_frontal)
     root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
     while np.any(root[root] != root):
         root = root[root]
@@ -184,19 +183,19 @@ def _prepare(graph: Graph, chi2: float) -> BatchResult | None:
         return _failed(
             f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
             f'and no observed node: their poses are not determined', chi2)
-    plant(graph, analysis)
+    plant(graph, cliques)
     return None
 
 
-def plant(graph: Graph, analysis: symbolic.Analysis) -> None:
+def plant(graph: Graph, cliques: symbolic.Cliques) -> None:
     """Store the cliques of a whole graph, without values, in place of its present ones."""
     memory = graph.memory
     keep_f, keep_i = (
         memory.head[tb.POOL_F_END:tb.POOL_I_END + 1] if memory.head[tb.N_PRIORS] > 0 else (0, 0))
-    memory.ensure('pool_f', max(analysis.need_f, int(keep_f)), keep=int(keep_f))
-    memory.ensure('pool_i', max(analysis.need_i, int(keep_i)), keep=int(keep_i))
-    memory.ensure('work_f', analysis.largest)
-    symbolic.plant_all(memory.head, analysis.cliques)
+    memory.ensure('pool_f', max(cliques.need_f, int(keep_f)), keep=int(keep_f))
+    memory.ensure('pool_i', max(cliques.need_i, int(keep_i)), keep=int(keep_i))
+    memory.ensure('work_f', cliques.largest)
+    symbolic.plant_all(memory.head, cliques)
 
 
 def chi2_of(graph: Graph) -> float:

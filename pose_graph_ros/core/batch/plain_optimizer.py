@@ -179,8 +179,7 @@ class PlainOptimizer:
         graph, (by_i, by_j) = self._graph, self._by
         if not chord or self._factors is None:
             information = graph.factors.information
-            self._factors = self._nodes.factors(
-                self._by, (information @ by_i, information @ by_j))
+            self._factors = self._nodes.factors(self._by, (information @ by_i, information @ by_j))
         step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
         poses = graph.poses.copy()
         poses[self._nodes.free] += step

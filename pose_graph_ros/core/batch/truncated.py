@@ -105,9 +105,7 @@ class TruncatedProblem:
     right, from the poses of the graph.
     """
 
-    def __init__(
-        self, graph: Graph, ids: IntArray, start: FloatArray | None = None,
-    ) -> None:
+    def __init__(self, graph: Graph, ids: IntArray, start: FloatArray | None = None) -> None:
         self.graph, self.ids = graph, ids
         self.edges = graph.factors_at(ids)
         """What may be wrong; their weights have no meaning."""
@@ -216,9 +214,7 @@ class TruncatedProblem:
                     mu *= GRADUATION
         return (yield from self.choice(share <= 1.0))
 
-    def improved(
-        self, choice: Choice, retests: int = 20,
-    ) -> Generator[None, None, Choice]:
+    def improved(self, choice: Choice, retests: int = 20) -> Generator[None, None, Choice]:
         """
         Return a set that no retest lowers the cost of.
 

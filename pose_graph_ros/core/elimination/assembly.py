@@ -196,8 +196,7 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     cliques[child].turn_seen = phi
     if n_frontal == 0:
         linear = work_f[len(front) + len(front) // ld:]
-        clique_frames.linearize_prior(
-            head, child, phi, linear, linear[triangle_size(size, size):])
+        clique_frames.linearize_prior(head, child, phi, linear, linear[triangle_size(size, size):])
         update = linear
     elif phi != 0.0:
         turned = work_f[len(front) + len(front) // ld:]

@@ -34,51 +34,33 @@ def padded(n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _subtract_3(front, k, i, ld):  # type: ignore[no-untyped-def]
-    """Subtract the contribution of the rows of R from k to k + 2 from rows i to i + 2."""
-    p, q, r, t = k * ld, (k + 1) * ld, (k + 2) * ld, i * ld
-    a0, b0, c0 = spread(front[p + i]), spread(front[p + i + 1]), spread(front[p + i + 2])
-    a1, b1, c1 = spread(front[q + i]), spread(front[q + i + 1]), spread(front[q + i + 2])
-    a2, b2, c2 = spread(front[r + i]), spread(front[r + i + 1]), spread(front[r + i + 2])
-    for c in range(i // WIDTH * WIDTH, ld, WIDTH):
-        x, y, z = load(front, p + c), load(front, q + c), load(front, r + c)
-        u, v, w = load(front, t + c), load(front, t + ld + c), load(front, t + 2 * ld + c)
-        store(front, t + c, fnmadd(fnmadd(fnmadd(u, a0, x), a1, y), a2, z))
-        store(front, t + ld + c, fnmadd(fnmadd(fnmadd(v, b0, x), b1, y), b2, z))
-        store(front, t + 2 * ld + c, fnmadd(fnmadd(fnmadd(w, c0, x), c1, y), c2, z))
+def _spread_block(front, at, ld):  # type: ignore[no-untyped-def]
+    """Return the entries of a 3x3 block, row by row, as vectors of equal numbers."""
+    b, c = at + ld, at + 2 * ld
+    return (spread(front[at]), spread(front[at + 1]), spread(front[at + 2]),
+            spread(front[b]), spread(front[b + 1]), spread(front[b + 2]),
+            spread(front[c]), spread(front[c + 1]), spread(front[c + 2]))
 
 
 @kernel
-def _subtract_6(front, k, i, ld):  # type: ignore[no-untyped-def]
-    """Subtract the contribution of the rows of R from k to k + 5 from rows i to i + 2."""
-    p, t = k * ld, i * ld
-    o = p + i
-    a0, b0, c0 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a1, b1, c1 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a2, b2, c2 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a3, b3, c3 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a4, b4, c4 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a5, b5, c5 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
+def _minus(front, at, ld, s, u, v, w):  # type: ignore[no-untyped-def]
+    """Subtract a spread block times three rows, of which a vector begins at an index."""
+    x, y, z = load(front, at), load(front, at + ld), load(front, at + 2 * ld)
+    return (fnmadd(fnmadd(fnmadd(u, s[0], x), s[3], y), s[6], z),
+            fnmadd(fnmadd(fnmadd(v, s[1], x), s[4], y), s[7], z),
+            fnmadd(fnmadd(fnmadd(w, s[2], x), s[5], y), s[8], z))
+
+
+@kernel
+def _subtract(front, k, i, ld, six):  # type: ignore[no-untyped-def]
+    """Subtract the contribution of the three, or six, rows of R from row k on from i to i + 2."""
+    p, q, t = k * ld, (k + 3) * ld if six else k * ld, i * ld
+    first, second = _spread_block(front, p + i, ld), _spread_block(front, q + i, ld)
     for c in range(i // WIDTH * WIDTH, ld, WIDTH):
-        o = p + c
         u, v, w = load(front, t + c), load(front, t + ld + c), load(front, t + 2 * ld + c)
-        x = load(front, o)
-        u, v, w = fnmadd(u, a0, x), fnmadd(v, b0, x), fnmadd(w, c0, x)
-        x = load(front, o + ld)
-        u, v, w = fnmadd(u, a1, x), fnmadd(v, b1, x), fnmadd(w, c1, x)
-        x = load(front, o + 2 * ld)
-        u, v, w = fnmadd(u, a2, x), fnmadd(v, b2, x), fnmadd(w, c2, x)
-        x = load(front, o + 3 * ld)
-        u, v, w = fnmadd(u, a3, x), fnmadd(v, b3, x), fnmadd(w, c3, x)
-        x = load(front, o + 4 * ld)
-        u, v, w = fnmadd(u, a4, x), fnmadd(v, b4, x), fnmadd(w, c4, x)
-        x = load(front, o + 5 * ld)
-        u, v, w = fnmadd(u, a5, x), fnmadd(v, b5, x), fnmadd(w, c5, x)
+        u, v, w = _minus(front, p + c, ld, first, u, v, w)
+        if six:
+            u, v, w = _minus(front, q + c, ld, second, u, v, w)
         store(front, t + c, u)
         store(front, t + ld + c, v)
         store(front, t + 2 * ld + c, w)
@@ -121,10 +103,10 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
         # from all others six rows are subtracted at once, those of the next node need these three
         if k % 6 == 3:
             for i in range(k + 3, n, 3):
-                _subtract_6(front, k - 3, i, ld)
+                _subtract(front, k - 3, i, ld, True)
         else:
             for i in range(k + 3, k + 6 if k + 6 <= rows else n, 3):
-                _subtract_3(front, k, i, ld)
+                _subtract(front, k, i, ld, False)
     return -1
 
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from numba import types
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import INDICES, kernel
+from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
@@ -33,24 +33,20 @@ RELAXED_FRONTAL = 24
 
 
 class Cliques(NamedTuple):
-    """The C cliques of a whole graph, in postorder."""
+    """C cliques in postorder."""
 
     first: Any  # (C + 1,); the nodes of clique k are `nodes[first[k]:first[k + 1]]`
     n_frontal: Any  # (C,) number of frontal nodes, which come first; the others are the separator
     parent: Any     # (C + O,), -1 for a root; the last ones are those of orphans
     nodes: Any
+    # memory that they need: numbers in the pool of values, `pool_f`, and in that of node lists,
+    # `pool_i`, and of work space for the largest front
+    need_f: int
+    need_i: int
+    largest: int
 
 
-CLIQUES = types.NamedUniTuple(INDICES, len(Cliques._fields), Cliques)
-
-
-class Analysis(NamedTuple):
-    """The cliques and the memory that they need."""
-
-    cliques: Cliques
-    need_f: int     # numbers in the pool of values, `pool_f`
-    need_i: int     # numbers in the pool of node lists, `pool_i`
-    largest: int    # numbers of work space for the largest front
+CLIQUES = types.NamedTuple((*[INDICES] * 4, *[INTEGER] * 3), Cliques)
 
 
 @kernel
@@ -159,19 +155,19 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD,), allocates=True)
 def analyse(head):  # type: ignore[no-untyped-def]
-    """Return the `Analysis` of a fill-reducing order of all nodes, without storing the cliques."""
+    """Return the cliques of a fill-reducing order of all nodes, without storing them."""
     order = np.arange(head[tb.N_NODES]).astype(np.int32)
     n_last = newest_last(order, head[tb.NEWEST])
     priors = prior_rows.all_priors(head)
     _, start, adjacency = structure(head, np.empty(0, np.int32), priors, order)
-    cliques, need_f, need_i, largest = in_postorder(
+    first, n_frontal, parent, nodes, need_f, need_i, largest = in_postorder(
         order, minimum_degree(len(order), len(priors), 0, n_last, start, adjacency), 0,
         RELAXED_ZEROS, RELAXED_FRONTAL, True)
     for c in priors:
         n_separator = np.int64(tb.cliques(head)[c].n_separator)
         need_f += pools.rounded(pools.n_values(0, n_separator))
         need_i += pools.rounded(n_separator)
-    return Analysis(cliques, need_f, need_i, largest)
+    return Cliques(first, n_frontal, parent, nodes, need_f, need_i, largest)
 
 
 @kernel(allocates=True)
@@ -179,7 +175,7 @@ def in_postorder(  # type: ignore[no-untyped-def]
     order, eliminated, n_before, most_zeros, most_frontal, sorts,
 ):
     """
-    Return the cliques found by `minimum_degree`, amalgamated and in postorder, and their memory.
+    Return the cliques found by `minimum_degree`, amalgamated and in postorder.
 
     Its node k is `order[k]`; the first `n_before` are not in a clique with others. If asked for it
     sorts separators, which pays where the same cliques are eliminated several times.
@@ -250,7 +246,7 @@ def in_postorder(  # type: ignore[no-untyped-def]
             filled[k] += 1
     for m in range(len(nodes)):
         nodes[m] = order[nodes[m]]
-    return Analysis(Cliques(first, n_frontal, parent, nodes), need_f, need_i, largest)
+    return Cliques(first, n_frontal, parent, nodes, need_f, need_i, largest)
 
 
 @kernel(allocates=True)
@@ -321,7 +317,7 @@ def plant_all(head, cliques):  # type: ignore[no-untyped-def]
     """
     Replace all cliques in the tables by those of a symbolic factorisation, without values.
 
-    The pools must have been enlarged by what `Analysis` requires. The rows are in the order of the
+    The pools must have been enlarged by what the cliques need. The rows are in the order of the
     elimination, behind those of the priors. No node is touched afterwards, and the log of the
     update is empty: a rollback is not possible.
     """

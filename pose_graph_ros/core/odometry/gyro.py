@@ -400,8 +400,7 @@ class Gyros:
         """
         for source, bias in biases.items() if start_ns < end_ns else ():
             stream = self.streams.get(source)
-            integral = None if stream is None else stream.integral(
-                start_ns, end_ns, to_come=True)
+            integral = None if stream is None else stream.integral(start_ns, end_ns, to_come=True)
             if integral is not None:
                 angle, variance, seconds = integral.between(start_ns, end_ns)
                 return angle - bias * seconds, variance

@@ -188,11 +188,13 @@ class HiddenNodes(NodeTable):
         else:
             # the new primary source has no sample at the newest node
             begin_ns = int(timeline.stamps_ns[0])
-            self._span = self._motion_since_node(old, min(begin_ns, last_ns))
+            self._span = self._since_node(
+                old, old.timeline.motion(self._base_ns, min(begin_ns, last_ns)))
             self._base_ns = begin_ns
             if begin_ns > last_ns:
-                self._span = self._after_span(
-                    *gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns))
+                mean, noise = gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns)
+                self._span = (se2.compose(self._span[0], mean),
+                              passed_on(mean, self._span[1], noise))
         self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
         self._catch_up()
 
@@ -204,8 +206,9 @@ class HiddenNodes(NodeTable):
         the pose of the robot in it, with its covariance in the frame at the end. Returns the id of
         the new node in the graph, or -1 if it could not be made.
         """
-        timeline = self.streams[self.primary].timeline
-        moved = self._motion_since_node(self.streams[self.primary], self.covered_ns)[0]
+        stream = self.streams[self.primary]
+        timeline = stream.timeline
+        moved = self._since_node(stream, timeline.motion(self._base_ns, self.covered_ns))[0]
         node = self._make_node(NewNode(mean, covariance.information(noise), self.primary))
         if node < 0:
             return node
@@ -215,9 +218,9 @@ class HiddenNodes(NodeTable):
             stamp_ns, node, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
         self._base_ns = self.covered_ns
         # no secondary edge spans the step to the new pose
-        for source, stream in self.streams.items():
+        for source, other in self.streams.items():
             if source != self.primary:
-                stream.tie_from(len(self) - 1, reached=False)
+                other.tie_from(len(self) - 1, reached=False)
         return node
 
     def _catch_up(self) -> None:
@@ -248,7 +251,7 @@ class HiddenNodes(NodeTable):
             return
         stream = self.streams[self.primary]
         motion = stream.timeline.motion(self._base_ns, stamp_ns)
-        mean, noise = self._after_span(motion.increment, stream.covariance(motion))
+        mean, noise = self._since_node(stream, motion)
         known, noise = self._corrected(mean, noise, stamp_ns)
         node = self._make_node(NewNode(
             known, covariance.information(noise), self.primary, stamp_ns,
@@ -278,15 +281,11 @@ class HiddenNodes(NodeTable):
         return (self.errors.motions(mean[None], seconds)[0],
                 self.errors.covariances(noise[None])[0])
 
-    def _motion_since_node(
-        self, stream: OdometryStream, stamp_ns: int,
+    def _since_node(
+        self, stream: OdometryStream, motion: Motion, *, floor: bool = True,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the motion from the newest node to a stamp [ns], and its covariance."""
-        motion = stream.timeline.motion(self._base_ns, stamp_ns)
-        return self._after_span(motion.increment, stream.covariance(motion))
-
-    def _after_span(self, mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Append a motion and its covariance to those from the newest node to `_base_ns`."""
+        """Return a motion from `_base_ns` on as one from the newest node, and its covariance."""
+        mean, noise = motion.increment, stream.covariance(motion, floor=floor)
         if self._span is None:
             return mean, noise
         return se2.compose(self._span[0], mean), passed_on(mean, self._span[1], noise)
@@ -338,8 +337,8 @@ class HiddenNodes(NodeTable):
         """Return the newest node and the motion to a later stamp [ns], settled or not."""
         stream = self.streams[self.primary]
         motion = stream.motion_ahead(self._base_ns, stamp_ns)
-        return None if motion is None else Attachment(int(self.ids[-1]), *self._after_span(
-            motion.increment, stream.covariance(motion, floor=False)))
+        return None if motion is None else Attachment(
+            int(self.ids[-1]), *self._since_node(stream, motion, floor=False))
 
     def drop_samples(self, newest: int) -> None:
         """
@@ -379,8 +378,7 @@ class HiddenNodes(NodeTable):
         stream, newest_ns = self.streams[self.primary], max(
             self.newest_ns, int(self.stamps_ns[-1]))
         motion, raw = stream.newest(self._base_ns)
-        mean, noise = self._corrected(*self._after_span(
-            motion.increment, stream.covariance(motion, floor=False)), newest_ns)
+        mean, noise = self._corrected(*self._since_node(stream, motion, floor=False), newest_ns)
         moving = self._moving(motion, newest_ns)
         if moving > 0.0:
             mean = calibration.motions(mean[None], np.array([moving]))[0]

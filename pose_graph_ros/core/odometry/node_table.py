@@ -18,10 +18,6 @@ from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Integers, Matrix, Numbers, Rows3, Rows6
 
 
-def _no_integers() -> IntArray:
-    return np.empty(0, dtype=np.int64)
-
-
 class Place(NamedTuple):
     """Where a node is relative to another one."""
 
@@ -34,8 +30,9 @@ class Place(NamedTuple):
 class ThinnedPlaces:
     """Nodes that have left although older ones stay, each with its place relative to another."""
 
-    numbers: Integers = field(default_factory=_no_integers)  # of the nodes, ascending
-    anchors: Integers = field(default_factory=_no_integers)  # numbers of those beside them
+    # numbers of the nodes, ascending, and of those beside them
+    numbers: Integers = field(default_factory=lambda: np.empty(0, np.int64))
+    anchors: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     relative: Rows3 = field(default_factory=lambda: np.empty((0, 3)))  # poses in the anchors
     # upper triangles of the covariances of these poses, in the frames of the nodes
     noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
@@ -162,7 +159,7 @@ class SavedNodes:
     # of the edges stand for them
     errors: Numbers = field(default_factory=lambda: np.empty(0))
     # numbers of the nodes at which the robot was put by hand; empty in older files
-    relocated: Integers = field(default_factory=_no_integers)
+    relocated: Integers = field(default_factory=lambda: np.empty(0, np.int64))
 
     def poses(self, node_ids: IntArray, poses: Poses) -> Poses:
         """Return the poses of all nodes."""
@@ -262,9 +259,7 @@ class NodeTable:
         """Return whether a node has left the graph, by its number."""
         return number < self.n_frozen or self.thinned.place(number) is not None
 
-    def thin(
-        self, ids: IntArray, anchors: IntArray, relative: Poses, noise: Covariances,
-    ) -> None:
+    def thin(self, ids: IntArray, anchors: IntArray, relative: Poses, noise: Covariances) -> None:
         """Let nodes leave, each with its place relative to a node that stays."""
         self.thinned.add(
             np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors), relative, noise)

@@ -60,8 +60,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     # approximate squared linearization error due to the turn since the last check
     turn2 = (dth - phi - f.checked_turn) ** 2
     error2 = turn2 * (turn2 * f.scale_r * f.scale_r + USUAL_ENERGY)
-    if (error2 > scalars.share or moved > 100.0 * alpha
-            or head[tb.SINCE] < head[tb.ITERATION]):
+    if (error2 > scalars.share or moved > 100.0 * alpha or head[tb.SINCE] < head[tb.ITERATION]):
         f.checked_turn = dth - phi
         work_i[room + head[tb.N_CHECKS]] = v
         head[tb.N_CHECKS] += 1
@@ -158,8 +157,7 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
         x, y = f.pose[0] - dx - pivot_x, f.pose[1] - dy - pivot_y
         dx -= goal_x - pivot_x + versine * x - sine * y
         dy -= goal_y - pivot_y + sine * x + versine * y
-        deviation = max(deviation, max(abs(dx), abs(dy)) * f.scale_t,
-                        abs(dth - turn) * f.scale_r)
+        deviation = max(deviation, max(abs(dx), abs(dy)) * f.scale_t, abs(dth - turn) * f.scale_r)
         if deviation > limit:
             break
     return deviation, turn, pivot_x, pivot_y, goal_x, goal_y

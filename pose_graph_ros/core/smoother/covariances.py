@@ -64,13 +64,6 @@ def innovations(head: IntArray, edges: Factors) -> Innovations:
     return result
 
 
-@kernel(signature=(tb.HEAD, INTEGER, ROWS), allocates=True)
-def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
-    """Write the covariance of a node, shape (3, 3)."""
-    out[:] = 0.0
-    _begin(head, v, np.eye(3), -1, np.empty((3, 48)), np.empty((3, 48)), out)
-
-
 @kernel(signature=(tb.HEAD, tb.RECORDS, ROWS, MATRICES), allocates=True)
 def _write_innovations(head, records, error, out):  # type: ignore[no-untyped-def]
     """Write errors, (M, 3), of edges given by records of `Factors`, and J P J^T, (M, 3, 3)."""
@@ -93,9 +86,16 @@ def _write_innovations(head, records, error, out):  # type: ignore[no-untyped-de
 
 @kernel(signature=(tb.HEAD, INTEGER, ROWS, INTEGER, ROWS, ROWS), allocates=True)
 def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-def]
-    """Write J P J^T, shape (m, m), of an error with Jacobians by two nodes, shape (m, 3)."""
+    """
+    Write J P J^T, shape (m, m), of an error with Jacobians by two nodes, shape (m, 3).
+
+    Without a second node j is -1.
+    """
     nodes, cliques, m = tb.nodes(head), tb.cliques(head), len(out)
     out[:] = 0.0
+    if j < 0:
+        _begin(head, i, of_i, -1, np.empty((m, 48)), np.empty((m, 48)), out)
+        return
     # Each path to a root goes on along the other one: they meet in the lowest clique above both
     # nodes, or both end at -1.
     begin_i, begin_j = nodes[i].clique, nodes[j].clique
@@ -161,8 +161,7 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
         spare = _cleared(spare, 3 * n_above)
         for m in range(n_above):
             nodes[pool_i[above.members + m]].index = 3 * m
-        turn = (clique_frames.present_turn(head, c)
-                - clique_frames.present_turn(head, row.parent))
+        turn = (clique_frames.present_turn(head, c) - clique_frames.present_turn(head, row.parent))
         cos, sin = math.cos(turn), math.sin(turn)
         for s in range(n_frontal, n):
             at = nodes[members[s]].index

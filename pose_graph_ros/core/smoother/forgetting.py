@@ -232,8 +232,7 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
     for v in leaving:
         c = nodes[v].clique
         row = cliques[c]
-        if pool_i[row.members] == v and (
-                row.parent < 0 or state[row.parent] != _WHOLE):
+        if pool_i[row.members] == v and (row.parent < 0 or state[row.parent] != _WHOLE):
             tops[n_tops] = c
             n_tops += 1
             need_f += pools.rounded(pools.n_values(0, row.n_separator))

@@ -45,6 +45,7 @@ class Refinement(NamedTuple):
     moved: float    # largest change of a coordinate of a position [m]
 
 
+_UNIT = np.eye(3)
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', eliminated=1, visited=1, iterations=1)
 
 
@@ -261,9 +262,7 @@ class IncrementalSmoother:
         if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
             # raises an error with the cause
             return self.covariance(self.graph.newest_pose)
-        out = np.empty((3, 3))
-        covariances.node_covariance(head, head[tb.NEWEST], out)
-        return out
+        return self._covariance(head[tb.NEWEST])
 
     def covariance(self, node: int) -> se2.Covariance:
         """
@@ -271,9 +270,11 @@ class IncrementalSmoother:
 
         Raises ValueError if there is no such node, or edits of the graph are not solved for.
         """
-        row, = self._eliminated([node])
+        return self._covariance(*self._eliminated([node]))
+
+    def _covariance(self, row: int) -> se2.Covariance:
         out = np.empty((3, 3))
-        covariances.node_covariance(self._memory.head, row, out)
+        covariances.write_covariance(self._memory.head, row, _UNIT, -1, _UNIT, out)
         return out
 
     def joint_covariance(self, i: int, j: int) -> FloatArray:

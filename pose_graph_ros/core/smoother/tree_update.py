@@ -94,11 +94,12 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             n_leaving += 1
     n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
-    cliques, need_f, need_i, largest = in_postorder(
+    cliques = in_postorder(
         affected, minimum_degree(
             len(affected), len(orphans), n_leaving, n_last, start, adjacency),
         n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, False)
-    if lacks_memory(head, head[tb.POOL_F_END] + need_f, head[tb.POOL_I_END] + need_i, largest):
+    if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
+                    head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
         return MORE_MEMORY
     # to each orphan goes the drift of all cliques above it, which are about to be dropped
     drifting = False

@@ -157,6 +157,5 @@ def continued(graph: Graph, poses: Poses, ids: IntArray | None = None) -> Poses:
     last = int(rows[(rows >= 0) & is_pose[rows]][-1])
     moved[rows[rows >= 0]] = poses[rows >= 0]
     newer = n + np.flatnonzero(is_pose[n:])
-    moved[newer] = se2.compose(
-        moved[last], se2.between(graph.poses[last], graph.poses[newer]))
+    moved[newer] = se2.compose(moved[last], se2.between(graph.poses[last], graph.poses[newer]))
     return moved
