@@ -13,13 +13,8 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import (
-    BatchResult,
-    optimize_from_two_starts,
-    SAME_MINIMUM,
-    Solve,
-    Status,
-)
+from pose_graph_ros.core.batch import optimizer
+from pose_graph_ros.core.batch.optimizer import BatchResult, SAME_MINIMUM, Solve, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -60,7 +55,7 @@ def optimize(
     poses, weights = graph.poses.copy(), graph.weights
     try:
         if len(reweighting) == 0:
-            result = optimize_from_two_starts(graph, config, solve)
+            result = optimizer.optimize_from_two_starts(graph, config, solve)
         else:
             result = _optimize_robustly(graph, reweighting, config, solve)
     except Exception as error:
@@ -87,7 +82,7 @@ def _optimize_robustly(
     best, poses, weights = None, graph.poses, graph.weights
     for weight, widened in ((1.0, TUNING.widened), (TUNING.small_weight, ())):
         graph.apply(GraphUpdate(weigh=reweighting.all_alike(weight)))
-        result = optimize_from_two_starts(graph, config, solve)
+        result = optimizer.optimize_from_two_starts(graph, config, solve)
         for factor in widened:
             if result.status is not Status.FAILED:
                 result = _solved_with(

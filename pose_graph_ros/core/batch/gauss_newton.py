@@ -23,9 +23,8 @@ from pose_graph_ros.core.elimination.assembly import (
     LINEARIZED,
     POSITIONS,
 )
-from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows, solve_rows
+from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
@@ -38,25 +37,21 @@ def put_poses(memory: tb.Memory, poses: Poses) -> None:
         rows[field] = 0.0
 
 
-@kernel(signature=(tb.HEAD,))
-def linearize(head):  # type: ignore[no-untyped-def]
-    """Make the poses the references and linearize all factors there."""
-    for v in range(head[tb.N_NODES]):
-        factors.refer_to_pose(tb.nodes(head)[v])
-    for e in range(head[tb.N_FACTORS]):
-        if tb.factors(head)[e].weight > 0.0:
-            factors.linearize(head, e)
-
-
 @kernel(signature=(tb.HEAD, NUMBER, INTEGER))
 def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    `terms` says what constraints add; see `assembly`. Return False if a node is not determined,
+    `terms` says what constraints add; see `assembly`. For LINEARIZED the poses become the
+    references, and all factors are linearized there. Return False if a node is not determined,
     which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)[0]
+    for v in range(head[tb.N_NODES] if terms == LINEARIZED else 0):
+        factors.refer_to_pose(tb.nodes(head)[v])
+    for e in range(head[tb.N_FACTORS] if terms == LINEARIZED else 0):
+        if tb.factors(head)[e].weight > 0.0:
+            factors.linearize(head, e)
     scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
@@ -66,14 +61,6 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
             break
     scalars.damping = 0.0
     return bad < 0
-
-
-@kernel
-def _update_pose(f):  # type: ignore[no-untyped-def]
-    """Set the pose of a node, given as its row, to reference plus solution."""
-    f.pose[0] = f.reference[0] + f.delta[0]
-    f.pose[1] = f.reference[1] + f.delta[1]
-    f.pose[2] = factors.wrap(f.reference[2] + f.delta[2])
 
 
 @kernel(forceinline=True)
@@ -110,10 +97,7 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
     largest = 0.0
     for c in range(n_cliques - 1, n_priors - 1, -1):
         members, n_frontal, values, x = _clique(head, c, right)
-        if chord:
-            backward_rows(values, 3 * n_frontal, len(x), x)
-        else:
-            solve_rows(values, 3 * n_frontal, len(x), x)
+        backward_rows(values, 3 * n_frontal, len(x), x, not chord)
         for k in range(n_frontal):
             v = members[k]
             f = nodes[v]
@@ -124,16 +108,11 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
             for m in range(3):
                 right[v, m] = x[3 * k + m]
                 f.delta[m] += right[v, m]
-                largest = _larger(largest, right[v, m])
-            _update_pose(f)
+                if not abs(right[v, m]) <= largest:     # also if it is NaN
+                    largest = abs(right[v, m])
+                f.pose[m] = f.reference[m] + f.delta[m]
+            f.pose[2] = factors.wrap(f.pose[2])
     return largest
-
-
-@kernel
-def _larger(largest, number):  # type: ignore[no-untyped-def]
-    """Return the larger of `largest` and the magnitude of a number, NaN if one of them is NaN."""
-    number = abs(number)
-    return largest if number <= largest else number
 
 
 @kernel(signature=(tb.HEAD, ROWS))
@@ -143,7 +122,8 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
 
     `right`, shape (N, 3), receives -b: half the gradient of chi2, with negative sign.
     """
-    nodes = tb.nodes(head)
+    nodes, cliques = tb.nodes(head), tb.cliques(head)
+    pool_i, work = tb.pool_i(head), tb.work_f(head)
     right[:] = 0.0
     chi2 = gradient_sum = cancelled = reach = 0.0
     for e in range(head[tb.N_FACTORS]):
@@ -152,41 +132,23 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
             chi2 += energy
             gradient_sum += size
             cancelled += terms
-    energy, size, terms = _add_priors(head, right)
-    chi2 += energy
-    gradient_sum += size
-    cancelled += terms
-    for v in range(head[tb.N_NODES]):
-        reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
-    # rounding of a sum of many numbers, and of coordinates
-    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (
-        reach * gradient_sum + cancelled)
-
-
-@kernel
-def _add_priors(head, right):  # type: ignore[no-untyped-def]
-    """
-    Add the priors to -b, shape (N, 3).
-
-    Return their energies, the sum of the magnitudes of their gradients by a position, and that of
-    the terms that cancel each other in their energies.
-    """
-    cliques, pool_i, work = tb.cliques(head), tb.pool_i(head), tb.work_f(head)
-    energies = gradients = cancelled = 0.0
     for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
         if not prior_rows.is_prior(head, c):
             continue
         row = cliques[c]
         n = row.n_separator
-        energies += prior_rows.gradient(head, c, work)
+        chi2 += prior_rows.gradient(head, c, work)
         d, g = work[:3 * n], work[3 * n:6 * n]
         for k in range(n):
             v = pool_i[row.members + k]
-            gradients += abs(g[3 * k]) + abs(g[3 * k + 1])
+            gradient_sum += abs(g[3 * k]) + abs(g[3 * k + 1])
             for m in range(3):
                 right[v, m] -= g[3 * k + m]
                 cancelled += abs(d[3 * k + m] * g[3 * k + m])
-    return energies, gradients, cancelled
+    for v in range(head[tb.N_NODES]):
+        reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
+    # rounding of a sum of many numbers, and of coordinates
+    return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (reach * gradient_sum + cancelled)
 
 
 @kernel(signature=(tb.HEAD,))
@@ -231,62 +193,41 @@ class CompiledSystem:
         self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
         # -b, which a chord step overwrites
         self._right = np.zeros((len(self._rows), 3))
-        self.keep_poses()
 
-    def keep_poses(self) -> None:
-        self._best = self._rows['pose'].copy()
+    @property
+    def poses(self) -> Poses:
+        return np.array(self._rows['pose'])
 
-    def restore_poses(self) -> None:
-        put_poses(self._memory, self._best)
-
-    def halve_step(self) -> None:
-        step = self._rows['pose'] - self._best
-        step[:, 2] = se2.wrap(step[:, 2])
-        put_poses(self._memory, se2.wrapped(self._best + 0.5 * step))
+    def set_poses(self, poses: Poses) -> None:
+        put_poses(self._memory, poses)
 
     def evaluate(self) -> tuple[float, float]:
         chi2, rounding = evaluate(self._head, self._right)
         return chi2, rounding
 
-    def step(self, damping: float, *, chord: bool) -> float:
+    def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         if chord:
-            return float(step(self._head, self._right, True))
-        linearize(self._head)
+            return float(step(self._head, self._right, True)), 0.0
         if not eliminate(self._head, damping, LINEARIZED):
-            return math.inf
-        return float(step(self._head, np.zeros_like(self._right), False))
-
-    def decrease(self) -> float:
-        return float(np.sum(self._right * self._rows['delta']))
-
-    def settle(self) -> None:
-        settle(self._head)
+            return math.inf, 0.0
+        length = float(step(self._head, np.zeros_like(self._right), False))
+        return length, float(np.sum(self._right * self._rows['delta']))
 
 
-class CompiledChordal:
-    """The `ChordalSystem` of `linear_starts` for a graph in tables; changes its poses."""
-
-    def __init__(self, memory: tb.Memory) -> None:
-        self._head = memory.head
-        self._rows = memory['nodes'][:memory.head[tb.N_NODES]]
-        self._fixed = self._rows['fixed'] != 0
-
-    def headings(self, known: ComplexArray) -> ComplexArray:
-        return self._solved(HEADINGS, known)
-
-    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
-        self._rows['pose'][~self._fixed, 2] = np.angle(u[:-1])[~self._fixed]
-        return self._solved(POSITIONS, known)
-
-    def _solved(self, terms: int, known: ComplexArray) -> ComplexArray:
-        rows, fixed = self._rows, self._fixed
-        # the unknowns are the solutions of the nodes
-        delta = rows['delta']
-        for field in ('reference', 'delta', 'seen', 'checked_turn'):
-            rows[field] = 0.0
-        delta[fixed, 0] = known.real[:-1][fixed]
-        delta[fixed, 1] = known.imag[:-1][fixed]
-        if not eliminate(self._head, 0.0, terms):
-            raise LinearSolveError('chordal start: singular')
-        step(self._head, np.zeros((len(rows), 3)), False)
-        return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])
+def solve_chordal(
+    memory: tb.Memory, known: ComplexArray, headings: ComplexArray | None,
+) -> ComplexArray:
+    """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
+    rows = memory['nodes'][:memory.head[tb.N_NODES]]
+    fixed = rows['fixed'] != 0
+    if headings is not None:
+        rows['pose'][~fixed, 2] = np.angle(headings[:-1])[~fixed]
+    # the unknowns are the solutions of the nodes
+    delta = rows['delta']
+    for field in ('reference', 'delta', 'seen', 'checked_turn'):
+        rows[field] = 0.0
+    delta[fixed, 0], delta[fixed, 1] = known.real[:-1][fixed], known.imag[:-1][fixed]
+    if not eliminate(memory.head, 0.0, HEADINGS if headings is None else POSITIONS):
+        raise LinearSolveError('chordal start: singular')
+    step(memory.head, np.zeros((len(rows), 3)), False)
+    return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])

@@ -22,6 +22,8 @@ import math
 from typing import Protocol, TypeVar
 
 from pose_graph_ros.core.config import SolverConfig
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import Poses
 
 # Relative difference of chi2 below which two minima count as the same.
 SAME_MINIMUM = 1e-9
@@ -131,32 +133,25 @@ def to_the_end(parts: Generator[None, None, Result]) -> Result:
 
 
 class System(Protocol):
-    """A graph whose poses are moved; it keeps the best of them and the last factorisation."""
+    """A graph whose poses are moved; it keeps the last factorisation."""
 
-    def keep_poses(self) -> None:
-        """Take the present poses for the best."""
+    @property
+    def poses(self) -> Poses:
+        """Poses of all nodes, which further steps leave as they are."""
 
-    def restore_poses(self) -> None:
-        """Go back to the best poses."""
-
-    def halve_step(self) -> None:
-        """Go half of the way back to the best poses."""
+    def set_poses(self, poses: Poses) -> None:
+        """Set the poses of all nodes."""
 
     def evaluate(self) -> tuple[float, float]:
         """Return chi2 at the poses and its rounding error; note the gradient."""
 
-    def step(self, damping: float, *, chord: bool) -> float:
+    def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         """
         Move all poses; return the largest change of a coordinate, infinite if H is singular.
 
-        A chord step takes the last factorisation, with the gradient that was noted.
+        A chord step takes the last factorisation, with the gradient that was noted. Of another one
+        the step times that gradient is returned as well, which a quadratic chi2 falls by.
         """
-
-    def decrease(self) -> float:
-        """Return the last step times the noted gradient, which a quadratic chi2 falls by."""
-
-    def settle(self) -> None:
-        """Bring what else depends on the poses up to date."""
 
 
 def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
@@ -165,7 +160,7 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
 
     The poses are those of the lowest chi2 found, unless it has failed as H is singular.
     """
-    system.keep_poses()
+    best = system.poses
     end, iterations, uphill = Status.MAX_ITERATIONS, 0, 0
     solved = False  # whether any factorisation succeeded
     rejected = False  # whether any step was rejected
@@ -177,16 +172,18 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
     while iterations < config.max_iterations:
         yield
         trial = math.inf
-        length = system.step(damping, chord=chord)
+        length, predicted = system.step(damping, chord=chord)
         if length < math.inf:
             solved = True
             if rejected and damping == uphill == 0 and not chord and (
-                    system.decrease() < TUNING.least_decrease * max(chi2, 1.0)):
+                    predicted < TUNING.least_decrease * max(chi2, 1.0)):
                 end = Status.CONVERGED
                 break
             trial, rounding = system.evaluate()
             if damping > 0.0 and not trial <= chi2 + rounding < math.inf:
-                system.halve_step()
+                step = system.poses - best
+                step[:, 2] = se2.wrap(step[:, 2])
+                system.set_poses(se2.wrapped(best + 0.5 * step))
                 trial, rounding = system.evaluate()
         lower = trial <= chi2 + rounding
         current = lower and damping == 0.0
@@ -199,7 +196,7 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
             slow = damping > 0.0 and chi2 - trial < TUNING.slow * max(chi2, 1.0)
             n_slow = n_slow + 1 if slow else 0
             chi2 = trial
-            system.keep_poses()
+            best = system.poses
             iterations += 1
             # an uphill step or stronger damping before this step changes its length
             comparable = uphill == 0 and damping <= last_damping
@@ -220,7 +217,7 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
             iterations += 1
             uphill, previous = uphill + 1, length
         else:
-            system.restore_poses()
+            system.set_poses(best)
             system.evaluate()
             rejected = True
             if not chord:
@@ -233,20 +230,19 @@ def minimize(system: System, chi2: float, config: SolverConfig) -> Optimization:
     # after a rejected step short steps may mean that it is stuck where an error is at pi
     at_best = current and not rejected and end is not Status.MAX_ITERATIONS
     if not at_best and end is not Status.FAILED:
-        system.restore_poses()
+        system.set_poses(best)
         end = _refactorized(system, end, chi2)
-    if end is not Status.FAILED:
-        system.settle()
     return BatchResult(end, '', iterations, chi2)
 
 
 def _refactorized(system: System, end: Status, chi2: float) -> Status:
     """Eliminate all nodes at the best poses without damping; return the final status."""
+    best = system.poses
     system.evaluate()
-    if not system.step(0.0, chord=False) < math.inf:
+    length, predicted = system.step(0.0, chord=False)
+    if not length < math.inf:
         return Status.FAILED
-    predicted = system.decrease()
-    system.restore_poses()
+    system.set_poses(best)
     least = TUNING.at_the_end if end is Status.MAX_ITERATIONS else TUNING.stall
     if not predicted > least * max(chi2, 1.0):
         return Status.CONVERGED

@@ -14,14 +14,14 @@ condition |u| = 1 both equations are linear.
   from odometry.
 - `joint` solves for both together, which needs no measured heading.
 
-Nothing in here is compiled. `gauss_newton.CompiledChordal` solves the systems of `chordal` over
+Nothing in here is compiled. `gauss_newton.solve_chordal` solves the systems of `chordal` over
 the cliques of a graph.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 import math
-from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -33,30 +33,23 @@ from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, 
 from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, order_of
 
 if TYPE_CHECKING:
+    from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
     from pose_graph_ros.core.graph.graph import Graph
     from pose_graph_ros.core.graph.priors import Prior
 
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
 Ends = Sequence[Blocks]   # one for each end of a constraint
+Constrained: TypeAlias = 'Graph | PlainGraph'
+ChordalSolve = Callable[[ComplexArray, ComplexArray | None], ComplexArray]
+"""
+Solves for all positions of a graph, given headings u with |u| = 1, or for u if none are given.
+
+What is known of fixed nodes, and what is returned, are complex numbers, the last that of the map.
+"""
 
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
 _LINEAR = [*_PLACING, *(kind for kind, factor in FACTORS.items() if 0 not in factor.rows)]
-
-
-class Constrained(Protocol):
-    """What is needed of a graph, a `Graph` or a `PlainGraph`."""
-
-    @property
-    def node_kind(self) -> npt.NDArray[Any]: ...
-    @property
-    def n_priors(self) -> int: ...
-    @property
-    def poses(self) -> Poses: ...
-    @property
-    def fixed(self) -> BoolArray: ...
-    @property
-    def factors_by_row(self) -> Factors: ...  # with rows for ends
 
 
 class Terms(NamedTuple):
@@ -146,8 +139,7 @@ class NodeSystem:
         for end, each in zip(self._ends, by, strict=True):
             values = np.ascontiguousarray(np.einsum('mrk,mr...->mk...', each.conj(), weighted))
             # bincount takes one column of real numbers
-            columns = values.reshape(
-                len(values), math.prod(values.shape[1:])).view(np.float64).T
+            columns = values.reshape(len(values), math.prod(values.shape[1:])).view(np.float64).T
             total = total + np.stack([np.bincount(end, column, self._n) for column in columns],
                                      axis=1).view(values.dtype).reshape(-1, *values.shape[1:])
         return np.asarray(total[self.free])
@@ -180,42 +172,26 @@ class NodeSystem:
         return solve
 
 
-class ChordalSystem(Protocol):
-    """
-    A graph for `chordal`: solves for its headings, and for its positions.
+def sparse_chordal(graph: Constrained, nodes: NodeSystem | None = None) -> ChordalSolve:
+    """Return the `ChordalSolve` that is not compiled; `nodes` is that of the edges."""
+    terms = Terms.of_factors(graph.factors_by_row, len(graph.poses)).informative()
+    system = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
 
-    Both, and what is known of fixed nodes, are complex numbers, the last one that of the map.
-    """
-
-    def headings(self, known: ComplexArray) -> ComplexArray:
-        """Return u at the minimum."""
-
-    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
-        """Return t at the minimum for headings u with |u| = 1."""
-
-
-class SparseChordal:
-    """The `ChordalSystem` that is not compiled; `nodes` is that of the edges."""
-
-    def __init__(self, graph: Constrained, nodes: NodeSystem | None = None) -> None:
-        self._terms = terms = Terms.of_factors(
-            graph.factors_by_row, len(graph.poses)).informative()
-        self._nodes = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
-
-    def headings(self, known: ComplexArray) -> ComplexArray:
-        root = np.sqrt(self._terms.kappa)[:, None, None]
-        return self._nodes.solver(
-            (-root * self._terms.turn[:, None, None], root + 0j),
-            np.zeros((len(root), 1), complex), known[:, None])()[:, 0]
-
-    def positions(self, u: ComplexArray, known: ComplexArray) -> ComplexArray:
-        terms, root = self._terms, np.sqrt(self._terms.tau)[:, None]
-        right = root * (u[terms.i] * terms.arm_i - u[terms.j] * terms.arm_j)[:, None]
-        return self._nodes.solver(
-            (-root[:, None], root[:, None]), right, known[:, None])()[:, 0]
+    def solve(known: ComplexArray, headings: ComplexArray | None) -> ComplexArray:
+        if headings is None:
+            root = np.sqrt(terms.kappa)[:, None, None]
+            by = -root * terms.turn[:, None, None], root + 0j
+            right = np.zeros(len(root), complex)
+        else:
+            root = np.sqrt(terms.tau)[:, None, None]
+            by = -root, root
+            right = root[:, 0, 0] * (
+                headings[terms.i] * terms.arm_i - headings[terms.j] * terms.arm_j)
+        return system.solver(by, right[:, None], known[:, None])()[:, 0]
+    return solve
 
 
-def chordal(graph: Constrained, system: ChordalSystem | None = None) -> Poses:
+def chordal(graph: Constrained, solve: ChordalSolve | None = None) -> Poses:
     """
     Return initial poses from the constraints and the poses of fixed nodes: headings come first.
 
@@ -226,15 +202,15 @@ def chordal(graph: Constrained, system: ChordalSystem | None = None) -> Poses:
         raise LinearSolveError('chordal start: a bias or a landmark has no heading')
     if graph.n_priors > 0:
         raise LinearSolveError('chordal start: a prior has no term for a heading alone')
-    system = system or SparseChordal(graph)
+    solve = solve or sparse_chordal(graph)
     t, u = _known(graph.poses)
-    u = system.headings(u)
+    u = solve(u, None)
     length = np.abs(u)
     # what remains of u where measured headings cancel often leads to another minimum
     if np.any(length < 1e-6):
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
     u /= length
-    return _poses(graph, system.positions(u, t), u)
+    return _poses(graph, solve(t, u), u)
 
 
 def joint(graph: 'Graph', *, unit: bool = False) -> Poses:

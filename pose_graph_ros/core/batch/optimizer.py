@@ -10,6 +10,7 @@ poses, with which the incremental smoother can continue.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -28,26 +29,14 @@ from pose_graph_ros.core.batch.levenberg_marquardt import (
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
 
 __all__ = [
-    'SAME_MINIMUM',
-    'TRUSTED_ITERATIONS',
-    'BatchResult',
-    'Optimization',
-    'Solve',
-    'Start',
-    'Status',
-    'chi2_of',
-    'in_parts',
-    'optimize',
-    'optimize_from_linear_start',
-    'optimize_from_two_starts',
-    'plant',
-    'to_the_end',
-]
+    'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Solve', 'Start',
+    'Status', 'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start',
+    'optimize_from_two_starts', 'plant', 'to_the_end']
 
 Solve = Callable[[Graph, SolverConfig], BatchResult]
 """Function that optimises a graph in place, such as `optimize`."""
@@ -109,8 +98,7 @@ def _from_starts(
         except LinearSolveError:
             continue
         yield
-        result = replace(
-            (yield from _minimize(graph, few, chi2_of(graph))), start=start)
+        result = replace((yield from _minimize(graph, few, chi2_of(graph))), start=start)
         if result.is_better_than(best):
             best, best_poses = result, graph.poses.copy()
         if is_trusted(result, chi2):
@@ -157,7 +145,7 @@ def _is_observed(graph: Graph) -> bool:
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     if start is Start.CHORDAL:
-        return linear_starts.chordal(graph, gauss_newton.CompiledChordal(graph.memory))
+        return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory))
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT and not _is_observed(graph):
@@ -175,38 +163,39 @@ def _prepare(graph: Graph, chi2: float) -> BatchResult | None:
         return _failed('chi2 is not finite', chi2)
     if np.all(graph.fixed):
         return BatchResult(Status.CONVERGED, '', 0, chi2)
-    analysis = symbolic.analyse(graph.memory.head)
-    loose = loose_nodes(graph, analysis.cliques)
+    cliques = symbolic.analyse(graph.memory.head)
+    # the root of the tree of cliques, a part of the graph, that each node is in
+    n = len(cliques.n_frontal)
+    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
+    while np.any(root[root] != root):
+        root = root[root]
+    part = np.empty(graph.n_nodes, dtype=np.int64)
+    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
+    # parts with a fixed or an observed node or an anchored prior
+    held = np.zeros(n, dtype=bool)
+    held[part[graph.fixed]] = True
+    ends = graph.factor_records['ends']
+    held[part[ends[(ends[:, 1] < 0) & (graph.weights > 0.0), 0]]] = True
+    for prior in graph.priors if graph.n_priors > 0 else ():
+        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
+    loose = graph.node_ids[~held[part]]
     if len(loose) > 0:
         return _failed(
             f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
             f'and no observed node: their poses are not determined', chi2)
-    plant(graph, analysis)
+    plant(graph, cliques)
     return None
 
 
-def plant(graph: Graph, analysis: symbolic.Analysis) -> None:
+def plant(graph: Graph, cliques: symbolic.Cliques) -> None:
     """Store the cliques of a whole graph, without values, in place of its present ones."""
     memory = graph.memory
     keep_f, keep_i = (
         memory.head[tb.POOL_F_END:tb.POOL_I_END + 1] if memory.head[tb.N_PRIORS] > 0 else (0, 0))
-    memory.ensure('pool_f', max(analysis.need_f, int(keep_f)), keep=int(keep_f))
-    memory.ensure('pool_i', max(analysis.need_i, int(keep_i)), keep=int(keep_i))
-    memory.ensure('work_f', analysis.largest)
-    symbolic.plant_all(memory.head, analysis.cliques)
-
-
-def loose_nodes(graph: Graph, cliques: symbolic.Cliques) -> IntArray:
-    """Return ids of nodes in parts without a fixed or observed node or an anchored prior."""
-    part = symbolic.trees(cliques, graph.n_nodes)
-    held = np.zeros(len(cliques.n_frontal), dtype=bool)
-    held[part[graph.fixed]] = True
-    ends = graph.factor_records['ends']
-    holds = (ends[:, 1] < 0) & (graph.weights > 0.0)
-    held[part[ends[holds, 0]]] = True
-    for prior in graph.priors if graph.n_priors > 0 else ():
-        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
-    return graph.node_ids[~held[part]]
+    memory.ensure('pool_f', max(cliques.need_f, int(keep_f)), keep=int(keep_f))
+    memory.ensure('pool_i', max(cliques.need_i, int(keep_i)), keep=int(keep_i))
+    memory.ensure('work_f', cliques.largest)
+    symbolic.plant_all(memory.head, cliques)
 
 
 def chi2_of(graph: Graph) -> float:
@@ -220,6 +209,7 @@ def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
     if result.status is Status.FAILED:
         node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
+    gauss_newton.settle(graph.memory.head)
     return result
 
 

@@ -22,7 +22,7 @@ from pose_graph_ros.core.batch.levenberg_marquardt import (
     to_the_end,
     TRUSTED_ITERATIONS,
 )
-from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, SparseChordal
+from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, sparse_chordal
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
@@ -138,7 +138,7 @@ class PlainOptimizer:
                 first = chi2 = self.evaluate()[0]
                 if start is Start.CHORDAL and first < np.inf:
                     steps = min(steps, TRUSTED_ITERATIONS)
-                    graph.poses = chordal(graph, SparseChordal(graph, self._nodes))
+                    graph.poses = chordal(graph, sparse_chordal(graph, self._nodes))
                     chi2 = self.evaluate()[0]
                 if chi2 < np.inf:
                     result = to_the_end(minimize(
@@ -157,14 +157,12 @@ class PlainOptimizer:
         right[:, 2] = derivative
         return np.asarray(self._factors.solve(right.ravel())[2::3])
 
-    def keep_poses(self) -> None:
-        self._best = self._graph.poses
+    @property
+    def poses(self) -> Poses:
+        return self._graph.poses
 
-    def restore_poses(self) -> None:
-        self._graph.poses = self._best
-
-    def halve_step(self) -> None:
-        raise AssertionError('only damped steps are halved')
+    def set_poses(self, poses: Poses) -> None:
+        self._graph.poses = poses
 
     def evaluate(self) -> tuple[float, float]:
         graph = self._graph
@@ -175,22 +173,15 @@ class PlainOptimizer:
         chi2 = float(np.einsum('mi,mi->', weighted, error))
         return chi2, 1e-9 * chi2   # its rounding
 
-    def step(self, damping: float, *, chord: bool) -> float:
+    def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         if damping > 0.0:
             raise LinearSolveError('left to the compiled optimiser: it needs damping')
         graph, (by_i, by_j) = self._graph, self._by
         if not chord or self._factors is None:
             information = graph.factors.information
-            self._factors = self._nodes.factors(
-                self._by, (information @ by_i, information @ by_j))
-        self._step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
+            self._factors = self._nodes.factors(self._by, (information @ by_i, information @ by_j))
+        step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
         poses = graph.poses.copy()
-        poses[self._nodes.free] += self._step
+        poses[self._nodes.free] += step
         graph.set_poses(poses)
-        return float(np.max(np.abs(self._step), initial=0.0))
-
-    def decrease(self) -> float:
-        return float(np.sum(self._right * self._step))
-
-    def settle(self) -> None:
-        pass
+        return float(np.max(np.abs(step), initial=0.0)), float(np.sum(self._right * step))

@@ -105,13 +105,13 @@ class TruncatedProblem:
     right, from the poses of the graph.
     """
 
-    def __init__(
-        self, graph: Graph, ids: IntArray, start: FloatArray | None = None,
-    ) -> None:
+    def __init__(self, graph: Graph, ids: IntArray, start: FloatArray | None = None) -> None:
         self.graph, self.ids = graph, ids
         self.edges = graph.factors_at(ids)
         """What may be wrong; their weights have no meaning."""
-        self.limits = LIMITS[_ranks(self.edges.information)]
+        # by the ranks of the information, whatever units it has
+        values = np.linalg.eigvalsh(scaled(self.edges.information))
+        self.limits = LIMITS[np.sum(values > 1e-9, axis=1)]
         """c^2 of each, shape (M,)."""
         self._weights = self.edges.weight
         self._choices: dict[tuple[bytes, SolverConfig], Choice] = {}
@@ -159,20 +159,18 @@ class TruncatedProblem:
         """Return a set with its cost; None if it leaves a node undetermined."""
         # retests of different sets often lead to the same one
         key = believed.tobytes(), config
-        choice = self._choices.pop(key, None) or (yield from self._solved(believed, config))
-        if choice is not None:
-            self._choices[key] = choice
-            if len(self._choices) > 16:
-                del self._choices[next(iter(self._choices))]
+        choice = self._choices.pop(key, None)
+        if choice is None:
+            if not (yield from self.solve(believed.astype(np.float64), config)):
+                return None
+            squares = self.energies()
+            known = chi2_of(self.graph) - float(np.sum(squares[believed]))
+            cost = known + float(np.sum(np.minimum(squares, self.limits)))
+            choice = Choice(believed.copy(), squares, cost, self.graph.poses.copy())
+        self._choices[key] = choice
+        if len(self._choices) > 16:
+            del self._choices[next(iter(self._choices))]
         return choice
-
-    def _solved(self, believed: BoolArray, config: SolverConfig) -> Choosing:
-        if not (yield from self.solve(believed.astype(np.float64), config)):
-            return None
-        squares = self.energies()
-        known = chi2_of(self.graph) - float(np.sum(squares[believed]))
-        cost = known + float(np.sum(np.minimum(squares, self.limits)))
-        return Choice(believed.copy(), squares, cost, self.graph.poses.copy())
 
     def near_start(self) -> Choosing:
         """Return a set with poses of no higher truncated cost than the start; None as `choice`."""
@@ -216,9 +214,7 @@ class TruncatedProblem:
                     mu *= GRADUATION
         return (yield from self.choice(share <= 1.0))
 
-    def improved(
-        self, choice: Choice, retests: int = 20,
-    ) -> Generator[None, None, Choice]:
+    def improved(self, choice: Choice, retests: int = 20) -> Generator[None, None, Choice]:
         """
         Return a set that no retest lowers the cost of.
 
@@ -240,9 +236,3 @@ class TruncatedProblem:
         self.graph.apply(GraphUpdate(weigh=dict(zip(
             self.ids[changed].tolist(), weights[changed].tolist(), strict=True))))
         self._weights = weights.copy()
-
-
-def _ranks(information: FloatArray) -> IntArray:
-    """Return the ranks of information matrices, shape (M,), whatever units they have."""
-    ranks: IntArray = np.sum(np.linalg.eigvalsh(scaled(information)) > 1e-9, axis=1)
-    return ranks

@@ -196,8 +196,7 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     cliques[child].turn_seen = phi
     if n_frontal == 0:
         linear = work_f[len(front) + len(front) // ld:]
-        clique_frames.linearize_prior(
-            head, child, phi, linear, linear[triangle_size(size, size):])
+        clique_frames.linearize_prior(head, child, phi, linear, linear[triangle_size(size, size):])
         update = linear
     elif phi != 0.0:
         turned = work_f[len(front) + len(front) // ld:]
@@ -211,7 +210,20 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     for k in range(size):
         front[(index[k // 3] + k % 3) * ld + ld - 1] += update[row_start(k, size) + size]
     if not in_order:
-        _add_in_other_order(update, n_separator, index, front, ld)
+        for a in range(n_separator):
+            i = index[a]
+            for m in range(3):
+                source = update[row_start(3 * a + m, size):]
+                for q in range(m, 3):
+                    front[(i + m) * ld + i + q] += source[3 * a + q]
+                for b in range(a + 1, n_separator):
+                    j = index[b]
+                    if j > i:   # else the entry is below the diagonal there: add its transpose
+                        to, step = (i + m) * ld + j, 1
+                    else:
+                        to, step = j * ld + i + m, ld
+                    for q in range(3):
+                        front[to + q * step] += source[3 * b + q]
         return
     # add runs of columns that are contiguous both in the update matrix and in the front
     begin = 0
@@ -230,27 +242,6 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
             add(update, row_start(k, size) + k, front, target, 3 * end - k)
             target += ld + 1
         begin = end
-
-
-@kernel
-def _add_in_other_order(update, n_separator, index, front, ld):  # type: ignore[no-untyped-def]
-    """Add an update matrix whose nodes are ordered differently in the parent's front."""
-    size = 3 * n_separator
-    for a in range(n_separator):
-        i = index[a]
-        for m in range(3):
-            source = update[row_start(3 * a + m, size):]
-            for q in range(m, 3):
-                front[(i + m) * ld + i + q] += source[3 * a + q]
-            for b in range(a + 1, n_separator):
-                j = index[b]
-                if j > i:   # else the entry is below the diagonal there: add its transpose
-                    to, step = (i + m) * ld + j, 1
-                else:
-                    to, step = j * ld + i + m, ld
-                front[to] += source[3 * b]
-                front[to + step] += source[3 * b + 1]
-                front[to + 2 * step] += source[3 * b + 2]
 
 
 @kernel

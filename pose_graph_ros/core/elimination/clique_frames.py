@@ -70,13 +70,6 @@ def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def map_delta(f, x, y, px, py, cos, sin):  # type: ignore[no-untyped-def]
-    """Return the position of a node's solution in map axes, the inverse of `local_delta`."""
-    x, y = x + f.reference[0] - px, y + f.reference[1] - py
-    return cos * x - sin * y + px - f.reference[0], sin * x + cos * y + py - f.reference[1]
-
-
-@kernel
 def add_product(update, size, x, out):  # type: ignore[no-untyped-def]
     """Add U x to a vector; U is an upper triangle laid out by `pools.row_start`."""
     for i in range(size):

@@ -34,85 +34,36 @@ def padded(n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _subtract_3(front, k, i, ld):  # type: ignore[no-untyped-def]
-    """Subtract the contribution of the rows of R from k to k + 2 from rows i to i + 2."""
-    p, q, r, t = k * ld, (k + 1) * ld, (k + 2) * ld, i * ld
-    a0, b0, c0 = spread(front[p + i]), spread(front[p + i + 1]), spread(front[p + i + 2])
-    a1, b1, c1 = spread(front[q + i]), spread(front[q + i + 1]), spread(front[q + i + 2])
-    a2, b2, c2 = spread(front[r + i]), spread(front[r + i + 1]), spread(front[r + i + 2])
-    for c in range(i // WIDTH * WIDTH, ld, WIDTH):
-        x, y, z = load(front, p + c), load(front, q + c), load(front, r + c)
-        u, v, w = load(front, t + c), load(front, t + ld + c), load(front, t + 2 * ld + c)
-        store(front, t + c, fnmadd(fnmadd(fnmadd(u, a0, x), a1, y), a2, z))
-        store(front, t + ld + c, fnmadd(fnmadd(fnmadd(v, b0, x), b1, y), b2, z))
-        store(front, t + 2 * ld + c, fnmadd(fnmadd(fnmadd(w, c0, x), c1, y), c2, z))
+def _spread_block(front, at, ld):  # type: ignore[no-untyped-def]
+    """Return the entries of a 3x3 block, row by row, as vectors of equal numbers."""
+    b, c = at + ld, at + 2 * ld
+    return (spread(front[at]), spread(front[at + 1]), spread(front[at + 2]),
+            spread(front[b]), spread(front[b + 1]), spread(front[b + 2]),
+            spread(front[c]), spread(front[c + 1]), spread(front[c + 2]))
 
 
 @kernel
-def _subtract_6(front, k, i, ld):  # type: ignore[no-untyped-def]
-    """Subtract the contribution of the rows of R from k to k + 5 from rows i to i + 2."""
-    p, t = k * ld, i * ld
-    o = p + i
-    a0, b0, c0 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a1, b1, c1 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a2, b2, c2 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a3, b3, c3 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a4, b4, c4 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
-    o += ld
-    a5, b5, c5 = spread(front[o]), spread(front[o + 1]), spread(front[o + 2])
+def _minus(front, at, ld, s, u, v, w):  # type: ignore[no-untyped-def]
+    """Subtract a spread block times three rows, of which a vector begins at an index."""
+    x, y, z = load(front, at), load(front, at + ld), load(front, at + 2 * ld)
+    return (fnmadd(fnmadd(fnmadd(u, s[0], x), s[3], y), s[6], z),
+            fnmadd(fnmadd(fnmadd(v, s[1], x), s[4], y), s[7], z),
+            fnmadd(fnmadd(fnmadd(w, s[2], x), s[5], y), s[8], z))
+
+
+@kernel
+def _subtract(front, k, i, ld, six):  # type: ignore[no-untyped-def]
+    """Subtract the contribution of the three, or six, rows of R from row k on from i to i + 2."""
+    p, q, t = k * ld, (k + 3) * ld if six else k * ld, i * ld
+    first, second = _spread_block(front, p + i, ld), _spread_block(front, q + i, ld)
     for c in range(i // WIDTH * WIDTH, ld, WIDTH):
-        o = p + c
         u, v, w = load(front, t + c), load(front, t + ld + c), load(front, t + 2 * ld + c)
-        x = load(front, o)
-        u, v, w = fnmadd(u, a0, x), fnmadd(v, b0, x), fnmadd(w, c0, x)
-        x = load(front, o + ld)
-        u, v, w = fnmadd(u, a1, x), fnmadd(v, b1, x), fnmadd(w, c1, x)
-        x = load(front, o + 2 * ld)
-        u, v, w = fnmadd(u, a2, x), fnmadd(v, b2, x), fnmadd(w, c2, x)
-        x = load(front, o + 3 * ld)
-        u, v, w = fnmadd(u, a3, x), fnmadd(v, b3, x), fnmadd(w, c3, x)
-        x = load(front, o + 4 * ld)
-        u, v, w = fnmadd(u, a4, x), fnmadd(v, b4, x), fnmadd(w, c4, x)
-        x = load(front, o + 5 * ld)
-        u, v, w = fnmadd(u, a5, x), fnmadd(v, b5, x), fnmadd(w, c5, x)
+        u, v, w = _minus(front, p + c, ld, first, u, v, w)
+        if six:
+            u, v, w = _minus(front, q + c, ld, second, u, v, w)
         store(front, t + c, u)
         store(front, t + ld + c, v)
         store(front, t + 2 * ld + c, w)
-
-
-@kernel
-def _factorize_3(front, k, ld, least):  # type: ignore[no-untyped-def]
-    """Factorise rows k to k + 2; return the first of them with a bad pivot, or -1."""
-    p, q, r = k * ld, (k + 1) * ld, (k + 2) * ld
-    # the 3x3 block on the diagonal first: it gives all factors for the rest of the rows
-    pivot = front[p + k]
-    if not pivot > least[k]:
-        return k
-    f = 1.0 / math.sqrt(pivot)
-    b, d = front[p + k + 1] * f, front[p + k + 2] * f
-    pivot = front[q + k + 1] - b * b
-    if not pivot > least[k + 1]:
-        return k + 1
-    g = 1.0 / math.sqrt(pivot)
-    e = (front[q + k + 2] - b * d) * g
-    pivot = front[r + k + 2] - d * d - e * e
-    if not pivot > least[k + 2]:
-        return k + 2
-    h = 1.0 / math.sqrt(pivot)
-    vf, vg, vh, vb, vd, ve = spread(f), spread(g), spread(h), spread(b), spread(d), spread(e)
-    for c in range(k // WIDTH * WIDTH, ld, WIDTH):
-        x = times(load(front, p + c), vf)
-        y = times(fnmadd(load(front, q + c), vb, x), vg)
-        z = times(fnmadd(fnmadd(load(front, r + c), vd, x), ve, y), vh)
-        store(front, p + c, x)
-        store(front, q + c, y)
-        store(front, r + c, z)
-    front[p + k], front[q + k + 1], front[r + k + 2] = f, g, h
-    return -1
 
 
 @kernel
@@ -123,23 +74,39 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
     They are replaced by rows of R; the other ones of all n rows, of `ld = padded(n)` numbers,
     become the update matrix. Each pivot must be above its `least`.
     """
-    k = 0
-    while k < rows:
-        bad = _factorize_3(front, k, ld, least)
-        if bad >= 0:
-            return bad
-        if k + 6 <= rows:
-            _subtract_3(front, k, k + 3, ld)
-            bad = _factorize_3(front, k + 3, ld, least)
-            if bad >= 0:
-                return bad
-            for i in range(k + 6, n, 3):
-                _subtract_6(front, k, i, ld)
-            k += 6
-        else:
+    for k in range(0, rows, 3):
+        p, q, r = k * ld, (k + 1) * ld, (k + 2) * ld
+        # the 3x3 block on the diagonal first: it gives all factors for the rest of the rows
+        pivot = front[p + k]
+        if not pivot > least[k]:
+            return k
+        f = 1.0 / math.sqrt(pivot)
+        b, d = front[p + k + 1] * f, front[p + k + 2] * f
+        pivot = front[q + k + 1] - b * b
+        if not pivot > least[k + 1]:
+            return k + 1
+        g = 1.0 / math.sqrt(pivot)
+        e = (front[q + k + 2] - b * d) * g
+        pivot = front[r + k + 2] - d * d - e * e
+        if not pivot > least[k + 2]:
+            return k + 2
+        h = 1.0 / math.sqrt(pivot)
+        vf, vg, vh, vb, vd, ve = spread(f), spread(g), spread(h), spread(b), spread(d), spread(e)
+        for c in range(k // WIDTH * WIDTH, ld, WIDTH):
+            x = times(load(front, p + c), vf)
+            y = times(fnmadd(load(front, q + c), vb, x), vg)
+            z = times(fnmadd(fnmadd(load(front, r + c), vd, x), ve, y), vh)
+            store(front, p + c, x)
+            store(front, q + c, y)
+            store(front, r + c, z)
+        front[p + k], front[q + k + 1], front[r + k + 2] = f, g, h
+        # from all others six rows are subtracted at once, those of the next node need these three
+        if k % 6 == 3:
             for i in range(k + 3, n, 3):
-                _subtract_3(front, k, i, ld)
-            k += 3
+                _subtract(front, k - 3, i, ld, True)
+        else:
+            for i in range(k + 3, k + 6 if k + 6 <= rows else n, 3):
+                _subtract(front, k, i, ld, False)
     return -1
 
 
@@ -171,35 +138,22 @@ def forward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
 
 
 @kernel(fastmath=_FAST)
-def _backward_block(values, k, n, x, a, b, c):  # type: ignore[no-untyped-def]
-    """Solve rows k to k + 2 of R for the right-hand sides a, b, c."""
-    r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
-                  values[row_start(k + 2, n):])
-    for m in range(k + 3, n):
-        a -= r0[m] * x[m]
-        b -= r1[m] * x[m]
-        c -= r2[m] * x[m]
-    c *= r2[k + 2]
-    b = (b - r1[k + 2] * c) * r1[k + 1]
-    x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
-    x[k + 1], x[k + 2] = b, c
-
-
-@kernel
-def backward_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
+def backward_rows(values, rows, n, x, stored):  # type: ignore[no-untyped-def]
     """
-    Solve `R x = y` for the frontal nodes of a clique, with y given in the frontal part of x.
+    Solve `R x = y` for the frontal nodes of a clique.
 
-    Values are as for `forward_rows`; behind y, x has the solution of the separator.
+    Values are as for `forward_rows`; x has the solution of the separator, and before it y, unless
+    y is the right-hand side that is stored with R.
     """
     for k in range(rows - 3, -1, -3):
-        _backward_block(values, k, n, x, x[k], x[k + 1], x[k + 2])
-
-
-@kernel
-def solve_rows(values, rows, n, x):  # type: ignore[no-untyped-def]
-    """Solve as `backward_rows`, with y the right-hand side column of R."""
-    for k in range(rows - 3, -1, -3):
-        at = row_start(k, n) + n
-        _backward_block(
-            values, k, n, x, values[at], values[at + n - k], values[at + 2 * (n - k) - 1])
+        r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
+                      values[row_start(k + 2, n):])
+        a, b, c = (r0[n], r1[n], r2[n]) if stored else (x[k], x[k + 1], x[k + 2])
+        for m in range(k + 3, n):
+            a -= r0[m] * x[m]
+            b -= r1[m] * x[m]
+            c -= r2[m] * x[m]
+        c *= r2[k + 2]
+        b = (b - r1[k + 2] * c) * r1[k + 1]
+        x[k] = (a - r0[k + 1] * b - r0[k + 2] * c) * r0[k]
+        x[k + 1], x[k + 2] = b, c

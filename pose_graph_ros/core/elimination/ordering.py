@@ -131,51 +131,6 @@ def _write_element(t, iw, p, stamp, top):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _count_outside(t, iw, first, last, flag):  # type: ignore[no-untyped-def]
-    """Count how many nodes of each other element are not in the new one."""
-    for k in range(first, last):
-        i = iw[k]
-        for m in range(t[i].begin, t[i].begin + t[i].n_in):
-            e = iw[m]
-            if t[e].size > 0:
-                if t[e].outside < flag:
-                    t[e].outside = flag + t[e].size
-                t[e].outside -= t[i].weight
-
-
-@kernel
-def _prune(t, iw, i, p, flag, stamp, absorbs):  # type: ignore[no-untyped-def]
-    """
-    Remove from the list of a node what the new element p has.
-
-    Return its approximate degree outside, where the nodes begin in the list, its end and a hash.
-    Aggressive absorption: an element all of whose nodes are in the new one goes, but not for a
-    node before all others, as what is below such a node leaves with it.
-    """
-    to, d, h = t[i].begin, 0, np.int64(0)
-    for m in range(t[i].begin, t[i].begin + t[i].n_in):
-        e = iw[m]
-        if t[e].size > 0:
-            if t[e].outside > flag or not absorbs:
-                d += t[e].outside - flag
-                iw[to] = e
-                to += 1
-                h += e
-            else:
-                t[e].size = 0
-                t[e].absorber = p
-    first_node = to
-    for m in range(t[i].begin + t[i].n_in, t[i].begin + t[i].length):
-        j = iw[m]
-        if t[j].weight > 0 and t[j].mark != stamp:
-            d += t[j].weight
-            iw[to] = j
-            to += 1
-            h += j
-    return d, first_node, to, h
-
-
-@kernel
 def _merge_twins(t, iw, first, last, n_first, stamp):  # type: ignore[no-untyped-def]
     """Merge indistinguishable nodes, found by a hash of their lists, into supernodes."""
     for k in range(first, last):
@@ -195,7 +150,13 @@ def _merge_twins(t, iw, first, last, n_first, stamp):  # type: ignore[no-untyped
                     t[iw[m]].mark = stamp
                 j = t[i].bucket_next
                 while j >= 0:
-                    if t[j].weight > 0 and _is_marked(t, iw, j, i, stamp):
+                    same = t[j].weight > 0 and (
+                        t[j].length == t[i].length and t[j].n_in == t[i].n_in)
+                    m = t[j].begin
+                    while same and m < t[j].begin + t[j].length:
+                        same = t[iw[m]].mark == stamp
+                        m += 1
+                    if same:
                         t[i].degree -= t[j].weight
                         t[i].weight += t[j].weight
                         t[j].weight = 0
@@ -207,44 +168,62 @@ def _merge_twins(t, iw, first, last, n_first, stamp):  # type: ignore[no-untyped
 
 
 @kernel
-def _is_marked(t, iw, j, i, stamp):  # type: ignore[no-untyped-def]
-    """Tell whether node j has the list of node i, whose entries are marked."""
-    same = t[j].length == t[i].length and t[j].n_in == t[i].n_in
-    m = t[j].begin
-    while same and m < t[j].begin + t[j].length:
-        same = t[iw[m]].mark == stamp
-        m += 1
-    return same
-
-
-@kernel
 def _shorten_lists(t, iw, p, within, stamps, nodes, sums):  # type: ignore[no-untyped-def]
     """
     Update the members of the new element p, which are `iw[new:top]`, and keep those that stay.
 
-    Return where they end, where `nodes` end, and the numbers of nodes that are eliminated and in
-    the element. Those all of whose neighbours are in the element are eliminated with p.
+    What p has is removed from their lists. Return where they end, where `nodes` end, and the
+    numbers of nodes that are eliminated and in the element. Those all of whose neighbours are in
+    the element are eliminated with p. Aggressive absorption: an element all of whose nodes are in
+    the new one goes, but not for a node before all others, as what is below such a node leaves
+    with it.
     """
     (n, new, top, n_before, n_first), (flag, stamp) = within, stamps
     nodes_end, eliminated, element_size = sums
+    # how many nodes of each other element are not in the new one
+    for k in range(new, top):
+        i = iw[k]
+        for m in range(t[i].begin, t[i].begin + t[i].n_in):
+            e = iw[m]
+            if t[e].size > 0:
+                if t[e].outside < flag:
+                    t[e].outside = flag + t[e].size
+                t[e].outside -= t[i].weight
     keep = new
     for k in range(new, top):
         i = iw[k]
         if i < n_first:
             _remove(t, i)
-        d, first_node, to, h = _prune(t, iw, i, p, flag, stamp, p >= n_before)
-        if d == 0 and i < n_first and (p >= n_before or first_node == t[i].begin):
+        # the approximate degree outside, and a hash of the list
+        begin, to, d, h = t[i].begin, t[i].begin, 0, np.int64(0)
+        for m in range(begin, begin + t[i].n_in):
+            e = iw[m]
+            if t[e].size > 0 and t[e].outside <= flag and p >= n_before:
+                t[e].size = 0
+                t[e].absorber = p
+            elif t[e].size > 0:
+                d += t[e].outside - flag
+                iw[to] = e
+                to += 1
+                h += e
+        first_node = to
+        for m in range(begin + t[i].n_in, begin + t[i].length):
+            j = iw[m]
+            if t[j].weight > 0 and t[j].mark != stamp:
+                d += t[j].weight
+                iw[to] = j
+                to += 1
+                h += j
+        if d == 0 and i < n_first and (p >= n_before or first_node == begin):
             nodes_end = _put(t, i, nodes, nodes_end)
             eliminated += t[i].weight
             element_size -= t[i].weight
             t[i].weight = 0
             continue
         # the new element comes first; there is room, as at least one entry was removed
-        iw[to] = iw[first_node]
-        iw[first_node] = iw[t[i].begin]
-        iw[t[i].begin] = p
-        t[i].n_in = first_node - t[i].begin + 1
-        t[i].length = to - t[i].begin + 1
+        iw[to], iw[first_node], iw[begin] = iw[first_node], iw[begin], p
+        t[i].n_in = first_node - begin + 1
+        t[i].length = to - begin + 1
         t[i].degree = min(t[i].degree, d) + element_size - t[i].weight
         t[i].code = (h + p) % n
         iw[keep] = i
@@ -307,7 +286,6 @@ def minimum_degree(n, n_elements, n_before, n_last, start, adjacency):  # type: 
         t[p].weight = 0
         new = end
         top, size = _write_element(t, iw, p, stamp, new)
-        _count_outside(t, iw, new, top, flag)
         offset[n_cliques] = nodes_end
         nodes_end = _put(t, p, nodes, nodes_end)
         keep, nodes_end, eliminated, size = _shorten_lists(

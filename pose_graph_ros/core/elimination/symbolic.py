@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from numba import types
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import FLAG, INDICES, INTEGER, INTEGERS, kernel
+from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
@@ -33,29 +33,23 @@ RELAXED_FRONTAL = 24
 
 
 class Cliques(NamedTuple):
-    """The C cliques of a whole graph, in postorder."""
+    """C cliques in postorder."""
 
     first: Any  # (C + 1,); the nodes of clique k are `nodes[first[k]:first[k + 1]]`
     n_frontal: Any  # (C,) number of frontal nodes, which come first; the others are the separator
     parent: Any     # (C + O,), -1 for a root; the last ones are those of orphans
     nodes: Any
+    # memory that they need: numbers in the pool of values, `pool_f`, and in that of node lists,
+    # `pool_i`, and of work space for the largest front
+    need_f: int
+    need_i: int
+    largest: int
 
 
-# What `minimum_degree` returns.
-ELIMINATED = types.Tuple((INTEGER, INTEGERS, INDICES, INDICES, INDICES))
-CLIQUES = types.NamedUniTuple(INDICES, len(Cliques._fields), Cliques)
+CLIQUES = types.NamedTuple((*[INDICES] * 4, *[INTEGER] * 3), Cliques)
 
 
-class Analysis(NamedTuple):
-    """The cliques and the memory that they need."""
-
-    cliques: Cliques
-    need_f: int     # numbers in the pool of values, `pool_f`
-    need_i: int     # numbers in the pool of node lists, `pool_i`
-    largest: int    # numbers of work space for the largest front
-
-
-@kernel(signature=(INDICES, INTEGER))
+@kernel
 def newest_last(affected, newest):  # type: ignore[no-untyped-def]
     """
     Return how many of the newest nodes were moved to the end of the list, in order of age.
@@ -76,41 +70,14 @@ def newest_last(affected, newest):  # type: ignore[no-untyped-def]
     return n_last
 
 
-@kernel
-def _other_ends(factors, e, side):  # type: ignore[no-untyped-def]
-    """Return the nodes at the other ends of a factor; -1 where there is none."""
-    ends = factors[e].ends
-    return ends[1 if side == 0 else 0], ends[1 if side == 2 else 2]
-
-
-@kernel(allocates=True)
-def _orphans(head, marked, loose, stamp):  # type: ignore[no-untyped-def]
-    """Return the children of cliques marked with a stamp that are not, then the loose priors."""
-    cliques = tb.cliques(head)
-    orphans = np.empty(len(loose) + 16, np.int32)
-    n = 0
-    for k in range(len(marked)):
-        c = cliques[marked[k]].child
-        while c >= 0:
-            if cliques[c].marked != stamp:
-                if n + len(loose) == len(orphans):
-                    orphans = grown(orphans, 0)
-                orphans[n] = c
-                n += 1
-            c = cliques[c].sibling
-    for k in range(len(loose)):
-        orphans[n + k] = loose[k]
-    return orphans[:n + len(loose)]
-
-
 @kernel(allocates=True)
 def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     """
     Return the orphans, and the quotient graph of the affected nodes with them as elements.
 
-    Orphans are children of marked cliques that are not marked themselves, then the loose priors.
-    Marked cliques have FRONT_SERIAL of the head in their field `marked`. The graph is given as
-    `start` and `adjacency` of `ordering.minimum_degree`; node k is `affected[k]`.
+    Orphans are the children of cliques with FRONT_SERIAL in their field `marked` that do not have
+    it, then the loose priors. The graph is `start` and `adjacency` of `ordering.minimum_degree`,
+    its node k is `affected[k]`.
     """
     cliques = tb.cliques(head)
     nodes, factors, pool_i = tb.nodes(head), tb.factors(head), tb.pool_i(head)
@@ -120,8 +87,18 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     for k in range(n):
         nodes[affected[k]].index = k
         nodes[affected[k]].front = serial
-    orphans = _orphans(head, marked, loose, serial - 1)
-    n_orphans = len(orphans)
+    orphans, n_orphans = np.empty(len(loose) + 16, np.int32), 0
+    for k in range(len(marked)):
+        c = cliques[marked[k]].child
+        while c >= 0:
+            if cliques[c].marked != serial - 1:
+                if n_orphans + len(loose) == len(orphans):
+                    orphans = grown(orphans, 0)
+                orphans[n_orphans] = c
+                n_orphans += 1
+            c = cliques[c].sibling
+    transaction_log.copied(loose, orphans[n_orphans:n_orphans + len(loose)])
+    n_orphans += len(loose)
     # which orphans each node is a member of
     first = np.zeros(n + 1, np.int32)
     n_entries = 0
@@ -156,15 +133,15 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             end += 1
         entry = nodes[affected[k]].factor_list
         while entry >= 0:
-            e, side = entry >> 2, entry & 3
-            for other in _other_ends(factors, e, side):
+            f = factors[entry >> 2]
+            for other in f.ends:
                 if other >= 0 and nodes[other].front == serial:
                     i = nodes[other].index
-                    if last_seen[i] != k:   # each neighbour once
+                    if i != k and last_seen[i] != k:    # each neighbour once
                         last_seen[i] = k
                         adjacency[end] = i
                         end += 1
-            entry = factors[e].next[side]
+            entry = f.next[entry & 3]
     for k in range(n_orphans):
         start[n + k] = end
         row = cliques[orphans[k]]
@@ -173,59 +150,27 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             adjacency[end] = nodes[pool_i[m]].index
             end += 1
     start[n + n_orphans] = end
-    return orphans, start, adjacency
+    return orphans[:n_orphans], start, adjacency
+
+
+@kernel(signature=(tb.HEAD,), allocates=True)
+def analyse(head):  # type: ignore[no-untyped-def]
+    """Return the cliques of a fill-reducing order of all nodes, without storing them."""
+    order = np.arange(head[tb.N_NODES]).astype(np.int32)
+    n_last = newest_last(order, head[tb.NEWEST])
+    priors = prior_rows.all_priors(head)
+    _, start, adjacency = structure(head, np.empty(0, np.int32), priors, order)
+    first, n_frontal, parent, nodes, need_f, need_i, largest = in_postorder(
+        order, minimum_degree(len(order), len(priors), 0, n_last, start, adjacency), 0,
+        RELAXED_ZEROS, RELAXED_FRONTAL, True)
+    for c in priors:
+        n_separator = np.int64(tb.cliques(head)[c].n_separator)
+        need_f += pools.rounded(pools.n_values(0, n_separator))
+        need_i += pools.rounded(n_separator)
+    return Cliques(first, n_frontal, parent, nodes, need_f, need_i, largest)
 
 
 @kernel(allocates=True)
-def amalgamate(  # type: ignore[no-untyped-def]
-    n_cliques, n_frontal, offset, parent, n_apart, most_zeros, most_frontal,
-):
-    """
-    Return into which clique to merge each: a parent where that stores few explicit zero blocks.
-
-    That is itself, or a later one, but never the last, that of the newest pose: the next edge
-    changes it. With them come the numbers of frontal nodes after merging.
-    """
-    into = np.arange(n_cliques).astype(np.int32)
-    frontal = n_frontal[:n_cliques].copy()
-    zeros = np.zeros(n_cliques, np.int32)
-    for k in range(n_cliques - 1):
-        q = parent[k]
-        if q < 0 or q == n_cliques - 1 or k < n_apart <= q:
-            continue
-        separator = offset[k + 1] - offset[k] - n_frontal[k]
-        width = frontal[q] + offset[q + 1] - offset[q] - n_frontal[q]
-        added = zeros[k] + zeros[q] + frontal[k] * (width - separator)
-        if added <= most_zeros and frontal[k] + frontal[q] <= most_frontal:
-            into[k] = q
-            frontal[q] += frontal[k]
-            zeros[q] = added
-    for k in range(n_cliques - 1, -1, -1):
-        into[k] = into[into[k]]
-    return into, frontal
-
-
-def analyse(head: tb.IntHead) -> Analysis:
-    """Return the cliques of a fill-reducing order of all nodes, without storing them."""
-    order = np.arange(int(head[tb.N_NODES])).astype(np.int32)
-    n_last = newest_last(order, int(head[tb.NEWEST]))
-    start, adjacency = _adjacency(head, order)
-    n_priors = len(start) - 1 - len(order)
-    cliques = in_postorder(order, minimum_degree(
-        len(order), n_priors, 0, n_last, start, adjacency), 0, RELAXED_ZEROS, RELAXED_FRONTAL,
-        True)
-    return Analysis(cliques, *_memory_of_all(head, cliques))
-
-
-@kernel(signature=(tb.HEAD, INDICES), allocates=True)
-def _adjacency(head, order):  # type: ignore[no-untyped-def]
-    """Return the lists of neighbours of all nodes, in this order, and of the priors' nodes."""
-    _, start, adjacency = structure(
-        head, np.empty(0, np.int32), prior_rows.all_priors(head), order)
-    return start, adjacency
-
-
-@kernel(signature=(INDICES, ELIMINATED, INTEGER, INTEGER, INTEGER, FLAG), allocates=True)
 def in_postorder(  # type: ignore[no-untyped-def]
     order, eliminated, n_before, most_zeros, most_frontal, sorts,
 ):
@@ -239,18 +184,38 @@ def in_postorder(  # type: ignore[no-untyped-def]
     n_apart = 0
     while n_apart < n_raw and raw_nodes[offset[n_apart]] < n_before:
         n_apart += 1
-    into, n_frontal_of = amalgamate(
-        n_raw, raw_frontal, offset, raw_parent, n_apart, most_zeros, most_frontal)
+    # A clique is merged with its parent where that stores few explicit zero blocks, but not with
+    # the last one, that of the newest pose, which the next edge changes.
+    into = np.arange(n_raw).astype(np.int32)
+    n_frontal_of, zeros = raw_frontal[:n_raw].copy(), np.zeros(n_raw, np.int32)
+    for k in range(n_raw - 1):
+        q = raw_parent[k]
+        if q < 0 or q == n_raw - 1 or k < n_apart <= q:
+            continue
+        separator = offset[k + 1] - offset[k] - raw_frontal[k]
+        width = n_frontal_of[q] + offset[q + 1] - offset[q] - raw_frontal[q]
+        added = zeros[k] + zeros[q] + n_frontal_of[k] * (width - separator)
+        if added <= most_zeros and n_frontal_of[k] + n_frontal_of[q] <= most_frontal:
+            into[k], zeros[q] = q, added
+            n_frontal_of[q] += n_frontal_of[k]
+    for k in range(n_raw - 1, -1, -1):
+        into[k] = into[into[k]]
     raw_order = _postorder(n_raw, into, raw_parent)
     n_cliques = len(raw_order)
     place = np.full(n_raw, -1, np.int32)
     n_frontal = np.empty(n_cliques, np.int32)
     first = np.zeros(n_cliques + 1, np.int32)
+    need_f = need_i = largest = 0
     for k in range(n_cliques):
         q = raw_order[k]
         place[q] = k
         n_frontal[k] = n_frontal_of[q]
-        first[k + 1] = first[k] + n_frontal[k] + offset[q + 1] - offset[q] - raw_frontal[q]
+        n_separator = offset[q + 1] - offset[q] - raw_frontal[q]
+        n_all = n_separator + n_frontal[k]
+        first[k + 1] = first[k] + n_all
+        need_f += pools.rounded(pools.n_values(np.int64(n_frontal[k]), n_separator))
+        need_i += pools.rounded(n_all)
+        largest = max(largest, work_size(n_all))
     parent = np.full(n_cliques + len(raw_parent) - n_raw, -1, np.int32)
     for k in range(len(parent)):
         q = raw_parent[raw_order[k] if k < n_cliques else n_raw + k - n_cliques]
@@ -281,43 +246,7 @@ def in_postorder(  # type: ignore[no-untyped-def]
             filled[k] += 1
     for m in range(len(nodes)):
         nodes[m] = order[nodes[m]]
-    return Cliques(first, n_frontal, parent, nodes)
-
-
-@kernel(signature=(tb.HEAD, CLIQUES), allocates=True)
-def _memory_of_all(head, cliques):  # type: ignore[no-untyped-def]
-    """Return what cliques and priors need in both pools, and work space of the largest front."""
-    need_f, need_i, largest = required_memory(cliques)
-    for c in prior_rows.all_priors(head):
-        n_separator = np.int64(tb.cliques(head)[c].n_separator)
-        need_f += pools.rounded(pools.n_values(0, n_separator))
-        need_i += pools.rounded(n_separator)
-    return need_f, need_i, largest
-
-
-@kernel
-def required_memory(cliques):  # type: ignore[no-untyped-def]
-    """Return what cliques need in both pools, and work space of the largest front."""
-    need_f, need_i, largest = np.int64(0), np.int64(0), np.int64(0)
-    for k in range(len(cliques.n_frontal)):
-        n_all = np.int64(cliques.first[k + 1] - cliques.first[k])
-        n_frontal = np.int64(cliques.n_frontal[k])
-        need_f += pools.rounded(pools.n_values(n_frontal, n_all - n_frontal))
-        need_i += pools.rounded(n_all)
-        largest = max(largest, work_size(n_all))
-    return need_f, need_i, largest
-
-
-@kernel(signature=(CLIQUES, INTEGER), allocates=True)
-def trees(cliques, n_nodes):  # type: ignore[no-untyped-def]
-    """Return the root of the tree of cliques, a part of the graph, that each node is in."""
-    first, n_frontal, parent, nodes = cliques
-    root, of_node = np.empty(len(n_frontal), np.int32), np.empty(n_nodes, np.int32)
-    for k in range(len(n_frontal) - 1, -1, -1):
-        root[k] = root[parent[k]] if parent[k] >= 0 else k
-        for m in range(first[k], first[k] + n_frontal[k]):
-            of_node[nodes[m]] = root[k]
-    return of_node
+    return Cliques(first, n_frontal, parent, nodes, need_f, need_i, largest)
 
 
 @kernel(allocates=True)
@@ -388,7 +317,7 @@ def plant_all(head, cliques):  # type: ignore[no-untyped-def]
     """
     Replace all cliques in the tables by those of a symbolic factorisation, without values.
 
-    The pools must have been enlarged by what `Analysis` requires. The rows are in the order of the
+    The pools must have been enlarged by what the cliques need. The rows are in the order of the
     elimination, behind those of the priors. No node is touched afterwards, and the log of the
     update is empty: a rollback is not possible.
     """

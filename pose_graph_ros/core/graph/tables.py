@@ -311,7 +311,7 @@ class Memory:
         for name in NAMES:
             self.ensure(name, 1 if name == 'scalars' else {
                 'pool_f': 32, 'pool_i': 4}.get(name, 1) * FIRST_ROWS)
-        self.ensure('work_f', 256)  # for `chain` and `relinearization`; fronts ask for more
+        self.ensure('work_f', 256)  # for `chain` and `step`; fronts ask for more
         self.ensure('log', 64)  # for `transaction_log.begin` of an empty graph
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:

@@ -92,48 +92,33 @@ def descend(stacked, blocks, redundant):  # type: ignore[no-untyped-def]
     # J A^-1 J^T and J (I - A)^-1 J^T
     inside, gap = np.empty((n_rows, n_rows)), np.empty((n_rows, n_rows))
     step, trial = np.zeros(blocks.shape), np.empty(blocks.shape)
+    now, way, then = (blocks.reshape(blocks.size), step.reshape(step.size),
+                      trial.reshape(trial.size))
     for mu in _BARRIERS:
         for _ in range(_MAX_STEPS):
-            A = _information(stacked, blocks)
+            A, below_one = _information(stacked, blocks)
             _products(stacked, A, inside)
-            _products(stacked, _below_one(A), gap)
+            _products(stacked, below_one, gap)
             decrement = _newton(stacked, blocks, inside, gap, mu, redundant, step)
             before, length = _value(stacked, blocks, mu, redundant), 1.0
             while length > 1e-9:
-                _add_scaled(blocks, length, step, trial)
+                for k in range(len(now)):
+                    then[k] = now[k] + length * way[k]
                 if (_value(stacked, trial, mu, redundant)
                         <= before - _DESCENT * length * decrement):
-                    _add_scaled(blocks, length, step, blocks)
+                    for k in range(len(now)):
+                        now[k] = then[k]
                     break
                 length *= 0.5
             if decrement < mu:
                 break
 
 
-@kernel
-def _add_scaled(blocks, length, step, out):  # type: ignore[no-untyped-def]
-    for m in range(len(blocks)):
-        for p in range(3):
-            for q in range(3):
-                out[m, p, q] = blocks[m, p, q] + length * step[m, p, q]
-
-
-@kernel(allocates=True)
-def _below_one(A):  # type: ignore[no-untyped-def]
-    """Return I - A; loops, as an expression of arrays takes seconds to compile."""
-    r = len(A)
-    out = np.empty((r, r))
-    for k in range(r):
-        for m in range(r):
-            out[k, m] = (1.0 if k == m else 0.0) - A[k, m]
-    return out
-
-
 @kernel(allocates=True, fastmath=_FAST)
 def _information(stacked, blocks):  # type: ignore[no-untyped-def]
-    """Return A, shape (r, r)."""
+    """Return A and I - A, shape (r, r)."""
     r = stacked.shape[1]
-    A, weighted = np.zeros((r, r)), np.empty(r)
+    A, below_one, weighted = np.zeros((r, r)), np.empty((r, r)), np.empty(r)
     for m in range(len(blocks)):
         for p in range(3):
             row = stacked[3 * m + p]
@@ -145,13 +130,20 @@ def _information(stacked, blocks):  # type: ignore[no-untyped-def]
                 value = row[k]
                 for q in range(r):
                     A[k, q] += value * weighted[q]
-    return A
+    for k in range(r):  # loops, as an expression of arrays takes seconds to compile
+        for q in range(r):
+            below_one[k, q] = (1.0 if k == q else 0.0) - A[k, q]
+    return A, below_one
 
 
 @kernel(fastmath=_FAST)
 def _factorize(A):  # type: ignore[no-untyped-def]
-    """Replace the lower triangle by L with `A = L L^T`; False if A is not positive definite."""
-    n = len(A)
+    """
+    Replace the lower triangle by L with `A = L L^T`; return `log det A`.
+
+    It is minus infinity if A is not positive definite.
+    """
+    n, log_det = len(A), 0.0
     for k in range(n):
         for m in range(k + 1):
             value = A[k, m]
@@ -161,17 +153,10 @@ def _factorize(A):  # type: ignore[no-untyped-def]
                 A[k, m] = value / A[m, m]
             elif value > 0.0:
                 A[k, k] = math.sqrt(value)
+                log_det += 2.0 * math.log(A[k, k])
             else:
-                return False
-    return True
-
-
-@kernel
-def _log_det(L):  # type: ignore[no-untyped-def]
-    total = 0.0
-    for k in range(len(L)):
-        total += math.log(L[k, k])
-    return 2.0 * total
+                return -np.inf
+    return log_det
 
 
 @kernel(allocates=True, fastmath=_FAST)
@@ -200,20 +185,13 @@ def _products(stacked, A, out):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def _value(stacked, blocks, mu, redundant):  # type: ignore[no-untyped-def]
     """Return what is minimised; infinite where A or W are not inside."""
-    A = _information(stacked, blocks)
-    r = len(A)
-    other, total = _below_one(A), 0.0
-    for k in range(r):
+    A, below_one = _information(stacked, blocks)
+    total = 0.0
+    for k in range(len(A)):
         total += A[k, k]
-    if not _factorize(A) or not _factorize(other):
-        return np.inf
-    total -= _log_det(A) + mu * _log_det(other)
-    if redundant != 0:
-        for m in range(len(blocks)):
-            W = _padded(blocks[m])
-            if not _factorize(W):
-                return np.inf
-            total -= mu * _log_det(W)
+    total -= _factorize(A) + mu * _factorize(below_one)
+    for m in range(len(blocks) if redundant != 0 else 0):
+        total -= mu * _factorize(_padded(blocks[m]))
     return total
 
 

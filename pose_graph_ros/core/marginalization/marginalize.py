@@ -107,10 +107,15 @@ def marginal(
     kept = kept[np.any(np.any(U != 0.0, axis=1).reshape(-1, 3), axis=1)]
     if len(kept) == 0:
         return None
-    says = np.flatnonzero(np.isin(columns // 3, kept))
+    says, factors_of = np.flatnonzero(np.isin(columns // 3, kept)), part.factors
+    only_poses = bool(np.all(part.is_pose[kept]))
+    relative = [*_RELATIVE, *(_TO_LANDMARKS if only_poses else ())]
+    # whether a constraint knows where its nodes are in the map, of which some remain
+    anchored = (
+        bool(np.any(inside & fixed)) or any(prior.anchored for prior in part.priors)
+        or not np.all(np.isin(factors_of.kind, relative) & (only_poses | (factors_of.k < 0))))
     return Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
-                 _symmetric(U[np.ix_(says, says)]), u[says], energy,
-                 bool(np.any(inside & fixed)) or _is_anchored(part, part.node_ids[kept]))
+                 _symmetric(U[np.ix_(says, says)]), u[says], energy, anchored)
 
 
 def schur_complement(
@@ -137,8 +142,7 @@ def standing_for(rows: GraphRows) -> Factors:
         linear = model(prior, rows.poses[at], is_pose)
         if not np.any(is_pose):
             continue
-        U, u = schur_complement(
-            linear.information, -linear.gradient, np.flatnonzero(~is_pose))
+        U, u = schur_complement(linear.information, -linear.gradient, np.flatnonzero(~is_pose))
         if not np.any(np.diagonal(U) > 1e-12):
             continue    # it tells of biases alone, but for rounding
         sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
@@ -198,26 +202,14 @@ def _ends(factors: Factors) -> IntArray:
     return np.stack((factors.i, factors.j, factors.k))
 
 
-def _is_anchored(graph: Graph, kept: IntArray) -> bool:
-    """Tell whether a constraint knows where its nodes are in the map, of which some remain."""
-    factors = graph.factors
-    only_poses = bool(np.all(graph.is_pose[graph.node_rows(kept)]))
-    relative = [*_RELATIVE, *(_TO_LANDMARKS if only_poses else ())]
-    turn = np.isin(factors.kind, relative) & (only_poses | (factors.k < 0))
-    return not np.all(turn) or any(prior.anchored for prior in graph.priors)
-
-
-def _part(
-    graph: Graph, leaving: IntArray, more: Sequence[int], without: Sequence[int],
-) -> Graph:
+def _part(graph: Graph, leaving: IntArray, more: Sequence[int], without: Sequence[int]) -> Graph:
     """Return the part of a graph with the factors of leaving nodes and further ones."""
     factors = graph.factors
     ids = np.union1d(graph.factors_on(leaving), np.array(more, dtype=np.int64))
     chosen = np.isin(graph.factor_ids, np.setdiff1d(ids, without)) & (factors.weight > 0.0)
     priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
     ends = _ends(factors)[:, chosen].ravel()
-    ids = np.unique(np.concatenate((
-        leaving, ends[ends >= 0], *(each.nodes for each in priors))))
+    ids = np.unique(np.concatenate((leaving, ends[ends >= 0], *(each.nodes for each in priors))))
     return part_of(graph, ids, chosen, priors)
 
 

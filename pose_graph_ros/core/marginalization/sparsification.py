@@ -140,7 +140,10 @@ def _basis(
     scaled = 0.5 * (information + information.T) * scale[:, None] * scale
     n_gauge = 0
     if not anchored:
-        gauge = np.linalg.qr(_rigid_motions(poses) / scale[:, None])[0]
+        motions = np.tile(np.eye(3), (len(poses), 1))   # of all poses as one body
+        motions[0::3, 2] = -(poses[:, 1] - poses[0, 1])
+        motions[1::3, 2] = poses[:, 0] - poses[0, 0]
+        gauge = np.linalg.qr(motions / scale[:, None])[0]
         n_gauge = 3
         scaled = scaled - gauge @ (gauge.T @ scaled)
         scaled = scaled - (scaled @ gauge) @ gauge.T
@@ -173,14 +176,6 @@ def _minimum(basis: FloatArray, vector: FloatArray, n_poses: int) -> FloatArray:
         delta = basis @ (wanted - left @ (gain * (left.T @ wanted)))
         damping *= 4.0
     return np.asarray(delta)
-
-
-def _rigid_motions(poses: FloatArray) -> FloatArray:
-    """Return the displacements of all poses as one body, shape (3 k, 3)."""
-    motions = np.tile(np.eye(3), (len(poses), 1))
-    motions[0::3, 2] = -(poses[:, 1] - poses[0, 1])
-    motions[1::3, 2] = poses[:, 0] - poses[0, 0]
-    return motions
 
 
 def _candidates(
@@ -246,9 +241,7 @@ def _spanning_tree(found: _Candidates, n: int) -> IntArray:
     return np.sort(row[tree.nonzero()])
 
 
-def _overestimated(
-    found: _Candidates, chosen: IntArray, blocks: FloatArray,
-) -> IntArray:
+def _overestimated(found: _Candidates, chosen: IntArray, blocks: FloatArray) -> IntArray:
     """Return the other candidates by how much the chosen ones overestimate their covariance."""
     information = np.einsum('mir,mij,mjs->rs', found.rows[chosen], blocks, found.rows[chosen])
     covariance = np.linalg.pinv(information, hermitian=True)

@@ -50,10 +50,6 @@ class Rotation(NamedTuple):
     variance: float  # by the white noise and the error of the scale [rad^2]
     seconds: float
 
-    def without(self, part: 'Rotation') -> 'Rotation':
-        """Return the rotation during the rest of the time."""
-        return Rotation(*(whole - less for whole, less in zip(self, part, strict=True)))
-
 
 class RateIntegral:
     """The integral of the polygon through at least two samples, given by rates and variances."""
@@ -209,7 +205,7 @@ class GyroStream(ReorderBuffer[YawRate]):
     def configure(self, source: GyroSource) -> None:
         """Set the settings for samples that are not integrated yet."""
         self._source = source
-        self._set_window(source.reorder_window)
+        self._window_ns = round(source.reorder_window * 1e9)
 
     @property
     def samples(self) -> tuple[YawRate, ...]:
@@ -341,31 +337,24 @@ class Gyros:
         rotation = integral.between(start_ns, end_ns)
         at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
         self.counts[source, 'rotations'] += 1
-        self._compare(source, integral, start_ns, end_ns)
+        odometry = nodes.streams[nodes.primary_at(end_ns)]
+        if odometry.timeline.covers(start_ns) and odometry.timeline.covers(end_ns):
+            motion = odometry.timeline.motion(start_ns, end_ns)
+            stream.agreement.add(
+                float(se2.wrap(rotation.angle - motion.increment[2])), rotation.seconds,
+                integral.rate(end_ns) - integral.rate(start_ns), rotation.angle,
+                rotation.variance + float(odometry.covariance(motion)[2, 2]))
         i, j = nodes.ids[node - 1:node + 1].tolist()
         middle_ns = (start_ns + end_ns) // 2
         if at_rest.seconds == 0.0:
             self.new.append(Turn(source, i, j, middle_ns, *rotation))
             return
-        angle, variance, seconds = rotation.without(at_rest)
         self.new.append(Turn(
-            source, i, j, middle_ns, angle + creep, variance + creep_variance, seconds,
+            source, i, j, middle_ns, rotation.angle - at_rest.angle + creep,
+            rotation.variance - at_rest.variance + creep_variance,
+            rotation.seconds - at_rest.seconds,
             (at_rest.angle - creep) / at_rest.seconds,
             (at_rest.variance + creep_variance) / at_rest.seconds**2))
-
-    def _compare(
-        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
-    ) -> None:
-        """Compare the rotation between two stamps [ns] with that by odometry."""
-        stream = self._nodes.streams[self._nodes.primary_at(end_ns)]
-        if not (stream.timeline.covers(start_ns) and stream.timeline.covers(end_ns)):
-            return
-        motion, rotation = stream.timeline.motion(start_ns, end_ns), integral.between(
-            start_ns, end_ns)
-        self.streams[source].agreement.add(
-            float(se2.wrap(rotation.angle - motion.increment[2])), rotation.seconds,
-            integral.rate(end_ns) - integral.rate(start_ns), rotation.angle,
-            rotation.variance + float(stream.covariance(motion)[2, 2]))
 
     def _at_rest(
         self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
@@ -384,7 +373,8 @@ class Gyros:
             rest = integral.between(begin_ns, until_ns)
             if abs(rest.angle) > most * rest.seconds:
                 continue
-            total = Rotation(*(one + more for one, more in zip(total, rest, strict=True)))
+            total = Rotation(total.angle + rest.angle, total.variance + rest.variance,
+                             total.seconds + rest.seconds)
             creep += float(timeline.motion(begin_ns, until_ns).increment[2])
             variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
         return total, creep, variance
@@ -410,8 +400,7 @@ class Gyros:
         """
         for source, bias in biases.items() if start_ns < end_ns else ():
             stream = self.streams.get(source)
-            integral = None if stream is None else stream.integral(
-                start_ns, end_ns, to_come=True)
+            integral = None if stream is None else stream.integral(start_ns, end_ns, to_come=True)
             if integral is not None:
                 angle, variance, seconds = integral.between(start_ns, end_ns)
                 return angle - bias * seconds, variance

@@ -17,14 +17,13 @@ from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.jumps import gap_motion
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
 from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, SavedSpan
-from pose_graph_ros.core.odometry.several_sources import (
+from pose_graph_ros.core.odometry.stream import (
     choose_first,
     find_silence,
     first_with_sample,
-    Silence,
+    OdometryStream,
 )
-from pose_graph_ros.core.odometry.stream import OdometryStream
-from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline, Row
+from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 from pose_graph_ros.core.saved_columns import as_matrix, as_pose
 
 
@@ -42,8 +41,8 @@ class HiddenNodes(NodeTable):
     """
     The hidden nodes by stamp, and the odometry that makes them.
 
-    A settled sample of the primary source (`several_sources`) makes a node if one is due by the
-    node policy, with an edge from the node before. The other sources add edges between them.
+    A settled sample of the primary source (see `stream`) makes a node if one is due by the node
+    policy, with an edge from the node before. The other sources add edges between them.
 
     `make_node` returns the id of a new node in the graph, or -1 if there is none: it is then tried
     again at the next sample.
@@ -112,7 +111,9 @@ class HiddenNodes(NodeTable):
 
     def add_sample(self, sample: OdometrySample, source: str) -> Answer:
         """Return the answer to a sample of a source, after making what is due."""
-        stream = self.streams.get(source) or self._make_stream(source)
+        if source not in self.streams:
+            self.streams[source] = OdometryStream(self._config.odometry_source(source))
+        stream = self.streams[source]
         answer = stream.add(sample)
         self._process(source, stream.settle())
         return answer
@@ -130,10 +131,6 @@ class HiddenNodes(NodeTable):
         """Return the new edges of the other sources with their sources' names; forget them."""
         edges, self._secondary = self._secondary, []
         return edges
-
-    def _make_stream(self, source: str) -> OdometryStream:
-        stream = self.streams[source] = OdometryStream(self._config.odometry_source(source))
-        return stream
 
     def _process(self, source: str, settled: Iterable[tuple[int, Pose]]) -> None:
         """Make the nodes and edges that are due after settling samples of a source."""
@@ -174,11 +171,9 @@ class HiddenNodes(NodeTable):
         silence = find_silence(
             self.streams, [self.primary, *others], self.covered_ns, (source, settled_ns),
             self._patience_ns)
-        if silence is not None:
-            self._switch(silence, others)
-
-    def _switch(self, silence: Silence, others: list[str]) -> None:
-        """Make another source the primary one after the last sample before a silence."""
+        if silence is None:
+            return
+        # another source makes the nodes after the last sample before the silence
         old, last_ns = self.streams[self.primary], silence.last_ns
         for stamp_ns, pose in old.settle(last_ns):
             self._extend(stamp_ns, pose)
@@ -193,11 +188,13 @@ class HiddenNodes(NodeTable):
         else:
             # the new primary source has no sample at the newest node
             begin_ns = int(timeline.stamps_ns[0])
-            self._span = self._motion_since_node(old, min(begin_ns, last_ns))
+            self._span = self._since_node(
+                old, old.timeline.motion(self._base_ns, min(begin_ns, last_ns)))
             self._base_ns = begin_ns
             if begin_ns > last_ns:
-                self._span = self._after_span(
-                    *gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns))
+                mean, noise = gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns)
+                self._span = (se2.compose(self._span[0], mean),
+                              passed_on(mean, self._span[1], noise))
         self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
         self._catch_up()
 
@@ -209,8 +206,9 @@ class HiddenNodes(NodeTable):
         the pose of the robot in it, with its covariance in the frame at the end. Returns the id of
         the new node in the graph, or -1 if it could not be made.
         """
-        timeline = self.streams[self.primary].timeline
-        moved = self._motion_since_node(self.streams[self.primary], self.covered_ns)[0]
+        stream = self.streams[self.primary]
+        timeline = stream.timeline
+        moved = self._since_node(stream, timeline.motion(self._base_ns, self.covered_ns))[0]
         node = self._make_node(NewNode(mean, covariance.information(noise), self.primary))
         if node < 0:
             return node
@@ -220,9 +218,9 @@ class HiddenNodes(NodeTable):
             stamp_ns, node, as_pose(timeline.poses[-1]), se2.compose(self.odometry[-1], moved))
         self._base_ns = self.covered_ns
         # no secondary edge spans the step to the new pose
-        for source, stream in self.streams.items():
+        for source, other in self.streams.items():
             if source != self.primary:
-                stream.tie_from(len(self) - 1, reached=False)
+                other.tie_from(len(self) - 1, reached=False)
         return node
 
     def _catch_up(self) -> None:
@@ -253,7 +251,7 @@ class HiddenNodes(NodeTable):
             return
         stream = self.streams[self.primary]
         motion = stream.timeline.motion(self._base_ns, stamp_ns)
-        mean, noise = self._after_span(motion.increment, stream.covariance(motion))
+        mean, noise = self._since_node(stream, motion)
         known, noise = self._corrected(mean, noise, stamp_ns)
         node = self._make_node(NewNode(
             known, covariance.information(noise), self.primary, stamp_ns,
@@ -283,15 +281,11 @@ class HiddenNodes(NodeTable):
         return (self.errors.motions(mean[None], seconds)[0],
                 self.errors.covariances(noise[None])[0])
 
-    def _motion_since_node(
-        self, stream: OdometryStream, stamp_ns: int,
+    def _since_node(
+        self, stream: OdometryStream, motion: Motion, *, floor: bool = True,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the motion from the newest node to a stamp [ns], and its covariance."""
-        motion = stream.timeline.motion(self._base_ns, stamp_ns)
-        return self._after_span(motion.increment, stream.covariance(motion))
-
-    def _after_span(self, mean: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Append a motion and its covariance to those from the newest node to `_base_ns`."""
+        """Return a motion from `_base_ns` on as one from the newest node, and its covariance."""
+        mean, noise = motion.increment, stream.covariance(motion, floor=floor)
         if self._span is None:
             return mean, noise
         return se2.compose(self._span[0], mean), passed_on(mean, self._span[1], noise)
@@ -324,9 +318,12 @@ class HiddenNodes(NodeTable):
         node_ns = int(self.stamps_ns[node])
         stream = self.streams[self.primary_at(max(stamp_ns, node_ns))]
         if node_ns <= stamp_ns < self._samples_since_ns:
-            motion = self._between_nodes(node, stamp_ns)
-            return self.attachment(
-                node, motion.increment, stream.covariance(motion, floor=False))
+            # to before the next node, without the samples there
+            first = next_row(None, node_ns, as_pose(self.odometry[node - self.n_frozen]))
+            after = next_row(first, int(self.stamps_ns[node + 1]),
+                             as_pose(self.odometry[node + 1 - self.n_frozen]))
+            motion = OdometryTimeline((first, after)).motion(node_ns, stamp_ns)
+            return self.attachment(node, motion.increment, stream.covariance(motion, floor=False))
         if not (stream.timeline.covers(node_ns) and stream.timeline.covers(stamp_ns)):
             return None
         motion = stream.timeline.motion(min(node_ns, stamp_ns), max(node_ns, stamp_ns))
@@ -340,17 +337,8 @@ class HiddenNodes(NodeTable):
         """Return the newest node and the motion to a later stamp [ns], settled or not."""
         stream = self.streams[self.primary]
         motion = stream.motion_ahead(self._base_ns, stamp_ns)
-        return None if motion is None else Attachment(int(self.ids[-1]), *self._after_span(
-            motion.increment, stream.covariance(motion, floor=False)))
-
-    def _between_nodes(self, node: int, stamp_ns: int) -> Motion:
-        """Return the motion from a node to before the next one, without the samples there."""
-        rows: list[Row] = []
-        for number in (node, node + 1):
-            rows.append(next_row(
-                rows[-1] if rows else None, int(self.stamps_ns[number]),
-                as_pose(self.odometry[number - self.n_frozen])))
-        return OdometryTimeline(rows).motion(int(self.stamps_ns[node]), stamp_ns)
+        return None if motion is None else Attachment(
+            int(self.ids[-1]), *self._since_node(stream, motion, floor=False))
 
     def drop_samples(self, newest: int) -> None:
         """
@@ -390,8 +378,7 @@ class HiddenNodes(NodeTable):
         stream, newest_ns = self.streams[self.primary], max(
             self.newest_ns, int(self.stamps_ns[-1]))
         motion, raw = stream.newest(self._base_ns)
-        mean, noise = self._corrected(*self._after_span(
-            motion.increment, stream.covariance(motion, floor=False)), newest_ns)
+        mean, noise = self._corrected(*self._since_node(stream, motion, floor=False), newest_ns)
         moving = self._moving(motion, newest_ns)
         if moving > 0.0:
             mean = calibration.motions(mean[None], np.array([moving]))[0]
@@ -419,7 +406,8 @@ class HiddenNodes(NodeTable):
         if saved.bridge is not None:
             self._span = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)
         for name, stream in saved.streams.items():
-            self._make_stream(name).restore(stream)
+            self.streams[name] = OdometryStream(self._config.odometry_source(name))
+            self.streams[name].restore(stream)
         self.relocated = {*saved.relocated.tolist()}
         if len(saved.errors) > 0:
             self.errors = OdometryErrors(*saved.errors.tolist())

@@ -77,9 +77,7 @@ def step_variance(
     return x, y, theta
 
 
-def odometry_covariance(
-    noise: OdometryNoise, motion: Motion, *, floor: bool = True,
-) -> FloatArray:
+def odometry_covariance(noise: OdometryNoise, motion: Motion, *, floor: bool = True) -> FloatArray:
     """
     Return the covariance, shape (3, 3), of a motion by odometry in the frame at its end.
 

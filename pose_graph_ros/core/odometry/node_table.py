@@ -10,40 +10,29 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import (
-    Covariance,
-    Covariances,
-    FloatArray,
-    IntArray,
-    Pose,
-    Poses,
-    PoseVector,
-)
-from pose_graph_ros.core.graph.constraints import full
+from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Pose, Poses
+from pose_graph_ros.core.graph.constraints import full, upper
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Integers, Matrix, Numbers, Rows3, Rows6
 
 
-def _no_integers() -> IntArray:
-    return np.empty(0, dtype=np.int64)
-
-
 class Place(NamedTuple):
     """Where a node is relative to another one."""
 
     anchor: int  # number of the node that stands for it
-    mean: PoseVector  # pose in the anchor
-    noise: Covariance  # of that pose, in the frame of the node
+    mean: se2.PoseVector  # pose in the anchor
+    noise: se2.Covariance  # of that pose, in the frame of the node
 
 
 @dataclass(frozen=True, slots=True)
 class ThinnedPlaces:
     """Nodes that have left although older ones stay, each with its place relative to another."""
 
-    numbers: Integers = field(default_factory=_no_integers)  # of the nodes, ascending
-    anchors: Integers = field(default_factory=_no_integers)  # numbers of those beside them
+    # numbers of the nodes, ascending, and of those beside them
+    numbers: Integers = field(default_factory=lambda: np.empty(0, np.int64))
+    anchors: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     relative: Rows3 = field(default_factory=lambda: np.empty((0, 3)))  # poses in the anchors
     # upper triangles of the covariances of these poses, in the frames of the nodes
     noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
@@ -82,12 +71,12 @@ class ThinnedNodes:
             self._rows.values['anchor'][-more:] = -1
         table = self._rows.values
         table['anchor'][rows], table['relative'][rows] = anchors, relative
-        table['noise'][rows] = _upper(noise)
+        table['noise'][rows] = upper(noise)
         self._size += len(rows)
         passed = np.flatnonzero(np.isin(table['anchor'], numbers))
         own, before = table[passed], table[table['anchor'][passed] - self._first]
         mean = own['relative'].astype(np.float64)
-        table['noise'][passed] = _upper(
+        table['noise'][passed] = upper(
             passed_on(mean, _full(before['noise']), _full(own['noise'])))
         table['relative'][passed] = se2.compose(before['relative'].astype(np.float64), mean)
         table['anchor'][passed] = before['anchor']
@@ -135,10 +124,6 @@ def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArr
     return np.asarray(adjoint @ first @ np.swapaxes(adjoint, -1, -2) + then)
 
 
-def _upper(matrices: Covariances) -> FloatArray:
-    return matrices[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
-
-
 def _full(triangles: FloatArray) -> Covariances:
     return full(triangles.astype(np.float64))
 
@@ -174,7 +159,7 @@ class SavedNodes:
     # of the edges stand for them
     errors: Numbers = field(default_factory=lambda: np.empty(0))
     # numbers of the nodes at which the robot was put by hand; empty in older files
-    relocated: Integers = field(default_factory=_no_integers)
+    relocated: Integers = field(default_factory=lambda: np.empty(0, np.int64))
 
     def poses(self, node_ids: IntArray, poses: Poses) -> Poses:
         """Return the poses of all nodes."""
@@ -241,7 +226,7 @@ class NodeTable:
         steps = np.diff(self.odometry[:, :2], axis=0)
         return np.cumsum(np.append(self._travelled, np.hypot(steps[:, 0], steps[:, 1])))
 
-    def append(self, stamp_ns: int, node: int, odometry: PoseVector) -> None:
+    def append(self, stamp_ns: int, node: int, odometry: se2.PoseVector) -> None:
         """Append a node."""
         self._stamps.append_one(stamp_ns)
         self._ids.append_one(node)
@@ -262,7 +247,7 @@ class NodeTable:
                 present[thinned.anchors - first], thinned.relative)
         return present
 
-    def attachment(self, number: int, mean: PoseVector, noise: Covariance) -> Attachment:
+    def attachment(self, number: int, mean: se2.PoseVector, noise: se2.Covariance) -> Attachment:
         """Return the attachment of a motion from a node, or from the one that stands for it."""
         place = self.thinned.place(number)
         if place is None:
@@ -274,21 +259,15 @@ class NodeTable:
         """Return whether a node has left the graph, by its number."""
         return number < self.n_frozen or self.thinned.place(number) is not None
 
-    def thin(
-        self, ids: IntArray, anchors: IntArray, relative: Poses, noise: Covariances,
-    ) -> None:
+    def thin(self, ids: IntArray, anchors: IntArray, relative: Poses, noise: Covariances) -> None:
         """Let nodes leave, each with its place relative to a node that stays."""
         self.thinned.add(
             np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors), relative, noise)
 
-    def move_frozen(self, T: PoseVector) -> None:
+    def move_frozen(self, T: se2.PoseVector) -> None:
         """Move the frozen poses by a rigid motion of the map."""
         if self.n_frozen > 0:
-            self.set_frozen(se2.compose(T, self._frozen.values))
-
-    def set_frozen(self, poses: Poses) -> None:
-        """Set the frozen poses."""
-        self._frozen.values[:] = poses
+            self._frozen.values[:] = se2.compose(T, self._frozen.values)
 
     def fill(self, saved: SavedNodes) -> None:
         """Fill this empty table."""

@@ -3,11 +3,12 @@
 """Samples of one source that wait, in the order of stamps, until no older one can come."""
 
 import bisect
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+import operator
 from typing import Generic, Protocol, TypeVar
 
 from pose_graph_ros.core.measurements import Answer, LARGEST_STAMP, rejected
-from pose_graph_ros.core.quantities import Seconds, StampNs
+from pose_graph_ros.core.quantities import StampNs
 
 # A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
 # stamps of this number of consecutive samples that came after it.
@@ -24,6 +25,7 @@ class Stamped(Protocol):
 
 
 Sample = TypeVar('Sample', bound=Stamped)
+stamp_of: Callable[[Stamped], StampNs] = operator.attrgetter('stamp_ns')
 
 
 class ReorderBuffer(Generic[Sample]):
@@ -39,7 +41,7 @@ class ReorderBuffer(Generic[Sample]):
         self.n_dropped = 0  # accepted samples that were dropped later, as they were far ahead
         self.settled_ns = -1  # stamp of the newest settled sample; -1 before the first [ns]
         self._waiting: list[Sample] = []
-        self._what, self._window_ns = what, 0
+        self._what, self._window_ns = what, 0  # [ns]
         self._n_behind = 0  # consecutive received samples that are far behind the newest one
 
     @property
@@ -50,9 +52,6 @@ class ReorderBuffer(Generic[Sample]):
     def _was_settled(self, stamp_ns: StampNs) -> bool:
         """Tell whether there was a settled sample with a stamp."""
         raise NotImplementedError
-
-    def _set_window(self, window: Seconds) -> None:
-        self._window_ns = round(window * 1e9)
 
     def _settle(self, until_ns: StampNs | None = None) -> Iterator[Sample]:
         """
@@ -92,8 +91,3 @@ class ReorderBuffer(Generic[Sample]):
             del samples[kept:]
             self._n_behind = 0
         return at
-
-
-def stamp_of(sample: Stamped) -> StampNs:
-    """Return the stamp of a sample, as a key to sort by."""
-    return sample.stamp_ns

@@ -1,9 +1,18 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One source of odometry: its samples in the order of their stamps, without jumps."""
+"""
+One source of odometry: its samples in the order of their stamps, without jumps.
+
+Of several sources the primary one makes the nodes; the others add edges. The preferred source
+becomes the primary one unless it begins later than another by more than the patience. A primary
+source that is silent for longer than the patience is replaced by the most preferred source that
+has samples then. The choice depends on the stamps alone if all sources deliver samples in the
+order of stamps, up to the reorder window: when one source settles a stamp, the earlier samples of
+all sources are known.
+"""
 
 import bisect
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -12,14 +21,7 @@ import numpy as np
 
 from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.se2 import (
-    between_one,
-    compose_one,
-    FloatArray,
-    IntArray,
-    Pose,
-    wrap_one,
-)
+from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, IntArray, Pose
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import (
     ACCEPTED,
@@ -28,17 +30,7 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     rejected,
 )
-from pose_graph_ros.core.odometry.jumps import (
-    is_jump,
-    JUMP_SIGMA,
-    MEMORY_TIME,
-    RESTART_VARIANCE,
-    RESUMED_WITHIN,
-    SPEED_TIME_NS,
-    Speeds,
-    SpeedWindow,
-    UNKNOWN,
-)
+from pose_graph_ros.core.odometry import jumps
 from pose_graph_ros.core.odometry.motion import (
     integrated,
     Motion,
@@ -48,7 +40,7 @@ from pose_graph_ros.core.odometry.motion import (
 )
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
-from pose_graph_ros.core.quantities import StampsNs
+from pose_graph_ros.core.quantities import StampNs, StampsNs
 from pose_graph_ros.core.saved_columns import Flags, Integers, Rows8
 
 NO_TWIST: Pose = (0.0, 0.0, 0.0)
@@ -72,7 +64,7 @@ class Instant(NamedTuple):
     row: Row  # the sample in a frame without jumps, with its sums
     # pose of the odometry frame in the frame without jumps; None before the first jump
     offset: Pose | None
-    window: SpeedWindow  # speeds of the robot by this odometry
+    window: jumps.SpeedWindow  # speeds of the robot by this odometry
     jumped: bool  # whether odometry jumped to this sample
     restarted: bool = False  # whether odometry restarted at this sample, after a graph was loaded
     twist: Pose = NO_TWIST  # as `Received.twist`
@@ -131,7 +123,7 @@ class OdometryStream(ReorderBuffer[Received]):
             # the variances of the timeline contain all of the noise
             self._noise = replace(source.noise, sigma_distance=0.0, sigma_lateral=0.0,
                                   sigma_heading_distance=0.0, sigma_heading_turn=0.0)
-        self._set_window(source.reorder_window)
+        self._window_ns = round(source.reorder_window * 1e9)
         # samples not settled yet get the new settings, even if their states were computed before
         self._ahead.clear()
 
@@ -151,7 +143,7 @@ class OdometryStream(ReorderBuffer[Received]):
                 return rejected('too_large' if all(map(math.isfinite, numbers)) else 'not_finite',
                                 f'{what} {numbers}')
         at = self._insert(Received(
-            sample.stamp_ns, (x, y, wrap_one(theta)),
+            sample.stamp_ns, (x, y, se2.wrap_one(theta)),
             sample.speed if math.isfinite(sample.speed) else 0.0,
             None if variance is None else tuple(
                 np.nan_to_num(variance, posinf=0.0, neginf=0.0).tolist()), twist))
@@ -176,7 +168,11 @@ class OdometryStream(ReorderBuffer[Received]):
             ahead = self._ahead.pop(0) if self._ahead else None
             before, self._last = self._last, ahead or self._next_instant(self._last, sample)
             if self._last.jumped and before is not None:
-                self.jump = _described(before, self._last)
+                x, y, turn = between_one(before.raw, self._last.raw)
+                begin_ns, end_ns = before.row.stamp_ns, self._last.row.stamp_ns
+                self.jump = (
+                    f'by {math.hypot(x, y):.2f} m and {math.degrees(turn):.1f} degrees within '
+                    f'{(end_ns - begin_ns) * 1e-9:.3f} s at {end_ns * 1e-9:.3f} s')
             self.n_jumps += self._last.jumped
             if self._last.restarted:
                 self.restarted_ns = self._last.row.stamp_ns
@@ -190,7 +186,7 @@ class OdometryStream(ReorderBuffer[Received]):
 
     def forget(self, before_ns: int) -> None:
         """Drop settled samples that motions from an instant [ns] on do not depend on."""
-        self.timeline.drop_before(min(before_ns, self.settled_ns - SPEED_TIME_NS))
+        self.timeline.drop_before(min(before_ns, self.settled_ns - jumps.SPEED_TIME_NS))
 
     def first_after(self, stamp_ns: int) -> int | None:
         """
@@ -314,20 +310,29 @@ class OdometryStream(ReorderBuffer[Received]):
         """Return the state at a sample from the state at the sample before."""
         stamp_ns, raw, twist = sample.stamp_ns, sample.pose, sample.twist
         if before is None:
-            return Instant(raw, next_row(None, stamp_ns, raw), None,
-                           SpeedWindow(UNKNOWN, stamp_ns, raw), jumped=False, twist=twist)
+            window = jumps.SpeedWindow(jumps.UNKNOWN, stamp_ns, raw)
+            return Instant(
+                raw, next_row(None, stamp_ns, raw), None, window, jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
         integrates = self._source.integrate is Integrate.TWIST
         motion = (integrated(before.twist, twist, elapsed) if integrates
                   else between_one(before.raw, raw))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
         # twists are not integrated over a longer gap [s]
-        jump = (integrates and elapsed > 1.0) or is_jump(
+        jump = (integrates and elapsed > 1.0) or jumps.is_jump(
             before.window.speeds, step, elapsed, sample.speed, self._source.maximum_speed)
-        if before.row.stamp_ns <= self.saved_ns < stamp_ns and (jump or elapsed > RESUMED_WITHIN):
-            return _elsewhere(before, sample, before.row.pose, RESTART_VARIANCE, restarted=True)
+        if before.row.stamp_ns <= self.saved_ns < stamp_ns and (
+                jump or elapsed > jumps.RESUMED_WITHIN):
+            return _elsewhere(
+                before, sample, before.row.pose, jumps.RESTART_VARIANCE, restarted=True)
         if jump:
-            return _after_jump(before, sample, elapsed)
+            time, speeds = min(elapsed, jumps.MEMORY_TIME), before.window.speeds
+            x, y, theta = speeds.velocity
+            pose = compose_one(before.row.pose, (x * time, y * time, se2.wrap_one(theta * time)))
+            position, heading = (
+                (sigma + (0.0 if speeds == jumps.UNKNOWN else rate * elapsed))**2
+                for sigma, rate in zip(jumps.JUMP_SIGMA, speeds.recent, strict=True))
+            return _elsewhere(before, sample, pose, (position, position, heading), speeds)
         if integrates:
             pose = compose_one(before.row.pose, motion)
         else:
@@ -339,31 +344,71 @@ class OdometryStream(ReorderBuffer[Received]):
                        jumped=False, twist=twist)
 
 
-def _after_jump(before: Instant, sample: Received, elapsed: float) -> Instant:
-    """Return the state at a sample to which odometry has jumped."""
-    time = min(elapsed, MEMORY_TIME)
-    speeds = before.window.speeds
-    x, y, theta = speeds.velocity
-    pose = compose_one(before.row.pose, (x * time, y * time, wrap_one(theta * time)))
-    way, turn = (0.0 if speeds == UNKNOWN else rate * elapsed for rate in speeds.recent)
-    position, heading = (JUMP_SIGMA[0] + way)**2, (JUMP_SIGMA[1] + turn)**2
-    return _elsewhere(before, sample, pose, (position, position, heading), speeds)
-
-
 def _elsewhere(
-    before: Instant, sample: Received, pose: Pose, variance: Variances, speeds: Speeds = UNKNOWN,
-    *, restarted: bool = False,
+    before: Instant, sample: Received, pose: Pose, variance: Variances,
+    speeds: jumps.Speeds = jumps.UNKNOWN, *, restarted: bool = False,
 ) -> Instant:
     """Return the state at a sample from which on odometry has another origin."""
     row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
     offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
-    return Instant(sample.pose, row, offset, SpeedWindow(speeds, sample.stamp_ns, pose),
+    return Instant(sample.pose, row, offset, jumps.SpeedWindow(speeds, sample.stamp_ns, pose),
                    jumped=True, restarted=restarted, twist=sample.twist)
 
 
-def _described(before: Instant, after: Instant) -> str:
-    """Return when and how far odometry jumped between two samples."""
-    x, y, turn = between_one(before.raw, after.raw)
-    begin_ns, end_ns = before.row.stamp_ns, after.row.stamp_ns
-    return (f'by {math.hypot(x, y):.2f} m and {math.degrees(turn):.1f} degrees within '
-            f'{(end_ns - begin_ns) * 1e-9:.3f} s at {end_ns * 1e-9:.3f} s')
+Streams = Mapping[str, OdometryStream]
+
+
+class Silence(NamedTuple):
+    """A silence of the primary source during which another source has samples."""
+
+    last_ns: int  # stamp of the last sample before the silence [ns]
+    known_ns: int  # stamp of the sample of another source that proves the silence too long [ns]
+
+
+def choose_first(
+    streams: Streams, names: Sequence[str], preferred: str, settled_ns: StampNs, patience_ns: int,
+) -> str | None:
+    """Return the source that becomes the first primary one, or None if that is not decided yet."""
+    ready_ns = []
+    for name in names:
+        begin_ns = streams[name].first_after(-1)
+        if begin_ns is not None and name != preferred:
+            begin_ns = streams[name].first_after(begin_ns + patience_ns - 1)
+        if begin_ns is not None and begin_ns <= settled_ns:
+            ready_ns.append(begin_ns)
+    return first_with_sample(streams, names, -1, min(ready_ns)) if len(ready_ns) > 0 else None
+
+
+def first_with_sample(
+    streams: Streams, names: Sequence[str], after_ns: StampNs, until_ns: StampNs,
+) -> str:
+    """
+    Return the first source that has a sample in (after_ns, until_ns]; at least one must have.
+    """
+    return next(name for name in names
+                if (streams[name].first_after(after_ns) or until_ns + 1) <= until_ns)
+
+
+def find_silence(
+    streams: Streams, names: Sequence[str], last_ns: int, settled: tuple[str, int],
+    patience_ns: int,
+) -> Silence | None:
+    """
+    Return the first silence of the primary source that is longer than the patience, if any.
+
+    `names` begin with the primary source; the search starts at its sample at `last_ns`. The
+    samples before a settled one, given by source and stamp, are known.
+    """
+    primary, *others = names
+    source, settled_ns = settled
+    while True:
+        # the next sample of the primary source ends its silence
+        next_ns = settled_ns if source == primary else streams[primary].first_after(last_ns)
+        until_ns = settled_ns + 1 if next_ns is None else min(next_ns, settled_ns + 1)
+        after = (streams[name].first_after(last_ns + patience_ns) for name in others)
+        known = [stamp_ns for stamp_ns in after if stamp_ns is not None and stamp_ns < until_ns]
+        if len(known) > 0:
+            return Silence(last_ns, min(known))
+        if next_ns is None or next_ns >= settled_ns:
+            return None
+        last_ns = next_ns

@@ -10,15 +10,10 @@ a simulation that is reset). Only messages that are usable otherwise are shown t
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from pose_graph_ros.core.measurements import (
-    Answer,
-    Measurement,
-    OdometrySample,
-    rejected,
-    YawRate,
-)
+from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected, YawRate
 from pose_graph_ros.core.quantities import StampNs
 
 # Stamps that are farther apart are not of one time [ns]. The poses of odometry are accumulated, so
@@ -41,28 +36,20 @@ class Judgement(NamedTuple):
 PRESENT = Judgement()
 
 
+@dataclass(slots=True)
 class _Watch:
     """The stamps of one source; 0 stands for none [ns]."""
 
-    def __init__(self) -> None:
-        self.newest_ns = 0  # newest one of the present; 0 as well if they are of another time
-        self.passed_ns = 0  # newest one that was not refused
-        self.was_present = False
-        self.n_apart = 0  # number of the last stamps that are of another time and agree
-        self.first_ns = self.last_ns = 0  # first and last of these
-        self.others_ns = 0  # newest stamp of the other odometry at the first
-        self.in_doubt = False  # whether time begins again with them if they go on
-        self.clock_ns = 0  # newest stamp of the odometry that is preferred to it
-        self.since_ns = 0  # its own stamp when that one came
-
-    def extend(self, stamp_ns: int, others_ns: int) -> None:
-        if self.n_apart == 0 or not 0 < stamp_ns - self.last_ns <= APART_NS:
-            self.n_apart, self.first_ns, self.others_ns = 0, stamp_ns, others_ns
-        self.n_apart, self.last_ns = self.n_apart + 1, stamp_ns
-
-    @property
-    def is_evidence(self) -> bool:
-        return self.n_apart >= EVIDENCE and self.last_ns - self.first_ns >= EVIDENCE_NS
+    newest_ns: int = 0  # newest one of the present; 0 as well if they are of another time
+    passed_ns: int = 0  # newest one that was not refused
+    was_present: bool = False
+    n_apart: int = 0  # number of the last stamps that are of another time and agree
+    first_ns: int = 0  # first and last of these
+    last_ns: int = 0
+    others_ns: int = 0  # newest stamp of the other odometry at the first
+    in_doubt: bool = False  # whether time begins again with them if they go on
+    clock_ns: int = 0  # newest stamp of the odometry that is preferred to it
+    since_ns: int = 0  # its own stamp when that one came
 
     def set_present(self, newest_ns: int) -> None:
         self.newest_ns = self.passed_ns = newest_ns
@@ -129,11 +116,18 @@ class TimeKeeper:
     ) -> Judgement:
         """Judge a stamp of odometry that is before the earliest one of the present, or ahead."""
         others_ns = self._newest_but(source)
-        watch.extend(stamp_ns, others_ns)
+        if watch.n_apart == 0 or not 0 < stamp_ns - watch.last_ns <= APART_NS:
+            watch.n_apart, watch.first_ns, watch.others_ns = 0, stamp_ns, others_ns
+        watch.n_apart, watch.last_ns = watch.n_apart + 1, stamp_ns
+        lasts_ns = stamp_ns - watch.first_ns
         # for ten seconds preferred odometry need not have the time of the one that came before it
         decides = (not watch.was_present and source == self._odometry[0]
                    and now_ns - self._since_ns < 10_000_000_000)
-        if watch.is_evidence and (decides or self._moves(watch, others_ns)):
+        is_evidence = watch.n_apart >= EVIDENCE and lasts_ns >= EVIDENCE_NS
+        # time does not move with the source if it went on elsewhere meanwhile
+        if is_evidence and not decides and 2 * (others_ns - watch.others_ns) > lasts_ns:
+            watch.newest_ns = 0
+        if is_evidence and (decides or watch.newest_ns > 0):
             begins_again = stamp_ns < earliest_ns
             if decides or begins_again:
                 self._watches, self._since_ns = {source: watch}, watch.first_ns
@@ -153,12 +147,6 @@ class TimeKeeper:
         if clock_ns != watch.clock_ns:
             watch.clock_ns, watch.since_ns = clock_ns, stamp_ns
         return stamp_ns - clock_ns > LATEST_NS >= stamp_ns - watch.since_ns
-
-    def _moves(self, watch: _Watch, others_ns: int) -> bool:
-        """Tell whether time moves with a source; not if it went on elsewhere meanwhile."""
-        if 2 * (others_ns - watch.others_ns) > watch.last_ns - watch.first_ns:
-            watch.newest_ns = 0
-        return watch.newest_ns > 0
 
     def _follow(self, source: str, watch: _Watch, stamp_ns: int) -> Judgement:
         """Judge a source that tells no time: by odometry, and by what it sent before."""

@@ -7,7 +7,7 @@ A clique is visited if it was built in this iteration, or if a node of its separ
 more than the wildfire threshold (M. Kaess et al., "iSAM2", IJRR 2012) since its solution was last
 passed to the cliques below. The threshold is `alpha` times the sigma that the node's own
 constraints give it. Nodes that have turned, and cliques whose frames have turned, are listed for
-`relinearization`, which checks their linearization errors.
+`step`, which checks their linearization errors.
 
 The error of a constraint between two poses does not change with a common motion of both. So if the
 separator of a clique that is not anchored has moved as a rigid body, that motion is applied to the
@@ -22,7 +22,7 @@ import math
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import fetch
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.elimination.fronts import solve_rows
+from pose_graph_ros.core.elimination.fronts import backward_rows
 from pose_graph_ros.core.graph import factors, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.pools import triangle_size
 
@@ -60,23 +60,10 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     # approximate squared linearization error due to the turn since the last check
     turn2 = (dth - phi - f.checked_turn) ** 2
     error2 = turn2 * (turn2 * f.scale_r * f.scale_r + USUAL_ENERGY)
-    if (error2 > scalars.share or moved > 100.0 * alpha
-            or head[tb.SINCE] < head[tb.ITERATION]):
+    if (error2 > scalars.share or moved > 100.0 * alpha or head[tb.SINCE] < head[tb.ITERATION]):
         f.checked_turn = dth - phi
         work_i[room + head[tb.N_CHECKS]] = v
         head[tb.N_CHECKS] += 1
-
-
-@kernel
-def _visit_pair(head, values, v, other, alpha):  # type: ignore[no-untyped-def]
-    """Solve for the frontal node of a clique with one separator node, as along a chain."""
-    nodes, pool_f = tb.nodes(head), tb.pool_f(head)
-    r, f = pool_f[values:values + 18], nodes[other]
-    a, b, c = f.delta[0], f.delta[1], f.delta[2]
-    z = (r[17] - (r[14] * a + r[15] * b + r[16] * c)) * r[13]
-    y = (r[12] - (r[9] * a + r[10] * b + r[11] * c) - r[8] * z) * r[7]
-    x = (r[6] - (r[3] * a + r[4] * b + r[5] * c) - r[2] * z - r[1] * y) * r[0]
-    _move(head, v, x, y, z, 0.0, alpha)
 
 
 @kernel
@@ -93,8 +80,13 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
     if row.anchored == 0:
         alpha *= FREE_FRACTION
     if phi == 0.0 and n_frontal == 1 and n_separator == 1:
-        if nodes[members[0]].fixed == 0:
-            _visit_pair(head, row.values, members[0], members[1], alpha)
+        if nodes[members[0]].fixed == 0:    # as along a chain
+            r, f = pool_f[row.values:row.values + 18], nodes[members[1]]
+            x2, y2, th2 = f.delta[0], f.delta[1], f.delta[2]
+            th = (r[17] - (r[14] * x2 + r[15] * y2 + r[16] * th2)) * r[13]
+            y = (r[12] - (r[9] * x2 + r[10] * y2 + r[11] * th2) - r[8] * th) * r[7]
+            dx = (r[6] - (r[3] * x2 + r[4] * y2 + r[5] * th2) - r[2] * th - r[1] * y) * r[0]
+            _move(head, members[0], dx, y, th, 0.0, alpha)
         return
     x = work_f[:n]
     cos, sin, px, py = 1.0, 0.0, 0.0, 0.0
@@ -109,31 +101,19 @@ def _visit(head, c):  # type: ignore[no-untyped-def]
         else:
             x[3 * k], x[3 * k + 1], x[3 * k + 2] = clique_frames.local_delta(
                 f, px, py, cos, sin, phi)
-    solve_rows(pool_f[row.values:], rows, n, x)
+    backward_rows(pool_f[row.values:], rows, n, x, True)
     for k in range(n_frontal):
         v = members[k]
         dx, dy, dth = x[3 * k], x[3 * k + 1], x[3 * k + 2]
         if phi != 0.0:
-            dx, dy = clique_frames.map_delta(nodes[v], dx, dy, px, py, cos, sin)
+            # the inverse of `local_delta`
+            f = nodes[v]
+            dx, dy = dx + f.reference[0] - px, dy + f.reference[1] - py
+            dx, dy = (cos * dx - sin * dy + px - f.reference[0],
+                      sin * dx + cos * dy + py - f.reference[1])
             dth += phi
         if nodes[v].fixed == 0:
             _move(head, v, dx, dy, dth, phi, alpha)
-
-
-@kernel
-def _set_turn(head, c, parent_turn):  # type: ignore[no-untyped-def]
-    """Set the angle of a clique's frame; list the clique if its slip is large."""
-    clique, work_i = tb.cliques(head)[c], tb.work_i(head)
-    if clique.anchored != 0:
-        clique.turn = 0.0
-        return
-    clique.turn = clique_frames.present_turn(head, c)
-    slip = clique.turn - clique.turn_seen - parent_turn
-    slip2 = slip * slip
-    error2 = slip2 * (slip2 * clique.slip_scale + USUAL_ENERGY)
-    if error2 > tb.scalars(head)[0].share:
-        work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = c
-        head[tb.N_TURNED] += 1
 
 
 @kernel
@@ -177,8 +157,7 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
         x, y = f.pose[0] - dx - pivot_x, f.pose[1] - dy - pivot_y
         dx -= goal_x - pivot_x + versine * x - sine * y
         dy -= goal_y - pivot_y + sine * x + versine * y
-        deviation = max(deviation, max(abs(dx), abs(dy)) * f.scale_t,
-                        abs(dth - turn) * f.scale_r)
+        deviation = max(deviation, max(abs(dx), abs(dy)) * f.scale_t, abs(dth - turn) * f.scale_r)
         if deviation > limit:
             break
     return deviation, turn, pivot_x, pivot_y, goal_x, goal_y
@@ -252,22 +231,11 @@ def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fetch_rows(head, c):  # type: ignore[no-untyped-def]
-    """Prefetch the rows of R of a clique, which are used once and are not in the cache."""
-    cliques, pool_f = tb.cliques(head), tb.pool_f(head)
-    row = cliques[c]
-    rows, begin = 3 * row.n_frontal, row.values
-    size = triangle_size(rows, rows + 3 * row.n_separator)
-    for at in range(begin, begin + size, 8):
-        fetch(pool_f, at)
-
-
-@kernel
 def back_substitute(head):  # type: ignore[no-untyped-def]
     """Visit the cliques from the roots on the stack down; list the nodes to be checked."""
-    cliques = tb.cliques(head)
+    cliques, pool_f = tb.cliques(head), tb.pool_f(head)
     work_i, nodes, scalars = tb.work_i(head), tb.nodes(head), tb.scalars(head)[0]
-    stack, depth = work_i, head[tb.N_ROOTS]
+    stack, depth, turned = work_i, head[tb.N_ROOTS], work_i[2 * head[tb.NODE_ROOM]:]
     refines = head[tb.SINCE] < head[tb.ITERATION]
     n_visited = 0
     for k in range(depth):
@@ -295,7 +263,7 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                     transaction_log.log_clique(head, child)
                     prior_rows.update_energy(head, child)
                     if prior_rows.turns(head, child):
-                        work_i[2 * head[tb.NODE_ROOM] + head[tb.N_TURNED]] = child
+                        turned[head[tb.N_TURNED]] = child
                         head[tb.N_TURNED] += 1
                     child = cliques[child].sibling
                     continue
@@ -303,10 +271,19 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
                     transaction_log.log_clique(head, child)
                     cliques[child].drift += drift
                 code = _update_child(head, child, stack, depth)
-                if code != _AS_IT_IS or refines:
-                    _set_turn(head, child, turn)
+                row = cliques[child]
+                if code != _AS_IT_IS or refines:    # no turn nor slip if it is anchored
+                    row.turn = clique_frames.present_turn(head, child)
+                    slip2 = (row.turn - row.turn_seen - turn)**2
+                    if slip2 * (slip2 * row.slip_scale + USUAL_ENERGY) > scalars.share:
+                        turned[head[tb.N_TURNED]] = child
+                        head[tb.N_TURNED] += 1
                 if code == _SOLVED:
-                    _fetch_rows(head, child)
+                    # the rows of R are used once and are not in the cache
+                    rows = 3 * row.n_frontal
+                    size = triangle_size(rows, rows + 3 * row.n_separator)
+                    for at in range(row.values, row.values + size, 8):
+                        fetch(pool_f, at)
                     if c >= 0:
                         stack[depth] = c
                         depth += 1

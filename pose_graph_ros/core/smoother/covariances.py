@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Marginal covariances from the Bayes tree: of a node, of two jointly, and of errors of edges.
+Marginal covariances from the Bayes tree: of nodes, alone and jointly, and of errors of edges.
 
 With J the Jacobian of an error and `P = H^-1` the covariance of all nodes, `H = R^T R`, that is
 `J P J^T = Y^T Y` with `R^T Y = J^T`; for the covariance of nodes, J has rows of the identity. J^T
@@ -14,6 +14,13 @@ Rows of R hold the reciprocal of their diagonal. A fixed node has rows of the id
 out, and so gets no uncertainty. The rows of a clique are equations in its frame (`clique_frames`),
 so right-hand sides are rotated by the angle of the frame. A node is updated by adding to its pose
 in map axes, so covariances are in map axes [m, m, rad].
+
+Those of all nodes come in one sweep down the tree. The entries of the inverse Z = H^-1 within
+cliques follow from the roots down (K. Takahashi, J. Fagan, M. Chen, "Formation of a sparse bus
+impedance matrix", 1973). With f the frontal and s the separator nodes of a clique, and Z_ss a part
+of the inverse of its parent,
+
+    Z_fs = -R_ff^-1 R_fs Z_ss,    Z_ff = R_ff^-1 (R_ff^-T - R_fs Z_sf).
 """
 
 import math
@@ -21,13 +28,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import (
-    INTEGER,
-    kernel,
-    MATRICES,
-    ROWS,
-)
+from pose_graph_ros.core.compiled.jit import INTEGER, kernel, MATRICES, ROWS
 from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.elimination.ordering import grown
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import Factors
@@ -61,67 +64,45 @@ def innovations(head: IntArray, edges: Factors) -> Innovations:
     return result
 
 
-@kernel(signature=(tb.HEAD, ROWS), allocates=True)
-def newest_covariance(head, out):  # type: ignore[no-untyped-def]
-    """Write that of the newest pose; False if there is none, or edits are not solved for."""
-    if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
-        return False
-    node_covariance(head, head[tb.NEWEST], out)
-    return True
-
-
-@kernel(signature=(tb.HEAD, INTEGER, ROWS), allocates=True)
-def node_covariance(head, v, out):  # type: ignore[no-untyped-def]
-    """Write the covariance of a node, shape (3, 3)."""
-    out[:] = 0.0
-    _begin(head, v, np.eye(3), -1, np.empty((3, 48)), np.empty((3, 48)), out)
-    _mirror(out)
-
-
-@kernel(signature=(tb.HEAD, INTEGER, INTEGER, ROWS), allocates=True)
-def pair_covariance(head, i, j, out):  # type: ignore[no-untyped-def]
-    """Write the joint covariance of two nodes, shape (6, 6)."""
-    of_i, of_j = np.zeros((6, 3)), np.zeros((6, 3))
-    for m in range(3):
-        of_i[m, m] = of_j[3 + m, m] = 1.0
-    _write_covariance(head, i, of_i, j, of_j, out)
-
-
 @kernel(signature=(tb.HEAD, tb.RECORDS, ROWS, MATRICES), allocates=True)
 def _write_innovations(head, records, error, out):  # type: ignore[no-untyped-def]
     """Write errors, (M, 3), of edges given by records of `Factors`, and J P J^T, (M, 3, 3)."""
     nodes = tb.nodes(head)
-    record, start_j, end_j = np.empty(1, tb.FACTOR), np.empty((3, 3)), np.empty((3, 3))
+    record, start_j, end_j = np.empty(1, tb.FACTOR), np.zeros((3, 3)), np.zeros((3, 3))
     for k in range(len(records)):
         f = record[0]   # in here, as Numba frees the array after its last use
-        new = records[k]
+        new, e = records[k], error[k]
         write_data(f, new)
-        _edge_jacobians(
-            f, new.kind, nodes[new.i].pose, nodes[new.j].pose, error[k], start_j, end_j)
-        _write_covariance(head, new.i, start_j, new.j, end_j, out[k])
+        e[0], e[1], e[2], c, s, ax, ay = factors.model(
+            f, new.kind, nodes[new.i].pose, nodes[new.j].pose, factors.NO_THIRD[0])
+        ft, fth = factors.factors_of_end(f, new.kind)
+        start_j[0, 0], start_j[0, 1], start_j[0, 2] = -c, -s, c * ay - s * ax
+        start_j[1, 0], start_j[1, 1], start_j[1, 2] = s, -c, -s * ay - c * ax
+        start_j[2, 2] = -1.0
+        end_j[0, 0], end_j[0, 1], end_j[1, 0], end_j[1, 1] = ft * c, ft * s, -ft * s, ft * c
+        end_j[2, 2] = fth
+        write_covariance(head, new.i, start_j, new.j, end_j, out[k])
 
 
-@kernel
-def _edge_jacobians(f, kind, start, end, error, start_j, end_j):  # type: ignore[no-untyped-def]
-    """Write the error of an edge between two poses, and its Jacobians, in map axes."""
-    error[0], error[1], error[2], c, s, ax, ay = factors.model(
-        f, kind, start, end, factors.NO_THIRD[0])
-    ft, fth = factors.factors_of_end(f, kind)
-    start_j[:] = 0.0
-    end_j[:] = 0.0
-    start_j[0, 0], start_j[0, 1], start_j[0, 2] = -c, -s, c * ay - s * ax
-    start_j[1, 0], start_j[1, 1], start_j[1, 2] = s, -c, -s * ay - c * ax
-    start_j[2, 2] = -1.0
-    end_j[0, 0], end_j[0, 1], end_j[1, 0], end_j[1, 1] = ft * c, ft * s, -ft * s, ft * c
-    end_j[2, 2] = fth
+@kernel(signature=(tb.HEAD, INTEGER, ROWS, INTEGER, ROWS, ROWS), allocates=True)
+def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-def]
+    """
+    Write J P J^T, shape (m, m), of an error with Jacobians by two nodes, shape (m, 3).
 
-
-@kernel(allocates=True)
-def _write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-def]
-    """Write J P J^T, shape (m, m), of an error with Jacobians by two nodes, shape (m, 3)."""
+    Without a second node j is -1.
+    """
     nodes, cliques, m = tb.nodes(head), tb.cliques(head), len(out)
     out[:] = 0.0
-    common = _lowest_common(cliques, nodes[i].clique, nodes[j].clique)
+    if j < 0:
+        _begin(head, i, of_i, -1, np.empty((m, 48)), np.empty((m, 48)), out)
+        return
+    # Each path to a root goes on along the other one: they meet in the lowest clique above both
+    # nodes, or both end at -1.
+    begin_i, begin_j = nodes[i].clique, nodes[j].clique
+    common, other = begin_i, begin_j
+    while common != other:
+        common = cliques[common].parent if common >= 0 else begin_j
+        other = cliques[other].parent if other >= 0 else begin_i
     spare = np.empty((m, 96))
     first, spare, at_i = _begin(head, i, of_i, common, np.empty((m, 96)), spare, out)
     second, spare, at_j = _begin(head, j, of_j, common, np.empty((m, 96)), spare, out)
@@ -131,31 +112,6 @@ def _write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-d
             for q in range(n):
                 first[r, q] += second[r, q]
         _climb(head, common, -1, min(at_i, at_j), first, spare, out)
-    _mirror(out)
-
-
-@kernel
-def _depth(cliques, c):  # type: ignore[no-untyped-def]
-    depth = 0
-    while c >= 0:
-        depth += 1
-        c = cliques[c].parent
-    return depth
-
-
-@kernel
-def _lowest_common(cliques, a, b):  # type: ignore[no-untyped-def]
-    """Return the lowest clique on the paths of two cliques to their roots; -1 without one."""
-    depth_a, depth_b = _depth(cliques, a), _depth(cliques, b)
-    while depth_a > depth_b:
-        a = cliques[a].parent
-        depth_a -= 1
-    while depth_b > depth_a:
-        b = cliques[b].parent
-        depth_b -= 1
-    while a != b:
-        a, b = cliques[a].parent, cliques[b].parent
-    return a
 
 
 @kernel(allocates=True)
@@ -163,8 +119,8 @@ def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped
     """
     Climb from a node to a clique, which is not solved for; -1 to climb beyond the root.
 
-    Add Y^T Y to the upper triangle of `out`. Return the right-hand sides of the clique, work
-    space, and the number of its frontal nodes before the first with a nonzero right-hand side.
+    Add Y^T Y to `out`. Return the right-hand sides of the clique, work space, and the number of
+    its frontal nodes before the first with a nonzero right-hand side.
     """
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
     c = nodes[v].clique
@@ -188,43 +144,34 @@ def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped
 @kernel(allocates=True)
 def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-def]
     """Solve for the cliques from c up to, and without, one above; return its right-hand sides."""
-    nodes, pool_i, pool_f = tb.nodes(head), tb.pool_i(head), tb.pool_f(head)
+    nodes, cliques = tb.nodes(head), tb.cliques(head)
+    pool_i, pool_f = tb.pool_i(head), tb.pool_f(head)
     while c != top:
-        row = tb.cliques(head)[c]
-        n_frontal, n_separator = row.n_frontal, row.n_separator
-        members = pool_i[row.members:row.members + n_frontal + n_separator]
-        values = pool_f[row.values:]
+        row = cliques[c]
+        n_frontal, n = row.n_frontal, row.n_frontal + row.n_separator
+        members, values = pool_i[row.members:row.members + n], pool_f[row.values:]
         for f in range(first, n_frontal):
             if nodes[members[f]].fixed == 0:
-                _solve_block(values, 3 * f, 3 * (n_frontal + n_separator), here, out)
-        first, below, c = 0, c, row.parent
-        if c < 0:
+                _solve_block(values, 3 * f, 3 * n, here, out)
+        if row.parent < 0:
             break
-        spare = _passed_up(head, below, here, spare)
+        # the right-hand sides of the separator are those of the parent, in its frame
+        above = cliques[row.parent]
+        n_above = above.n_frontal + above.n_separator
+        spare = _cleared(spare, 3 * n_above)
+        for m in range(n_above):
+            nodes[pool_i[above.members + m]].index = 3 * m
+        turn = (clique_frames.present_turn(head, c) - clique_frames.present_turn(head, row.parent))
+        cos, sin = math.cos(turn), math.sin(turn)
+        for s in range(n_frontal, n):
+            at = nodes[members[s]].index
+            for r in range(len(here)):
+                x, y = here[r, 3 * s], here[r, 3 * s + 1]
+                spare[r, at], spare[r, at + 1] = cos * x - sin * y, sin * x + cos * y
+                spare[r, at + 2] = here[r, 3 * s + 2]
+        first, c = 0, row.parent
         here, spare = spare, here
     return here, spare
-
-
-@kernel(allocates=True)
-def _passed_up(head, c, here, above):  # type: ignore[no-untyped-def]
-    """Return the right-hand sides of a clique's separator as those of its parent, in its frame."""
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    row = cliques[c]
-    parent = cliques[row.parent]
-    n_above = parent.n_frontal + parent.n_separator
-    above = _cleared(above, 3 * n_above)
-    for m in range(n_above):
-        nodes[pool_i[parent.members + m]].index = 3 * m
-    turn = (clique_frames.present_turn(head, c)
-            - clique_frames.present_turn(head, row.parent))
-    cos, sin = math.cos(turn), math.sin(turn)
-    for s in range(row.n_frontal, row.n_frontal + row.n_separator):
-        at = nodes[pool_i[row.members + s]].index
-        for r in range(len(here)):
-            p, q = here[r, 3 * s], here[r, 3 * s + 1]
-            above[r, at], above[r, at + 1] = cos * p - sin * q, sin * p + cos * q
-            above[r, at + 2] = here[r, 3 * s + 2]
-    return above
 
 
 @kernel(allocates=True)
@@ -238,7 +185,7 @@ def _cleared(vectors, n):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True, fastmath=_FAST)
 def _solve_block(values, k, n, rhs, out):  # type: ignore[no-untyped-def]
-    """Solve for the three rows of R from row k on; add Y^T Y to the upper triangle of `out`."""
+    """Solve for the three rows of R from row k on; add Y^T Y to `out`."""
     r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
                   values[row_start(k + 2, n):])
     for r in range(len(rhs)):
@@ -252,11 +199,117 @@ def _solve_block(values, k, n, rhs, out):  # type: ignore[no-untyped-def]
         for s in range(r + 1):
             y = rhs[s]
             out[s, r] += y[k] * a + y[k + 1] * b + y[k + 2] * c
+            out[r, s] = out[s, r]
+
+
+@kernel(signature=(tb.HEAD, MATRICES), allocates=True)
+def all_covariances(head, out):  # type: ignore[no-untyped-def]
+    """
+    Write the covariances of all nodes into zeros of shape (N, 3, 3).
+
+    The sweep keeps a stack of cliques and a stack of their Z_ss.
+    """
+    nodes, pool_i = tb.nodes(head), tb.pool_i(head)
+    cliques, blocks = np.empty(64, np.int32), np.empty(1024)
+    for root in range(head[tb.N_CLIQUES]):
+        if tb.cliques(head)[root].n_frontal <= 0 or tb.cliques(head)[root].parent >= 0:
+            continue  # a free row, a prior, or no root
+        cliques[0] = root
+        depth, end = 1, 0
+        while depth > 0:
+            depth -= 1
+            c = cliques[depth]
+            row = tb.cliques(head)[c]
+            rows, rest = 3 * row.n_frontal, 3 * row.n_separator
+            inverse = np.empty((rows + rest, rows + rest))
+            end -= rest * rest
+            for i in range(rest):
+                for q in range(rest):
+                    inverse[rows + i, rows + q] = blocks[end + i * rest + q]
+            _invert_clique(head, row, inverse)
+            turn = clique_frames.present_turn(head, c)
+            for k in range(0, rows, 3):
+                block = out[pool_i[row.members + k // 3]]
+                for m in range(3):
+                    for q in range(3):
+                        block[m, q] = inverse[k + m, k + q]
+                if turn != 0.0:
+                    _rotate(block, turn)
+                    for i, j in ((1, 0), (2, 0), (2, 1)):   # exactly symmetric
+                        block[i, j] = block[j, i]
+            for m in range(len(inverse) // 3):
+                nodes[pool_i[row.members + m]].index = 3 * m
+            child = row.child
+            while child >= 0:
+                if tb.cliques(head)[child].n_frontal > 0:
+                    size = 3 * tb.cliques(head)[child].n_separator
+                    if end + size * size > len(blocks):
+                        blocks = grown(blocks, end + size * size)
+                    below = blocks[end:end + size * size].reshape(size, size)
+                    _read_separator(head, child, inverse, below)
+                    turn_below = clique_frames.present_turn(head, child)
+                    if turn_below != turn:
+                        _rotate(below, turn - turn_below)
+                    end += size * size
+                    if depth == len(cliques):
+                        cliques = grown(cliques, 0)
+                    cliques[depth] = child
+                    depth += 1
+                child = tb.cliques(head)[child].sibling
 
 
 @kernel
-def _mirror(out):  # type: ignore[no-untyped-def]
-    """Copy the upper triangle of a matrix to the lower one."""
-    for r in range(len(out)):
-        for s in range(r):
-            out[r, s] = out[s, r]
+def _rotate(block, angle):  # type: ignore[no-untyped-def]
+    """Rotate a covariance of nodes to axes in which angles are larger by `angle` [rad]."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    for r in range(0, len(block), 3):
+        for q in range(len(block)):
+            x, y = block[r, q], block[r + 1, q]
+            block[r, q], block[r + 1, q] = cos * x - sin * y, sin * x + cos * y
+    for r in range(len(block)):
+        for q in range(0, len(block), 3):
+            x, y = block[r, q], block[r, q + 1]
+            block[r, q], block[r, q + 1] = cos * x - sin * y, sin * x + cos * y
+
+
+@kernel
+def _read_separator(head, child, inverse, block):  # type: ignore[no-untyped-def]
+    """Copy Z_ss of a child from the inverse of its parent, whose nodes have their INDEX set."""
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    row = cliques[child]
+    members = pool_i[row.members + row.n_frontal:]
+    for a in range(row.n_separator):
+        i = nodes[members[a]].index
+        for b in range(row.n_separator):
+            j = nodes[members[b]].index
+            for m in range(3):
+                for q in range(3):
+                    block[3 * a + m, 3 * b + q] = inverse[i + m, j + q]
+
+
+@kernel(fastmath=_FAST)
+def _invert_clique(head, row, inverse):  # type: ignore[no-untyped-def]
+    """Fill the inverse of a clique, which has Z_ss already, from its last row to its first."""
+    pool_f, nodes, pool_i, n = tb.pool_f(head), tb.nodes(head), tb.pool_i(head), len(inverse)
+    for k in range(3 * row.n_frontal - 1, -1, -1):
+        r, of_row = pool_f[row.values + row_start(k, n):], inverse[k]
+        of_row[k:] = 0.0
+        if nodes[pool_i[row.members + k // 3]].fixed != 0:
+            inverse[k:, k] = 0.0
+            continue
+        m = k + 1
+        while m + 3 <= n:   # three rows at a time, which takes half of the time
+            a, b, c = -r[k] * r[m], -r[k] * r[m + 1], -r[k] * r[m + 2]
+            x, y, z = inverse[m], inverse[m + 1], inverse[m + 2]
+            for q in range(k + 1, n):
+                of_row[q] += a * x[q] + b * y[q] + c * z[q]
+            m += 3
+        while m < n:
+            for q in range(k + 1, n):
+                of_row[q] -= r[k] * r[m] * inverse[m, q]
+            m += 1
+        total = r[k]
+        for q in range(k + 1, n):
+            total -= r[q] * of_row[q]
+            inverse[q, k] = of_row[q]
+        of_row[k] = r[k] * total

@@ -15,21 +15,11 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
-from pose_graph_ros.core.graph import (
-    pools,
-    prior_rows,
-    tables as tb,
-    transaction_log,
-)
+from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import unlink
 from pose_graph_ros.core.graph.pools import row_start, triangle_size
 from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
-from pose_graph_ros.core.smoother.tree_update import (
-    DONE,
-    lacks_memory,
-    MORE_MEMORY,
-    ORDERED_FIRST,
-)
+from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_MEMORY, ORDERED_FIRST
 
 # States of cliques: whether all nodes at and below them leave.
 _UNKNOWN, _WHOLE, _MIXED = range(3)
@@ -129,27 +119,6 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _drop_factors(head, v, leaves):  # type: ignore[no-untyped-def]
-    """Take the factors of a leaving node out of all lists and sums; return their energy."""
-    node = tb.nodes(head)[v]
-    energy, at = 0.0, node.factor_list
-    while at >= 0:
-        e, f = at >> 2, tb.factors(head)[at >> 2]
-        at = f.next[at & 3]
-        if f.weight == 0.0:
-            continue    # another of its ends has left just before
-        scale_by(head, e, -f.weight)
-        for m in range(3):
-            if f.ends[m] >= 0 and not leaves[f.ends[m]]:
-                unlink(head, e, m)
-        energy += f.energy
-        f.weight = f.energy = f.error2 = 0.0
-    node.clique, node.factor_list = -1, tb.LEAVES
-    head[tb.N_LEAVING] += 1
-    return energy
-
-
-@kernel
 def _scale_by_prior(head, c, sign):  # type: ignore[no-untyped-def]
     """Add the information of a prior to the diagonal scales of its nodes, or subtract it."""
     pool_i, row = tb.pool_i(head), tb.cliques(head)[c]
@@ -162,6 +131,7 @@ def _scale_by_prior(head, c, sign):  # type: ignore[no-untyped-def]
 def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
     """Drop all cliques below one, and all constraints in them and in it; return their energy."""
     pool_i, stack, cliques = tb.pool_i(head), tb.work_i(head), tb.cliques(head)
+    nodes = tb.nodes(head)
     stack[0] = top
     depth, energy = 1, 0.0
     while depth > 0:
@@ -172,7 +142,21 @@ def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
             _scale_by_prior(head, c, -1.0)
             energy += cliques[c].energy
         for m in range(row.members, row.members + row.n_frontal):
-            energy += _drop_factors(head, pool_i[m], leaves)
+            node = nodes[pool_i[m]]
+            at = node.factor_list
+            while at >= 0:
+                e, f = at >> 2, tb.factors(head)[at >> 2]
+                at = f.next[at & 3]
+                if f.weight == 0.0:
+                    continue    # another of its ends has left just before
+                scale_by(head, e, -f.weight)
+                for side in range(3):
+                    if f.ends[side] >= 0 and not leaves[f.ends[side]]:
+                        unlink(head, e, side)
+                energy += f.energy
+                f.weight = f.energy = f.error2 = 0.0
+            node.clique, node.factor_list = -1, tb.LEAVES
+            head[tb.N_LEAVING] += 1
         child = row.child
         while child >= 0:
             stack[depth] = child
@@ -182,23 +166,6 @@ def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
             transaction_log.give_clique(head, c)
     cliques[top].child = -1
     return energy
-
-
-@kernel
-def _clear_rounding(head, c):  # type: ignore[no-untyped-def]
-    """Clear rows and columns of an update matrix that are what rounding has left of zero."""
-    nodes, pool_f, pool_i = tb.nodes(head), tb.pool_f(head), tb.pool_i(head)
-    row = tb.cliques(head)[c]
-    rows, size = 3 * row.n_frontal, 3 * row.n_separator
-    update = pool_f[row.values + triangle_size(rows, rows + size):]
-    for i in range(size):
-        f = nodes[pool_i[row.members + (rows + i) // 3]]
-        scale = f.scale_t if i % 3 < 2 else f.scale_r
-        if update[row_start(i, size) + i] <= 1e-14 * scale * scale:
-            for k in range(i):
-                update[row_start(k, size) + i] = 0.0
-            for k in range(i, size + 1):
-                update[row_start(i, size) + k] = 0.0
 
 
 @kernel
@@ -249,17 +216,6 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
     _scale_by_prior(head, c, 1.0)
 
 
-@kernel
-def _keep_waiting(head):  # type: ignore[no-untyped-def]
-    """Take the constraints without a weight out of the list of the waiting."""
-    waiting, kept = tb.waiting(head), 0
-    for n in range(head[tb.N_WAITING]):
-        if tb.factors(head)[waiting[n]].weight > 0.0:
-            waiting[kept] = waiting[n]
-            kept += 1
-    head[tb.N_WAITING] = kept
-
-
 @kernel(signature=(tb.HEAD, INTEGERS), allocates=True)
 def drop(head, leaving):  # type: ignore[no-untyped-def]
     """
@@ -269,30 +225,45 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
     must grow to `NEED_F` and `NEED_I` of the head. No node may be touched.
     """
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    scalars = tb.scalars(head)[0]
+    pool_f, waiting, scalars = tb.pool_f(head), tb.waiting(head), tb.scalars(head)[0]
     state, leaves = _states(head, leaving)
     tops = np.empty(len(leaving), np.int32)
     n_tops, need_f, need_i = 0, head[tb.POOL_F_END], head[tb.POOL_I_END]
     for v in leaving:
         c = nodes[v].clique
         row = cliques[c]
-        if pool_i[row.members] == v and (
-                row.parent < 0 or state[row.parent] != _WHOLE):
+        if pool_i[row.members] == v and (row.parent < 0 or state[row.parent] != _WHOLE):
             tops[n_tops] = c
             n_tops += 1
             need_f += pools.rounded(pools.n_values(0, row.n_separator))
             need_i += pools.rounded(row.n_separator)
     if lacks_memory(head, need_f, need_i, 0):
         return MORE_MEMORY
-    for k in range(n_tops):
-        _clear_rounding(head, tops[k])
-        energy = _drop_subtree(head, tops[k], leaves)
+    for t in range(n_tops):
+        # rows and columns of the update matrix that are what rounding has left of zero
+        row = cliques[tops[t]]
+        rows, size = 3 * row.n_frontal, 3 * row.n_separator
+        update = pool_f[row.values + triangle_size(rows, rows + size):]
+        for i in range(size):
+            node = nodes[pool_i[row.members + (rows + i) // 3]]
+            scale = node.scale_t if i % 3 < 2 else node.scale_r
+            if update[row_start(i, size) + i] <= 1e-14 * scale * scale:
+                for k in range(i):
+                    update[row_start(k, size) + i] = 0.0
+                for k in range(i, size + 1):
+                    update[row_start(i, size) + k] = 0.0
+        energy = _drop_subtree(head, tops[t], leaves)
         scalars.chi2 -= energy
-        if cliques[tops[k]].n_separator > 0:
-            _turn_into_prior(head, tops[k], energy)
+        if row.n_separator > 0:
+            _turn_into_prior(head, tops[t], energy)
         else:
-            transaction_log.give_clique(head, tops[k])
-    _keep_waiting(head)
+            transaction_log.give_clique(head, tops[t])
+    kept = 0    # those of the waiting that have still a weight
+    for n in range(head[tb.N_WAITING]):
+        if tb.factors(head)[waiting[n]].weight > 0.0:
+            waiting[kept] = waiting[n]
+            kept += 1
+    head[tb.N_WAITING] = kept
     head[tb.N_TURNED] = 0
     head[tb.LOG_END] = 0
     return DONE

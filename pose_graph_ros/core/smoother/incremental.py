@@ -12,28 +12,13 @@ from pose_graph_ros.core.batch.optimizer import chi2_of, Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import (
-    Covariance,
-    Covariances,
-    FloatArray,
-    IntArray,
-    Poses,
-    PoseVector,
-)
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_update import Gone
-from pose_graph_ros.core.smoother import (
-    chain,
-    covariances,
-    forgetting,
-    step,
-    tree_update,
-    trial,
-)
+from pose_graph_ros.core.smoother import chain, covariances, forgetting, step, tree_update, trial
 from pose_graph_ros.core.smoother.covariances import Innovations, innovations
-from pose_graph_ros.core.smoother.sparse_inverse import all_covariances
 from pose_graph_ros.core.smoother.trial import Trial
 
 # Reason of an update that has failed because it must not fall back to the batch optimiser.
@@ -60,6 +45,7 @@ class Refinement(NamedTuple):
     moved: float    # largest change of a coordinate of a position [m]
 
 
+_UNIT = np.eye(3)
 _EXTENDED_RESULT = UpdateResult(Status.CONVERGED, '', eliminated=1, visited=1, iterations=1)
 
 
@@ -160,7 +146,8 @@ class IncrementalSmoother:
         """Return a trial of new weights, on a copy; raises ValueError as `refine` does."""
         self._require_solved()
         other = IncrementalSmoother(self._config)
-        return Trial(self.graph, other.graph, update, other._eliminate, poses)
+        return Trial(self.graph, other.graph, update,
+                     lambda: other._eliminate().status is not Status.FAILED, poses)
 
     def adopt(self, trial: Trial) -> UpdateResult:
         """
@@ -185,7 +172,7 @@ class IncrementalSmoother:
         self._memory.head[tb.INTERRUPT] = 1
 
     def extend(
-        self, mean: PoseVector, information: FloatArray, weight: float = 1.0,
+        self, mean: se2.PoseVector, information: FloatArray, weight: float = 1.0,
     ) -> UpdateResult:
         """
         Return the result of appending a hidden node to the newest pose by an odometry edge.
@@ -231,85 +218,78 @@ class IncrementalSmoother:
         like that of an update. Raises GraphUpdateError for a node that is not in the graph, for
         the newest pose, and if that step fails; ValueError as `refine` does.
         """
-        rows = self._may_leave(nodes)
-        self._linearize(rows)
-        self._order_first(rows)
+        rows, head = self.linearize(nodes), self._memory.head
+        for _ in range(4):  # a step may touch further nodes that wait to be linearized
+            with self._editing():
+                if not forgetting.touch_mixed(head, rows):
+                    self.graph.rollback()
+                    break
+                result = self._step(step.FIRST)
+            if result.status is Status.FAILED:
+                raise GraphUpdateError(f'forget: {result.reason}')
+        else:
+            raise GraphUpdateError('forget: the nodes cannot be ordered first')
         while forgetting.drop(self._memory.head, rows) == tree_update.MORE_MEMORY:
             self._make_room()
         return self.graph.commit()
 
-    def linearize(self, nodes: Collection[int]) -> None:
+    def linearize(self, nodes: Collection[int]) -> IntArray:
         """
         Linearize again what an update has left, by an iteration of `refine`, before nodes leave.
 
         What `forget` makes of them keeps its linearization. Nothing happens if the linearization
         errors of the constraints of the nodes are within the budget of an update that moves them.
-        Whoever wants their last estimate asks for it between the two. Raises as `forget` does.
+        Whoever wants their last estimate asks for it between the two. Returns the rows of the
+        nodes, ascending; raises as `forget` does.
         """
-        self._linearize(self._may_leave(nodes))
-
-    def _may_leave(self, nodes: Collection[int]) -> IntArray:
-        """Return the rows of nodes, ascending; raise GraphUpdateError if one cannot leave."""
         self._require_solved()
-        ids = np.fromiter(nodes, np.int64, len(nodes))
+        ids, head = np.fromiter(nodes, np.int64, len(nodes)), self._memory.head
         if not (ids[1:] > ids[:-1]).all():
             ids = np.unique(ids)    # takes 20 us
         rows = self.graph.node_rows(ids)
         if (rows < 0).any():
             raise GraphUpdateError(f'forget: no hidden node has id {ids[np.argmin(rows)]}')
-        if (rows == self._memory.head[tb.NEWEST]).any():
+        if (rows == head[tb.NEWEST]).any():
             raise GraphUpdateError(f'forget: {self.graph.newest_pose} is the newest pose')
-        return rows
-
-    def _linearize(self, rows: IntArray) -> None:
-        head = self._memory.head
         if forgetting.far_from_linear(head, rows):
             while self._refinement_step() == tree_update.INTERRUPTED:
                 head[tb.INTERRUPT] = 0
+        return rows
 
-    def _order_first(self, rows: IntArray) -> None:
-        """Make whole subtrees of nodes, by row, or raise GraphUpdateError."""
-        for _ in range(4):  # a step may touch further nodes that wait to be linearized
-            with self._editing():
-                if not forgetting.touch_mixed(self._memory.head, rows):
-                    self.graph.rollback()
-                    return
-                result = self._step(step.FIRST)
-            if result.status is Status.FAILED:
-                raise GraphUpdateError(f'forget: {result.reason}')
-        raise GraphUpdateError('forget: the nodes cannot be ordered first')
-
-    def newest_covariance(self) -> Covariance:
+    def newest_covariance(self) -> se2.Covariance:
         """Return the covariance of the newest pose in map axes."""
-        covariance = np.empty((3, 3))
-        if not covariances.newest_covariance(self._memory.head, covariance):
+        head = self._memory.head
+        if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
             # raises an error with the cause
             return self.covariance(self.graph.newest_pose)
-        return covariance
+        return self._covariance(head[tb.NEWEST])
 
-    def covariance(self, node: int) -> Covariance:
+    def covariance(self, node: int) -> se2.Covariance:
         """
         Return the covariance of a hidden node in map axes.
 
         Raises ValueError if there is no such node, or edits of the graph are not solved for.
         """
-        row, = self._eliminated([node])
+        return self._covariance(*self._eliminated([node]))
+
+    def _covariance(self, row: int) -> se2.Covariance:
         out = np.empty((3, 3))
-        covariances.node_covariance(self._memory.head, row, out)
+        covariances.write_covariance(self._memory.head, row, _UNIT, -1, _UNIT, out)
         return out
 
     def joint_covariance(self, i: int, j: int) -> FloatArray:
         """Return the joint covariance, (6, 6), of two hidden nodes; raises as `covariance`."""
-        rows = self._eliminated([i, j])
-        out = np.zeros((6, 6))
-        covariances.pair_covariance(self._memory.head, *rows, out)
+        row_i, row_j = self._eliminated([i, j])
+        out = np.empty((6, 6))
+        covariances.write_covariance(
+            self._memory.head, row_i, np.eye(6, 3), row_j, np.eye(6, 3, -3), out)
         return out
 
-    def covariances(self) -> Covariances:
+    def covariances(self) -> se2.Covariances:
         """Return those of all hidden nodes; raises as `covariance`."""
         self._require_solved()
         out = np.zeros((self.graph.n_nodes, 3, 3))
-        all_covariances(self._memory.head, out)
+        covariances.all_covariances(self._memory.head, out)
         return out
 
     def innovations(self, edges: Factors) -> Innovations:
@@ -340,10 +320,10 @@ class IncrementalSmoother:
         """Return the energy of all constraints."""
         return chi2_of(self.graph)
 
-    def _eliminate(self) -> bool:
-        """Eliminate what waits, from poses of the batch optimiser; tell whether that worked."""
+    def _eliminate(self) -> UpdateResult:
+        """Eliminate what waits, from poses of the batch optimiser."""
         self.graph.begin()
-        return self._step(step.AFTER_BATCH).status is not Status.FAILED
+        return self._step(step.AFTER_BATCH)
 
     def _step(self, entered: int, *, fall_back: bool = True) -> UpdateResult:
         """Bring the estimate up to date, growing the memory as needed, or roll the update back."""
@@ -382,8 +362,7 @@ class IncrementalSmoother:
         """
         other = IncrementalSmoother(self._config)
         if trial.optimize_copy(self.graph, other.graph):
-            other.graph.begin()
-            result = other._step(step.AFTER_BATCH)
+            result = other._eliminate()
             if result.status is not Status.FAILED:
                 self.graph.memory = self._memory = other.graph.memory
                 self.graph.commit()

@@ -12,19 +12,22 @@ steps have solved for since the last one, checks all constraints there, lineariz
 error again, and repeats this until the errors are below `ENOUGH`. By Cauchy-Schwarz no coordinate
 of any node is then further from the minimum than the root of that, in its posterior sigmas. Each
 call of `refine` does one iteration, and the graph is valid after each.
+
+After a solve the factors of nodes that have turned are checked, and so are the frames of cliques
+that have turned against their parents' frames. If their squared linearization errors add up to
+more than the budget of the step, the largest of them are linearized again, and their nodes are
+touched for the next iteration: fluid relinearization (M. Kaess et al., "iSAM2", IJRR 2012), here
+with whitened errors.
 """
 
+import math
+
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
-from pose_graph_ros.core.graph import tables as tb, transaction_log
+from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
 from pose_graph_ros.core.graph.rows import touch
-from pose_graph_ros.core.smoother import relinearization, tree_update
-from pose_graph_ros.core.smoother.tree_update import (
-    DIVERGED,
-    DONE,
-    INTERRUPTED,
-    MORE_MEMORY,
-    UNFINISHED,
-)
+from pose_graph_ros.core.smoother import tree_update
+from pose_graph_ros.core.smoother.back_substitution import back_substitute
 
 # How `run` is entered: after an edit; again, with the memory that it has asked for; after the
 # batch fallback, when there is no further fallback.
@@ -34,24 +37,6 @@ ENOUGH = 1e-10
 # `alpha` [sigma] and `budget_share` [sigma^2] of a refinement.
 ALPHA = 1e-6
 SHARE = 1e-13
-
-
-@kernel
-def _has_diverged(head, out_of_iterations):  # type: ignore[no-untyped-def]
-    """
-    Tell whether the iterations have diverged.
-
-    That is so if the squared linearization error is large, in sigma^2 and against the lowest chi2
-    of the step (a false constraint raises chi2 and all linearization errors with it), and either
-    no iteration remains, the last one has not halved the error, or it is so large that another can
-    only increase it.
-    """
-    scalars = tb.scalars(head)[0]
-    error2, before = scalars.error2_sum, scalars.error2_before
-    scalars.error2_before, scalars.lowest = error2, min(scalars.lowest, scalars.chi2)
-    if error2 <= 1.0 or error2 <= 1e-3 * scalars.lowest:
-        return False
-    return out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6
 
 
 @kernel
@@ -69,119 +54,85 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     UNFINISHED: linearization errors above the budget wait for the next update. After MORE_MEMORY
     the step is entered again as RESUMED (AFTER_BATCH if it was that before).
     """
+    scalars = tb.scalars(head)[0]
     if entered == FIRST:
         _reset_counters(head)
     if entered != RESUMED:
-        tb.scalars(head)[0].lowest = tb.scalars(head)[0].chi2
+        scalars.lowest = scalars.chi2
     head[tb.N_TURNED] = 0   # cliques that were listed in the last update may have been replaced
     settled = True
     while True:
         # in the first iteration, the constraints that the last update has left over
-        relinearization.relinearize(head)
+        _relinearize(head)
         if head[tb.N_TOUCHED] == 0:
             break
-        code = tree_update.eliminate(head)
-        if code != DONE:
+        # all cliques from the touched nodes up to the roots are eliminated again
+        marked, affected = tree_update.mark(head)
+        head[tb.ITERATION] += 1
+        head[tb.SINCE] = head[tb.ITERATION]
+        if head[tb.STRUCTURE] != 0:
+            code = tree_update.rebuild(head, marked, affected)
+        else:
+            code = tree_update.refresh(head, marked, False)
+        if code != tree_update.DONE:
             return code
-        settled = relinearization.solve(head)
+        head[tb.STRUCTURE] = 0
+        tree_update.forget_touched(head)
+        head[tb.N_ELIMINATED] += len(affected)
+        error2 = _solve_and_check(head)
+        settled = error2 <= _budget(head)
         if settled:
+            _forget_waiting(head)
             break
+        # The iterations have diverged if the error is large, in sigma^2 and against the lowest chi2
+        # of the step (a false constraint raises chi2 and all linearization errors with it), and
+        # either no iteration remains, the last one has not halved it, or another can only increase
+        # it.
         out_of_iterations = head[tb.N_ITERATIONS] >= max_iterations
-        if _has_diverged(head, out_of_iterations):
-            return DIVERGED
+        before, scalars.error2_before = scalars.error2_before, error2
+        scalars.lowest = min(scalars.lowest, scalars.chi2)
+        large = error2 > 1.0 and error2 > 1e-3 * scalars.lowest
+        if large and (out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6):
+            return tree_update.DIVERGED
         if out_of_iterations:
             break
     transaction_log.commit(head)
-    return DONE if settled else UNFINISHED
-
-
-@kernel
-def _touch_clique(head, c):  # type: ignore[no-untyped-def]
-    pool_i, cliques = tb.pool_i(head), tb.cliques(head)
-    v = pool_i[cliques[c].members]
-    transaction_log.log_node(head, v)
-    touch(head, v)
-    head[tb.N_RELINEARIZED] += 1
-
-
-@kernel
-def _touch_waiting(head):  # type: ignore[no-untyped-def]
-    """Touch the cliques of waiting constraints and turned frames; eliminating linearizes them."""
-    factors, work_i = tb.factors(head), tb.work_i(head)
-    turned = work_i[2 * head[tb.NODE_ROOM]:]
-    for n in range(head[tb.N_TURNED]):
-        _touch_clique(head, tb.cliques(head)[turned[n]].parent)
-    for n in range(head[tb.N_WAITING]):
-        e = tb.waiting(head)[n]
-        transaction_log.log_factor(head, e)
-        relinearization.set_waits(head, e, 0)
-        _touch_clique(head, factors[e].owner)
-    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
-
-
-@kernel
-def _solve(head):  # type: ignore[no-untyped-def]
-    """Solve for the cliques that have changed since the last refinement, and check them."""
-    head[tb.SINCE] = head[tb.REFINED]
-    relinearization.solve_and_check(head)
-
-
-@kernel
-def _solve_from_the_root(head):  # type: ignore[no-untyped-def]
-    nodes, cliques, work_i = tb.nodes(head), tb.cliques(head), tb.work_i(head)
-    c = nodes[head[tb.NEWEST]].clique
-    while cliques[c].parent >= 0:
-        c = cliques[c].parent
-    work_i[0] = c
-    head[tb.N_ROOTS] = 1
-    head[tb.ITERATION] += 1
-    _solve(head)
+    return tree_update.DONE if settled else tree_update.UNFINISHED
 
 
 @kernel(allocates=True)
 def _iterate(head):  # type: ignore[no-untyped-def]
     """Linearize what waits again, eliminate it and what is above it, and solve."""
-    scalars = tb.scalars(head)[0]
+    scalars, cliques = tb.scalars(head)[0], tb.cliques(head)
+    turned = tb.work_i(head)[2 * head[tb.NODE_ROOM]:]
     chi2, error2 = scalars.chi2, scalars.error2_sum
-    _touch_waiting(head)
+    # eliminating the cliques linearizes the constraints in them
+    for n in range(head[tb.N_TURNED]):
+        _touch_clique(head, cliques[turned[n]].parent)
+    for n in range(head[tb.N_WAITING]):
+        e = tb.waiting(head)[n]
+        transaction_log.log_factor(head, e)
+        tb.factors(head)[e].waits = 0
+        _touch_clique(head, tb.factors(head)[e].owner)
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
     if head[tb.N_TOUCHED] == 0:
-        return DONE      # many errors, each of them negligible
+        return tree_update.DONE      # many errors, each of them negligible
     marked, affected = tree_update.mark(head)
     head[tb.ITERATION] += 1
     code = tree_update.refresh(head, marked, True)
-    if code != DONE:
+    if code != tree_update.DONE:
         return code
     tree_update.forget_touched(head)
-    head[tb.N_ELIMINATED] = len(affected)
-    _solve(head)
+    head[tb.N_ELIMINATED], head[tb.SINCE] = len(affected), head[tb.REFINED]
+    _solve_and_check(head)
     # Gauss-Newton goes uphill, by at most 0.1 sigma^2, where it swings a soft mode
     if not scalars.chi2 <= scalars.lowest + 0.1 or head[tb.ROUND] >= 20:
-        return DIVERGED
+        return tree_update.DIVERGED
     head[tb.ROUND] += 1
     scalars.lowest = min(scalars.lowest, scalars.chi2)
     least = 1e-11 * max(chi2, 1.0)  # rounding errors, which cannot be reduced any further
     stalls = abs(scalars.chi2 - chi2) <= least and scalars.error2_sum > 0.5 * error2
-    return DONE if stalls or scalars.error2_sum <= ENOUGH else UNFINISHED
-
-
-@kernel(allocates=True)
-def _refine(head):  # type: ignore[no-untyped-def]
-    scalars = tb.scalars(head)[0]
-    if head[tb.LISTED] != head[tb.UPDATE] - 1:
-        head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
-        _solve_from_the_root(head)
-        head[tb.ROUND], scalars.lowest = 0, scalars.chi2
-    if head[tb.INTERRUPT] != 0:
-        return INTERRUPTED
-    code = _iterate(head) if scalars.error2_sum > ENOUGH else DONE
-    if head[tb.INTERRUPT] != 0 and code != MORE_MEMORY:
-        return INTERRUPTED
-    if code == DONE:
-        relinearization.forget_waiting(head)
-        head[tb.REFINED] = head[tb.ITERATION] + 1
-    elif code == UNFINISHED:
-        head[tb.LISTED] = head[tb.UPDATE]
-    return code
+    return tree_update.DONE if stalls or scalars.error2_sum <= ENOUGH else tree_update.UNFINISHED
 
 
 @kernel(signature=(tb.HEAD,), allocates=True)
@@ -193,13 +144,167 @@ def refine(head):  # type: ignore[no-untyped-def]
     minimum. After all but the first two the caller has to roll back what `transaction_log.begin`
     has begun. The graph must have no touched nodes.
     """
-    scalars = tb.scalars(head)[0]
+    scalars, cliques = tb.scalars(head)[0], tb.cliques(head)
     alpha, share = scalars.alpha, scalars.share
-    scalars.alpha, scalars.share = ALPHA, SHARE
+    scalars.alpha, scalars.share = ALPHA, SHARE     # a rollback restores them, too
     _reset_counters(head)
-    code = _refine(head)
+    if head[tb.LISTED] != head[tb.UPDATE] - 1:
+        head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
+        # from the root down, for the cliques that have changed since the last refinement
+        c = tb.nodes(head)[head[tb.NEWEST]].clique
+        while cliques[c].parent >= 0:
+            c = cliques[c].parent
+        tb.work_i(head)[0] = c
+        head[tb.N_ROOTS], head[tb.SINCE] = 1, head[tb.REFINED]
+        head[tb.ITERATION] += 1
+        _solve_and_check(head)
+        head[tb.ROUND], scalars.lowest = 0, scalars.chi2
+    if head[tb.INTERRUPT] != 0:
+        return tree_update.INTERRUPTED
+    code = _iterate(head) if scalars.error2_sum > ENOUGH else tree_update.DONE
+    if head[tb.INTERRUPT] != 0 and code != tree_update.MORE_MEMORY:
+        return tree_update.INTERRUPTED
+    if code == tree_update.DONE:
+        _forget_waiting(head)
+        head[tb.REFINED] = head[tb.ITERATION] + 1
+    elif code == tree_update.UNFINISHED:
+        head[tb.LISTED] = head[tb.UPDATE]
+    else:
+        return code
     scalars.alpha, scalars.share = alpha, share
-    if code in (DONE, UNFINISHED):
-        scalars.largest_move = transaction_log.largest_move(head)
-        transaction_log.commit(head)
+    scalars.largest_move = transaction_log.largest_move(head)
+    transaction_log.commit(head)
     return code
+
+
+@kernel
+def _forget_waiting(head):  # type: ignore[no-untyped-def]
+    """Empty the lists of waiting factors and turned frames without linearizing them again."""
+    for n in range(head[tb.N_WAITING]):
+        tb.factors(head)[tb.waiting(head)[n]].waits = 0
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _relinearize(head):  # type: ignore[no-untyped-def]
+    """
+    Linearize the worst waiting factors again, until 0.4 of the budget remains.
+
+    The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
+    """
+    allowed = 0.4 * _budget(head)
+    work_f, waiting, cliques = tb.work_f(head), tb.waiting(head), tb.cliques(head)
+    work_i = tb.work_i(head)
+    # sums of the errors by powers of two of their ratio to `allowed`, largest first
+    bins = work_f[:64]
+    bins[:] = 0.0
+    left, cut = 0.0, 0
+    for n in range(head[tb.N_WAITING]):
+        error2 = tb.factors(head)[waiting[n]].error2
+        bins[_bin(error2 / allowed)] += error2
+        left += error2
+    turned = work_i[2 * head[tb.NODE_ROOM]:]
+    for n in range(head[tb.N_TURNED]):
+        error2 = cliques[turned[n]].slip_error2
+        bins[_bin(error2 / allowed)] += error2
+        left += error2
+    while cut < 64 and left > allowed:
+        left -= bins[cut]
+        cut += 1
+    for n in range(head[tb.N_WAITING]):
+        e = waiting[n]
+        transaction_log.log_factor(head, e)
+        f = tb.factors(head)[e]
+        f.waits = 0
+        if _bin(f.error2 / allowed) < cut:
+            head[tb.N_RELINEARIZED] += 1
+            factors.linearize(head, e)
+            for v in f.ends:
+                if v >= 0:
+                    transaction_log.log_node(head, v)
+                    touch(head, v)
+    for n in range(head[tb.N_TURNED]):
+        c = turned[n]
+        if _bin(cliques[c].slip_error2 / allowed) < cut:
+            # the parent adds the update matrix again, at the present angle of the frame
+            _touch_clique(head, cliques[c].parent)
+    head[tb.N_WAITING] = head[tb.N_TURNED] = 0
+
+
+@kernel
+def _touch_clique(head, c):  # type: ignore[no-untyped-def]
+    """Touch a clique, whose elimination linearizes something again."""
+    v = tb.pool_i(head)[tb.cliques(head)[c].members]
+    transaction_log.log_node(head, v)
+    touch(head, v)
+    head[tb.N_RELINEARIZED] += 1
+
+
+@kernel
+def _bin(ratio):  # type: ignore[no-untyped-def]
+    """Return 0 for a ratio of 2 or more, and 1 more for each halving, up to 63."""
+    if ratio <= 0.0:
+        return 63
+    return min(max(int(1.0 - math.floor(math.log2(ratio))), 0), 63)
+
+
+@kernel
+def _budget(head):  # type: ignore[no-untyped-def]
+    """Return the squared linearization error that a step may leave [sigma^2]."""
+    scalars = tb.scalars(head)[0]
+    return min(scalars.budget, scalars.share * scalars.n_moved)
+
+
+@kernel
+def _solve_and_check(head):  # type: ignore[no-untyped-def]
+    """
+    Solve from the roots on the stack down; return the sum of the squared linearization errors.
+
+    They are those of the factors of all nodes that the solve lists, each factor once, and of the
+    listed turned frames. Factors with large errors wait to be linearized again, and frames with
+    large errors stay listed.
+    """
+    back_substitute(head)
+    scalars, cliques, waiting = tb.scalars(head)[0], tb.cliques(head), tb.waiting(head)
+    work_i, work_f, iteration = tb.work_i(head), tb.work_f(head), head[tb.ITERATION]
+    checks, turned = work_i[head[tb.NODE_ROOM]:], work_i[2 * head[tb.NODE_ROOM]:]
+    large = factors.LEAST_FRACTION * scalars.share
+    scalars.error2_sum = 0.0
+    owner, frame = -1, factors.NO_TURN  # those that follow each other often have the same owner
+    for n in range(head[tb.N_CHECKS]):
+        at = tb.nodes(head)[checks[n]].factor_list
+        while at >= 0:
+            e, f = at >> 2, tb.factors(head)[at >> 2]
+            at = f.next[at & 3]
+            if f.checked == iteration:
+                continue
+            f.checked = iteration
+            if f.owner != owner:
+                owner = f.owner
+                phi = clique_frames.present_turn(head, owner)
+                frame = (phi, math.cos(phi), math.sin(phi))
+            transaction_log.log_energy(head, e)
+            scalars.chi2 -= f.energy
+            factors.check(head, e, frame)
+            scalars.chi2 += f.energy
+            scalars.error2_sum += f.error2
+            if f.error2 > large and f.waits == 0:
+                f.waits = 1
+                waiting[head[tb.N_WAITING]] = e
+                head[tb.N_WAITING] += 1
+    kept = 0
+    for n in range(head[tb.N_TURNED]):
+        c = turned[n]
+        if cliques[c].n_frontal == 0:
+            error2 = clique_frames.prior_error2(head, c, work_f)
+        else:
+            error2 = clique_frames.interface_error2(
+                head, c, clique_frames.frame_slip(head, c), work_f)
+        scalars.error2_sum += error2
+        if error2 > large:
+            cliques[c].slip_error2 = error2
+            turned[kept] = c
+            kept += 1
+    head[tb.N_TURNED] = kept
+    head[tb.N_ITERATIONS] += 1
+    return scalars.error2_sum

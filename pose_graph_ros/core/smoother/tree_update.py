@@ -14,13 +14,7 @@ import numpy as np
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.elimination.assembly import eliminate_clique, RELINEARIZED, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
-from pose_graph_ros.core.elimination.symbolic import (
-    in_postorder,
-    newest_last,
-    plant,
-    required_memory,
-    structure,
-)
+from pose_graph_ros.core.elimination.symbolic import in_postorder, newest_last, plant, structure
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 
 # Return codes of the kernels of all modules here. UNFINISHED: what remains can wait for another
@@ -87,40 +81,50 @@ def mark(head):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True, inline='always')    # callees compile once
 def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
-    """Replace the marked cliques: their nodes are ordered and eliminated anew."""
-    n_leaving = _leaving_first(head, affected)
+    """
+    Replace the marked cliques: their nodes are ordered and eliminated anew.
+
+    The new roots are put on the stack for the back-substitution.
+    """
+    nodes, tree = tb.nodes(head), tb.cliques(head)
+    n_leaving = 0   # the nodes that are about to leave come first
+    for k in range(len(affected)):
+        if nodes[affected[k]].touched == ORDERED_FIRST:
+            affected[n_leaving], affected[k] = affected[k], affected[n_leaving]
+            n_leaving += 1
     n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
     orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
     cliques = in_postorder(
         affected, minimum_degree(
             len(affected), len(orphans), n_leaving, n_last, start, adjacency),
         n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, False)
-    need_f, need_i, largest = required_memory(cliques)
-    if lacks_memory(head, head[tb.POOL_F_END] + need_f, head[tb.POOL_I_END] + need_i, largest):
+    if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
+                    head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
         return MORE_MEMORY
-    _push_drift_down(head, marked, orphans)
+    # to each orphan goes the drift of all cliques above it, which are about to be dropped
+    drifting = False
+    for k in range(len(marked)):
+        drifting = drifting or tree[marked[k]].drift > 0.0
+    for k in range(len(orphans) if drifting else 0):
+        drift, c = 0.0, tree[orphans[k]].parent
+        while c >= 0:
+            drift += tree[c].drift
+            c = tree[c].parent
+        if drift > 0.0:
+            transaction_log.log_clique(head, orphans[k])
+            tree[orphans[k]].drift += drift
     for k in range(len(marked)):
         transaction_log.drop_clique(head, marked[k])
-    rows = plant(head, cliques, orphans)
-    for k in range(len(rows)):
-        bad = eliminate_clique(head, rows[k], RELINEARIZED)
+    head[tb.N_ROOTS] = 0
+    for c in plant(head, cliques, orphans):
+        bad = eliminate_clique(head, c, RELINEARIZED)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             return BAD_PIVOT
-    _find_roots(head, rows)
+        if tree[c].parent < 0:
+            tb.work_i(head)[head[tb.N_ROOTS]] = c
+            head[tb.N_ROOTS] += 1
     return DONE
-
-
-@kernel
-def _leaving_first(head, affected):  # type: ignore[no-untyped-def]
-    """Move the nodes that are about to leave to the front of the list; return their number."""
-    nodes = tb.nodes(head)
-    n = 0
-    for k in range(len(affected)):
-        if nodes[affected[k]].touched == ORDERED_FIRST:
-            affected[n], affected[k] = affected[k], affected[n]
-            n += 1
-    return n
 
 
 @kernel(allocates=True)
@@ -137,28 +141,13 @@ def _loose_priors(head):  # type: ignore[no-untyped-def]
     return loose
 
 
-@kernel
-def _push_drift_down(head, marked, orphans):  # type: ignore[no-untyped-def]
-    """Add to each orphan the drift of all cliques above it, which are about to be dropped."""
-    cliques = tb.cliques(head)
-    drifting = False
-    for k in range(len(marked)):
-        drifting = drifting or cliques[marked[k]].drift > 0.0
-    if not drifting:
-        return
-    for k in range(len(orphans)):
-        drift, c = 0.0, cliques[orphans[k]].parent
-        while c >= 0:
-            drift += cliques[c].drift
-            c = cliques[c].parent
-        if drift > 0.0:
-            transaction_log.log_clique(head, orphans[k])
-            cliques[orphans[k]].drift += drift
-
-
 @kernel(inline='always')
 def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
-    """Eliminate the marked cliques again with the same structure."""
+    """
+    Eliminate the marked cliques again with the same structure.
+
+    Their roots are put on the stack for the back-substitution.
+    """
     ready, cliques = tb.work_i(head), tb.cliques(head)
     need, largest = np.int64(0), np.int64(0)
     for k in range(len(marked)):
@@ -174,7 +163,7 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
         if parent >= 0:
             cliques[parent].marked += 1
     # children first; MARKED counts the marked children that are still to be eliminated
-    n_ready = 0
+    n_ready = head[tb.N_ROOTS] = 0
     for k in range(len(marked)):
         if cliques[marked[k]].marked == 0:
             ready[n_ready] = marked[k]
@@ -192,44 +181,15 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
             return BAD_PIVOT
         cliques[c].built = head[tb.ITERATION]
         parent = cliques[c].parent
-        if parent >= 0:
-            cliques[parent].marked -= 1
-            if cliques[parent].marked == 0:
-                ready[n_ready] = parent
-                n_ready += 1
-    _find_roots(head, marked)
+        if parent < 0:  # the stack is the first part of the queue, which is done with
+            ready[head[tb.N_ROOTS]] = c
+            head[tb.N_ROOTS] += 1
+            continue
+        cliques[parent].marked -= 1
+        if cliques[parent].marked == 0:
+            ready[n_ready] = parent
+            n_ready += 1
     return DONE
-
-
-@kernel
-def _find_roots(head, cliques):  # type: ignore[no-untyped-def]
-    """Put those of the cliques that are roots on the stack for the back-substitution."""
-    work_i = tb.work_i(head)
-    n_roots = 0
-    for k in range(len(cliques)):
-        if tb.cliques(head)[cliques[k]].parent < 0:
-            work_i[n_roots] = cliques[k]
-            n_roots += 1
-    head[tb.N_ROOTS] = n_roots
-
-
-@kernel(allocates=True, inline='always')
-def eliminate(head):  # type: ignore[no-untyped-def]
-    """
-    Eliminate all cliques from the touched nodes up to the roots again.
-
-    DONE: no node is touched any more, and the roots are on the stack for the back-substitution.
-    """
-    marked, affected = mark(head)
-    head[tb.ITERATION] += 1
-    head[tb.SINCE] = head[tb.ITERATION]
-    changed = head[tb.STRUCTURE] != 0
-    code = rebuild(head, marked, affected) if changed else refresh(head, marked, False)
-    if code == DONE:
-        head[tb.STRUCTURE] = 0
-        forget_touched(head)
-        head[tb.N_ELIMINATED] += len(affected)
-    return code
 
 
 @kernel

@@ -18,7 +18,7 @@ with the graph, and adopted by the smoother with all that was added meanwhile
 (`IncrementalSmoother.adopt`); or it is dropped, without a trace.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +27,7 @@ from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import BatchResult, Optimization, Start, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
+from pose_graph_ros.core.geometry.se2 import IntArray, Poses
 from pose_graph_ros.core.graph import transaction_log
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed, Prior
@@ -123,13 +123,19 @@ class Trial:
         now, before, copy = self._graph.rows(), self._before, self.graph
         poses = continued(self._graph, copy.poses, copy.node_ids)
         copy.fill(now._replace(poses=poses).since(before.next_ids))
-        weights = _changed(before.factor_ids, before.factors.weight, now.factor_ids,
-                           now.factors.weight, self._update.weigh)
+        # weights that have changed and are not chosen, of what is still in the graph
+        ids, old, new = np.intersect1d(
+            before.factor_ids, now.factor_ids, assume_unique=True, return_indices=True)
+        changed = (before.factors.weight[old] != now.factors.weight[new]) & ~np.isin(
+            ids, list(self._update.weigh))
         was_fixed = copy.fixed[copy.node_rows(now.node_ids)]
         known = {_key(prior) for prior in before.priors}
-        copy.apply(_gone(copy, self._graph)._replace(
+        copy.apply(GraphUpdate(
+            remove_nodes=copy.node_ids[self._graph.node_rows(copy.node_ids) < 0].tolist(),
+            drop=copy.factor_ids[self._graph.factor_rows(copy.factor_ids) < 0].tolist(),
             priors=[prior for prior in now.priors if _key(prior) not in known],
-            weigh=weights,
+            weigh=dict(zip(ids[changed].tolist(),
+                           now.factors.weight[new[changed]].tolist(), strict=True)),
             fix=self._graph.node_ids[now.fixed & ~was_fixed].tolist(),
             free=self._graph.node_ids[was_fixed & ~now.fixed].tolist()))
 
@@ -137,25 +143,6 @@ class Trial:
 def _key(prior: Prior) -> bytes:
     """Return all of a prior as bytes."""
     return prior.nodes.tobytes() + packed(prior).tobytes()
-
-
-def _gone(copy: Graph, graph: Graph) -> GraphUpdate:
-    """Return the update that takes out of a copy what has left the graph."""
-    nodes, factors = (ids[rows(ids) < 0].tolist() for ids, rows in (
-        (copy.node_ids, graph.node_rows), (copy.factor_ids, graph.factor_rows)))
-    return GraphUpdate(remove_nodes=nodes, drop=factors)
-
-
-def _changed(
-    ids_before: IntArray, old: FloatArray, ids_now: IntArray, new: FloatArray,
-    chosen: Mapping[int, float],
-) -> dict[int, float]:
-    """Return the weights that have changed and are not chosen, of what is still in the graph."""
-    ids, rows_before, rows_now = np.intersect1d(
-        ids_before, ids_now, assume_unique=True, return_indices=True)
-    weights = zip(ids.tolist(), old[rows_before].tolist(), new[rows_now].tolist(), strict=True)
-    return {number: weight for number, before, weight in weights
-            if weight != before and number not in chosen}
 
 
 def continued(graph: Graph, poses: Poses, ids: IntArray | None = None) -> Poses:
@@ -170,6 +157,5 @@ def continued(graph: Graph, poses: Poses, ids: IntArray | None = None) -> Poses:
     last = int(rows[(rows >= 0) & is_pose[rows]][-1])
     moved[rows[rows >= 0]] = poses[rows >= 0]
     newer = n + np.flatnonzero(is_pose[n:])
-    moved[newer] = se2.compose(
-        moved[last], se2.between(graph.poses[last], graph.poses[newer]))
+    moved[newer] = se2.compose(moved[last], se2.between(graph.poses[last], graph.poses[newer]))
     return moved

@@ -141,8 +141,16 @@ def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cu
     chain = inside[np.isin(factors.i[inside], nodes)]
     seen = np.flatnonzero(
         (factors.j < 0) & np.isin(factors.i, nodes[:-1]) & (factors.weight > 0.0))
-    part = part_of(graph, np.sort(nodes), np.sort(np.concatenate((chain, seen, (edge,)))),
-                   _of_chain(graph, nodes[:-1]))
+    priors = []     # what dense priors tell of the chain alone
+    for prior in graph.priors:
+        known = np.isin(prior.nodes, nodes[:-1])
+        if np.any(known):
+            rows = graph.node_rows(prior.nodes)
+            linear = model(prior, graph.poses[rows], graph.is_pose[rows])
+            U, u = schur_complement(linear.information, -linear.gradient, np.flatnonzero(~known))
+            priors.append(Prior(prior.nodes[known], graph.poses[rows[known]], U, u, 0.0, True))
+    part = part_of(
+        graph, np.sort(nodes), np.sort(np.concatenate((chain, seen, (edge,)))), priors)
     x, first, y = part.node_rows(nodes[[0, -2, -1]])
     H, b = equations(part)
     part.apply(GraphUpdate(weigh={int(graph.factor_ids[edge]): 0.0}))
@@ -164,28 +172,12 @@ def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cu
     return Cut(int(graph.factor_ids[edge]), int(nodes[0]), given * own[0], given * own[1]), rest
 
 
-def _of_chain(graph: Graph, chain: IntArray) -> list[Prior]:
-    """Return what dense priors tell of a chain alone."""
-    found = []
-    for prior in graph.priors:
-        known = np.isin(prior.nodes, chain)
-        if np.any(known):
-            rows = graph.node_rows(prior.nodes)
-            linear = model(prior, graph.poses[rows], graph.is_pose[rows])
-            U, u = schur_complement(
-                linear.information, -linear.gradient, np.flatnonzero(~known))
-            found.append(Prior(prior.nodes[known], graph.poses[rows[known]], U, u, 0.0, True))
-    return found
-
-
 def _of_one(H: FloatArray, b: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
     """Return what the equations of a chain tell of one of its nodes."""
     return schur_complement(H, b, np.delete(np.arange(len(b) // 3), row))
 
 
-def sparse_removal(
-    graph: Graph, nodes: IntArray, factors: IntArray = NONE,
-) -> GraphUpdate | None:
+def sparse_removal(graph: Graph, nodes: IntArray, factors: IntArray = NONE) -> GraphUpdate | None:
     """
     Return the update by which nodes, ascending, and factors leave, and few take their place.
 

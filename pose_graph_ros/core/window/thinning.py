@@ -62,11 +62,33 @@ def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | 
 
     No bias has measurements in it and after it.
     """
-    holder = carriers(graph)
+    holder, factors = carriers(graph), graph.factors
     ahead = older[np.searchsorted(older, first_of(holder)):]
-    size = _size(graph, ahead[:LIMITS.stretch], leaving)
-    # where no bias is needed on both sides
-    ends = _ends(graph, ahead[:LIMITS.longest_stretch + 1], holder)
+    # how many poses make a stretch, as far as not too many others are around
+    some = ahead[:LIMITS.stretch]
+    near, size = _near(graph, np.intersect1d(some, leaving)), len(some)
+    around, inside = set[int](), set[int]()
+    for n, pose in enumerate(some.tolist()):
+        if pose in near:
+            inside.add(pose)
+        around |= near.get(pose, {pose})
+        if n > 0 and len(around - inside) > LIMITS.stretch_around:
+            size = n
+            break
+    # after how many poses, at least one, no bias has measurements on both sides: it is in use
+    # between its first and its last pose
+    poses = ahead[:LIMITS.longest_stretch + 1]
+    measured = (holder >= 0) & (factors.j >= 0)
+    bias = np.where(factors.k >= 0, factors.k, factors.j)[measured]
+    biases, which = np.unique(bias, return_inverse=True)
+    at = np.searchsorted(poses, holder[measured])
+    first, last = np.full(len(biases), len(poses)), np.zeros(len(biases), dtype=np.int64)
+    np.minimum.at(first, which, at)
+    np.maximum.at(last, which, at)
+    in_use = np.zeros(len(poses) + 2, dtype=np.int64)
+    np.add.at(in_use, first + 1, 1)
+    np.add.at(in_use, last + 1, -1)
+    ends = np.flatnonzero(np.cumsum(in_use)[:-1] == 0)[1:]
     ends = ends[ends < len(ahead)]
     if size == 0 or len(ends) == 0 or len(ahead) <= size:
         return None
@@ -74,36 +96,6 @@ def next_segment(graph: Graph, older: IntArray, leaving: IntArray) -> Segment | 
     end = int(ends[max(fitting - 1, 0)])
     poses = ahead[:end]
     return Segment(poses, graph.factor_ids[np.isin(holder, poses)], int(ahead[end]))
-
-
-def _ends(graph: Graph, poses: IntArray, holder: IntArray) -> IntArray:
-    """Return after how many of some poses no bias has measurements on both sides, at least one."""
-    factors = graph.factors
-    measured = (holder >= 0) & (factors.j >= 0)
-    bias = np.where(factors.k >= 0, factors.k, factors.j)[measured]
-    biases, which = np.unique(bias, return_inverse=True)
-    at = np.searchsorted(poses, holder[measured])
-    # a bias is in use between its first and its last pose
-    first, last = np.full(len(biases), len(poses)), np.zeros(len(biases), dtype=np.int64)
-    np.minimum.at(first, which, at)
-    np.maximum.at(last, which, at)
-    in_use = np.zeros(len(poses) + 2, dtype=np.int64)
-    np.add.at(in_use, first + 1, 1)
-    np.add.at(in_use, last + 1, -1)
-    return np.flatnonzero(np.cumsum(in_use)[:-1] == 0)[1:]
-
-
-def _size(graph: Graph, poses: IntArray, leaving: IntArray) -> int:
-    """Return how many of some poses make a stretch, as far as not too many others are around."""
-    near = _near(graph, np.intersect1d(poses, leaving))
-    around, inside = set[int](), set[int]()
-    for size, pose in enumerate(poses.tolist()):
-        if pose in near:
-            inside.add(pose)
-        around |= near.get(pose, {pose})
-        if size > 0 and len(around - inside) > LIMITS.stretch_around:
-            return size
-    return len(poses)
 
 
 def _near(graph: Graph, poses: IntArray) -> dict[int, set[int]]:

@@ -38,7 +38,6 @@ def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
 def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     """Make a step; return the solution of the free nodes, in the order of H."""
     head = graph.memory.head
-    gauss_newton.linearize(head)
     assert gauss_newton.eliminate(head, damping, LINEARIZED)
     length = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
     step = graph.node_records['delta']

@@ -3,6 +3,7 @@
 """Linear starts: exact without noise, in any gauge, independent of the present poses."""
 
 from collections.abc import Callable
+from functools import partial
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from random_graphs import consistent_graph, random_graph, random_observed, random_poses
 
 from pose_graph_ros.core.batch import linear_starts
-from pose_graph_ros.core.batch.gauss_newton import CompiledChordal
+from pose_graph_ros.core.batch.gauss_newton import solve_chordal
 from pose_graph_ros.core.batch.linear_starts import joint
 from pose_graph_ros.core.batch.optimizer import plant
 from pose_graph_ros.core.elimination import symbolic
@@ -39,7 +40,7 @@ def assert_poses_equal(poses: FloatArray, expected: FloatArray) -> None:
 def compiled(graph: Graph) -> FloatArray:
     """Return the chordal start as the optimiser finds it, over the cliques of the graph."""
     plant(graph, symbolic.analyse(graph.memory.head))
-    return linear_starts.chordal(graph, CompiledChordal(graph.memory))
+    return linear_starts.chordal(graph, partial(solve_chordal, graph.memory))
 
 
 either = pytest.mark.parametrize('chordal', [linear_starts.chordal, compiled])

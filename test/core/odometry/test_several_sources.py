@@ -10,8 +10,7 @@ import numpy as np
 
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.odometry.several_sources import find_silence, Silence
-from pose_graph_ros.core.odometry.stream import OdometryStream
+from pose_graph_ros.core.odometry.stream import find_silence, OdometryStream, Silence
 
 PATIENCE = 20
 
