@@ -29,22 +29,6 @@ DROPPED = -1.0
 
 
 @kernel
-def _start_nodes(head, first, first_other, types):  # type: ignore[no-untyped-def]
-    """Initialise rows of new hidden nodes: poses, then from `first_other` on the others."""
-    for v in range(first, first_other + len(types)):
-        rows.start_node(head, v)
-        tb.node_id(head)[v] = head[tb.NEXT_NODE]
-        head[tb.NEXT_NODE] += 1
-        if v >= first_other:
-            node = tb.nodes(head)[v]
-            node.kind, node.dimension = rows.kind_and_dimension(types[v - first_other])
-        touch(head, v)
-        head[tb.STRUCTURE] = 1
-    if first_other > first:
-        head[tb.NEWEST] = first_other - 1
-
-
-@kernel
 def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
     """Tell whether a clique that one end of a factor is frontal in has all its ends."""
     ends, n_ends = tb.factors(head)[e].ends, 0
@@ -64,28 +48,6 @@ def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
         if n == n_ends:
             return True
     return False
-
-
-@kernel
-def _touch_ends(head, e):  # type: ignore[no-untyped-def]
-    """Log and touch the ends of a factor; ask for a new ordering if no clique has all."""
-    f = tb.factors(head)[e]
-    if f.ends[1] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
-        head[tb.STRUCTURE] = 1
-    for v in f.ends:
-        if v >= 0:
-            transaction_log.log_node(head, v)
-            touch(head, v)
-
-
-@kernel
-def _link(head, e):  # type: ignore[no-untyped-def]
-    """Put a factor at the heads of the lists of its ends; the caller has logged all rows."""
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    for side in range(3):
-        v = f.ends[side]
-        if v >= 0:
-            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
 
 
 @kernel
@@ -117,38 +79,30 @@ def _evaluate(head, e):  # type: ignore[no-untyped-def]
 @kernel
 def weigh(head, e, weight):  # type: ignore[no-untyped-def]
     """Change the weight of a factor; at 0 it is in no list."""
-    f = tb.factors(head)[e]
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
     before = f.weight
     if weight == before:
         return
     transaction_log.log_factor(head, e)
-    _touch_ends(head, e)
+    if f.ends[1] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
+        head[tb.STRUCTURE] = 1
+    for v in f.ends:
+        if v >= 0:
+            transaction_log.log_node(head, v)
+            touch(head, v)
     rows.scale_by(head, e, weight - before)
     tb.scalars(head)[0].chi2 -= f.energy
     f.weight = weight
-    if weight > 0.0:
-        if before == 0.0:
-            _link(head, e)
-        _evaluate(head, e)
-        return
-    f.error2 = f.energy = 0.0
     for side in range(3):
-        if f.ends[side] >= 0:
+        v = f.ends[side]
+        if v >= 0 and weight == 0.0:
             unlink(head, e, side)
-
-
-@kernel
-def _start(head, e):  # type: ignore[no-untyped-def]
-    """Initialise the new row of a factor, and add it to the graph if it has a weight."""
-    f = tb.factors(head)[e]
-    factors.prepare(f, f.kind)
-    f.error2 = f.energy = 0.0
-    f.checked = f.waits = 0
-    f.next[0], f.logged = -1, head[tb.UPDATE]
-    tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
-    head[tb.NEXT_FACTOR] += 1
-    weight, f.weight = f.weight, 0.0
-    weigh(head, e, weight)
+        elif v >= 0 and before == 0.0:  # put it at the head of the list
+            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
+    if weight > 0.0:
+        _evaluate(head, e)
+    else:
+        f.error2 = f.energy = 0.0
 
 
 @kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
@@ -214,10 +168,28 @@ def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
-    _start_nodes(head, first, first_other, types)
+    for v in range(first, n_nodes):
+        rows.start_node(head, v)
+        tb.node_id(head)[v] = head[tb.NEXT_NODE]
+        head[tb.NEXT_NODE] += 1
+        if v >= first_other:
+            node, code = tb.nodes(head)[v], types[v - first_other]
+            node.kind, node.dimension = code & 3, 3 - (code >> 2)
+        touch(head, v)
+        head[tb.STRUCTURE] = 1
+    if first_other > first:
+        head[tb.NEWEST] = first_other - 1
     head[tb.N_FACTORS] = n_factors
     for e in range(n_factors - len(records), n_factors):
-        _start(head, e)
+        f = tb.factors(head)[e]
+        factors.prepare(f, f.kind)
+        f.error2 = f.energy = 0.0
+        f.checked = f.waits = 0
+        f.next[0], f.logged = -1, head[tb.UPDATE]
+        tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
+        head[tb.NEXT_FACTOR] += 1
+        weight, f.weight = f.weight, 0.0
+        weigh(head, e, weight)
     return ADDED
 
 

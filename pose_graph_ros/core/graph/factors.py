@@ -86,12 +86,6 @@ def is_relative(kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def frame_moves(kind):  # type: ignore[no-untyped-def]
-    """Tell whether the frame of an error moves with the nodes, so that it is linearized."""
-    return is_relative(kind) or kind == RANGE
-
-
-@kernel(forceinline=True)
 def anchors(f):  # type: ignore[no-untyped-def]
     """Tell whether axes of a factor's errors or unknowns do not turn with its clique."""
     return (f.kind >= BIAS and f.kind != PRIOR) or f.ends[2] >= 0
@@ -132,17 +126,9 @@ def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def heading_offset(f, kind):  # type: ignore[no-untyped-def]
-    """Return the constant part of the heading's error [rad]."""
-    if kind == BIAS:
-        return f.mean[2]
-    return -f.mean[2] if kind < OBSERVED else f.mean[2] - f.constants[2]
-
-
-@kernel(forceinline=True)
 def frame(f, kind):  # type: ignore[no-untyped-def]
     """Return cosine and sine of the frame at the linearization."""
-    if frame_moves(kind):
+    if is_relative(kind) or kind == RANGE:  # it moves with the nodes
         return f.lin_cos, f.lin_sin
     if kind < OBSERVED or f.mean[2] == 0.0:
         return 1.0, 0.0
@@ -157,12 +143,6 @@ def constant(f, kind, c, s, ax, ay):  # type: ignore[no-untyped-def]
     if kind == RANGE:
         return -ax - c * f.mean[0], -ay - s * f.mean[0]
     return f.mean[0] - ax, f.mean[1] - ay
-
-
-@kernel(forceinline=True)
-def relative_error(f, x, y):  # type: ignore[no-untyped-def]
-    """Return e_t of a relative error, for d in the axes of its frame."""
-    return x - f.constants[0], y - f.constants[1]
 
 
 @kernel(forceinline=True)
@@ -193,7 +173,7 @@ def motion(nodes, f):  # type: ignore[no-untyped-def]
 def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     """Return the error e_t, cosine and sine of its frame, and its arm, for d and `rotation`."""
     if is_relative(kind):
-        ex, ey = relative_error(f, c * dx + s * dy, c * dy - s * dx)
+        ex, ey = c * dx + s * dy - f.constants[0], c * dy - s * dx - f.constants[1]
         return ex, ey, c, s, dx, dy
     ox, oy = f.constants[0], f.constants[1]
     ax, ay = c * ox - s * oy, s * ox + c * oy
@@ -239,7 +219,11 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     c, s = rotation(f, kind, start[2])
     ex, ey, c, s, ax, ay = error(
         f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
-    eth = fth * end[2] - start[2] + heading_offset(f, kind) + third[2]
+    eth = fth * end[2] - start[2] + third[2]
+    if kind < OBSERVED:
+        eth += f.mean[2] if kind == BIAS else -f.mean[2]
+    else:
+        eth += f.mean[2] - f.constants[2]
     return ex + third[0], ey + third[1], wrap(eth), c, s, ax, ay
 
 
@@ -249,24 +233,10 @@ def _linearize(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     by_pose, delta_k = third
     _, _, eth, c, s, ax, ay = model(f, kind, start.pose, end.pose, by_pose)
     _, fth = factors_of_end(f, kind)
-    if frame_moves(kind):
+    if is_relative(kind) or kind == RANGE:
         f.lin_cos, f.lin_sin = c, s
     f.lin_arm[0], f.lin_arm[1], f.lin_th = ax, ay, start.delta[2]
     f.lin_k = eth - (fth * end.delta[2] - start.delta[2] + delta_k)
-
-
-@kernel(forceinline=True)
-def _versine_and_sine(turn):  # type: ignore[no-untyped-def]
-    """Return cosine minus 1 and sine of an angle, which is small as a rule."""
-    if abs(turn) < 0.1:
-        # cos - 1 and sin by their series, exact to rounding
-        square = turn * turn
-        versine = -square * (0.5 - square * (1 / 24 - square * (1 / 720 - square * (
-            1 / 40320 - square / 3628800))))
-        sine = turn * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
-            1 / 5040 - square * (1 / 362880 - square / 39916800)))))
-        return versine, sine
-    return math.cos(turn) - 1.0, math.sin(turn)
 
 
 @kernel(forceinline=True)
@@ -287,11 +257,16 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
     if is_relative(kind):
         # d in the axes of the linearized frame, and by how much the turn changes it
         qx, qy = c_bar * dx + s_bar * dy, c_bar * dy - s_bar * dx
-        versine, sine = _versine_and_sine(turn)
+        if abs(turn) < 0.1:     # as a rule: cos - 1 and sin by their series, exact to rounding
+            versine = -turned * (0.5 - turned * (1 / 24 - turned * (1 / 720 - turned * (
+                1 / 40320 - turned / 3628800))))
+            sine = turn * (1.0 - turned * (1 / 6 - turned * (1 / 120 - turned * (
+                1 / 5040 - turned * (1 / 362880 - turned / 39916800)))))
+        else:
+            versine, sine = math.cos(turn) - 1.0, math.sin(turn)
         px, py = versine * qx + sine * qy, versine * qy - sine * qx
         ax, ay = qx + px, qy + py
-        ex, ey = relative_error(f, ax, ay)
-        ex, ey = ex + by_x, ey + by_y
+        ex, ey = ax - f.constants[0] + by_x, ay - f.constants[1] + by_y
         rx, ry = px - gy * turn, py + gx * turn
     else:   # its clique is anchored, so phi is zero
         c, s = rotation(f, kind, start.pose[2])
@@ -306,7 +281,7 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
     linear = f.lin_k + fth * end.delta[2] - th + delta_k
     eth = wrap(linear)
     if kind == BIAS:    # a factor times a heading that is wrapped
-        eth = wrap(fth * end.pose[2] - start.pose[2] + heading_offset(f, kind))
+        eth = wrap(fth * end.pose[2] - start.pose[2] + f.mean[2])
     rth = eth - linear
     if abs(rth) < 1.0:
         rth = 0.0  # rounding of the wrap; at a jump it is a multiple of 2 pi

@@ -50,17 +50,6 @@ def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _turned(f, c, s):  # type: ignore[no-untyped-def]
-    """Return the weighted information, rotated by the angle with cosine c and sine s."""
-    i, w = f.information, f.weight
-    xx, xy, xt, yy, yt, tt = i[0], i[1], i[2], i[3], i[4], i[5]
-    cc, ss, cs = c * c, s * s, c * s
-    return (w * (cc * xx - 2.0 * cs * xy + ss * yy), w * (cs * (xx - yy) + (cc - ss) * xy),
-            w * (c * xt - s * yt), w * (ss * xx + 2.0 * cs * xy + cc * yy),
-            w * (s * xt + c * yt), w * tt)
-
-
-@kernel(forceinline=True)
 def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
     front[at] += x
     front[at + 1] += y
@@ -76,7 +65,11 @@ def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-
     """
     a, b, k = at
     c, s = frame(f, kind)
-    xx, xy, xt, yy, yt, tt = _turned(f, c, s)
+    # the weighted information, turned into map axes
+    i, w, cc, ss, cs = f.information, f.weight, c * c, s * s, c * s
+    xx, yy = cc * i[0] - 2.0 * cs * i[1] + ss * i[3], ss * i[0] + 2.0 * cs * i[1] + cc * i[3]
+    xx, xy, yy = w * xx, w * (cs * (i[0] - i[3]) + (cc - ss) * i[1]), w * yy
+    xt, yt, tt = w * (c * i[2] - s * i[4]), w * (s * i[2] + c * i[4]), w * i[5]
     ft, fth = factors_of_end(f, kind)
     px, py = -f.lin_arm[1], f.lin_arm[0]  # S a
     kx, ky = constant(f, kind, c, s, py, -px)
@@ -128,13 +121,6 @@ def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-
 
 
 @kernel
-def _column(f, c, s, m):  # type: ignore[no-untyped-def]
-    """Return a column of G, in the map axes that the frame's cosine and sine are of."""
-    x, y, th = by_state(f, 1.0 - m, float(m))
-    return c * x - s * y, s * x + c * y, th
-
-
-@kernel
 def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore[no-untyped-def]
     """
     Add the blocks of a third node to a front.
@@ -144,13 +130,16 @@ def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore
     c, s, px, py = turned
     xx, xy, xt, yy, yt, tt = information
     a, b, k = at
+    # the columns of G, in map axes
+    (bx, by, bth), (sx, sy, sth) = by_state(f, 1.0, 0.0), by_state(f, 0.0, 1.0)
+    columns = ((c * bx - s * by, s * bx + c * by, bth), (c * sx - s * sy, s * sx + c * sy, sth))
     for m in range(2):
-        x, y, th = _column(f, c, s, m)
+        x, y, th = columns[m]
         front[(k + m + 1) * ld - 1] -= x * gradient[0] + y * gradient[1] + th * gradient[2]
         wx, wy, wth = xx * x + xy * y + xt * th, xy * x + yy * y + yt * th, (
             xt * x + yt * y + tt * th)
         for n in range(m, 2):
-            x, y, th = _column(f, c, s, n)
+            x, y, th = columns[n]
             front[(k + m) * ld + k + n] += x * wx + y * wy + th * wth
         of_i = -wx, -wy, -(px * wx + py * wy + wth)
         of_j = wx, wy, wth

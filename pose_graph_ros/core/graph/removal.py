@@ -25,46 +25,10 @@ from pose_graph_ros.core.graph.rows import touch
 _POSE = int(NodeKind.POSE)
 
 
-@kernel
-def _touch_cliques_with(head, v):  # type: ignore[no-untyped-def]
-    """
-    Touch a node of each clique that has a given one, so that all of them are built anew.
-
-    They are a subtree below the clique that it is frontal in. A clique may have it in the
-    separator although no constraint below leads to it any more.
-    """
-    cliques, top = tb.cliques(head), tb.nodes(head)[v].clique
-    if top < 0:
-        return
-    parent, c = top, cliques[top].child
-    while True:
-        if c >= 0 and prior_rows.is_in_separator(head, c, v):
-            u = tb.pool_i(head)[cliques[c].members]
-            transaction_log.log_node(head, u)
-            touch(head, u)
-            parent, c = c, cliques[c].child
-        elif c >= 0:
-            c = cliques[c].sibling
-        elif parent == top:
-            return
-        else:
-            c, parent = cliques[parent].sibling, cliques[parent].parent
-
-
-@kernel
-def _forget_newest(head):  # type: ignore[no-untyped-def]
-    """Let the newest pose be the last one that does not leave."""
-    nodes = tb.nodes(head)
-    v = head[tb.NEWEST]
-    while v >= 0 and (nodes[v].factor_list == tb.LEAVES or nodes[v].kind != _POSE):
-        v -= 1
-    head[tb.NEWEST] = v
-
-
 @kernel(signature=(tb.HEAD, INTEGERS))
 def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
     """Take hidden nodes, by id, out of the graph with all their factors; rows leave later."""
-    nodes = tb.nodes(head)
+    nodes, cliques = tb.nodes(head), tb.cliques(head)
     for number in ids:
         v = rows.node_row(head, number)
         prior_rows.remove_of_node(head, v)
@@ -73,12 +37,29 @@ def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
         transaction_log.log_node(head, v)
         while nodes[v].factor_list >= 0:
             weigh(head, nodes[v].factor_list >> 2, 0.0)
-        _touch_cliques_with(head, v)
+        # Touch a node of each clique that has it, so that all of them are built anew. They are a
+        # subtree below the clique that it is frontal in. A clique may have it in the separator
+        # although no constraint below leads to it any more.
+        top = parent = nodes[v].clique
+        c = cliques[top].child if top >= 0 else -1
+        while c >= 0 or parent != top:
+            if c >= 0 and prior_rows.is_in_separator(head, c, v):
+                u = tb.pool_i(head)[cliques[c].members]
+                transaction_log.log_node(head, u)
+                touch(head, u)
+                parent, c = c, cliques[c].child
+            elif c >= 0:
+                c = cliques[c].sibling
+            else:
+                c, parent = cliques[parent].sibling, cliques[parent].parent
         touch(head, v)
         nodes[v].factor_list = tb.LEAVES
         head[tb.N_LEAVING] += 1
         head[tb.STRUCTURE] = 1
-    _forget_newest(head)
+    v = head[tb.NEWEST]     # the last pose that does not leave
+    while v >= 0 and (nodes[v].factor_list == tb.LEAVES or nodes[v].kind != _POSE):
+        v -= 1
+    head[tb.NEWEST] = v
 
 
 def compact(memory: tb.Memory) -> Gone:

@@ -137,8 +137,8 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         nodes[last].scale_t, nodes[last].scale_r = scale_t, scale_r
         return NOT_A_CHAIN
     # nothing can fail from here on
-    pools.give_values(head, old.values, _ROOT)
-    pools.give_nodes(head, old.members, 1)
+    pools.give(head, pools.VALUES, old.values, _ROOT)
+    pools.give(head, pools.NODES, old.members, 1)
     r = transaction_log.take_clique(head, 1, 0)
     new = cliques[r]
     pool_i[new.members] = v
@@ -147,7 +147,8 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     _clear_frame(new)
     _clear_frame(old)
     old.parent, old.sibling, old.n_separator = r, -1, 1
-    old.members, old.values = pools.take_nodes(head, 2), pools.take_values(head, _PAIR)
+    old.members = pools.take(head, pools.NODES, 2)
+    old.values = pools.take(head, pools.VALUES, _PAIR)
     pool_i[old.members], pool_i[old.members + 1] = last, v
     write_rows(front, 6, ld, pool_f, old.values)
     nodes[v].clique = r
