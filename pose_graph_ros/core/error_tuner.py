@@ -209,19 +209,14 @@ class ErrorTuner:
         graph.apply(GraphUpdate(
             measure=[Measured(ids, edges.mean, weight * edges.information)],
             weigh=dict(zip(ids.tolist(), (edges.weight / weight).tolist(), strict=True))))
-        self._reweighting.scale_base_weights(ids, 1.0 / weight)
+        self._reweighting['base'][np.isin(self._reweighting['id'], ids)] *= 1.0 / weight
         self._nodes.errors = self._odometry = OdometryErrors.scaled(weight**-0.5)
-
-    @property
-    def _given(self) -> OdometryErrors | None:
-        """Errors of odometry that are set by a person; None if they are to be found."""
-        scale = self._factors.config.odometry_scale
-        return OdometryErrors.scaled(scale) if scale > 0.0 else None
 
     def _wanted(self) -> OdometryErrors:
         """Return the errors of odometry that are given, or that were learnt."""
-        if self._given is not None:
-            return self._given
+        scale = self._factors.config.odometry_scale
+        if scale > 0.0:
+            return OdometryErrors.scaled(scale)     # set by a person
         # constant errors are those of one odometry; states of the graph are what calibrates it
         calibrated = self._factors.config.odometry_source(self._nodes.primary).calibrate
         if self._nodes.n_primaries > 1 or calibrated:
@@ -268,15 +263,11 @@ class ErrorTuner:
         for source in list(self._waiting):
             errors = self._waiting.pop(source)
             if errors != self._factors.errors_in_use(source):
-                self._begin(source, errors)
+                constraints = self._factors.sources[source]
+                self._change = _Change(source, errors, np.arange(len(constraints)),
+                                       constraints.measured['held_by'].copy())
                 return True
         return False
-
-    def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
-        """Begin to change the error model of a source."""
-        constraints = self._factors.sources[source]
-        self._change = _Change(
-            source, errors, np.arange(len(constraints)), constraints.measured['held_by'].copy())
 
     def _move(self, most: int) -> bool:
         """Move some measurements to the new model; return False if that has failed for good."""

@@ -26,7 +26,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses, PoseVector
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.error_functions import errors
+from pose_graph_ros.core.graph.factors import errors
 from pose_graph_ros.core.quantities import Radians
 
 

@@ -67,7 +67,8 @@ def find_folders(source: Path) -> Folders:
     others, tried = [], []
     for folder in _candidates(source):
         try:
-            _make_writable(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()  # whether files can be written
         except OSError as error:
             tried.append(f'{folder} ({error.strerror or error})')
             if folder.is_dir() and os.access(folder, os.R_OK):
@@ -93,12 +94,6 @@ def _candidates(source: Path) -> Iterator[Path]:
             yield cache / OWNER / own
 
 
-def _make_writable(folder: Path) -> None:
-    """Create a folder if it does not exist; raise OSError if files cannot be written in it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tempfile.TemporaryFile(dir=folder).close()
-
-
 # --- the fingerprint ----------------------------------------------------------------------------
 
 def fingerprint(dispatcher: Dispatcher) -> bytes:
@@ -121,7 +116,11 @@ def fingerprint(dispatcher: Dispatcher) -> bytes:
             if value not in seen and (is_kernel or _top(value.__module__) in ours):
                 seen.add(value)
                 codes = list(_codes(value.__code__))
-                parts += [value.__module__, value.__qualname__, *map(_code_parts, codes)]
+                parts += [value.__module__, value.__qualname__]
+                for code in codes:
+                    parts += [code.co_code.hex(), code.co_names, code.co_varnames,
+                              code.co_freevars, [_ordered(item) for item in code.co_consts
+                                                 if not isinstance(item, CodeType)]]
                 cells = value.__closure__ or ()
                 todo += [value.__defaults__, [cell.cell_contents for cell in cells]]
                 todo += _globals(value, {name for code in codes for name in code.co_names}, ours)
@@ -151,11 +150,6 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
     for item in code.co_consts:
         if isinstance(item, CodeType):
             yield from _codes(item)
-
-
-def _code_parts(code: CodeType) -> tuple[object, ...]:
-    constants = [_ordered(item) for item in code.co_consts if not isinstance(item, CodeType)]
-    return code.co_code.hex(), code.co_names, code.co_varnames, code.co_freevars, constants
 
 
 def _ordered(value: object) -> str:

@@ -60,10 +60,6 @@ class Ids(NamedTuple):
             raise ValueError(f'{what} {gone} is not in the graph')
         return rows
 
-    def by_row(self) -> IntArray:
-        """Return the ids of all rows, a copy."""
-        return np.arange(self.end) if self.present is None else self.present.astype(np.int64)
-
     def extended(self, n: int) -> 'Ids':
         """Return the ids with n more rows."""
         if self.present is None:
@@ -194,15 +190,14 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
 _BIASES = np.full(64, NodeKind.BIAS, np.uint8)
 
 
-def node_types(kind: npt.NDArray[Any], dimension: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the NODE_TYPE of nodes, given their `NodeKind` and numbers of coordinates."""
-    return kind + 4 * (3 - dimension)
-
-
 def other_nodes(
     biases: FloatArray, dimensions: Sequence[int], landmarks: FloatArray,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """Return values, shape (S + L, 3), and types of new nodes that are no poses."""
+    """
+    Return values, shape (S + L, 3), and types of new nodes that are no poses.
+
+    A type is the `NodeKind`, plus 4 for each coordinate that the node has less than 3.
+    """
     n = len(biases)
     if len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
         return biases, _BIASES[:n]
@@ -216,8 +211,7 @@ def other_nodes(
     dimension = np.concatenate((given, np.full(len(points), 2))).astype(np.uint8)
     values = np.concatenate((biases, np.pad(points, ((0, 0), (0, 1)))))
     kind = np.repeat(np.array((NodeKind.BIAS, NodeKind.LANDMARK), np.uint8), (n, len(points)))
-    return (np.where(np.arange(3) < dimension[:, None], values, 0.0),
-            node_types(kind, dimension))
+    return np.where(np.arange(3) < dimension[:, None], values, 0.0), kind + 4 * (3 - dimension)
 
 
 def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:

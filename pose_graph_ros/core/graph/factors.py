@@ -59,9 +59,13 @@ constraints is about the distance of chi2 from its minimum.
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import kernel, NUMBERS, ROWS
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import FactorKind
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 
 # Numbers of the definitions; all kinds from OBSERVED on have one end.
 ODOMETRY, BIAS, TURN, PRIOR, RANGE, OBSERVED = (int(kind) for kind in (
@@ -340,7 +344,7 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(tb.HEAD, NUMBERS))
-def energies(head, out):  # type: ignore[no-untyped-def]
+def write_energies(head, out):  # type: ignore[no-untyped-def]
     """Write the unweighted energies of all factors at the present poses [sigma^2]."""
     nodes = tb.nodes(head)
     for e in range(head[tb.N_FACTORS]):
@@ -349,3 +353,51 @@ def energies(head, out):  # type: ignore[no-untyped-def]
         by_pose, _ = third(nodes, f, k)
         ex, ey, eth, _, _, _, _ = model(f, kind, nodes[i].pose, nodes[j].pose, by_pose)
         out[e] = _form(f, ex, ey, eth)
+
+
+# --- constraints that need not be in a graph, at given poses -------------------------------------
+
+def errors(poses: Poses, factors: Factors) -> FloatArray:
+    """
+    Return the errors (3.48), (3.52) of factors, shape (M, 3) [m, m, rad], theta in [-pi, pi).
+
+    They are in the frames of the measured poses, those of edges to a bias in map axes.
+    """
+    error = np.empty((len(factors), 3))
+    # as kernels take arrays
+    _write_errors(*(np.require(each, requirements=('C', 'W'))
+                    for each in (poses, factors.records)), error)
+    observed = factors.j < 0    # of which (3.52) has the other sign
+    if np.any(observed):
+        error[observed] *= -1.0
+        error[observed, 2] = se2.wrap(error[observed, 2])
+    return error
+
+
+@kernel
+def write_data(f, new):  # type: ignore[no-untyped-def]
+    """Write what the error of a factor depends on, from a record of `Factors`."""
+    for m in range(3):
+        f.mean[m] = new.mean[m]
+    for m in range(4):
+        f.constants[m] = new.constants[m]
+    prepare(f, new.kind)
+
+
+@kernel(signature=(ROWS, tb.RECORDS, ROWS), allocates=True)
+def _write_errors(poses, records, error):  # type: ignore[no-untyped-def]
+    record = np.empty(1, tb.FACTOR)
+    for e in range(len(records)):
+        f = record[0]   # in here, as Numba frees the array after its last use
+        new = records[e]
+        write_data(f, new)
+        third, _ = NO_THIRD
+        if new.k >= 0:
+            third = by_state(f, poses[new.k, 0], poses[new.k, 1])
+        error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
+            f, new.kind, poses[new.i], poses[new.j if new.j >= 0 else new.i], third)
+
+
+def energies(error: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the energies [sigma^2] for information in the frames of the errors."""
+    return np.einsum('mi,mij,mj->m', error, information, error)

@@ -181,7 +181,8 @@ def write_rows(head, n_nodes, first_other, types, records):  # type: ignore[no-u
     """
     Write new factors, records of `Factors`, behind the last row; return whether all are valid.
 
-    The graph will have n_nodes nodes, from row `first_other` on with these `checks.node_types`.
+    The graph will have n_nodes nodes, from row `first_other` on with these types, see
+    `checks.other_nodes`.
     """
     valid = True
     for k in range(len(records)):

@@ -51,7 +51,7 @@ NODE: Final = np.dtype([
     ('reference', 'f8', (3,)),  # constant until all nodes are linearized anew [m, m, rad]
     ('clique', 'i4'),           # row of the clique that the node is frontal in
     # head of the list of its factors with a weight above 0, whose entries are 4 * factor + the
-    # index of the end; LEAVES if `removal.compact` takes the node out later
+    # index of the end; LEAVES if `editing.compact` takes the node out later
     ('factor_list', 'i4'),
     ('index', 'i4'),            # place of the node in the present front; work space
     ('front', 'i4'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
@@ -191,7 +191,7 @@ ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index
 #   ROUND: number of iterations of the refinement so far
 #   INTERRUPT: set to 1 by another thread to end a refinement
 #   NEXT_NODE, NEXT_FACTOR: ids of the next new rows
-#   N_LEAVING: number of rows that `removal.compact` takes out after the update, without those that
+#   N_LEAVING: number of rows that `editing.compact` takes out after the update, without those that
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 (N_NODES, N_FACTORS, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,

@@ -70,8 +70,9 @@ from pose_graph_ros.core.io.g2o_text import (
     AMBIGUOUS,
     GraphText,
     Lines,
+    lines_of,
     MEASURED,
-    read_lines,
+    read_text,
     TAGS,
 )
 from pose_graph_ros.core.odometry.motion import as_calibrated
@@ -134,7 +135,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
-    text = read_lines(path)
+    text = lines_of(path, read_text(path))
     if edge2_order is not None or not any(len(text.rows[tag]) for tag in AMBIGUOUS):
         return _graph_of(text, edge2_order)
     files: dict[str, GraphFile] = {}
@@ -153,7 +154,9 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
 def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
     """Return in which order the numbers of a file make more sense, and why."""
-    definite = [order for order, file in files.items() if _smallest(file.rows) > 1e-9]
+    # by the smallest eigenvalue of a matrix, its diagonal scaled to 1
+    definite = [order for order, file in files.items() if np.min(np.linalg.eigvalsh(
+        scaled(file.rows.factors.edges.information)), initial=1.0) > 1e-9]
     if len(definite) == 1:
         other = next(order for order in EDGE2_ORDERS if order != definite[0])
         return definite[0], (
@@ -164,11 +167,6 @@ def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
     order, other = sorted(EDGE2_ORDERS, key=lambda each: spread[each])
     return order, (f'at the optimum the mean energy of an edge is {spread[order]:.3g} times the '
                    f'median, in the order of {other} {spread[other]:.3g} times')
-
-
-def _smallest(rows: GraphRows) -> float:
-    """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
-    return float(np.min(np.linalg.eigvalsh(scaled(rows.factors.edges.information)), initial=1.0))
 
 
 def _spread(rows: GraphRows) -> float:

@@ -150,7 +150,10 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     members = {name: members[name] for name in members
                if name not in {'edge_losses', 'observed_losses'}} | {
         'graph': {name: rows[name] for name in _KEPT if name in rows} | {
-            'factor_kind': _joined(rows['edge_kind'], _renamed(rows['observed_kind'])),
+            'factor_kind': _joined(rows['edge_kind'], {
+                **rows['observed_kind'], 'names': [
+                    'node_prior' if name == 'prior' else name
+                    for name in rows['observed_kind']['names']]}),
             'factor_weight': rows['edge_weight'] + rows['observed_weight'],
             'others': given + [n_edges + row for row in rows['observed_on_bias']],
             'other_i': rows['bias_edge_i'] + rows['bias_observed_node'],
@@ -202,11 +205,6 @@ def _joined(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     """Return one column of names for two."""
     n = len(one['names'])
     return {'names': one['names'] + other['names'], 'of': one['of'] + [n + k for k in other['of']]}
-
-
-def _renamed(kinds: dict[str, Any]) -> dict[str, Any]:
-    return {**kinds, 'names': [
-        'node_prior' if name == 'prior' else name for name in kinds['names']]}
 
 
 def _with_states(members: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry.se2 import BoolArray, Covariance, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariance, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -75,12 +75,9 @@ class SourceState:
         else:
             self.measured.append_one((queued.stamp_ns, number, held_by, queued.noise.tolist()))
 
-    def leaving(self, factors: IntArray) -> BoolArray:
-        return np.isin(self.measured['id'], factors)
-
     def forget(self, nodes: IntArray, factors: IntArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
-        kept = np.flatnonzero(~self.leaving(factors))
+        kept = np.flatnonzero(~np.isin(self.measured['id'], factors))
         self.n_gone += len(self) - len(kept)
         for table in (self.measured, self.edges):
             gone = np.isin(table['id'], factors)
@@ -94,11 +91,6 @@ class SourceState:
         """Return the ids of the factors that hold some measurements."""
         some = self.measured.values[which]
         return np.where(some['held_by'] >= 0, some['held_by'], some['id'])
-
-    def are_used(self, graph: Graph, weights: FloatArray | None = None) -> BoolArray:
-        """Tell which measurements have a weight, in the graph or given by row."""
-        weights = graph.weights if weights is None else weights
-        return np.asarray(weights[graph.factor_rows(self.held())] > 0.0)
 
 
 class Origin(NamedTuple):
@@ -166,7 +158,8 @@ class FactorBuilder:
                 if not self._settings(source, queued.measured).finds_correlation:
                     factor, edge = edge, None
             elif queued.needs_bias:
-                factor = queued.on_bias(self._chains[source].state(queued.stamp_ns))
+                factor = factor.replaced(**{'i' if len(queued.nodes) == 0 else 'k': [
+                    self._chains[source].state(queued.stamp_ns)]})
             number = int(additions.add(factor if edge is None else factor.replaced(weight=0.0))[0])
             if len(queued.nodes) == 0:
                 continue    # it has a say on the bias alone
@@ -400,7 +393,7 @@ class FactorBuilder:
     def report(self, source: str, graph: Graph) -> SourceReport:
         """Return how well the newest measurements of a source fit the estimate."""
         state = self.sources[source]
-        used = state.measured.values[state.are_used(graph)]
+        used = state.measured.values[graph.weights[graph.factor_rows(state.held())] > 0.0]
         return source_report.report(
             graph, used['stamp_ns'], used['id'], in_use=self.errors_in_use(source),
             found=self._settings(source).finds_correlation)

@@ -231,16 +231,12 @@ class MeasurementPipeline:
                 self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
 
     def _attach(self, measurement: PoseMeasurement, source: str) -> Answer:
-        answer = self._try_to_attach(measurement, source)
+        attachment = attach(self.nodes, measurement.stamp_ns)
+        answer = attachment if isinstance(attachment, Answer) else KINDS[
+            type(measurement)].attach(measurement, source, attachment, self)
         if answer.status is AnswerStatus.REJECTED and isinstance(measurement, LoopClosure):
             self.refused_closures.append((source, measurement.stamp_ns, measurement.reference_ns))
         return answer
-
-    def _try_to_attach(self, measurement: PoseMeasurement, source: str) -> Answer:
-        attachment = attach(self.nodes, measurement.stamp_ns)
-        if isinstance(attachment, Answer):
-            return attachment
-        return KINDS[type(measurement)].attach(measurement, source, attachment, self)
 
     def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
         """Attach a measurement to a hidden node, with no motion in between."""

@@ -65,12 +65,6 @@ class Queued(NamedTuple):
         """Whether one of its ends is a state of the bias, as those of a gyroscope."""
         return len(self.nodes) == 0 or int(self.factor.kind[0]) == FactorKind.TURN
 
-    def on_bias(self, state: int) -> Factors:
-        """Return its factor with a state of the bias, by its id."""
-        if len(self.nodes) == 0:
-            return self.factor.replaced(i=[state])
-        return self.factor.replaced(k=[state])
-
 
 @dataclass(frozen=True, slots=True)
 class SavedQueue:

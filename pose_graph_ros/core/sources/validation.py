@@ -47,7 +47,7 @@ def check_position(
 def check_pose(measurement: GlobalPose, policy: CovariancePolicy) -> Validated | Answer:
     """Return a pose, or its position or heading if it has no information on the other."""
     never = policy.heading is Heading.NEVER
-    if _lacks_position(measurement.covariance):
+    if np.all(_is_uninformative(measurement.covariance)[:2]):
         variance = None if never else _heading_variance(measurement.covariance, policy)
         return _no_information(measurement) if variance is None else Validated(
             HeadingOnly(measurement.stamp_ns, float(measurement.pose[2]), variance), ())
@@ -66,7 +66,7 @@ def check_pose(measurement: GlobalPose, policy: CovariancePolicy) -> Validated |
 
 def check_closure(measurement: LoopClosure, policy: CovariancePolicy) -> Validated | Answer:
     """Return a loop closure; without information on the position, that is infinite."""
-    if not _lacks_position(measurement.covariance):
+    if not np.all(_is_uninformative(measurement.covariance)[:2]):
         return _finished(measurement, *_given(measurement.covariance, policy), policy)
     variance = _heading_variance(measurement.covariance, policy)
     return _no_information(measurement) if variance is None else Validated(
@@ -104,7 +104,10 @@ def _given(given: FloatArray, policy: CovariancePolicy) -> tuple[FloatArray, lis
     """Return a covariance as a policy overrides it, or its default, and what was repaired."""
     cov = np.array(given, dtype=np.float64)
     if len(policy.override) > 0:
-        return _overridden(cov, policy), []
+        variances = np.diagonal(cov).copy()
+        variances[:2] = policy.override[0]**2
+        variances[2:] = policy.override[-1]**2 if len(policy.override) == 2 else variances[2:]
+        return np.diag(variances), []
     if not np.any(cov) and policy.repair:
         return np.diag(_defaults(policy)[:len(cov)]), ['default_covariance']
     return cov, []
@@ -125,7 +128,9 @@ def _finished(
         repairs.append(f'repaired_covariance_{defect}')
     floors = np.array([policy.position_floor, policy.position_floor, policy.heading_floor])
     cov = covariance.floored(policy.scale * cov, floors[:len(cov)]**2)
-    return Validated(replace(measurement, covariance=_capped(cov, policy)), tuple(repairs))
+    factor = np.minimum(1.0, np.sqrt(_ceilings(policy)[:len(cov)] / np.diagonal(cov)))
+    return Validated(
+        replace(measurement, covariance=cov * factor * factor[:, None]), tuple(repairs))
 
 
 def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
@@ -154,18 +159,6 @@ def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     scale = sigma / np.sqrt(np.diagonal(correlation))
     result: FloatArray = correlation * scale * scale[:, None]
     return 0.5 * (result + result.T)
-
-
-def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
-    variances = np.diagonal(cov).copy()
-    variances[:2] = policy.override[0]**2
-    if len(policy.override) == 2:
-        variances[2:] = policy.override[1]**2
-    return np.diag(variances)
-
-
-def _lacks_position(cov: FloatArray) -> bool:
-    return bool(np.all(_is_uninformative(np.asarray(cov))[:2]))
 
 
 def _no_information(measurement: GlobalPose | LoopClosure) -> Answer:
@@ -198,8 +191,3 @@ def _defaults(policy: CovariancePolicy) -> FloatArray:
 def _ceilings(policy: CovariancePolicy) -> FloatArray:
     return np.array([policy.position_ceiling**2, policy.position_ceiling**2,
                      covariance.UNKNOWN_HEADING_VARIANCE])
-
-
-def _capped(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
-    factor = np.minimum(1.0, np.sqrt(_ceilings(policy)[:len(cov)] / np.diagonal(cov)))
-    return np.asarray(cov * factor * factor[:, None])

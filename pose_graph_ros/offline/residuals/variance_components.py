@@ -33,7 +33,7 @@ from scipy.sparse.linalg import splu
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.graph.error_functions import errors
+from pose_graph_ros.core.graph.factors import errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes

@@ -172,7 +172,7 @@ class Flaky(IncrementalSmoother):
 def everything(backend: PoseGraphBackend) -> list[object]:
     judge = backend._judge.fixes
     return [judge.states.records.tobytes(), judge._loosened,
-            [base.tolist() for base in backend._reweighting.base_weights()],
+            [base.tolist() for base in backend._reweighting['base']],
             judge._bank.rows['id'].tolist(), judge._slips]
 
 
