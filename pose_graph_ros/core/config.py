@@ -255,18 +255,15 @@ class MeasurementSource:
 
 
 # defaults of a source of global poses or positions
-POSITIONS = MeasurementSource(
-    robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
+POSITIONS = MeasurementSource(robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
 # defaults of a source of headings; thinned, as an IMU sends many redundant ones
 HEADINGS = MeasurementSource(minimum_period=0.5)
 # settings of poses that a user sets: neither judged nor with a loss, as the user is believed
 SET_POSES = MeasurementSource(robust=Robust.NONE)
 # defaults of loop closures; those with an invalid covariance are rejected
-LOOP_CLOSURES = MeasurementSource(
-    covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
+LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
 # defaults of a source of ranges to beacons; most messages do not say how accurate they are
-RANGES = MeasurementSource(
-    covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
+RANGES = MeasurementSource(covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
 
 
 class HasDefaults(Protocol):

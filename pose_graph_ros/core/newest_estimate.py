@@ -101,9 +101,7 @@ def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     return found
 
 
-def _turned(
-    parts: Parts, motion: FloatArray, noise: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def _turned(parts: Parts, motion: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the motion since the newest node, and its noise, with what a gyroscope says."""
     gyros, nodes = parts.pipeline.gyros, parts.nodes
     rotation = None if len(gyros.streams) == 0 else gyros.newest(

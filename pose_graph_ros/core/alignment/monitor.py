@@ -57,9 +57,7 @@ class AlignmentMonitor:
         """Set the settings for checks from now on, which use all measurements so far."""
         self._config = config
 
-    def find(
-        self, graph: Graph, waiting: list[Queued], nodes: HiddenNodes,
-    ) -> FloatArray | None:
+    def find(self, graph: Graph, waiting: list[Queued], nodes: HiddenNodes) -> FloatArray | None:
         """
         Return the motion of the graph into the map if it is found, and update the state.
 
@@ -69,8 +67,7 @@ class AlignmentMonitor:
         waiting = [each for each in waiting if each.is_in_map]
         if self.state is AlignmentState.ALIGNED or not any(each.is_placed for each in waiting):
             return None
-        found = estimator.find_alignment(
-            nodes.recent_poses(graph), self._given(nodes, waiting))
+        found = estimator.find_alignment(nodes.recent_poses(graph), self._given(nodes, waiting))
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
                       else AlignmentState.ALIGNED)
         self.sigma = found.sigma

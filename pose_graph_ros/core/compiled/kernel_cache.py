@@ -37,13 +37,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from pose_graph_ros.core.compiled.numba_internals import (
-    CompileResult,
-    Dispatcher,
-    rtsys,
-    serialize,
-    sigutils,
-)
+from pose_graph_ros.core.compiled import numba_internals as ni
 
 logger = logging.getLogger(__name__)
 
@@ -96,7 +90,7 @@ def _candidates(source: Path) -> Iterator[Path]:
 
 # --- the fingerprint ----------------------------------------------------------------------------
 
-def fingerprint(dispatcher: Dispatcher) -> bytes:
+def fingerprint(dispatcher: ni.Dispatcher) -> bytes:
     """Return a digest of all inputs of a kernel's machine code except its signature."""
     parts: list[object] = [
         numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
@@ -106,7 +100,7 @@ def fingerprint(dispatcher: Dispatcher) -> bytes:
     seen: set[FunctionType] = set()
     while len(todo) > 0:
         value = todo.pop()
-        is_kernel = isinstance(value, Dispatcher)
+        is_kernel = isinstance(value, ni.Dispatcher)
         if is_kernel:
             options = value.targetoptions
             parts += [(name, _ordered(options[name])) for name in sorted(options)]
@@ -175,7 +169,7 @@ def _globals(function: FunctionType, names: set[str], ours: set[str]) -> Iterato
 class KernelCache:
     """The cache of one kernel, which its dispatcher calls instead of one of Numba's."""
 
-    def __init__(self, dispatcher: Dispatcher) -> None:
+    def __init__(self, dispatcher: ni.Dispatcher) -> None:
         self._dispatcher = dispatcher
         source = Path(dispatcher.py_func.__code__.co_filename).absolute()
         self._own, others = find_folders(source.parent)
@@ -201,12 +195,12 @@ class KernelCache:
         """Return the code for a signature; None if there is none that is valid."""
         # Numba refreshes the context, which imports all that can be compiled (0.5 s) and does
         # this, which is all that machine code needs. The compiler refreshes the context itself.
-        rtsys.initialize(target_context)
+        ni.rtsys.initialize(target_context)
         for path in self._files(signature):
             code = self._code(path)
             try:
                 if code is not None:
-                    return CompileResult._rebuild(  # noqa: SLF001
+                    return ni.CompileResult._rebuild(  # noqa: SLF001
                         target_context, *pickle.loads(code))
             except Exception as error:
                 _warn('read', path.parent, error)
@@ -219,7 +213,7 @@ class KernelCache:
             return
         path = next(self._files(signature))
         try:
-            code = serialize.dumps(result._reduce())  # noqa: SLF001
+            code = ni.serialize.dumps(result._reduce())  # noqa: SLF001
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
                 file.write(self._fingerprint + hashlib.sha256(code).digest() + code)
             os.replace(file.name, path)
@@ -228,7 +222,7 @@ class KernelCache:
 
     def _files(self, signature: Any) -> Iterator[Path]:
         """Yield the places of the code for a signature."""
-        arguments, _ = sigutils.normalize_signature(signature)
+        arguments, _ = ni.sigutils.normalize_signature(signature)
         processor = self._dispatcher.targetctx.codegen().magic_tuple()
         key = repr((str(arguments), processor, sys.implementation.cache_tag)).encode()
         name = f'{self._name}-{hashlib.sha256(key).hexdigest()[:16]}.nbc'

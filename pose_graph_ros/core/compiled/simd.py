@@ -79,8 +79,7 @@ def fetch(_context: Any, array: Any, at: Any) -> Any:
         three = [ir.IntType(32)] * 3
         function = builder.module.declare_intrinsic(
             'llvm.prefetch', (byte,), ir.FunctionType(ir.VoidType(), [byte, *three]))
-        address = builder.bitcast(
-            _address(context, builder, signature.args[0], *arguments), byte)
+        address = builder.bitcast(_address(context, builder, signature.args[0], *arguments), byte)
         # arguments of llvm.prefetch: for reading, keep in all caches, data cache
         builder.call(function, [address, *(kind(value) for kind, value in zip(
             three, (0, 3, 1), strict=True))])

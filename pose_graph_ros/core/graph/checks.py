@@ -10,13 +10,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import (
-    FactorKind,
-    FACTORS,
-    Factors,
-    NodeKind,
-    RECORD,
-)
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind, RECORD
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
@@ -133,13 +127,11 @@ def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
 def _check_information(name: str, matrix: FloatArray) -> None:
     """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
     diagonal, correlation = np.diagonal(matrix, axis1=1, axis2=2), scaled(matrix)
-    skew = np.max(
-        np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
+    skew = np.max(np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
     _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
     smallest = np.zeros(len(matrix))
     doubtful = ~are_definite(matrix)
-    smallest[doubtful] = np.min(
-        np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
+    smallest[doubtful] = np.min(np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
     negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
     _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
                  f'{name} is not positive semidefinite, or zero', matrix)

@@ -18,15 +18,8 @@ refers to a row is rewritten. A factor leaves with any of its nodes. Cliques kee
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.compiled.jit import (
-    BYTES,
-    FLAG,
-    INTEGERS,
-    kernel,
-    MATRICES,
-    NUMBERS,
-    ROWS,
-)
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
@@ -81,14 +74,6 @@ def unlink(head, e, side):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _evaluate(head, e):  # type: ignore[no-untyped-def]
-    """Linearize a factor, and add its energy to chi2."""
-    factors.linearize(head, e)
-    factors.check(head, e, factors.NO_TURN)
-    tb.scalars(head)[0].chi2 += tb.factors(head)[e].energy
-
-
-@kernel
 def weigh(head, e, weight):  # type: ignore[no-untyped-def]
     """Change the weight of a factor; at 0 it is in no list."""
     nodes, f = tb.nodes(head), tb.factors(head)[e]
@@ -111,13 +96,14 @@ def weigh(head, e, weight):  # type: ignore[no-untyped-def]
             unlink(head, e, side)
         elif v >= 0 and before == 0.0:  # put it at the head of the list
             f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
+    f.error2 = f.energy = 0.0
     if weight > 0.0:
-        _evaluate(head, e)
-    else:
-        f.error2 = f.energy = 0.0
+        factors.linearize(head, e)
+        factors.check(head, e, factors.NO_TURN)
+        tb.scalars(head)[0].chi2 += f.energy
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
+@kernel(signature=(tb.HEAD, jit.INTEGERS, jit.NUMBERS))
 def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
     """Set weights of factors, by id; 0 takes one out of its lists, DROPPED out of the graph."""
     for m in range(len(ids)):
@@ -130,7 +116,7 @@ def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
             head[tb.N_LEAVING] += 1
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, ROWS, MATRICES))
+@kernel(signature=(tb.HEAD, jit.INTEGERS, jit.ROWS, jit.MATRICES))
 def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
     """Give factors, by id, other measurements."""
     for m in range(len(ids)):
@@ -144,7 +130,7 @@ def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
         weigh(head, e, weight)
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, FLAG))
+@kernel(signature=(tb.HEAD, jit.INTEGERS, jit.FLAG))
 def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
     """Fix hidden nodes, by id, at their present poses, or free them."""
     nodes = tb.nodes(head)
@@ -156,7 +142,7 @@ def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
             touch(head, v)
 
 
-@kernel(signature=(tb.HEAD, ROWS, ROWS, BYTES, tb.RECORDS, FLAG))
+@kernel(signature=(tb.HEAD, jit.ROWS, jit.ROWS, jit.BYTES, tb.RECORDS, jit.FLAG))
 def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-untyped-def]
     """
     Return ADDED after adding hidden nodes and factors, all of them, or why none.
@@ -222,13 +208,15 @@ def restart(head):  # type: ignore[no-untyped-def]
         f = tb.factors(head)[e]
         f.waits = 0
         if f.weight > 0.0:
-            _evaluate(head, e)
+            factors.linearize(head, e)
+            factors.check(head, e, factors.NO_TURN)
+            tb.scalars(head)[0].chi2 += f.energy
     prior_rows.add_energies(head)
 
 
 # --- removal for good, in two steps --------------------------------------------------------------
 
-@kernel(signature=(tb.HEAD, INTEGERS))
+@kernel(signature=(tb.HEAD, jit.INTEGERS))
 def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
     """Take hidden nodes, by id, out of the graph with all their factors; rows leave later."""
     nodes, cliques = tb.nodes(head), tb.cliques(head)

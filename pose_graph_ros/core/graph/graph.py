@@ -163,15 +163,12 @@ class Graph:
     @property
     def is_bias(self) -> BoolArray:
         """Whether hidden nodes are biases."""
-        return self._is(NodeKind.BIAS)
+        return np.asarray(self.node_records['kind'] == np.uint8(NodeKind.BIAS))
 
     @property
     def is_pose(self) -> BoolArray:
         """Whether hidden nodes are poses."""
-        return self._is(NodeKind.POSE)
-
-    def _is(self, kind: NodeKind) -> BoolArray:
-        return np.asarray(self.node_records['kind'] == np.uint8(kind))
+        return np.asarray(self.node_records['kind'] == np.uint8(NodeKind.POSE))
 
     @property
     def node_kind(self) -> npt.NDArray[Any]:
@@ -219,12 +216,6 @@ class Graph:
         ids = self._ids('node').present
         return table if ids is None else table.renumbered(ids.__getitem__)
 
-    def _with_rows(self, table: Factors) -> Factors:
-        """Return a table with the rows of the nodes in place of their ids."""
-        nodes = self._ids('node')
-        return table if nodes.present is None else table.renumbered(
-            lambda ids: nodes.known(ids, 'hidden node'))
-
     @property
     def weights(self) -> FloatArray:
         """Weights of all factors."""
@@ -254,7 +245,10 @@ class Graph:
 
     def errors(self, factors: Factors, poses: Poses | None = None) -> FloatArray:
         """Return the errors of factors with ids for ends, in the graph or not."""
-        return errors(self.poses if poses is None else poses, self._with_rows(factors))
+        nodes = self._ids('node')
+        if nodes.present is not None:
+            factors = factors.renumbered(lambda ids: nodes.known(ids, 'hidden node'))
+        return errors(self.poses if poses is None else poses, factors)
 
     # --- edits -----------------------------------------------------------------------------------
 
@@ -345,8 +339,7 @@ class Graph:
         nodes = self._ids('node').extended(len(hidden) + len(others[0]))
         factors = update.factors if len(update.factors) > 0 else gu.NO_FACTORS
         checks.check(factors, kind, dimension, nodes)
-        return tuple(np.array(column, order='C')
-                     for column in (hidden, *others, factors.records))
+        return tuple(np.array(column, order='C') for column in (hidden, *others, factors.records))
 
     def ensure(self, n_nodes: int, n_factors: int) -> None:
         """Make the tables and the transaction log large enough for a graph of this size."""
@@ -399,12 +392,9 @@ class Graph:
         self.memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
         self._append('factor', GraphUpdate(factors=rows.factors), rows.factor_ids,
                      rows.next_ids.factor)
-        self.apply(GraphUpdate(
-            fix=self.node_ids[begin:][rows.fixed].tolist(), priors=rows.priors))
+        self.apply(GraphUpdate(fix=self.node_ids[begin:][rows.fixed].tolist(), priors=rows.priors))
 
-    def _append(
-        self, name: str, update: GraphUpdate, ids: IntArray, next_id: int,
-    ) -> None:
+    def _append(self, name: str, update: GraphUpdate, ids: IntArray, next_id: int) -> None:
         """Add new rows of one table with given ids instead of the next ones."""
         head, n_rows, counter = self.memory.head, *COUNTERS[name]
         begin, first = int(head[n_rows]), int(head[counter])

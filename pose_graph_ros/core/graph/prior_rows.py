@@ -109,8 +109,7 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
         rx, ry = reference[i] - reference[0], reference[i + 1] - reference[1]
         d[i], d[i + 1] = x - rx - tangent * phi * ry, y - ry + tangent * phi * rx
-        d[i + 2] = (turn - (1.0 - tangent) * phi
-                    + wrap(f.pose[2] - reference[i + 2] - turn))
+        d[i + 2] = (turn - (1.0 - tangent) * phi + wrap(f.pose[2] - reference[i + 2] - turn))
         r[i], r[i + 1] = turning * (tangent * ry - y), turning * (x - tangent * rx)
         r[i + 2] = 1.0 - tangent
     energy, update = reference[n], pool_f[row.values:]
@@ -181,8 +180,7 @@ def gradient(head, c, work):  # type: ignore[no-untyped-def]
 @kernel
 def update_energy(head, c):  # type: ignore[no-untyped-def]
     """Set the energy of a prior to that at the present poses, and correct chi2 by the change."""
-    f, energy = tb.cliques(head)[c], evaluate(
-        head, c, present_frame(head, c), tb.work_f(head))
+    f, energy = tb.cliques(head)[c], evaluate(head, c, present_frame(head, c), tb.work_f(head))
     tb.scalars(head)[0].chi2 += energy - f.energy
     f.energy = energy
 

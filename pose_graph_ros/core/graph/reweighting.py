@@ -241,8 +241,7 @@ class Reweighting:
         energy, weight = _energies(graph, self['id'])
         for loss, threshold, chosen in self._groups(np.arange(len(self))):
             costs, _ = costs_and_weights(loss, energy[chosen], threshold)
-            total += float(np.sum(self['base'][chosen] * costs
-                                  - weight[chosen] * energy[chosen]))
+            total += float(np.sum(self['base'][chosen] * costs - weight[chosen] * energy[chosen]))
         return total
 
 

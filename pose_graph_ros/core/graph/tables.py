@@ -245,8 +245,7 @@ def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
             array = context.make_array(array_type)(context, builder)
             rest = () if columns == 1 else (columns,)
             shape = [rows, *(context.get_constant(types.intp, n) for n in rest)]
-            strides = [context.get_constant(types.intp, n)
-                       for n in (size, *(WORD for _ in rest))]
+            strides = [context.get_constant(types.intp, n) for n in (size, *(WORD for _ in rest))]
             populate_array(
                 array, builder.inttoptr(address, array.data.type), shape, strides,
                 context.get_constant(types.intp, size // columns), None)

@@ -133,8 +133,7 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     """Return members in which edges and observed nodes have the same ids."""
     rows = members['graph']
     n_edges, n_observed = (len(rows[f'{name}_weight']) for name in ('edge', 'observed'))
-    end = rows.get('next_ids') or {
-        'node': None, 'edge': n_edges, 'observed': n_observed}
+    end = rows.get('next_ids') or {'node': None, 'edge': n_edges, 'observed': n_observed}
     first = end['edge']
 
     def moved(ids: list[int]) -> list[int]:
@@ -179,9 +178,7 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     return members
 
 
-def _with_ids(
-    table: dict[str, Any], moved: Callable[[list[int]], list[int]],
-) -> dict[str, Any]:
+def _with_ids(table: dict[str, Any], moved: Callable[[list[int]], list[int]]) -> dict[str, Any]:
     """Return the columns of judged constraints with the new ids of observed nodes."""
     held = [number if is_edge else moved([number])[0]
             for number, is_edge in zip(table['held'], table['edge'], strict=True)]
@@ -274,9 +271,7 @@ def _state_of_gyro(
         'bias': _chain({'width_ns': width_ns, 'numbers': numbers}, ids, len(ids) * [-1], 0)}
 
 
-def _chain(
-    bins: dict[str, Any], nodes: list[int], ties: list[int], anchor: int,
-) -> dict[str, Any]:
+def _chain(bins: dict[str, Any], nodes: list[int], ties: list[int], anchor: int) -> dict[str, Any]:
     return {'begins_ns': [number * bins['width_ns'] for number in bins['numbers']],
             'nodes': nodes, 'ties': ties[:len(nodes)], 'bin_ns': bins['width_ns'],
             'anchor': nodes[anchor] if len(nodes) > 0 else -1}
