@@ -42,13 +42,6 @@ def is_prior(head, c):  # type: ignore[no-untyped-def]
     return row.n_frontal == 0 and row.parent != REMOVED
 
 
-@kernel
-def _references(row):  # type: ignore[no-untyped-def]
-    """Return where in pool_f the reference poses of a prior begin, given its row."""
-    n = 3 * row.n_separator
-    return row.values + triangle_size(n, n)
-
-
 @kernel(inline='always')
 def _nodes(head, c):  # type: ignore[no-untyped-def]
     """Return the nodes of a prior."""
@@ -72,8 +65,8 @@ def present_frame(head, c):  # type: ignore[no-untyped-def]
     """Return the mean turn of the nodes of a prior [rad], which is 0 if it does not turn."""
     if not turns(head, c):
         return 0.0
-    nodes, members = tb.nodes(head), _nodes(head, c)
-    reference = tb.pool_f(head)[_references(tb.cliques(head)[c]):]
+    nodes, members, n = tb.nodes(head), _nodes(head, c), 3 * tb.cliques(head)[c].n_separator
+    reference = tb.pool_f(head)[tb.cliques(head)[c].values + triangle_size(n, n):]
     first = wrap(nodes[members[0]].pose[2] - reference[2])
     total = 0.0
     for k in range(1, len(members)):
@@ -92,7 +85,7 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
     """
     nodes, members, row = tb.nodes(head), _nodes(head, c), tb.cliques(head)[c]
     pool_f, n = tb.pool_f(head), 3 * row.n_separator
-    reference = pool_f[_references(row):]
+    reference = pool_f[row.values + triangle_size(n, n):]
     d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]
     cos, sin = math.cos(phi), math.sin(phi)
     first = nodes[members[0]]
@@ -127,7 +120,7 @@ def keep_linearization(head, c, r):  # type: ignore[no-untyped-def]
     """Remember r (`evaluate`) of a new linearization; a rollback restores the last one."""
     row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
     n = 3 * row.n_separator
-    at = _references(row) + n + 1
+    at = row.values + triangle_size(n, n) + n + 1
     transaction_log.log_clique(head, c)
     if row.values_born != head[tb.UPDATE]:
         row.values_born = head[tb.UPDATE]
@@ -140,7 +133,7 @@ def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
     """Write by how much r has changed since the linearization: S times relative positions."""
     row = tb.cliques(head)[c]
     n = 3 * row.n_separator
-    before = tb.pool_f(head)[_references(row) + n + 1:]
+    before = tb.pool_f(head)[row.values + triangle_size(n, n) + n + 1:]
     for k in range(n):
         out[k] = r[k] - before[k]
 
@@ -149,8 +142,9 @@ def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
 def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
     """Make r of an anchored prior the derivative of the coordinates in its frame by -phi."""
     row = tb.cliques(head)[c]
-    reference = tb.pool_f(head)[_references(row):]
-    for i in range(0, 3 * row.n_separator, 3):
+    n = 3 * row.n_separator
+    reference = tb.pool_f(head)[row.values + triangle_size(n, n):]
+    for i in range(0, n, 3):
         r[i] -= reference[i + 1] - reference[1]
         r[i + 1] += reference[i] - reference[0]
 

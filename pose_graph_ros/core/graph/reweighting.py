@@ -120,8 +120,7 @@ class Reweighting:
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         """Return a column of `_ROW`, a view."""
-        column: npt.NDArray[Any] = self._table.values[name]
-        return column
+        return self._table[name]
 
     def saved(self) -> SavedLosses:
         """Return the state."""

@@ -256,25 +256,11 @@ def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
     return made
 
 
-nodes = _array('nodes')
-factors = _array('factors')
-cliques = _array('cliques')
-scalars = _array('scalars')
-pool_f = _array('pool_f')
-work_f = _array('work_f')
-log = _array('log')
-pool_i = _array('pool_i')
-work_i = _array('work_i')
-touched = _array('touched')
-freed = _array('freed')
-waiting = _array('waiting')
-node_id = _array('node_id')
-factor_id = _array('factor_id')
+(nodes, factors, cliques, scalars, pool_f, work_f, log, pool_i, work_i, touched, freed, waiting,
+ node_id, factor_id) = map(_array, NAMES)
 # the same memory as numbers of eight bytes
-node_words = _array('nodes', types.int64)
-factor_words = _array('factors', types.int64)
-clique_words = _array('cliques', types.int64)
-scalar_words = _array('scalars', types.int64)
+node_words, factor_words, clique_words, scalar_words = (
+    _array(name, types.int64) for name in NAMES[:4])
 log_numbers = _array('log', types.float64)
 
 

@@ -152,17 +152,9 @@ def drop_clique(head, c):  # type: ignore[no-untyped-def]
     """Give a clique back: at once if this update has made it, else on commit."""
     if tb.cliques(head)[c].born == head[tb.UPDATE]:
         give_clique(head, c)
-    else:
-        _give_on_commit(head, c, -1)
-
-
-@kernel
-def _give_on_commit(head, c, values):  # type: ignore[no-untyped-def]
-    """List a clique (values = -1), or the index of its old values, to be given back on commit."""
-    freed = tb.freed(head)
-    end = head[tb.N_FREED]
-    freed[end], freed[end + 1] = c, values
-    head[tb.N_FREED] = end + 2
+        return
+    freed, end = tb.freed(head), head[tb.N_FREED]
+    freed[end], freed[end + 1], head[tb.N_FREED] = c, -1, end + 2
 
 
 @kernel
@@ -172,7 +164,8 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
     if row.values_born == head[tb.UPDATE]:
         return
     log_clique(head, c)
-    _give_on_commit(head, c, row.values)
+    freed, end = tb.freed(head), head[tb.N_FREED]
+    freed[end], freed[end + 1], head[tb.N_FREED] = c, row.values, end + 2
     row.values = pools.take(head, pools.VALUES, pools.n_values(row.n_frontal, row.n_separator))
     row.values_born = head[tb.UPDATE]
 

@@ -117,44 +117,42 @@ def attach_reference(nodes: HiddenNodes, closure: ms.LoopClosure) -> Attachment 
     return nodes.attachment(node, np.zeros(3), np.zeros((3, 3)))
 
 
-def _observe(
-    measurement: ms.Absolute, source: str, attachment: Attachment, to: Target,
-) -> ms.Answer:
-    to.queue.append(observed(source, measurement, attachment))
+def _observe(given: ms.Absolute, source: str, at: Attachment, to: Target) -> ms.Answer:
+    to.queue.append(observed(source, given, at))
     return ms.ACCEPTED
 
 
-def _observe_fix(fix: ms.Fix, source: str, attachment: Attachment, to: Target) -> ms.Answer:
+def _observe_fix(fix: ms.Fix, source: str, at: Attachment, to: Target) -> ms.Answer:
     # the last step: only a fix that nothing else is wrong with may become the datum
     position = fix.placed()
     if (defect := ms.value_defect(position.position)) is not None:
         return ms.rejected(defect, f'Fix: {position.position.tolist()} m from the datum')
-    return _observe(position, source, attachment, to)
+    return _observe(position, source, at, to)
 
 
-def _join(closure: ms.LoopClosure, source: str, attachment: Attachment, to: Target) -> ms.Answer:
+def _join(closure: ms.LoopClosure, source: str, at: Attachment, to: Target) -> ms.Answer:
     reference = attach_reference(to.nodes, closure)
     if isinstance(reference, ms.Answer):
         return reference
-    if reference.node == attachment.node:
-        return ms.rejected('same_node', f'both ends are attached to hidden node {attachment.node}')
+    if reference.node == at.node:
+        return ms.rejected('same_node', f'both ends are attached to hidden node {at.node}')
     reference_ns = closure.reference_ns
     if reference_ns is None:
         reference_ns = int(to.nodes.stamps_ns[closure.reference_node])
     to.queue.append(Queued(
-        source, loop_closure_constraint(closure, reference, attachment), closure.stamp_ns,
+        source, loop_closure_constraint(closure, reference, at), closure.stamp_ns,
         reference_ns))
     return ms.ACCEPTED
 
 
-def _reach(measurement: ms.Range, source: str, attachment: Attachment, to: Target) -> ms.Answer:
-    variance = measurement.variance + swept_variance(measurement, attachment)
-    antenna = se2.compose(attachment.motion, np.append(measurement.lever_arm, 0.0))
+def _reach(given: ms.Range, source: str, at: Attachment, to: Target) -> ms.Answer:
+    variance = given.variance + swept_variance(given, at)
+    antenna = se2.compose(at.motion, np.append(given.lever_arm, 0.0))
     edge = Factors(     # to a landmark that there need not be yet
-        [attachment.node], [-1], [(measurement.distance, 0.0, 0.0)],
+        [at.node], [-1], [(given.distance, 0.0, 0.0)],
         [np.diag((1.0 / variance, 0.0, 0.0))], [FactorKind.RANGE],
         constants=[(antenna[0], antenna[1], 0.0, 0.0)])
-    to.beacons.add(WaitingRange(Queued(source, edge, measurement.stamp_ns), measurement))
+    to.beacons.add(WaitingRange(Queued(source, edge, given.stamp_ns), given))
     return ms.ACCEPTED
 
 
@@ -168,36 +166,30 @@ def observed(source: str, measurement: ms.Absolute, attachment: Attachment) -> Q
     return Queued(source, factor, measurement.stamp_ns, noise=noise)
 
 
-def _observed_position(
-    measurement: ms.Position, attachment: Attachment,
-) -> tuple[Factors, FloatArray]:
+def _observed_position(given: ms.Position, at: Attachment) -> tuple[Factors, FloatArray]:
     # it has no information on the heading, and lies in map axes
-    variance, information = swept_variance(measurement, attachment), np.zeros((3, 3))
-    information[:2, :2] = covariance.information(measurement.covariance + variance * np.eye(2))
-    offset = se2.compose(attachment.motion, np.append(measurement.lever_arm, 0.0))
+    variance, information = swept_variance(given, at), np.zeros((3, 3))
+    information[:2, :2] = covariance.information(given.covariance + variance * np.eye(2))
+    offset = se2.compose(at.motion, np.append(given.lever_arm, 0.0))
     return Factors.on(
-        [attachment.node], [offset], [np.append(measurement.position, 0.0)], [information],
+        [at.node], [offset], [np.append(given.position, 0.0)], [information],
         [FactorKind.POSITION]), np.array((variance, 0.0))
 
 
-def _observed_heading(
-    measurement: ms.HeadingOnly, attachment: Attachment,
-) -> tuple[Factors, FloatArray]:
-    variance, information = float(attachment.noise[2, 2]), np.zeros((3, 3))
-    information[2, 2] = 1.0 / (measurement.variance + variance)
+def _observed_heading(given: ms.HeadingOnly, at: Attachment) -> tuple[Factors, FloatArray]:
+    variance, information = float(at.noise[2, 2]), np.zeros((3, 3))
+    information[2, 2] = 1.0 / (given.variance + variance)
     return Factors.on(
-        [attachment.node], [attachment.motion], [(0.0, 0.0, measurement.heading)], [information],
+        [at.node], [at.motion], [(0.0, 0.0, given.heading)], [information],
         [FactorKind.HEADING]), np.array((0.0, variance))
 
 
-def _observed_pose(
-    measurement: ms.GlobalPose, attachment: Attachment,
-) -> tuple[Factors, FloatArray]:
-    noise, pose = attachment.noise, measurement.pose
+def _observed_pose(given: ms.GlobalPose, at: Attachment) -> tuple[Factors, FloatArray]:
+    noise, pose = at.noise, given.pose
     information = covariance.information(    # (3.51)-(3.53)
-        covariance.turned(measurement.covariance, float(pose[2])) + noise)
+        covariance.turned(given.covariance, float(pose[2])) + noise)
     return Factors.on(
-        [attachment.node], [attachment.motion], [pose], [information], [FactorKind.GLOBAL_POSE],
+        [at.node], [at.motion], [pose], [information], [FactorKind.GLOBAL_POSE],
         ), np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
 
 
