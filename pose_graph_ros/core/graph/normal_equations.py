@@ -62,7 +62,7 @@ def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-
     kx, ky = fc.constant(f, kind, c, s, py, -px)
     hx = ft * end.reference[0] - start.reference[0] + kx + px * f.lin_th
     hy = ft * end.reference[1] - start.reference[1] + ky + py * f.lin_th
-    hx, hy = hx + c * fc.third[0] - s * fc.third[1], hy + s * fc.third[0] + c * fc.third[1]
+    hx, hy = hx + c * third[0] - s * third[1], hy + s * third[0] + c * third[1]
     hth = f.lin_k
     # W T: the third column is W (S a, 1)
     wx, wy, wt = xx * px + xy * py + xt, xy * px + yy * py + yt, xt * px + yt * py + tt
