@@ -37,7 +37,7 @@ from pose_graph_ros.core.batch.truncated import Choosing, CONFIG, Surrogate, Tru
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.error_functions import energies as energies_of
+from pose_graph_ros.core.graph.factors import energies as energies_of
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement.closure_search import best
 from pose_graph_ros.core.judgement.closures import floored, FLOORS, forward, GATE

@@ -8,7 +8,12 @@ from typing import Self
 
 import numpy as np
 
-from pose_graph_ros.core import disagreement, newest_estimate
+from pose_graph_ros.core import (
+    disagreement,
+    measurements as ms,
+    newest_estimate,
+    transaction as tr,
+)
 from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
 from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Solve, Status
@@ -25,14 +30,6 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judge import Judge
-from pose_graph_ros.core.measurements import (
-    ACCEPTED,
-    Answer,
-    GlobalPose,
-    Measurement,
-    OdometrySample,
-    rejected,
-)
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
 from pose_graph_ros.core.parts import capture, Parts, restore
 from pose_graph_ros.core.refiner import Refiner
@@ -43,13 +40,6 @@ from pose_graph_ros.core.sources.kinds import attach, validate
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.core.transaction import (
-    checked,
-    succeeds,
-    Transaction,
-    update_isolated,
-    update_with_all,
-)
 
 
 class PoseGraphBackend:
@@ -161,12 +151,12 @@ class PoseGraphBackend:
         """Return the n constraints with the largest energies, with names, in descending order."""
         return cn.largest(self.graph, self._nodes, self._factors, n)
 
-    def decide(self, name: str, decision: vd.Decision) -> Answer:
+    def decide(self, name: str, decision: vd.Decision) -> ms.Answer:
         """Return the answer to a decision on a `Verdict.id`; the next update applies it."""
         self._refiner.restart()
         return self._judge.decide(name, decision)
 
-    def add_odometry(self, sample: OdometrySample, source: str = 'odom') -> Answer:
+    def add_odometry(self, sample: ms.OdometrySample, source: str = 'odom') -> ms.Answer:
         """Return the answer to a sample; `NodePolicy` may ask for a hidden node at it."""
         answer = self._pipeline.count(source, self._nodes.add_sample(sample, source))
         self._collect()
@@ -174,8 +164,7 @@ class PoseGraphBackend:
 
     def _collect(self) -> None:
         """Collect secondary edges and counts of odometry; attach measurements that are due."""
-        self._pipeline.queue += [
-            Queued(*edge) for edge in self._nodes.take_secondary_edges()]
+        self._pipeline.queue += [Queued(*edge) for edge in self._nodes.take_secondary_edges()]
         self._pipeline.count_sorted(self._nodes.streams)
         for source, stream in self._nodes.streams.items():
             if stream.n_jumps > 0:
@@ -215,7 +204,7 @@ class PoseGraphBackend:
         self._reweighting.add(edge, settings.loss, settings.rejection_threshold)
         return self.graph.newest_pose
 
-    def add_measurement(self, measurement: Measurement, source: str) -> Answer:
+    def add_measurement(self, measurement: ms.Measurement, source: str) -> ms.Answer:
         """
         Return the answer to a measurement that is added, in any order of stamps.
 
@@ -224,7 +213,7 @@ class PoseGraphBackend:
         """
         return self._pipeline.add(measurement, source)
 
-    def set_pose(self, pose: GlobalPose, source: str) -> Answer:
+    def set_pose(self, pose: ms.GlobalPose, source: str) -> ms.Answer:
         """
         Return the answer to a pose of the robot that the user sets.
 
@@ -234,38 +223,39 @@ class PoseGraphBackend:
         """
         self.finish()
         if self.graph.n_nodes == 0:
-            return self._pipeline.count(source, rejected('before_odometry', 'no odometry yet'))
+            return self._pipeline.count(source, ms.rejected('before_odometry', 'no odometry yet'))
         first_ns = max(int(self.node_stamps_ns[0]), self._nodes.last_frozen_ns)
         pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), self._nodes.covered_ns))
         if not self._alignment.is_aligned:
             return self.add_measurement(pose, source)
         moved = self._relocate(
-            pose, self._config.measurement_source(source, GlobalPose).covariance)
-        if isinstance(moved, Answer):
+            pose, self._config.measurement_source(source, ms.GlobalPose).covariance)
+        if isinstance(moved, ms.Answer):
             return self._pipeline.count(source, moved)
         self._collect()
         self._alignment.stop_rechecking()
         self._pipeline.attach_to_node(moved, source, int(self._nodes.ids[-1]))
-        return self._pipeline.count(source, ACCEPTED)
+        return self._pipeline.count(source, ms.ACCEPTED)
 
-    def _relocate(self, pose: GlobalPose, policy: CovariancePolicy) -> GlobalPose | Answer:
+    def _relocate(
+        self, pose: ms.GlobalPose, policy: CovariancePolicy,
+    ) -> ms.GlobalPose | ms.Answer:
         """Return the pose of a new hidden node after the newest odometry; or why there is none."""
         validated, last_ns = validate(pose, policy), self._nodes.covered_ns
-        if isinstance(validated, Answer):
+        if isinstance(validated, ms.Answer):
             return validated
         measurement = validated.measurement
         begin, end = attach(self._nodes, pose.stamp_ns), attach(self._nodes, last_ns)
-        if isinstance(begin, Answer) or isinstance(end, Answer) or not isinstance(
-                measurement, GlobalPose):
-            return rejected('no_odometry', 'none at that time')
-        first, last, newest = self.graph.poses_of([
-            begin.node, end.node, int(self._nodes.ids[-1])])
+        if isinstance(begin, ms.Answer) or isinstance(end, ms.Answer) or not isinstance(
+                measurement, ms.GlobalPose):
+            return ms.rejected('no_odometry', 'none at that time')
+        first, last, newest = self.graph.poses_of([begin.node, end.node, int(self._nodes.ids[-1])])
         moved = se2.between(se2.compose(first, begin.motion), se2.compose(last, end.motion))
         now = se2.compose(measurement.pose, moved)
         # the motion to the new node is unknown [m, m, rad]
         noise = np.diag((1000.0, 1000.0, 3.0)) ** 2
         if self._nodes.relocate(se2.between(newest, now), noise) < 0:
-            return rejected('failed', 'the solver failed')
+            return ms.rejected('failed', 'the solver failed')
         return replace(measurement, stamp_ns=last_ns + 1, pose=now)
 
     def update(self) -> UpdateReport:
@@ -282,13 +272,13 @@ class PoseGraphBackend:
 
     def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, list[Queued]]:
         """Return the report of an update, and the constraints for which it had no time."""
-        return update_isolated(
+        return tr.update_isolated(
             partial(self._add_queue, at_once=at_once), self._settle, self._pipeline,
             self._quarantine, lambda one: cn.queued(one, self._nodes)[0])
 
     def _settle(self) -> bool:
         """Tell whether an update without new constraints succeeds."""
-        return succeeds(self._smoother, GraphUpdate())
+        return tr.succeeds(self._smoother, GraphUpdate())
 
     def _add_queue(self, *, at_once: bool) -> tuple[UpdateReport, list[Queued]]:
         """Add the constraints in the queue and solve; return those that it could not add."""
@@ -299,7 +289,7 @@ class PoseGraphBackend:
             return UpdateReport(Status.MAX_ITERATIONS, chi2=self._chi2), []
         queue: list[Queued] = []
         T_map_graph, graph = None, self.graph
-        with Transaction() as transaction:
+        with tr.Transaction() as transaction:
             transaction.keep(self._alignment, 'state', 'sigma')
             T_map_graph = self._alignment.find(graph, self._pipeline.queue, self._nodes)
             queue = self._pipeline.take_ready(aligned=self._alignment.is_aligned)
@@ -317,7 +307,7 @@ class PoseGraphBackend:
             change = self._judge.before(self._factors.new, change, self._nodes.newest_ns)
             # but what has waited for a whole pause does not wait for another one
             at_once = at_once or self._waits or T_map_graph is not None
-            result = checked(self._judge.solve(change, at_once=at_once))
+            result = tr.checked(self._judge.solve(change, at_once=at_once))
         self._waits = transaction.failure == DIVERGED and not at_once
         if self._waits:
             self._refiner.restart()
@@ -368,10 +358,10 @@ class PoseGraphBackend:
         graph = self.graph
         oldest = int(graph.node_ids[np.argmax(graph.is_pose)])  # that thinning has left
         left = graph.poses_of(oldest)
-        with Transaction() as transaction:
+        with tr.Transaction() as transaction:
             transaction.callback(graph.set_poses, graph.poses.copy())
             graph.set_poses(poses)
-            checked(self._optimize_whole())
+            tr.checked(self._optimize_whole())
         if transaction.failure != '':
             self._settle()  # eliminates everything again
             return
@@ -387,7 +377,7 @@ class PoseGraphBackend:
     def optimize(self) -> UpdateReport:
         """Optimise the whole graph with all quarantined constraints; for the end of a stream."""
         self.finish()
-        report = update_with_all(
+        report = tr.update_with_all(
             partial(self._update, at_once=True), self._pipeline, self._quarantine)
         if self.graph.n_nodes == 0:
             return report
@@ -395,11 +385,11 @@ class PoseGraphBackend:
         self._tuner.decide()
         self._settle()
         optimized = UpdateReport(Status.FAILED, chi2=self._chi2)
-        with Transaction() as transaction:
+        with tr.Transaction() as transaction:
             self._judge.finish(transaction)
             self._settle()  # what is believed again
             optimized = self._optimize_whole()
-            checked(optimized)
+            tr.checked(optimized)
         return report.after(replace(optimized, reason=transaction.failure))
 
     def _optimize_whole(self) -> UpdateReport:

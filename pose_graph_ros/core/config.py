@@ -31,14 +31,6 @@ def require(settings: object, *names: str, positive: bool = False) -> None:
                 f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
 
 
-def require_member(settings: object, name: str, kind: type[Enum]) -> None:
-    """Raise ConfigError unless the named setting is a member of an enumeration."""
-    value = getattr(settings, name)
-    if not isinstance(value, kind):
-        raise ConfigError(f'{type(settings).__name__}.{name}: expected one of '
-                          f'{", ".join(map(str, kind))}, got {value!r}')
-
-
 def require_same(what: str, present: object, wanted: object, *names: str) -> None:
     """
     Raise ConfigError if one of the named settings differs, as it cannot change while it runs.
@@ -57,9 +49,11 @@ def check(settings: Any, *positive: str, but: str = '') -> None:
     Those of the given names are positive, and all but one are finite and not negative.
     """
     for name, default in ((each.name, each.default) for each in fields(settings)):
-        if isinstance(default, Enum):
-            require_member(settings, name, type(default))
-        elif isinstance(default, float | int) and name != but:
+        value = getattr(settings, name)
+        if isinstance(default, Enum) and not isinstance(value, type(default)):
+            raise ConfigError(f'{type(settings).__name__}.{name}: expected one of '
+                              f'{", ".join(map(str, type(default)))}, got {value!r}')
+        if isinstance(default, float | int) and name != but:
             require(settings, name, positive=name in positive)
 
 
@@ -261,18 +255,15 @@ class MeasurementSource:
 
 
 # defaults of a source of global poses or positions
-POSITIONS = MeasurementSource(
-    robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
+POSITIONS = MeasurementSource(robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
 # defaults of a source of headings; thinned, as an IMU sends many redundant ones
 HEADINGS = MeasurementSource(minimum_period=0.5)
 # settings of poses that a user sets: neither judged nor with a loss, as the user is believed
 SET_POSES = MeasurementSource(robust=Robust.NONE)
 # defaults of loop closures; those with an invalid covariance are rejected
-LOOP_CLOSURES = MeasurementSource(
-    covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
+LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False), robust=Robust.JUDGED)
 # defaults of a source of ranges to beacons; most messages do not say how accurate they are
-RANGES = MeasurementSource(
-    covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
+RANGES = MeasurementSource(covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
 
 
 class HasDefaults(Protocol):

@@ -109,9 +109,7 @@ def edges_by_source(
     return found
 
 
-def _strains(
-    graph: Graph, factors: FactorBuilder, parts: Mapping[str, _Part],
-) -> dict[str, float]:
+def _strains(graph: Graph, factors: FactorBuilder, parts: Mapping[str, _Part]) -> dict[str, float]:
     """Return the mean squared residual of each source, in units of what is known of its errors."""
     table, strains = factor_table(graph), {}
     for source, part in parts.items():

@@ -28,23 +28,7 @@ from pose_graph_ros.core.measurements import rejected
 from pose_graph_ros.core.odometry.node_table import NodeTable
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.transaction import succeeds
-from pose_graph_ros.core.window.sparse_removal import (
-    crowded_edges,
-    LIMITS,
-    NONE,
-    sparse_marginalization,
-    sparse_removal,
-)
-from pose_graph_ros.core.window.thinning import (
-    carriers,
-    certain,
-    first_of,
-    groups,
-    next_segment,
-    NOWHERE,
-    Places,
-    Thinning,
-)
+from pose_graph_ros.core.window import sparse_removal as sr, thinning as th
 
 
 def n_leaving(config: WindowConfig, table: NodeTable, needed_ns: int | None = None) -> int:
@@ -56,11 +40,11 @@ def n_leaving(config: WindowConfig, table: NodeTable, needed_ns: int | None = No
     stays until it is twice as old as the window.
     """
     n_kept = len(table) - table.n_frozen
-    leaving = min(_beyond(config, table, 1.0), n_kept - LIMITS.newest)
+    leaving = min(_beyond(config, table, 1.0), n_kept - sr.LIMITS.newest)
     if leaving > 0 and needed_ns is not None:
         at = int(np.searchsorted(table.stamps_ns, needed_ns, side='right')) - 1 - table.n_frozen
         if 0 <= at < leaving:
-            leaving = max(at, min(_beyond(config, table, LIMITS.longest_hold), leaving))
+            leaving = max(at, min(_beyond(config, table, sr.LIMITS.longest_hold), leaving))
     return max(leaving, 0)
 
 
@@ -72,11 +56,11 @@ def _beyond(config: WindowConfig, table: NodeTable, factor: float) -> int:
     travelled, most = table.travelled, 0
     for places, newest, limit, group in (
             (np.arange(first, n), n, math.ceil(factor * config.nodes),
-             max(math.floor(LIMITS.group * config.nodes), 1)),
+             max(math.floor(sr.LIMITS.group * config.nodes), 1)),
             (since_ns, int(since_ns[-1]), round(factor * second_ns),
-             max(round(LIMITS.group * second_ns), 1)),
+             max(round(sr.LIMITS.group * second_ns), 1)),
             (travelled, float(travelled[-1]), factor * config.metres,
-             LIMITS.group * config.metres)):
+             sr.LIMITS.group * config.metres)):
         if limit > 0:
             begin = math.floor((newest - limit) // group) * group
             most = max(most, int(np.searchsorted(places, begin)))
@@ -104,15 +88,19 @@ class Forgetting:
         # was frozen before the graph was aligned with the map; else None
         self._joint: FloatArray | None = None
         self._rest = 0  # number of hidden nodes from which on more of them may leave
-        self._thinning, self._n_made = Thinning(), 0
+        self._thinning, self._n_made = th.Thinning(), 0
         self._work: Iterator[None] = iter(())
 
     def step(self, config: BackendConfig) -> None:
         """Let the nodes leave that are due, by the window and by thinning."""
         if len(self._parts.nodes) == 0 or self._parts.graph.has_touched:
             return
-        if config.window.is_limited:
-            self._step_of_window(config.window)
+        nodes, window = self._parts.nodes, config.window
+        n = n_leaving(window, nodes) if window.is_limited else 0
+        if n > 0:
+            n = n_leaving(window, nodes, self._parts.pipeline.needed_ns)
+        if n > 0 and len(nodes) >= self._rest:
+            self._freeze(n, window.prior)
         self._step_of_thinning(config.thinning)
 
     def restored(self) -> None:
@@ -135,7 +123,7 @@ class Forgetting:
         biases = [] if after is None else tuner.leaving(factors)
         return _Asked(np.union1d(nodes, biases).astype(np.int64), judged)
 
-    def _tell(self, asked: _Asked, gone: Gone, places: Places) -> None:
+    def _tell(self, asked: _Asked, gone: Gone, places: th.Places) -> None:
         """Let all owners forget what has left the graph."""
         self._parts.judge.forget(gone.nodes, gone.factors, asked.judged)
         self._parts.reweighting.forget(gone.factors)
@@ -163,7 +151,7 @@ class Forgetting:
         # a bag is replayed with many new nodes from step to step
         n_made = len(self._parts.nodes)
         new, self._n_made = max(n_made - self._n_made, 1), n_made
-        for _ in range(min(new, LIMITS.pieces)):
+        for _ in range(min(new, sr.LIMITS.pieces)):
             if next(self._work, self) is self:
                 self._work = self._thinned(config)
                 if next(self._work, self) is self:
@@ -181,7 +169,7 @@ class Forgetting:
         older = graph.node_ids[graph.is_pose][:-config.newest]
         while self._thinning.measurements_are_due(graph):
             older = older[graph.node_rows(older) >= 0]
-            segment = next_segment(graph, older, places.nodes)
+            segment = th.next_segment(graph, older, places.nodes)
             if segment is None:
                 break
             inside = np.isin(places.nodes, segment.poses)
@@ -191,30 +179,30 @@ class Forgetting:
             places, older = places.rows(~inside), older[older >= segment.after]
             yield
         # others leave with their measurements
-        before = places.nodes < first_of(carriers(graph))
-        for chosen in groups(graph, self._present(places.rows(before), config)):
+        before = places.nodes < th.first_of(th.carriers(graph))
+        for chosen in th.groups(graph, self._present(places.rows(before), config)):
             group = self._present(chosen, config)
             if len(group.nodes) > 0:
                 self._leave(group)
                 yield
-        while any(self._leave(NOWHERE, edges) for edges in crowded_edges(graph, config.newest)):
+        while any(self._leave(th.NOWHERE, edges)
+                  for edges in sr.crowded_edges(graph, config.newest)):
             yield
         parts.nodes.drop_samples(config.newest)
-        parts.pipeline.seen.forget(parts.nodes.newest_ns - LIMITS.repeated_ns)
+        parts.pipeline.seen.forget(parts.nodes.newest_ns - sr.LIMITS.repeated_ns)
 
-    def _present(self, places: Places, config: ThinningConfig) -> Places:
+    def _present(self, places: th.Places, config: ThinningConfig) -> th.Places:
         """Return the places, as they are now, of those nodes that may still leave."""
         there = self._parts.graph.node_rows(np.stack((places.nodes, places.anchors))) >= 0
         free = np.all(there, axis=0) & ~np.isin(places.nodes, self._held())
-        return certain(
-            self._parts.smoother, places.nodes[free], places.anchors[free], config)
+        return th.certain(self._parts.smoother, places.nodes[free], places.anchors[free], config)
 
     def _leave(
-        self, places: Places, factors: IntArray = NONE, after: int | None = None,
+        self, places: th.Places, factors: IntArray = sr.NONE, after: int | None = None,
     ) -> bool:
         """Let nodes and further factors leave, few others in their place; tell if they did."""
         asked = self._ask(places.nodes, factors, after)
-        gone = self._solve(sparse_removal(self._parts.graph, asked.nodes, factors))
+        gone = self._solve(sr.sparse_removal(self._parts.graph, asked.nodes, factors))
         if gone is not None:
             self._tell(asked, gone, places)
         return gone is not None
@@ -225,15 +213,6 @@ class Forgetting:
         for queue in (parts.pipeline.queue, parts.quarantine):
             found += [node for each in queue for node in each.nodes]
         return np.array(found, dtype=np.int64)
-
-    def _step_of_window(self, window: WindowConfig) -> None:
-        """Let the nodes beyond the window leave, if a group is due."""
-        nodes, parts = self._parts.nodes, self._parts
-        n = n_leaving(window, nodes)
-        if n > 0:
-            n = n_leaving(window, nodes, parts.pipeline.needed_ns)
-        if n > 0 and len(nodes) >= self._rest:
-            self._freeze(n, window.prior)
 
     def _freeze(self, n: int, prior: WindowPrior) -> None:
         """Let the n oldest nodes leave, with a dense or a sparse prior instead."""
@@ -246,17 +225,17 @@ class Forgetting:
         leaving = graph.node_ids[:row][graph.is_pose[:row] & ~graph.fixed[:row]]
         self._follow_alignment()
         stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
-        asked = self._ask(leaving, NONE, int(graph.node_ids[np.argmax(stays)]))
+        asked = self._ask(leaving, sr.NONE, int(graph.node_ids[np.argmax(stays)]))
         parts.smoother.linearize(asked.nodes)
         poses, places = nodes.recent_poses(graph), self._other_anchors(first)
         gone = None if prior is WindowPrior.DENSE else self._solve(
-            sparse_marginalization(graph, asked.nodes))
+            sr.sparse_marginalization(graph, asked.nodes))
         if gone is None:
             try:
                 gone = parts.smoother.forget(asked.nodes)
             except GraphUpdateError:
                 parts.pipeline.counts['solver', 'failed'] += 1
-                self._rest = len(nodes) + LIMITS.rest
+                self._rest = len(nodes) + sr.LIMITS.rest
                 return
         self._tell(asked, gone, places)
         nodes.forget(poses[:n])
@@ -266,7 +245,7 @@ class Forgetting:
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         self._refuse(asked.nodes)
 
-    def _other_anchors(self, first: int) -> Places:
+    def _other_anchors(self, first: int) -> th.Places:
         """Return the places in others of anchors of thinned nodes that leave, before a number."""
         table, graph = self._parts.nodes, self._parts.graph
         thinned = table.thinned.places()
@@ -274,8 +253,7 @@ class Forgetting:
         kept = np.setdiff1d(np.arange(first, len(table)), thinned.numbers)
         ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
         nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
-        return Places.now(
-            self._parts.smoother, table.ids[leave], table.ids[kept[nearest]])
+        return th.Places.now(self._parts.smoother, table.ids[leave], table.ids[kept[nearest]])
 
     def _follow_alignment(self) -> None:
         """

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.monitor import AlignmentState, in_rows, placed
+from pose_graph_ros.core.alignment.monitor import AlignmentState
 from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.config import Loss, OdometrySource, Robust
 from pose_graph_ros.core.estimate import Estimate
@@ -45,13 +45,18 @@ def estimate(
     newest = se2.compose(node.pose, motion)
     cov = covariance.propagated(*node, motion, motion_noise)
     if state is AlignmentState.ALIGNED:
-        cov = cov + _of_other_hypotheses(parts, newest)
+        # by what may have happened, but is not believed
+        (x, y, _), spread = parts.judge.fixes.spread
+        moved = np.array(((1.0, 0.0, y - newest[1]), (0.0, 1.0, newest[0] - x), (0.0, 0.0, 1.0)))
+        cov = cov + moved @ spread @ moved.T
     shift = np.zeros(3)
     if state is AlignmentState.UNALIGNED:
         # if the aligning update failed, its measurements are in the quarantine
-        waiting = placed(parts.pipeline.queue + parts.quarantine)
+        waiting = [each.factor for each in (*parts.pipeline.queue, *parts.quarantine)
+                   if each.is_placed]
         if len(waiting) > 0:
-            shift, cov = estimator.guess(graph.poses, newest, in_rows(graph, waiting))
+            shift, cov = estimator.guess(
+                graph.poses, newest, Factors.joined(waiting).renumbered(graph.node_rows))
             newest = newest + shift
         else:
             # the nodes of all of them have left the graph
@@ -96,9 +101,7 @@ def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     return found
 
 
-def _turned(
-    parts: Parts, motion: FloatArray, noise: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def _turned(parts: Parts, motion: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the motion since the newest node, and its noise, with what a gyroscope says."""
     gyros, nodes = parts.pipeline.gyros, parts.nodes
     rotation = None if len(gyros.streams) == 0 else gyros.newest(
@@ -113,14 +116,6 @@ def _turned(
     turn = se2.rotation(motion[2])
     return (np.append(motion[:2] + turn @ step[:2], motion[2] + step[2]),
             noise - total * np.outer(gain, gain))
-
-
-def _of_other_hypotheses(parts: Parts, newest: FloatArray) -> FloatArray:
-    """Return the covariance at a pose by what may have happened, but is not believed."""
-    pose, spread = parts.judge.fixes.spread
-    moved = np.eye(3)
-    moved[0, 2], moved[1, 2] = pose[1] - newest[1], newest[0] - pose[0]
-    return np.asarray(moved @ spread @ moved.T)
 
 
 class Corrected(NamedTuple):

@@ -80,21 +80,17 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
     parts of the saved graph contradict each other.
     """
     try:
-        _restore(parts, saved)
+        parts.graph.fill(saved.rows)
+        parts.nodes.restore(saved.nodes)
+        parts.pipeline.seen.restore(saved.seen)
+        parts.factors.restore(saved.sources)
+        for name, gyro in saved.gyros.items():
+            parts.pipeline.gyros.restore(name, gyro)
+        parts.pipeline.beacons.ids |= saved.beacons
+        parts.reweighting.restore(saved.losses)
+        parts.alignment.load(saved.alignment)
+        parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
+        parts.pipeline.queue += saved.waiting.queue()
+        parts.quarantine.extend(saved.set_aside.queue())
     except MISMATCHES as error:
         raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
-
-
-def _restore(parts: Parts, saved: SavedGraph) -> None:
-    parts.graph.fill(saved.rows)
-    parts.nodes.restore(saved.nodes)
-    parts.pipeline.seen.restore(saved.seen)
-    parts.factors.restore(saved.sources)
-    for name, gyro in saved.gyros.items():
-        parts.pipeline.gyros.restore(name, gyro)
-    parts.pipeline.beacons.ids |= saved.beacons
-    parts.reweighting.restore(saved.losses)
-    parts.alignment.load(saved.alignment)
-    parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
-    parts.pipeline.queue += saved.waiting.queue()
-    parts.quarantine.extend(saved.set_aside.queue())

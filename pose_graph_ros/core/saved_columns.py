@@ -126,16 +126,11 @@ def decoded(kind: Any, plain: Any) -> Any:
 
 def _array(column: Choices | Column | Records, plain: Any) -> npt.NDArray[Any]:
     if isinstance(column, Records):
-        return _table(column.dtype, plain)
+        rows = np.empty(len(plain[(column.dtype.names or ())[0]]), column.dtype)
+        for name in rows.dtype.names or ():
+            rows[name] = np.reshape(plain[name], rows[name].shape)
+        return rows
     if isinstance(column, Column):
         return np.array(plain, dtype=column.kind).reshape(-1, *column.shape)
     numbers = [column.numbers[name] for name in plain['names']]
     return np.array(numbers, dtype=np.int64)[np.array(plain['of'], dtype=np.int64)]
-
-
-def _table(dtype: np.dtype[Any], plain: Any) -> npt.NDArray[Any]:
-    """Return records from their columns."""
-    rows = np.empty(len(plain[(dtype.names or ())[0]]), dtype)
-    for name in rows.dtype.names or ():
-        rows[name] = np.reshape(plain[name], rows[name].shape)
-    return rows

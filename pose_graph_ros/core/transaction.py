@@ -158,8 +158,7 @@ def isolate(
                 return bad, suspects + untried
             half, rest = suspects[:len(suspects) // 2], suspects[len(suspects) // 2:]
             attempts, reason = attempts + 1, attempt(half)
-            suspects, untried = (
-                (rest, untried) if reason == '' else (half, rest + untried))
+            suspects, untried = ((rest, untried) if reason == '' else (half, rest + untried))
         if reason == '':    # suspected because all others were added
             attempts, reason = attempts + 1, attempt(suspects)
         if reason != '':

@@ -14,6 +14,7 @@ started afresh and not forked, and get nothing but the path of imports and the e
 
 from collections.abc import Callable, Iterator
 import contextlib
+import functools
 import gc
 import os
 import subprocess
@@ -60,7 +61,7 @@ def _wait_for_parent() -> None:
 
 
 # Functions that the helper processes call: one begins with the first kernel, one with the last.
-HELPERS = ((__name__, 'compile_forwards'), (__name__, 'compile_backwards'))
+HELPERS = ((__name__, 'compile_missing'), (__name__, 'compile_backwards'))
 # Time after which a helper counts as stuck [s].
 PATIENCE = 600.0
 
@@ -92,22 +93,17 @@ def warm_up(stopped: Callable[[], bool] = lambda: False) -> float:
     return time.perf_counter() - start
 
 
-def compile_forwards() -> None:
+def compile_missing(step: int = 1) -> None:
     """Compile and store all kernels that are not in the cache; for a helper process."""
-    _compile_missing(jit.declared())
-
-
-def compile_backwards() -> None:
-    """Do as `compile_forwards`, in the opposite order: the two meet in the middle."""
-    _compile_missing(jit.declared()[::-1])
-
-
-def _compile_missing(names: list[str]) -> None:
     end_with_parent()
     with _rare_collections():
-        for name in names:
+        for name in jit.declared()[::step]:
             if not jit.is_cached(name):
                 jit.compile_kernels([name])
+
+
+# the opposite order: the two meet in the middle
+compile_backwards = functools.partial(compile_missing, -1)
 
 
 @contextlib.contextmanager

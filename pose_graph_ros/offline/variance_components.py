@@ -32,7 +32,7 @@ from scipy.sparse.linalg import splu
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import errors
+from pose_graph_ros.core.graph.factors import errors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.parts import Parts

@@ -12,7 +12,7 @@ import pytest
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import energies
+from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
 
 LIMIT = 11.345  # 99 % of chi2 with three degrees of freedom

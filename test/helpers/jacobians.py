@@ -9,7 +9,7 @@ import numpy as np
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.error_functions import errors
+from pose_graph_ros.core.graph.factors import errors
 
 
 class EdgeLinearization(NamedTuple):

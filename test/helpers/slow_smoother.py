@@ -18,7 +18,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SmootherConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions, tables as tb
+from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed
@@ -77,9 +77,9 @@ class SlowGraph:
         return replace(self, poses=moved)
 
     def chi2(self) -> float:
-        error = error_functions.errors(self.poses, self.factors)
+        error = factors.errors(self.poses, self.factors)
         return float(np.sum(
-            error_functions.energies(error, self.factors.weighted_information)))
+            factors.energies(error, self.factors.weighted_information)))
 
     def system(self) -> tuple[FloatArray, FloatArray]:
         """Return H, shape (3N, 3N), and b, shape (3N,), of all nodes, fixed or not."""

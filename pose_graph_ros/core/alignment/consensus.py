@@ -127,8 +127,7 @@ class Given(NamedTuple):
 def positions_along(poses: Poses, given: Given) -> Positions:
     """Return the positions of observed nodes in the order of the drive."""
     placed = given.observed.kind != FactorKind.HEADING
-    observed, stamp, tau = (
-        given.observed.rows(placed), given.stamps[placed], given.times[placed])
+    observed, stamp, tau = (given.observed.rows(placed), given.stamps[placed], given.times[placed])
     noise = given.noise
     # by all columns, so that the order of the result does not depend on that of the input
     order = np.lexsort((tau, *observed.information.reshape(-1, 9).T, *observed.mean.T,
@@ -174,13 +173,17 @@ class Consensus:
 def consensus(positions: Positions, given: Given) -> Consensus | None:
     """Return the motion that most positions agree on; None if no two agree on an angle."""
     policy, noise = given.policy, given.noise
-    variance = positions.variance + _drift(positions, noise)
+    # with that by odometry from the middle of the path, of a coordinate [m^2]
+    middle = int(np.argmin(np.abs(positions.path - np.mean(positions.path))))
+    far, along, walk = (np.abs(column - column[middle]) for column in (
+        positions.odometry, positions.path, positions.walk))
+    slip = noise.sigma_distance**2 + noise.sigma_lateral**2
+    variance = positions.variance + walk * far**2 / 6.0 + 0.5 * slip * along
     inlier, cost = _inliers(positions.odometry, positions.observed, variance)
     n = int(np.count_nonzero(inlier))
     if n < 2:
         return None
-    mirrored, cost_of_mirrored = _inliers(
-        positions.odometry.conj(), positions.observed, variance)
+    mirrored, cost_of_mirrored = _inliers(positions.odometry.conj(), positions.observed, variance)
     chosen, weight = positions.rows(inlier), 1.0 / variance[inlier]
     fitted = _fitted(weight[None], chosen.odometry, chosen.observed)
     z, shift, lever = complex(fitted[0][0]), fitted[1][0], fitted[2][0]
@@ -211,18 +214,7 @@ def consensus(positions: Positions, given: Given) -> Consensus | None:
         float(chosen.walk[best]), is_mirrored, is_certain)
 
 
-def _drift(positions: Positions, noise: OdometryNoise) -> FloatArray:
-    """Return the variance of a coordinate by odometry from the middle of the path, (K,) [m^2]."""
-    middle = int(np.argmin(np.abs(positions.path - np.mean(positions.path))))
-    far, along, walk = (np.abs(column - column[middle]) for column in (
-        positions.odometry, positions.path, positions.walk))
-    slip = noise.sigma_distance**2 + noise.sigma_lateral**2
-    return np.asarray(walk * far**2 / 6.0 + 0.5 * slip * along)
-
-
-def _inliers(
-    p: ComplexArray, q: ComplexArray, variance: FloatArray,
-) -> tuple[BoolArray, float]:
+def _inliers(p: ComplexArray, q: ComplexArray, variance: FloatArray) -> tuple[BoolArray, float]:
     """
     Return which positions are inliers of the best motion, shape (K,), and its cost.
 

@@ -13,20 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.alignment.consensus import (
-    Consensus,
-    consensus,
-    Given,
-    Positions,
-    positions_along,
-    TUNED,
-)
+from pose_graph_ros.core.alignment import consensus as cs
+from pose_graph_ros.core.alignment.consensus import TUNED
 from pose_graph_ros.core.config import AlignmentPolicy
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import FloatArray, Poses, PoseVector
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.error_functions import errors
+from pose_graph_ros.core.graph.factors import errors
 from pose_graph_ros.core.quantities import Radians
 
 
@@ -39,7 +33,7 @@ class GraphAlignment(NamedTuple):
     node: int = -1  # hidden node at which the angle has the least variance; -1 without an angle
 
 
-def find_alignment(poses: FloatArray, given: Given) -> GraphAlignment:
+def find_alignment(poses: FloatArray, given: cs.Given) -> GraphAlignment:
     """
     Return the rigid motion that takes a graph into the map, if it is known well enough.
 
@@ -47,7 +41,7 @@ def find_alignment(poses: FloatArray, given: Given) -> GraphAlignment:
     a position or a global pose.
     """
     by_heading = _by_heading(poses, given.observed)
-    by_positions = _from_positions(positions_along(poses, given), given)
+    by_positions = _from_positions(cs.positions_along(poses, given), given)
     better = by_positions.T_map_graph is None or by_heading.sigma < by_positions.sigma
     return by_heading if better and by_heading.sigma <= TUNED.aligning_sigma else by_positions
 
@@ -66,12 +60,11 @@ def _by_heading(poses: FloatArray, observed: Factors) -> GraphAlignment:
     shift = np.average(
         observed.mean[used, :2] - predicted[used, :2] @ se2.rotation(theta).T, axis=0,
         weights=weight)
-    return GraphAlignment(
-        np.array((*shift, theta)), float(sigma[best]), int(observed.i[best]))
+    return GraphAlignment(np.array((*shift, theta)), float(sigma[best]), int(observed.i[best]))
 
 
 def recheck(
-    solved: Poses, odometry: Poses, given: Given, sigma: Radians = 0.0,
+    solved: Poses, odometry: Poses, given: cs.Given, sigma: Radians = 0.0,
 ) -> GraphAlignment | None:
     """
     Return a new alignment if more positions show that the angle in use is wrong.
@@ -80,7 +73,7 @@ def recheck(
     between the solved graph and odometry at the same node. The result is the motion from the
     odometry frame into the map; None if the angle in use is right, or none is determined.
     """
-    found = _from_positions(positions_along(odometry, given), given)
+    found = _from_positions(cs.positions_along(odometry, given), given)
     if found.T_map_graph is None:
         return None
     in_use = solved[found.node, 2] - odometry[found.node, 2]
@@ -89,7 +82,7 @@ def recheck(
     return found if difference > limit else None
 
 
-def _from_positions(positions: Positions, given: Given) -> GraphAlignment:
+def _from_positions(positions: cs.Positions, given: cs.Given) -> GraphAlignment:
     """Return the motion that most stretches of the drive agree on."""
     policy = given.policy
     if positions.baseline < policy.minimum_baseline:
@@ -98,7 +91,7 @@ def _from_positions(positions: Positions, given: Given) -> GraphAlignment:
     for shortening in TUNED.shortenings:
         least = TUNED.least_of_shortened if shortening > 1.0 else min(3, len(positions.node))
         stretches = _stretches(positions, shortening)
-        found = [consensus(stretch, given) if len(stretch.node) >= least else None
+        found = [cs.consensus(stretch, given) if len(stretch.node) >= least else None
                  for stretch in stretches]
         sparse = sparse and all(len(stretch.node) < least for stretch in stretches)
         left_handed = [item.is_mirrored for item in found if item is not None]
@@ -113,11 +106,11 @@ def _from_positions(positions: Positions, given: Given) -> GraphAlignment:
     if sparse:
         # every stretch of the long drive has too few positions
         whole = positions.thinned()
-        best = _supported([whole], [consensus(whole, given)], policy, 3)
+        best = _supported([whole], [cs.consensus(whole, given)], policy, 3)
     return best or GraphAlignment(None, sigma)
 
 
-def _stretches(positions: Positions, shortening: float) -> list[Positions]:
+def _stretches(positions: cs.Positions, shortening: float) -> list[cs.Positions]:
     """Return stretches of the drive with about the same drift of odometry, newest first."""
     # the path length decides where odometry has no noise of the heading
     to_come = positions.walk[-1] - positions.walk + 1e-9 * (positions.path[-1] - positions.path)
@@ -132,7 +125,7 @@ def _stretches(positions: Positions, shortening: float) -> list[Positions]:
 
 
 def _supported(
-    stretches: list[Positions], found: list[Consensus | None], policy: AlignmentPolicy,
+    stretches: list[cs.Positions], found: list[cs.Consensus | None], policy: AlignmentPolicy,
     least: int,
 ) -> GraphAlignment | None:
     """Return the newest certain fit that enough stretches agree with, up to odometry's drift."""
@@ -166,9 +159,7 @@ def _supported(
     return GraphAlignment(best.T_map_odom, best.sigma_heading, best.node)
 
 
-def guess(
-    poses: Poses, newest: PoseVector, observed: Factors,
-) -> tuple[FloatArray, FloatArray]:
+def guess(poses: Poses, newest: PoseVector, observed: Factors) -> tuple[FloatArray, FloatArray]:
     """
     Return a shift of the graph into the map and a covariance while the angle is not known.
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decision when to align the graph with the map, and when to correct that."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 import math
@@ -58,9 +57,7 @@ class AlignmentMonitor:
         """Set the settings for checks from now on, which use all measurements so far."""
         self._config = config
 
-    def find(
-        self, graph: Graph, waiting: list[Queued], nodes: HiddenNodes,
-    ) -> FloatArray | None:
+    def find(self, graph: Graph, waiting: list[Queued], nodes: HiddenNodes) -> FloatArray | None:
         """
         Return the motion of the graph into the map if it is found, and update the state.
 
@@ -68,10 +65,9 @@ class AlignmentMonitor:
         known well enough.
         """
         waiting = [each for each in waiting if each.is_in_map]
-        if self.state is AlignmentState.ALIGNED or len(placed(waiting)) == 0:
+        if self.state is AlignmentState.ALIGNED or not any(each.is_placed for each in waiting):
             return None
-        found = estimator.find_alignment(
-            nodes.recent_poses(graph), self._given(nodes, waiting))
+        found = estimator.find_alignment(nodes.recent_poses(graph), self._given(nodes, waiting))
         self.state = (AlignmentState.UNALIGNED if found.T_map_graph is None
                       else AlignmentState.ALIGNED)
         self.sigma = found.sigma
@@ -80,7 +76,7 @@ class AlignmentMonitor:
     def add(self, added: list[Queued]) -> None:
         """Store the measurements that were added to the graph for the next check."""
         if self._next_recheck <= TUNED.last_recheck:
-            self._evidence += placed(added)
+            self._evidence += [each for each in added if each.is_placed]
 
     def stop_rechecking(self) -> None:
         """Stop checking the angle, because the path is not that of odometry any more."""
@@ -122,7 +118,8 @@ class AlignmentMonitor:
     def _given(self, nodes: HiddenNodes, evidence: list[Queued]) -> Given:
         """Return measurements by rows of `HiddenNodes.recent_poses`, and what is assumed."""
         ids = nodes.ids[nodes.n_frozen:]    # which has no biases
-        observed = _table(evidence).renumbered(lambda some: np.searchsorted(ids, some))
+        observed = Factors.joined([each.factor for each in evidence]).renumbered(
+            lambda some: np.searchsorted(ids, some))
         # the noise that odometry has at least, constant errors included
         scale = math.sqrt(max(nodes.errors.way, nodes.errors.turn, 1.0))
         noise = nodes.streams[nodes.primary].usual_noise().scaled(scale)
@@ -151,17 +148,3 @@ class AlignmentMonitor:
         self.sigma = np.inf if saved.sigma is None else saved.sigma
         self._next_recheck = saved.next_verdict
         self._evidence = saved.evidence.queue()
-
-
-def placed(queue: Sequence[Queued]) -> list[Queued]:
-    """Return the measurements in the map that contain a position: all but headings."""
-    return [each for each in queue if each.is_placed]
-
-
-def in_rows(graph: Graph, measurements: Sequence[Queued]) -> Factors:
-    """Return the observed nodes of measurements, with the rows of their hidden nodes."""
-    return _table(measurements).renumbered(graph.node_rows)
-
-
-def _table(measurements: Sequence[Queued]) -> Factors:
-    return Factors.joined([each.factor for each in measurements])

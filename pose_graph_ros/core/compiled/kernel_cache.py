@@ -37,13 +37,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from pose_graph_ros.core.compiled.numba_internals import (
-    CompileResult,
-    Dispatcher,
-    rtsys,
-    serialize,
-    sigutils,
-)
+from pose_graph_ros.core.compiled import numba_internals as ni
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +61,8 @@ def find_folders(source: Path) -> Folders:
     others, tried = [], []
     for folder in _candidates(source):
         try:
-            _make_writable(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()  # whether files can be written
         except OSError as error:
             tried.append(f'{folder} ({error.strerror or error})')
             if folder.is_dir() and os.access(folder, os.R_OK):
@@ -93,15 +88,9 @@ def _candidates(source: Path) -> Iterator[Path]:
             yield cache / OWNER / own
 
 
-def _make_writable(folder: Path) -> None:
-    """Create a folder if it does not exist; raise OSError if files cannot be written in it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    tempfile.TemporaryFile(dir=folder).close()
-
-
 # --- the fingerprint ----------------------------------------------------------------------------
 
-def fingerprint(dispatcher: Dispatcher) -> bytes:
+def fingerprint(dispatcher: ni.Dispatcher) -> bytes:
     """Return a digest of all inputs of a kernel's machine code except its signature."""
     parts: list[object] = [
         numba.__version__, dispatcher.targetctx.codegen().magic_tuple(),
@@ -111,7 +100,7 @@ def fingerprint(dispatcher: Dispatcher) -> bytes:
     seen: set[FunctionType] = set()
     while len(todo) > 0:
         value = todo.pop()
-        is_kernel = isinstance(value, Dispatcher)
+        is_kernel = isinstance(value, ni.Dispatcher)
         if is_kernel:
             options = value.targetoptions
             parts += [(name, _ordered(options[name])) for name in sorted(options)]
@@ -121,7 +110,11 @@ def fingerprint(dispatcher: Dispatcher) -> bytes:
             if value not in seen and (is_kernel or _top(value.__module__) in ours):
                 seen.add(value)
                 codes = list(_codes(value.__code__))
-                parts += [value.__module__, value.__qualname__, *map(_code_parts, codes)]
+                parts += [value.__module__, value.__qualname__]
+                for code in codes:
+                    parts += [code.co_code.hex(), code.co_names, code.co_varnames,
+                              code.co_freevars, [_ordered(item) for item in code.co_consts
+                                                 if not isinstance(item, CodeType)]]
                 cells = value.__closure__ or ()
                 todo += [value.__defaults__, [cell.cell_contents for cell in cells]]
                 todo += _globals(value, {name for code in codes for name in code.co_names}, ours)
@@ -153,11 +146,6 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
             yield from _codes(item)
 
 
-def _code_parts(code: CodeType) -> tuple[object, ...]:
-    constants = [_ordered(item) for item in code.co_consts if not isinstance(item, CodeType)]
-    return code.co_code.hex(), code.co_names, code.co_varnames, code.co_freevars, constants
-
-
 def _ordered(value: object) -> str:
     """Return a value as text; sets are sorted, as their order differs between processes."""
     return repr(sorted(map(repr, value)) if isinstance(value, set | frozenset) else value)
@@ -181,7 +169,7 @@ def _globals(function: FunctionType, names: set[str], ours: set[str]) -> Iterato
 class KernelCache:
     """The cache of one kernel, which its dispatcher calls instead of one of Numba's."""
 
-    def __init__(self, dispatcher: Dispatcher) -> None:
+    def __init__(self, dispatcher: ni.Dispatcher) -> None:
         self._dispatcher = dispatcher
         source = Path(dispatcher.py_func.__code__.co_filename).absolute()
         self._own, others = find_folders(source.parent)
@@ -207,12 +195,12 @@ class KernelCache:
         """Return the code for a signature; None if there is none that is valid."""
         # Numba refreshes the context, which imports all that can be compiled (0.5 s) and does
         # this, which is all that machine code needs. The compiler refreshes the context itself.
-        rtsys.initialize(target_context)
+        ni.rtsys.initialize(target_context)
         for path in self._files(signature):
             code = self._code(path)
             try:
                 if code is not None:
-                    return CompileResult._rebuild(  # noqa: SLF001
+                    return ni.CompileResult._rebuild(  # noqa: SLF001
                         target_context, *pickle.loads(code))
             except Exception as error:
                 _warn('read', path.parent, error)
@@ -225,7 +213,7 @@ class KernelCache:
             return
         path = next(self._files(signature))
         try:
-            code = serialize.dumps(result._reduce())  # noqa: SLF001
+            code = ni.serialize.dumps(result._reduce())  # noqa: SLF001
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
                 file.write(self._fingerprint + hashlib.sha256(code).digest() + code)
             os.replace(file.name, path)
@@ -234,7 +222,7 @@ class KernelCache:
 
     def _files(self, signature: Any) -> Iterator[Path]:
         """Yield the places of the code for a signature."""
-        arguments, _ = sigutils.normalize_signature(signature)
+        arguments, _ = ni.sigutils.normalize_signature(signature)
         processor = self._dispatcher.targetctx.codegen().magic_tuple()
         key = repr((str(arguments), processor, sys.implementation.cache_tag)).encode()
         name = f'{self._name}-{hashlib.sha256(key).hexdigest()[:16]}.nbc'

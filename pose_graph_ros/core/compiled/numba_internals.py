@@ -36,8 +36,7 @@ def check_version(version: str) -> None:
     major, minor = map(int, re.findall(r'\d+', version)[:2])
     if not OLDEST <= (major, minor) <= NEWEST:
         bounds = f'>={OLDEST[0]}.{OLDEST[1]},<{NEWEST[0]}.{NEWEST[1] + 1}'
-        raise NumbaVersionError(
-            f"Numba {version} is not supported: pip install 'numba{bounds}'")
+        raise NumbaVersionError(f"Numba {version} is not supported: pip install 'numba{bounds}'")
 
 
 check_version(numba.__version__)

@@ -79,8 +79,7 @@ def fetch(_context: Any, array: Any, at: Any) -> Any:
         three = [ir.IntType(32)] * 3
         function = builder.module.declare_intrinsic(
             'llvm.prefetch', (byte,), ir.FunctionType(ir.VoidType(), [byte, *three]))
-        address = builder.bitcast(
-            _address(context, builder, signature.args[0], *arguments), byte)
+        address = builder.bitcast(_address(context, builder, signature.args[0], *arguments), byte)
         # arguments of llvm.prefetch: for reading, keep in all caches, data cache
         builder.call(function, [address, *(kind(value) for kind, value in zip(
             three, (0, 3, 1), strict=True))])
@@ -99,30 +98,21 @@ def spread(_context: Any, number: Any) -> Any:
     return VECTOR(types.float64), codegen
 
 
-@_intrinsic
-def fnmadd(_context: Any, total: Any, a: Any, b: Any) -> Any:
-    """Return `total - a * b`, with a single rounding where the processor can."""
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        total, a, b = arguments
-        product = builder.fmul(a, b, flags=('contract',))
-        return builder.fsub(total, product, flags=('contract',))
-    return VECTOR(VECTOR, VECTOR, VECTOR), codegen
+def _of_vectors(n: int, build: Callable[..., Any]) -> Callable[..., Any]:
+    """Return an operation on n vectors, element by element, given what builds it."""
+    def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return build(builder, *arguments)
+
+    if n == 2:
+        return _intrinsic(lambda _context, a, b: (VECTOR(VECTOR, VECTOR), codegen))
+    return _intrinsic(lambda _context, total, a, b: (VECTOR(VECTOR, VECTOR, VECTOR), codegen))
 
 
-@_intrinsic
-def times(_context: Any, a: Any, b: Any) -> Any:
-    """Return `a * b`, element by element."""
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fmul(*arguments)
-    return VECTOR(VECTOR, VECTOR), codegen
-
-
-@_intrinsic
-def plus(_context: Any, a: Any, b: Any) -> Any:
-    """Return `a + b`, element by element."""
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fadd(*arguments)
-    return VECTOR(VECTOR, VECTOR), codegen
+# `total - a * b`, with a single rounding where the processor can
+fnmadd = _of_vectors(3, lambda builder, total, a, b: builder.fsub(
+    total, builder.fmul(a, b, flags=('contract',)), flags=('contract',)))
+times = _of_vectors(2, lambda builder, a, b: builder.fmul(a, b))
+plus = _of_vectors(2, lambda builder, a, b: builder.fadd(a, b))
 
 
 @kernel(inline='always')

@@ -33,7 +33,7 @@ import math
 
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors, prior_rows, tables as tb
-from pose_graph_ros.core.graph.pools import row_start, triangle_size
+from pose_graph_ros.core.graph.pools import add_product, row_start, triangle_size
 
 
 @kernel
@@ -67,18 +67,6 @@ def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
     x, y = f.reference[0] + f.delta[0] - px, f.reference[1] + f.delta[1] - py
     return (cos * x + sin * y + px - f.reference[0], cos * y - sin * x + py - f.reference[1],
             f.delta[2] - phi)
-
-
-@kernel
-def add_product(update, size, x, out):  # type: ignore[no-untyped-def]
-    """Add U x to a vector; U is an upper triangle laid out by `pools.row_start`."""
-    for i in range(size):
-        r = update[row_start(i, size):]
-        total = r[i] * x[i]
-        for k in range(i + 1, size):
-            total += r[k] * x[k]
-            out[k] += r[k] * x[i]
-        out[i] += total
 
 
 @kernel
@@ -205,7 +193,8 @@ def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
     update = pool_f[row.values:]
     prior_rows.evaluate(head, c, phi, work)
     g, r, z = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
-    prior_rows.product(head, c, r, z)
+    z[:] = 0.0
+    add_product(update, n, r, z)
     prior_rows.keep_linearization(head, c, r)
     turned = stiff = 0.0
     for i in range(n):
@@ -270,7 +259,8 @@ def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
     error2 = beta * beta * of_nodes + of_frame * of_frame * compliance
     if moved > factors.MUCH_LONGER * arms:
         error2 += moved / (arms + 1e-300)
-    prior_rows.product(head, c, w, change)
+    change[:] = 0.0
+    add_product(pool_f[row.values:], n, w, change)
     for i in range(n):
         error2 += w[i] * change[i]
     return max(error2, 0.0)

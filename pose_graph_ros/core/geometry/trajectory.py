@@ -12,18 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import (
-    between_one,
-    BoolArray,
-    compose_one,
-    FloatArray,
-    IntArray,
-    Points,
-    Pose,
-    Poses,
-    PoseVector,
-    wrap_one,
-)
+from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Points, Pose, Poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,13 +126,13 @@ class PathCorrection:
             x, y, theta = self._path.at(stamp_ns).tolist()
             return x, y, theta
         part = (stamp_ns - self._stamps[k]) / (self._stamps[k + 1] - self._stamps[k])
-        first = compose_one(self._poses[k], between_one(self._odometry[k], odometry))
-        last = compose_one(self._poses[k + 1], between_one(self._odometry[k + 1], odometry))
+        first, last = (se2.compose_one(
+            self._poses[at], se2.between_one(self._odometry[at], odometry)) for at in (k, k + 1))
         return (first[0] + part * (last[0] - first[0]), first[1] + part * (last[1] - first[1]),
-                wrap_one(first[2] + part * wrap_one(last[2] - first[2])))
+                se2.wrap_one(first[2] + part * se2.wrap_one(last[2] - first[2])))
 
 
-def fit_motion(source: Points, target: Points) -> PoseVector:
+def fit_motion(source: Points, target: Points) -> se2.PoseVector:
     """
     Return the rigid motion `T_target_source` that aligns points with others by least squares.
 

@@ -10,13 +10,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import (
-    FactorKind,
-    FACTORS,
-    Factors,
-    NodeKind,
-    RECORD,
-)
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind, RECORD
 
 # How far, with its diagonal scaled to 1, the smallest eigenvalue of an information matrix may be
 # below zero and its triangles may differ, because files print few digits.
@@ -59,10 +53,6 @@ class Ids(NamedTuple):
             gone = np.asarray(ids)[rows < 0].flat[0]
             raise ValueError(f'{what} {gone} is not in the graph')
         return rows
-
-    def by_row(self) -> IntArray:
-        """Return the ids of all rows, a copy."""
-        return np.arange(self.end) if self.present is None else self.present.astype(np.int64)
 
     def extended(self, n: int) -> 'Ids':
         """Return the ids with n more rows."""
@@ -137,13 +127,11 @@ def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
 def _check_information(name: str, matrix: FloatArray) -> None:
     """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
     diagonal, correlation = np.diagonal(matrix, axis1=1, axis2=2), scaled(matrix)
-    skew = np.max(
-        np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
+    skew = np.max(np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
     _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
     smallest = np.zeros(len(matrix))
     doubtful = ~are_definite(matrix)
-    smallest[doubtful] = np.min(
-        np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
+    smallest[doubtful] = np.min(np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
     negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
     _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
                  f'{name} is not positive semidefinite, or zero', matrix)
@@ -194,15 +182,14 @@ def checked_poses(name: str, poses: FloatArray) -> FloatArray:
 _BIASES = np.full(64, NodeKind.BIAS, np.uint8)
 
 
-def node_types(kind: npt.NDArray[Any], dimension: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the NODE_TYPE of nodes, given their `NodeKind` and numbers of coordinates."""
-    return kind + 4 * (3 - dimension)
-
-
 def other_nodes(
     biases: FloatArray, dimensions: Sequence[int], landmarks: FloatArray,
 ) -> tuple[npt.NDArray[Any], ...]:
-    """Return values, shape (S + L, 3), and types of new nodes that are no poses."""
+    """
+    Return values, shape (S + L, 3), and types of new nodes that are no poses.
+
+    A type is the `NodeKind`, plus 4 for each coordinate that the node has less than 3.
+    """
     n = len(biases)
     if len(landmarks) == len(dimensions) == 0 and n <= len(_BIASES):
         return biases, _BIASES[:n]
@@ -216,8 +203,7 @@ def other_nodes(
     dimension = np.concatenate((given, np.full(len(points), 2))).astype(np.uint8)
     values = np.concatenate((biases, np.pad(points, ((0, 0), (0, 1)))))
     kind = np.repeat(np.array((NodeKind.BIAS, NodeKind.LANDMARK), np.uint8), (n, len(points)))
-    return (np.where(np.arange(3) < dimension[:, None], values, 0.0),
-            node_types(kind, dimension))
+    return np.where(np.arange(3) < dimension[:, None], values, 0.0), kind + 4 * (3 - dimension)
 
 
 def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:

@@ -8,40 +8,29 @@ to be eliminated again. Edits of existing rows are not checked here; `graph.Grap
 
 Only factors with a weight above 0 are in the lists of their nodes. The others are rows that
 nothing looks at: adding one touches no node, and however many there are, solving takes no longer.
+
+What is removed for good, nodes and factors, leaves all lists within an update, and with it the
+tree, but keeps its rows, which are logged as any other edit; so a rollback brings them back. After
+the update `compact` takes the rows out: those that stay move up, in their order, and all that
+refers to a row is rewritten. A factor leaves with any of its nodes. Cliques keep their rows.
 """
 
-from pose_graph_ros.core.compiled.jit import (
-    BYTES,
-    FLAG,
-    INTEGERS,
-    kernel,
-    MATRICES,
-    NUMBERS,
-    ROWS,
-)
+import numpy as np
+import numpy.typing as npt
+
+from pose_graph_ros.core.compiled import jit
+from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.constraints import NodeKind
+from pose_graph_ros.core.graph.graph_update import Gone, NOTHING_GONE
 from pose_graph_ros.core.graph.rows import touch
 
 # Results of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
-# In place of a weight: the factor leaves the graph for good, by `removal.compact`.
+# In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
-
-
-@kernel
-def _start_nodes(head, first, first_other, types):  # type: ignore[no-untyped-def]
-    """Initialise rows of new hidden nodes: poses, then from `first_other` on the others."""
-    for v in range(first, first_other + len(types)):
-        rows.start_node(head, v)
-        tb.node_id(head)[v] = head[tb.NEXT_NODE]
-        head[tb.NEXT_NODE] += 1
-        if v >= first_other:
-            node = tb.nodes(head)[v]
-            node.kind, node.dimension = rows.kind_and_dimension(types[v - first_other])
-        touch(head, v)
-        head[tb.STRUCTURE] = 1
-    if first_other > first:
-        head[tb.NEWEST] = first_other - 1
+_POSE = int(NodeKind.POSE)
 
 
 @kernel
@@ -67,28 +56,6 @@ def _have_common_clique(head, e):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _touch_ends(head, e):  # type: ignore[no-untyped-def]
-    """Log and touch the ends of a factor; ask for a new ordering if no clique has all."""
-    f = tb.factors(head)[e]
-    if f.ends[1] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
-        head[tb.STRUCTURE] = 1
-    for v in f.ends:
-        if v >= 0:
-            transaction_log.log_node(head, v)
-            touch(head, v)
-
-
-@kernel
-def _link(head, e):  # type: ignore[no-untyped-def]
-    """Put a factor at the heads of the lists of its ends; the caller has logged all rows."""
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    for side in range(3):
-        v = f.ends[side]
-        if v >= 0:
-            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
-
-
-@kernel
 def unlink(head, e, side):  # type: ignore[no-untyped-def]
     """Take a factor out of the list of one of its ends, whose row has been logged."""
     factors = tb.factors(head)
@@ -107,51 +74,36 @@ def unlink(head, e, side):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _evaluate(head, e):  # type: ignore[no-untyped-def]
-    """Linearize a factor, and add its energy to chi2."""
-    factors.linearize(head, e)
-    factors.check(head, e, factors.NO_TURN)
-    tb.scalars(head)[0].chi2 += tb.factors(head)[e].energy
-
-
-@kernel
 def weigh(head, e, weight):  # type: ignore[no-untyped-def]
     """Change the weight of a factor; at 0 it is in no list."""
-    f = tb.factors(head)[e]
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
     before = f.weight
     if weight == before:
         return
     transaction_log.log_factor(head, e)
-    _touch_ends(head, e)
+    if f.ends[1] >= 0 and head[tb.STRUCTURE] == 0 and not _have_common_clique(head, e):
+        head[tb.STRUCTURE] = 1
+    for v in f.ends:
+        if v >= 0:
+            transaction_log.log_node(head, v)
+            touch(head, v)
     rows.scale_by(head, e, weight - before)
     tb.scalars(head)[0].chi2 -= f.energy
     f.weight = weight
-    if weight > 0.0:
-        if before == 0.0:
-            _link(head, e)
-        _evaluate(head, e)
-        return
-    f.error2 = f.energy = 0.0
     for side in range(3):
-        if f.ends[side] >= 0:
+        v = f.ends[side]
+        if v >= 0 and weight == 0.0:
             unlink(head, e, side)
-
-
-@kernel
-def _start(head, e):  # type: ignore[no-untyped-def]
-    """Initialise the new row of a factor, and add it to the graph if it has a weight."""
-    f = tb.factors(head)[e]
-    factors.prepare(f, f.kind)
+        elif v >= 0 and before == 0.0:  # put it at the head of the list
+            f.next[side], nodes[v].factor_list = nodes[v].factor_list, 4 * e + side
     f.error2 = f.energy = 0.0
-    f.checked = f.waits = 0
-    f.next[0], f.logged = -1, head[tb.UPDATE]
-    tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
-    head[tb.NEXT_FACTOR] += 1
-    weight, f.weight = f.weight, 0.0
-    weigh(head, e, weight)
+    if weight > 0.0:
+        factors.linearize(head, e)
+        factors.check(head, e, factors.NO_TURN)
+        tb.scalars(head)[0].chi2 += f.energy
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, NUMBERS))
+@kernel(signature=(tb.HEAD, jit.INTEGERS, jit.NUMBERS))
 def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
     """Set weights of factors, by id; 0 takes one out of its lists, DROPPED out of the graph."""
     for m in range(len(ids)):
@@ -164,7 +116,7 @@ def set_weights(head, ids, weights):  # type: ignore[no-untyped-def]
             head[tb.N_LEAVING] += 1
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, ROWS, MATRICES))
+@kernel(signature=(tb.HEAD, jit.INTEGERS, jit.ROWS, jit.MATRICES))
 def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
     """Give factors, by id, other measurements."""
     for m in range(len(ids)):
@@ -178,7 +130,7 @@ def measure(head, ids, means, informations):  # type: ignore[no-untyped-def]
         weigh(head, e, weight)
 
 
-@kernel(signature=(tb.HEAD, INTEGERS, FLAG))
+@kernel(signature=(tb.HEAD, jit.INTEGERS, jit.FLAG))
 def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
     """Fix hidden nodes, by id, at their present poses, or free them."""
     nodes = tb.nodes(head)
@@ -190,14 +142,14 @@ def set_fixed(head, ids, fixed):  # type: ignore[no-untyped-def]
             touch(head, v)
 
 
-@kernel(signature=(tb.HEAD, ROWS, ROWS, BYTES, tb.RECORDS, FLAG))
+@kernel(signature=(tb.HEAD, jit.ROWS, jit.ROWS, jit.BYTES, tb.RECORDS, jit.FLAG))
 def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-untyped-def]
     """
     Return ADDED after adding hidden nodes and factors, all of them, or why none.
 
     NO_ROOM: a table is full. UNSOUND: the rows fail the quick validation of `rows`, and
     `checks.check` has not accepted them (`checked`). `others` are values of new nodes that are no
-    poses, with their `checks.node_types`; the records are those of `Factors`.
+    poses, with their types of `checks.other_nodes`; the records are those of `Factors`.
     """
     first = head[tb.N_NODES]
     first_other = first + len(hidden)
@@ -214,10 +166,28 @@ def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
-    _start_nodes(head, first, first_other, types)
+    for v in range(first, n_nodes):
+        rows.start_node(head, v)
+        tb.node_id(head)[v] = head[tb.NEXT_NODE]
+        head[tb.NEXT_NODE] += 1
+        if v >= first_other:
+            node, code = tb.nodes(head)[v], types[v - first_other]
+            node.kind, node.dimension = code & 3, 3 - (code >> 2)
+        touch(head, v)
+        head[tb.STRUCTURE] = 1
+    if first_other > first:
+        head[tb.NEWEST] = first_other - 1
     head[tb.N_FACTORS] = n_factors
     for e in range(n_factors - len(records), n_factors):
-        _start(head, e)
+        f = tb.factors(head)[e]
+        factors.prepare(f, f.kind)
+        f.error2 = f.energy = 0.0
+        f.checked = f.waits = 0
+        f.next[0], f.logged = -1, head[tb.UPDATE]
+        tb.factor_id(head)[e] = head[tb.NEXT_FACTOR]
+        head[tb.NEXT_FACTOR] += 1
+        weight, f.weight = f.weight, 0.0
+        weigh(head, e, weight)
     return ADDED
 
 
@@ -238,5 +208,97 @@ def restart(head):  # type: ignore[no-untyped-def]
         f = tb.factors(head)[e]
         f.waits = 0
         if f.weight > 0.0:
-            _evaluate(head, e)
+            factors.linearize(head, e)
+            factors.check(head, e, factors.NO_TURN)
+            tb.scalars(head)[0].chi2 += f.energy
     prior_rows.add_energies(head)
+
+
+# --- removal for good, in two steps --------------------------------------------------------------
+
+@kernel(signature=(tb.HEAD, jit.INTEGERS))
+def remove_nodes(head, ids):  # type: ignore[no-untyped-def]
+    """Take hidden nodes, by id, out of the graph with all their factors; rows leave later."""
+    nodes, cliques = tb.nodes(head), tb.cliques(head)
+    for number in ids:
+        v = rows.node_row(head, number)
+        prior_rows.remove_of_node(head, v)
+        if nodes[v].factor_list == tb.LEAVES:
+            continue
+        transaction_log.log_node(head, v)
+        while nodes[v].factor_list >= 0:
+            weigh(head, nodes[v].factor_list >> 2, 0.0)
+        # Touch a node of each clique that has it, so that all of them are built anew. They are a
+        # subtree below the clique that it is frontal in. A clique may have it in the separator
+        # although no constraint below leads to it any more.
+        top = parent = nodes[v].clique
+        c = cliques[top].child if top >= 0 else -1
+        while c >= 0 or parent != top:
+            if c >= 0 and prior_rows.is_in_separator(head, c, v):
+                u = tb.pool_i(head)[cliques[c].members]
+                transaction_log.log_node(head, u)
+                touch(head, u)
+                parent, c = c, cliques[c].child
+            elif c >= 0:
+                c = cliques[c].sibling
+            else:
+                c, parent = cliques[parent].sibling, cliques[parent].parent
+        touch(head, v)
+        nodes[v].factor_list = tb.LEAVES
+        head[tb.N_LEAVING] += 1
+        head[tb.STRUCTURE] = 1
+    v = head[tb.NEWEST]     # the last pose that does not leave
+    while v >= 0 and (nodes[v].factor_list == tb.LEAVES or nodes[v].kind != _POSE):
+        v -= 1
+    head[tb.NEWEST] = v
+
+
+def compact(memory: tb.Memory) -> Gone:
+    """Take out all rows that leave, and return their ids; the update must have been committed."""
+    head = memory.head
+    if head[tb.N_LEAVING] == 0:
+        return NOTHING_GONE
+    nodes, factors = memory['nodes'][:head[tb.N_NODES]], memory['factors'][:head[tb.N_FACTORS]]
+    stays = nodes['factor_list'] != tb.LEAVES
+    with_ends = np.append(stays, True)  # -1: no such end
+    factor_stays = (factors['next'][:, 0] != tb.LEAVES) & np.all(
+        with_ends[factors['ends']], axis=1)
+    nodes_gone, of_node = _moved_up(memory, 'node', tb.N_NODES, stays)
+    factors_gone, of_factor = _moved_up(memory, 'factor', tb.N_FACTORS, factor_stays)
+    nodes, factors = memory['nodes'][:head[tb.N_NODES]], memory['factors'][:head[tb.N_FACTORS]]
+
+    def entries(old: npt.NDArray[np.int32]) -> IntArray:
+        return np.where(old >= 0, 4 * of_factor[old >> 2] + (old & 3), -1)
+
+    nodes['factor_list'] = entries(nodes['factor_list'])
+    factors['ends'] = of_node[factors['ends']]
+    # those without a weight are in no list
+    listed = (factors['weight'] > 0.0)[:, None] & (factors['ends'] >= 0)
+    factors['next'][listed] = entries(factors['next'][listed])
+    pool_i, cliques = memory['pool_i'], memory['cliques'][:head[tb.N_CLIQUES]]
+    sizes = np.maximum(cliques['n_frontal'] + cliques['n_separator'], 0)    # -1 if unused
+    begins = np.cumsum(sizes) - sizes
+    at = np.arange(np.sum(sizes)) + np.repeat(cliques['members'] - begins, sizes)
+    pool_i[at] = of_node[pool_i[at]]
+    for name, counter, rows_now in (
+            ('touched', tb.N_TOUCHED, of_node), ('waiting', tb.N_WAITING, of_factor)):
+        left = rows_now[memory[name][:head[counter]]]
+        left = left[left >= 0]
+        memory[name][:len(left)], head[counter] = left, len(left)
+    head[tb.NEWEST] = of_node[head[tb.NEWEST]]
+    head[tb.N_LEAVING] = 0
+    return Gone(nodes_gone, factors_gone)
+
+
+def _moved_up(
+    memory: tb.Memory, name: str, counter: int, stays: BoolArray,
+) -> tuple[IntArray, IntArray]:
+    """Move rows that stay up; return the ids of the others, and where each row is now, or -1."""
+    n, gone = len(stays), memory[f'{name}_id'][:len(stays)][~stays].astype(np.int64)
+    if len(gone) > 0:
+        first, left = int(np.argmin(stays)), n - len(gone)
+        for table in map(tb.as_bytes, (memory[f'{name}s'], memory[f'{name}_id'])):
+            table[first:left] = table[first:n][stays[first:]]
+        memory.head[counter] = left
+    # one more, so that -1 stays -1
+    return gone, np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)

@@ -59,9 +59,13 @@ constraints is about the distance of chi2 from its minimum.
 
 import math
 
-from pose_graph_ros.core.compiled.jit import kernel, NUMBERS
+import numpy as np
+
+from pose_graph_ros.core.compiled.jit import kernel, NUMBERS, ROWS
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import FloatArray, Poses
 from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.constraints import FactorKind
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 
 # Numbers of the definitions; all kinds from OBSERVED on have one end.
 ODOMETRY, BIAS, TURN, PRIOR, RANGE, OBSERVED = (int(kind) for kind in (
@@ -83,12 +87,6 @@ NO_THIRD = ((0.0, 0.0, 0.0), 0.0)
 def is_relative(kind):  # type: ignore[no-untyped-def]
     """Tell whether an error lies in the frame of the pose that was measured from node i."""
     return kind < BIAS or TURN < kind < RANGE
-
-
-@kernel(forceinline=True)
-def frame_moves(kind):  # type: ignore[no-untyped-def]
-    """Tell whether the frame of an error moves with the nodes, so that it is linearized."""
-    return is_relative(kind) or kind == RANGE
 
 
 @kernel(forceinline=True)
@@ -132,17 +130,9 @@ def factors_of_end(f, kind):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def heading_offset(f, kind):  # type: ignore[no-untyped-def]
-    """Return the constant part of the heading's error [rad]."""
-    if kind == BIAS:
-        return f.mean[2]
-    return -f.mean[2] if kind < OBSERVED else f.mean[2] - f.constants[2]
-
-
-@kernel(forceinline=True)
 def frame(f, kind):  # type: ignore[no-untyped-def]
     """Return cosine and sine of the frame at the linearization."""
-    if frame_moves(kind):
+    if is_relative(kind) or kind == RANGE:  # it moves with the nodes
         return f.lin_cos, f.lin_sin
     if kind < OBSERVED or f.mean[2] == 0.0:
         return 1.0, 0.0
@@ -157,12 +147,6 @@ def constant(f, kind, c, s, ax, ay):  # type: ignore[no-untyped-def]
     if kind == RANGE:
         return -ax - c * f.mean[0], -ay - s * f.mean[0]
     return f.mean[0] - ax, f.mean[1] - ay
-
-
-@kernel(forceinline=True)
-def relative_error(f, x, y):  # type: ignore[no-untyped-def]
-    """Return e_t of a relative error, for d in the axes of its frame."""
-    return x - f.constants[0], y - f.constants[1]
 
 
 @kernel(forceinline=True)
@@ -193,7 +177,7 @@ def motion(nodes, f):  # type: ignore[no-untyped-def]
 def error(f, kind, dx, dy, c, s):  # type: ignore[no-untyped-def]
     """Return the error e_t, cosine and sine of its frame, and its arm, for d and `rotation`."""
     if is_relative(kind):
-        ex, ey = relative_error(f, c * dx + s * dy, c * dy - s * dx)
+        ex, ey = c * dx + s * dy - f.constants[0], c * dy - s * dx - f.constants[1]
         return ex, ey, c, s, dx, dy
     ox, oy = f.constants[0], f.constants[1]
     ax, ay = c * ox - s * oy, s * ox + c * oy
@@ -237,9 +221,12 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     """
     ft, fth = factors_of_end(f, kind)
     c, s = rotation(f, kind, start[2])
-    ex, ey, c, s, ax, ay = error(
-        f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
-    eth = fth * end[2] - start[2] + heading_offset(f, kind) + third[2]
+    ex, ey, c, s, ax, ay = error(f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
+    eth = fth * end[2] - start[2] + third[2]
+    if kind < OBSERVED:
+        eth += f.mean[2] if kind == BIAS else -f.mean[2]
+    else:
+        eth += f.mean[2] - f.constants[2]
     return ex + third[0], ey + third[1], wrap(eth), c, s, ax, ay
 
 
@@ -249,24 +236,10 @@ def _linearize(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     by_pose, delta_k = third
     _, _, eth, c, s, ax, ay = model(f, kind, start.pose, end.pose, by_pose)
     _, fth = factors_of_end(f, kind)
-    if frame_moves(kind):
+    if is_relative(kind) or kind == RANGE:
         f.lin_cos, f.lin_sin = c, s
     f.lin_arm[0], f.lin_arm[1], f.lin_th = ax, ay, start.delta[2]
     f.lin_k = eth - (fth * end.delta[2] - start.delta[2] + delta_k)
-
-
-@kernel(forceinline=True)
-def _versine_and_sine(turn):  # type: ignore[no-untyped-def]
-    """Return cosine minus 1 and sine of an angle, which is small as a rule."""
-    if abs(turn) < 0.1:
-        # cos - 1 and sin by their series, exact to rounding
-        square = turn * turn
-        versine = -square * (0.5 - square * (1 / 24 - square * (1 / 720 - square * (
-            1 / 40320 - square / 3628800))))
-        sine = turn * (1.0 - square * (1 / 6 - square * (1 / 120 - square * (
-            1 / 5040 - square * (1 / 362880 - square / 39916800)))))
-        return versine, sine
-    return math.cos(turn) - 1.0, math.sin(turn)
 
 
 @kernel(forceinline=True)
@@ -287,11 +260,16 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
     if is_relative(kind):
         # d in the axes of the linearized frame, and by how much the turn changes it
         qx, qy = c_bar * dx + s_bar * dy, c_bar * dy - s_bar * dx
-        versine, sine = _versine_and_sine(turn)
+        if abs(turn) < 0.1:     # as a rule: cos - 1 and sin by their series, exact to rounding
+            versine = -turned * (0.5 - turned * (1 / 24 - turned * (1 / 720 - turned * (
+                1 / 40320 - turned / 3628800))))
+            sine = turn * (1.0 - turned * (1 / 6 - turned * (1 / 120 - turned * (
+                1 / 5040 - turned * (1 / 362880 - turned / 39916800)))))
+        else:
+            versine, sine = math.cos(turn) - 1.0, math.sin(turn)
         px, py = versine * qx + sine * qy, versine * qy - sine * qx
         ax, ay = qx + px, qy + py
-        ex, ey = relative_error(f, ax, ay)
-        ex, ey = ex + by_x, ey + by_y
+        ex, ey = ax - f.constants[0] + by_x, ay - f.constants[1] + by_y
         rx, ry = px - gy * turn, py + gx * turn
     else:   # its clique is anchored, so phi is zero
         c, s = rotation(f, kind, start.pose[2])
@@ -306,7 +284,7 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
     linear = f.lin_k + fth * end.delta[2] - th + delta_k
     eth = wrap(linear)
     if kind == BIAS:    # a factor times a heading that is wrapped
-        eth = wrap(fth * end.pose[2] - start.pose[2] + heading_offset(f, kind))
+        eth = wrap(fth * end.pose[2] - start.pose[2] + f.mean[2])
     rth = eth - linear
     if abs(rth) < 1.0:
         rth = 0.0  # rounding of the wrap; at a jump it is a multiple of 2 pi
@@ -365,7 +343,7 @@ def _form(f, x, y, th):  # type: ignore[no-untyped-def]
 
 
 @kernel(signature=(tb.HEAD, NUMBERS))
-def energies(head, out):  # type: ignore[no-untyped-def]
+def write_energies(head, out):  # type: ignore[no-untyped-def]
     """Write the unweighted energies of all factors at the present poses [sigma^2]."""
     nodes = tb.nodes(head)
     for e in range(head[tb.N_FACTORS]):
@@ -374,3 +352,51 @@ def energies(head, out):  # type: ignore[no-untyped-def]
         by_pose, _ = third(nodes, f, k)
         ex, ey, eth, _, _, _, _ = model(f, kind, nodes[i].pose, nodes[j].pose, by_pose)
         out[e] = _form(f, ex, ey, eth)
+
+
+# --- constraints that need not be in a graph, at given poses -------------------------------------
+
+def errors(poses: Poses, factors: Factors) -> FloatArray:
+    """
+    Return the errors (3.48), (3.52) of factors, shape (M, 3) [m, m, rad], theta in [-pi, pi).
+
+    They are in the frames of the measured poses, those of edges to a bias in map axes.
+    """
+    error = np.empty((len(factors), 3))
+    # as kernels take arrays
+    _write_errors(*(np.require(each, requirements=('C', 'W'))
+                    for each in (poses, factors.records)), error)
+    observed = factors.j < 0    # of which (3.52) has the other sign
+    if np.any(observed):
+        error[observed] *= -1.0
+        error[observed, 2] = se2.wrap(error[observed, 2])
+    return error
+
+
+@kernel
+def write_data(f, new):  # type: ignore[no-untyped-def]
+    """Write what the error of a factor depends on, from a record of `Factors`."""
+    for m in range(3):
+        f.mean[m] = new.mean[m]
+    for m in range(4):
+        f.constants[m] = new.constants[m]
+    prepare(f, new.kind)
+
+
+@kernel(signature=(ROWS, tb.RECORDS, ROWS), allocates=True)
+def _write_errors(poses, records, error):  # type: ignore[no-untyped-def]
+    record = np.empty(1, tb.FACTOR)
+    for e in range(len(records)):
+        f = record[0]   # in here, as Numba frees the array after its last use
+        new = records[e]
+        write_data(f, new)
+        third, _ = NO_THIRD
+        if new.k >= 0:
+            third = by_state(f, poses[new.k, 0], poses[new.k, 1])
+        error[e, 0], error[e, 1], error[e, 2], _, _, _, _ = model(
+            f, new.kind, poses[new.i], poses[new.j if new.j >= 0 else new.i], third)
+
+
+def energies(error: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the energies [sigma^2] for information in the frames of the errors."""
+    return np.einsum('mi,mij,mj->m', error, information, error)

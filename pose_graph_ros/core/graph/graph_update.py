@@ -4,7 +4,7 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -124,8 +124,3 @@ class GraphRows(NamedTuple):
             self.poses[nodes], self.node_kind[nodes], self.fixed[nodes],
             self.factors.rows(factors), self.node_ids[nodes], self.factor_ids[factors],
             self.next_ids, None if self.dimension is None else self.dimension[nodes])
-
-    def with_factors(self, factors: Factors) -> Self:
-        """Return the same rows with other factors, which get the ids 0, 1 and so on."""
-        return self._replace(factors=factors, factor_ids=np.arange(len(factors)),
-                             next_ids=self.next_ids._replace(factor=len(factors)))

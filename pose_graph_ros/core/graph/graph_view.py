@@ -134,5 +134,5 @@ class FactorTable(NamedTuple):
 def factor_table(graph: Graph) -> FactorTable:
     """Return the factors of a graph."""
     energies = np.empty(graph.n_factors)
-    factors.energies(graph.memory.head, energies)
+    factors.write_energies(graph.memory.head, energies)
     return FactorTable(graph.factor_records, energies)

@@ -10,20 +10,7 @@ Symbols are those of `factors`. With G the two columns of a third node, a factor
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import tables as tb
-from pose_graph_ros.core.graph.factors import (
-    BIAS,
-    by_state,
-    constant,
-    factors_of_end,
-    frame,
-    kind_and_ends,
-    model,
-    NO_THIRD,
-    OBSERVED,
-    ODOMETRY,
-    third,
-)
+from pose_graph_ros.core.graph import factors as fc, tables as tb
 
 
 @kernel
@@ -50,17 +37,6 @@ def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
 
 
 @kernel(forceinline=True)
-def _turned(f, c, s):  # type: ignore[no-untyped-def]
-    """Return the weighted information, rotated by the angle with cosine c and sine s."""
-    i, w = f.information, f.weight
-    xx, xy, xt, yy, yt, tt = i[0], i[1], i[2], i[3], i[4], i[5]
-    cc, ss, cs = c * c, s * s, c * s
-    return (w * (cc * xx - 2.0 * cs * xy + ss * yy), w * (cs * (xx - yy) + (cc - ss) * xy),
-            w * (c * xt - s * yt), w * (ss * xx + 2.0 * cs * xy + cc * yy),
-            w * (s * xt + c * yt), w * tt)
-
-
-@kernel(forceinline=True)
 def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
     front[at] += x
     front[at + 1] += y
@@ -75,11 +51,15 @@ def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-
     `third` is what the reference of the third node adds to the error.
     """
     a, b, k = at
-    c, s = frame(f, kind)
-    xx, xy, xt, yy, yt, tt = _turned(f, c, s)
-    ft, fth = factors_of_end(f, kind)
+    c, s = fc.frame(f, kind)
+    # the weighted information, turned into map axes
+    i, w, cc, ss, cs = f.information, f.weight, c * c, s * s, c * s
+    xx, yy = cc * i[0] - 2.0 * cs * i[1] + ss * i[3], ss * i[0] + 2.0 * cs * i[1] + cc * i[3]
+    xx, xy, yy = w * xx, w * (cs * (i[0] - i[3]) + (cc - ss) * i[1]), w * yy
+    xt, yt, tt = w * (c * i[2] - s * i[4]), w * (s * i[2] + c * i[4]), w * i[5]
+    ft, fth = fc.factors_of_end(f, kind)
     px, py = -f.lin_arm[1], f.lin_arm[0]  # S a
-    kx, ky = constant(f, kind, c, s, py, -px)
+    kx, ky = fc.constant(f, kind, c, s, py, -px)
     hx = ft * end.reference[0] - start.reference[0] + kx + px * f.lin_th
     hy = ft * end.reference[1] - start.reference[1] + ky + py * f.lin_th
     hx, hy = hx + c * third[0] - s * third[1], hy + s * third[0] + c * third[1]
@@ -128,13 +108,6 @@ def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-
 
 
 @kernel
-def _column(f, c, s, m):  # type: ignore[no-untyped-def]
-    """Return a column of G, in the map axes that the frame's cosine and sine are of."""
-    x, y, th = by_state(f, 1.0 - m, float(m))
-    return c * x - s * y, s * x + c * y, th
-
-
-@kernel
 def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore[no-untyped-def]
     """
     Add the blocks of a third node to a front.
@@ -144,13 +117,16 @@ def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore
     c, s, px, py = turned
     xx, xy, xt, yy, yt, tt = information
     a, b, k = at
+    # the columns of G, in map axes
+    (bx, by, bth), (sx, sy, sth) = fc.by_state(f, 1.0, 0.0), fc.by_state(f, 0.0, 1.0)
+    columns = ((c * bx - s * by, s * bx + c * by, bth), (c * sx - s * sy, s * sx + c * sy, sth))
     for m in range(2):
-        x, y, th = _column(f, c, s, m)
+        x, y, th = columns[m]
         front[(k + m + 1) * ld - 1] -= x * gradient[0] + y * gradient[1] + th * gradient[2]
         wx, wy, wth = xx * x + xy * y + xt * th, xy * x + yy * y + yt * th, (
             xt * x + yt * y + tt * th)
         for n in range(m, 2):
-            x, y, th = _column(f, c, s, n)
+            x, y, th = columns[n]
             front[(k + m) * ld + k + n] += x * wx + y * wy + th * wth
         of_i = -wx, -wy, -(px * wx + py * wy + wth)
         of_j = wx, wy, wth
@@ -168,13 +144,13 @@ def add(head, e, at, front, ld):  # type: ignore[no-untyped-def]
     right-hand side.
     """
     nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS and k < 0:
-        _add(f, ODOMETRY, nodes[i], nodes[j], NO_THIRD[0], (at[0], at[1], -1), front, ld)
+    kind, i, j, k = fc.kind_and_ends(f)
+    if kind < fc.BIAS and k < 0:
+        _add(f, fc.ODOMETRY, nodes[i], nodes[j], fc.NO_THIRD[0], (at[0], at[1], -1), front, ld)
         return
-    reference = NO_THIRD[0]
+    reference = fc.NO_THIRD[0]
     if k >= 0:
-        reference = by_state(f, nodes[k].reference[0], nodes[k].reference[1])
+        reference = fc.by_state(f, nodes[k].reference[0], nodes[k].reference[1])
     _add(f, kind, nodes[i], nodes[j], reference, at, front, ld)
 
 
@@ -233,8 +209,8 @@ def _gradient(f, kind, ends, nodes, right):  # type: ignore[no-untyped-def]
     energy, which cancel each other where W is nearly singular.
     """
     v, j, k = ends
-    by_pose, _ = third(nodes, f, k)
-    ex, ey, eth, c, s, ax, ay = model(f, kind, nodes[v].pose, nodes[j].pose, by_pose)
+    by_pose, _ = fc.third(nodes, f, k)
+    ex, ey, eth, c, s, ax, ay = fc.model(f, kind, nodes[v].pose, nodes[j].pose, by_pose)
     i, w = f.information, f.weight
     gx = w * (i[0] * ex + i[1] * ey + i[2] * eth)
     gy = w * (i[1] * ex + i[3] * ey + i[4] * eth)
@@ -243,14 +219,14 @@ def _gradient(f, kind, ends, nodes, right):  # type: ignore[no-untyped-def]
     terms = w * (i[0] * ex * ex + i[3] * ey * ey + i[5] * eth * eth)
     if k >= 0:
         for m in range(2):
-            x, y, th = by_state(f, 1.0 - m, float(m))
+            x, y, th = fc.by_state(f, 1.0 - m, float(m))
             right[k, m] -= x * gx + y * gy + th * gth
     gx, gy = c * gx - s * gy, s * gx + c * gy
     right[v, 0] += gx
     right[v, 1] += gy
     right[v, 2] += ax * gy - ay * gx + gth
-    if kind < OBSERVED:
-        ft, fth = factors_of_end(f, kind)
+    if kind < fc.OBSERVED:
+        ft, fth = fc.factors_of_end(f, kind)
         right[j, 0] -= ft * gx
         right[j, 1] -= ft * gy
         right[j, 2] -= fth * gth
@@ -263,7 +239,7 @@ def gradient(head, e, right):  # type: ignore[no-untyped-def]
     Return energy and the sums of `_gradient` of a factor after adding -b to `right`, (N, 3).
     """
     nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS and k < 0:
-        return _gradient(f, ODOMETRY, (i, j, -1), nodes, right)
+    kind, i, j, k = fc.kind_and_ends(f)
+    if kind < fc.BIAS and k < 0:
+        return _gradient(f, fc.ODOMETRY, (i, j, -1), nodes, right)
     return _gradient(f, kind, (i, j, k), nodes, right)

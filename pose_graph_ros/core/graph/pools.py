@@ -14,6 +14,9 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import tables as tb
 
 _SIZES: Final = np.array(tb.SIZES, dtype=np.int64)
+# The pools pool_f and pool_i, by where the head has their ends and free lists.
+VALUES: Final = (tb.POOL_F_END, tb.FREE_F)
+NODES: Final = (tb.POOL_I_END, tb.FREE_I)
 
 
 @kernel
@@ -30,6 +33,18 @@ def row_start(k, n):  # type: ignore[no-untyped-def]
 def triangle_size(rows, n):  # type: ignore[no-untyped-def]
     """Return the number of values in the first rows of an upper triangle with right-hand side."""
     return rows * (n + 1) - rows * (rows - 1) // 2
+
+
+@kernel
+def add_product(update, size, x, out):  # type: ignore[no-untyped-def]
+    """Add U x to a vector; U is an upper triangle laid out by `row_start`."""
+    for i in range(size):
+        r = update[row_start(i, size):]
+        total = r[i] * x[i]
+        for k in range(i + 1, size):
+            total += r[k] * x[k]
+            out[k] += r[k] * x[i]
+        out[i] += total
 
 
 @kernel
@@ -67,45 +82,23 @@ def rounded(n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _take(head, pool, end, free, n):  # type: ignore[no-untyped-def]
-    """Take a block for n numbers from a pool, given its end and its free lists in the head."""
-    size = _size_class(n)
+def take(head, pool, n):  # type: ignore[no-untyped-def]
+    """Take a block for n numbers from NODES or VALUES, which has room, and return its index."""
+    (end, free), size = pool, _size_class(n)
     at = head[free + size]
-    if at >= 0:
-        head[free + size] = np.int64(pool[at])
-        return at
-    at = head[end]
-    head[end] = at + _SIZES[size]
+    if at < 0:
+        head[end] += _SIZES[size]
+        return head[end] - _SIZES[size]
+    head[free + size] = tb.pool_i(head)[at] if pool == NODES else np.int64(tb.pool_f(head)[at])
     return at
 
 
 @kernel
-def _give(head, pool, free, at, n):  # type: ignore[no-untyped-def]
-    """Put a block of n numbers into the free list of its size."""
-    size = _size_class(n)
-    pool[at] = head[free + size]
-    head[free + size] = at
-
-
-@kernel
-def take_values(head, n):  # type: ignore[no-untyped-def]
-    """Take a block for n numbers from pool_f and return its index; the pool must have room."""
-    return _take(head, tb.pool_f(head), tb.POOL_F_END, tb.FREE_F, n)
-
-
-@kernel
-def give_values(head, at, n):  # type: ignore[no-untyped-def]
-    """Give a block back to pool_f."""
-    _give(head, tb.pool_f(head), tb.FREE_F, at, n)
-
-
-@kernel
-def take_nodes(head, n):  # type: ignore[no-untyped-def]
-    """Take a block for n nodes from pool_i and return its index; the pool must have room."""
-    return _take(head, tb.pool_i(head), tb.POOL_I_END, tb.FREE_I, n)
-
-
-@kernel
-def give_nodes(head, at, n):  # type: ignore[no-untyped-def]
-    """Give a block back to pool_i."""
-    _give(head, tb.pool_i(head), tb.FREE_I, at, n)
+def give(head, pool, at, n):  # type: ignore[no-untyped-def]
+    """Give a block of n numbers back to NODES or VALUES: put it into the list of its size."""
+    free = pool[1] + _size_class(n)
+    if pool == NODES:
+        tb.pool_i(head)[at] = head[free]
+    else:
+        tb.pool_f(head)[at] = head[free]
+    head[free] = at

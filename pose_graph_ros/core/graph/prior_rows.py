@@ -7,7 +7,7 @@ What is left of a clique whose nodes and constraints have left the graph is its 
 update matrix. So a prior is a leaf of the tree, its update matrix is added to the front of
 its parent like that of any child, and it turns with its separator as the frame of a clique does.
 Its block in the pool has the update matrix (U, u), then the reference poses of its nodes, then the
-energy at these, then r (`displacement`) at the last linearization, and r as it was when the update
+energy at these, then r (`evaluate`) at the last linearization, and r as it was when the update
 began that has linearized it. `priors` has the equations.
 
 A prior that no clique is the parent of is *loose*: it is new, or all cliques were removed. Its
@@ -25,7 +25,7 @@ from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.factors import wrap
 from pose_graph_ros.core.graph.normal_equations import weakest_of
-from pose_graph_ros.core.graph.pools import row_start, triangle_size
+from pose_graph_ros.core.graph.pools import add_product, row_start, triangle_size
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.graph.rows import add_to_scale, touch
 from pose_graph_ros.core.graph.transaction_log import copied
@@ -40,13 +40,6 @@ def is_prior(head, c):  # type: ignore[no-untyped-def]
     """Tell whether a row of the cliques is a prior of the graph."""
     row = tb.cliques(head)[c]
     return row.n_frontal == 0 and row.parent != REMOVED
-
-
-@kernel
-def _references(row):  # type: ignore[no-untyped-def]
-    """Return where in pool_f the reference poses of a prior begin, given its row."""
-    n = 3 * row.n_separator
-    return row.values + triangle_size(n, n)
 
 
 @kernel(inline='always')
@@ -68,10 +61,12 @@ def turns(head, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def mean_turn(head, c):  # type: ignore[no-untyped-def]
-    """Return the mean turn of the nodes of a prior from their references [rad]."""
-    nodes, members = tb.nodes(head), _nodes(head, c)
-    reference = tb.pool_f(head)[_references(tb.cliques(head)[c]):]
+def present_frame(head, c):  # type: ignore[no-untyped-def]
+    """Return the mean turn of the nodes of a prior [rad], which is 0 if it does not turn."""
+    if not turns(head, c):
+        return 0.0
+    nodes, members, n = tb.nodes(head), _nodes(head, c), 3 * tb.cliques(head)[c].n_separator
+    reference = tb.pool_f(head)[tb.cliques(head)[c].values + triangle_size(n, n):]
     first = wrap(nodes[members[0]].pose[2] - reference[2])
     total = 0.0
     for k in range(1, len(members)):
@@ -80,14 +75,18 @@ def mean_turn(head, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
+def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
     """
-    Write the displacement d of the nodes of a prior, and its derivative r by -phi; (3k,) each.
+    Return the energy of a prior at the present poses, its frame turned by phi.
 
-    phi is that of `present_frame`; r is zero if the prior does not turn.
+    The work space, 9 numbers for each node, receives the displacement d, half the gradient U d - u
+    in the frame, and r, the derivative of d by -phi, zero if the prior does not turn. phi is that
+    of `present_frame`.
     """
     nodes, members, row = tb.nodes(head), _nodes(head, c), tb.cliques(head)[c]
-    reference = tb.pool_f(head)[_references(row):]
+    pool_f, n = tb.pool_f(head), 3 * row.n_separator
+    reference = pool_f[row.values + triangle_size(n, n):]
+    d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]
     cos, sin = math.cos(phi), math.sin(phi)
     first = nodes[members[0]]
     turn = wrap(first.pose[2] - reference[2])
@@ -103,18 +102,25 @@ def displacement(head, c, phi, d, r):  # type: ignore[no-untyped-def]
         x, y = cos * dx + sin * dy, cos * dy - sin * dx
         rx, ry = reference[i] - reference[0], reference[i + 1] - reference[1]
         d[i], d[i + 1] = x - rx - tangent * phi * ry, y - ry + tangent * phi * rx
-        d[i + 2] = (turn - (1.0 - tangent) * phi
-                    + wrap(f.pose[2] - reference[i + 2] - turn))
+        d[i + 2] = (turn - (1.0 - tangent) * phi + wrap(f.pose[2] - reference[i + 2] - turn))
         r[i], r[i + 1] = turning * (tangent * ry - y), turning * (x - tangent * rx)
         r[i + 2] = 1.0 - tangent
+    energy, update = reference[n], pool_f[row.values:]
+    for i in range(n):
+        g[i] = -update[row_start(i, n) + n]
+        energy += d[i] * g[i]
+    add_product(update, n, d, g)
+    for i in range(n):
+        energy += d[i] * g[i]
+    return energy
 
 
 @kernel
 def keep_linearization(head, c, r):  # type: ignore[no-untyped-def]
-    """Remember r (`displacement`) of a new linearization; a rollback restores the last one."""
+    """Remember r (`evaluate`) of a new linearization; a rollback restores the last one."""
     row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
     n = 3 * row.n_separator
-    at = _references(row) + n + 1
+    at = row.values + triangle_size(n, n) + n + 1
     transaction_log.log_clique(head, c)
     if row.values_born != head[tb.UPDATE]:
         row.values_born = head[tb.UPDATE]
@@ -127,7 +133,7 @@ def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
     """Write by how much r has changed since the linearization: S times relative positions."""
     row = tb.cliques(head)[c]
     n = 3 * row.n_separator
-    before = tb.pool_f(head)[_references(row) + n + 1:]
+    before = tb.pool_f(head)[row.values + triangle_size(n, n) + n + 1:]
     for k in range(n):
         out[k] = r[k] - before[k]
 
@@ -136,52 +142,11 @@ def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
 def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
     """Make r of an anchored prior the derivative of the coordinates in its frame by -phi."""
     row = tb.cliques(head)[c]
-    reference = tb.pool_f(head)[_references(row):]
-    for i in range(0, 3 * row.n_separator, 3):
+    n = 3 * row.n_separator
+    reference = tb.pool_f(head)[row.values + triangle_size(n, n):]
+    for i in range(0, n, 3):
         r[i] -= reference[i + 1] - reference[1]
         r[i + 1] += reference[i] - reference[0]
-
-
-@kernel
-def product(head, c, x, out):  # type: ignore[no-untyped-def]
-    """Write U x."""
-    row = tb.cliques(head)[c]
-    n = 3 * row.n_separator
-    out[:n] = 0.0
-    for i in range(n):
-        u = tb.pool_f(head)[row.values + row_start(i, n):]
-        total = u[i] * x[i]
-        for k in range(i + 1, n):
-            total += u[k] * x[k]
-            out[k] += u[k] * x[i]
-        out[i] += total
-
-
-@kernel
-def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
-    """
-    Return the energy of a prior at the present poses, its frame turned by phi.
-
-    The work space, 9 numbers for each node, receives the displacement d, half the gradient U d - u
-    in the frame, and r.
-    """
-    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
-    n = 3 * row.n_separator
-    d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]
-    displacement(head, c, phi, d, r)
-    product(head, c, d, g)
-    energy = pool_f[_references(row) + n]
-    for i in range(n):
-        u = pool_f[row.values + row_start(i, n) + n]
-        energy += d[i] * (g[i] - 2.0 * u)
-        g[i] -= u
-    return energy
-
-
-@kernel
-def present_frame(head, c):  # type: ignore[no-untyped-def]
-    """Return the turn of the frame of a prior [rad], which is 0 if it does not turn."""
-    return mean_turn(head, c) if turns(head, c) else 0.0
 
 
 @kernel
@@ -209,8 +174,7 @@ def gradient(head, c, work):  # type: ignore[no-untyped-def]
 @kernel
 def update_energy(head, c):  # type: ignore[no-untyped-def]
     """Set the energy of a prior to that at the present poses, and correct chi2 by the change."""
-    f, energy = tb.cliques(head)[c], evaluate(
-        head, c, present_frame(head, c), tb.work_f(head))
+    f, energy = tb.cliques(head)[c], evaluate(head, c, present_frame(head, c), tb.work_f(head))
     tb.scalars(head)[0].chi2 += energy - f.energy
     f.energy = energy
 
@@ -275,14 +239,6 @@ def start(head, c, anchored):  # type: ignore[no-untyped-def]
     update_energy(head, c)
 
 
-@kernel
-def make_loose(head, c):  # type: ignore[no-untyped-def]
-    """Put a prior into the list of those without a parent."""
-    row = tb.cliques(head)[c]
-    row.parent, row.sibling = -1, head[tb.LOOSE]
-    head[tb.LOOSE] = c
-
-
 @kernel(signature=(tb.HEAD,), allocates=True)
 def all_priors(head):  # type: ignore[no-untyped-def]
     """Return the rows of all priors in the table of the cliques, ascending."""
@@ -319,7 +275,7 @@ def remove_cliques(head):  # type: ignore[no-untyped-def]
         copied(values[old.values:], tb.pool_f(head)[at:at + size])
         row.turn_seen = row.drift = 0.0
         row.anchored, row.energy, row.slip_scale = old.anchored, old.energy, old.slip_scale
-        make_loose(head, c)
+        row.sibling, head[tb.LOOSE] = head[tb.LOOSE], c
     head[tb.LOG_END] = end    # nothing of this can be rolled back
 
 
@@ -342,50 +298,39 @@ def _touch_nodes(head, c, sign):  # type: ignore[no-untyped-def]
 def add(head, nodes, values, anchored):  # type: ignore[no-untyped-def]
     """Add a prior on nodes, by row, with numbers from `priors.packed`; tables have room."""
     c = transaction_log.take_clique(head, 0, len(nodes))
-    at = tb.cliques(head)[c].values
+    row = tb.cliques(head)[c]
     copied(nodes, _nodes(head, c))
-    copied(values, tb.pool_f(head)[at:at + len(values)])
+    copied(values, tb.pool_f(head)[row.values:row.values + len(values)])
     start(head, c, anchored)
-    make_loose(head, c)
+    row.sibling, head[tb.LOOSE] = head[tb.LOOSE], c     # without a parent
     _touch_nodes(head, c, 1.0)
-
-
-@kernel
-def _unlink(head, c):  # type: ignore[no-untyped-def]
-    """Take a prior out of the list of its parent's children, or of the loose ones."""
-    cliques = tb.cliques(head)
-    parent, after = cliques[c].parent, cliques[c].sibling
-    before = head[tb.LOOSE] if parent < 0 else cliques[parent].child
-    if before == c:
-        if parent < 0:
-            head[tb.LOOSE] = after
-        else:
-            transaction_log.log_clique(head, parent)
-            cliques[parent].child = after
-        return
-    while cliques[before].sibling != c:
-        before = cliques[before].sibling
-    transaction_log.log_clique(head, before)
-    cliques[before].sibling = after
-
-
-@kernel
-def remove(head, c):  # type: ignore[no-untyped-def]
-    """Take a prior out of the graph."""
-    transaction_log.log_clique(head, c)
-    _touch_nodes(head, c, -1.0)
-    tb.scalars(head)[0].chi2 -= tb.cliques(head)[c].energy
-    _unlink(head, c)
-    tb.cliques(head)[c].parent = REMOVED
-    transaction_log.drop_clique(head, c)
 
 
 @kernel
 def remove_of_node(head, v):  # type: ignore[no-untyped-def]
     """Take all priors on a node out of the graph."""
+    cliques = tb.cliques(head)
     for c in range(head[tb.N_CLIQUES] if head[tb.N_PRIORS] > 0 else 0):
-        if is_prior(head, c) and is_in_separator(head, c, v):
-            remove(head, c)
+        if not is_prior(head, c) or not is_in_separator(head, c, v):
+            continue
+        transaction_log.log_clique(head, c)
+        _touch_nodes(head, c, -1.0)
+        tb.scalars(head)[0].chi2 -= cliques[c].energy
+        # out of the list of its parent's children, or of the loose ones
+        parent, after = cliques[c].parent, cliques[c].sibling
+        before = head[tb.LOOSE] if parent < 0 else cliques[parent].child
+        if before != c:
+            while cliques[before].sibling != c:
+                before = cliques[before].sibling
+            transaction_log.log_clique(head, before)
+            cliques[before].sibling = after
+        elif parent < 0:
+            head[tb.LOOSE] = after
+        else:
+            transaction_log.log_clique(head, parent)
+            cliques[parent].child = after
+        cliques[c].parent = REMOVED
+        transaction_log.drop_clique(head, c)
 
 
 def add_priors(memory: tb.Memory, priors: Sequence[Prior], rows: Sequence[IntArray]) -> None:

@@ -89,8 +89,7 @@ def model(prior: Prior, poses: FloatArray, is_pose: BoolArray) -> PriorModel:
         M = np.kron(np.eye(k), np.array(((c, s, 0.0), (-s, c, 0.0), (0.0, 0.0, 1.0))))
     flat, J = d.ravel(), P @ M
     g = U @ flat - prior.vector
-    return PriorModel(
-        float(flat @ (g - prior.vector) + prior.energy), J.T @ g, J.T @ U @ J)
+    return PriorModel(float(flat @ (g - prior.vector) + prior.energy), J.T @ g, J.T @ U @ J)
 
 
 def packed(prior: Prior) -> FloatArray:

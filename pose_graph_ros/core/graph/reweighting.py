@@ -39,7 +39,7 @@ import numpy.typing as npt
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.error_functions import energies
+from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
 
@@ -119,8 +119,8 @@ class Reweighting:
         return len(self._table)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        column: npt.NDArray[Any] = self._table.values[name]
-        return column
+        """Return a column of `_ROW`, a view."""
+        return self._table[name]
 
     def saved(self) -> SavedLosses:
         """Return the state."""
@@ -167,14 +167,6 @@ class Reweighting:
         self['base'][at_new] = self['base'][at]
         self['base'][at] = 0.0
 
-    def scale_base_weights(self, ids: IntArray, factor: float) -> None:
-        """Multiply the base weights of factors, where they have a loss."""
-        self['base'][np.isin(self['id'], ids)] *= factor
-
-    def knows(self, number: int) -> bool:
-        """Tell whether a factor has a loss."""
-        return self._index(number) >= 0
-
     def base_weight(self, number: int) -> float | None:
         """Return the base weight of a factor, by its id; None without a loss."""
         at = self._index(number)
@@ -186,32 +178,25 @@ class Reweighting:
         if at >= 0:
             self['base'][at] = weight
 
-    def base_weights(self) -> FloatArray:
-        """Return a copy of the base weights."""
-        return self['base'].copy()
-
-    def set_base_weights(self, weights: FloatArray) -> None:
-        """Set what `base_weights` has returned; nothing may have been added in between."""
-        self['base'][:] = weights
-
     def _index(self, number: int) -> int:
         """Return the index of a factor by its id, -1 if it was not added."""
         at = int(np.searchsorted(self['id'], number))
         return at if at < len(self) and self['id'][at] == number else -1
 
-    def _some(self) -> IntArray:
-        """Return the indices of the newest ones and, in turn, of some older ones."""
+    def changes(self, graph: Graph) -> Mapping[int, float]:
+        """
+        Return new weights, by id, where they change, for the next update.
+
+        They are those of the newest factors and, in turn, of some older ones.
+        """
         size = len(self)
         begin = max(size - TUNING.window, 0)
-        if begin == 0:
-            return np.arange(size)
-        older = (self._cursor + np.arange(min(TUNING.window, begin))) % begin
-        self._cursor = int(older[-1] + 1) % begin
-        return np.concatenate((older, np.arange(begin, size)))
-
-    def changes(self, graph: Graph) -> Mapping[int, float]:
-        """Return new weights of some factors, by id, where they change, for the next update."""
-        return self._changes(graph, self._some(), least=TUNING.least_change)
+        some = np.arange(begin, size)
+        if begin > 0:
+            older = (self._cursor + np.arange(min(TUNING.window, begin))) % begin
+            self._cursor = int(older[-1] + 1) % begin
+            some = np.concatenate((older, some))
+        return self._changes(graph, some, least=TUNING.least_change)
 
     def changes_of_part(self, graph: Graph, begin: int) -> Mapping[int, float]:
         """Return new weights for a refinement, of the factors from an index on."""
@@ -255,8 +240,7 @@ class Reweighting:
         energy, weight = _energies(graph, self['id'])
         for loss, threshold, chosen in self._groups(np.arange(len(self))):
             costs, _ = costs_and_weights(loss, energy[chosen], threshold)
-            total += float(np.sum(self['base'][chosen] * costs
-                                  - weight[chosen] * energy[chosen]))
+            total += float(np.sum(self['base'][chosen] * costs - weight[chosen] * energy[chosen]))
         return total
 
 

@@ -111,26 +111,23 @@ def start_node(head, v):  # type: ignore[no-untyped-def]
 # --- new rows -----------------------------------------------------------------------------------
 
 @kernel
-def _is_finite(x):  # type: ignore[no-untyped-def]
-    """Tell whether the magnitude of a number is at most 1e300; neither infinite nor NaN is."""
-    return abs(x) <= 1e300
-
-
-@kernel
-def _pack_information(to, w):  # type: ignore[no-untyped-def]
+def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
     """
-    Write the upper triangle of an information matrix, shape (6,).
+    Write mean and information of a factor; return whether both are valid.
 
-    Return whether the matrix is finite, symmetric, positive semidefinite and not zero.
+    That is, they are finite, and the matrix is symmetric, positive semidefinite and not zero.
     """
     # for symmetry and eigenvalues with the diagonal scaled to 1; a tenth of that in `checks.check`
     tolerance = 1e-6
+    to, w = f.information, information
     xx, yy, tt = w[0, 0], w[1, 1], w[2, 2]
     xy, xt, yt = 0.5 * (w[0, 1] + w[1, 0]), 0.5 * (w[0, 2] + w[2, 0]), 0.5 * (w[1, 2] + w[2, 1])
     to[0], to[1], to[2] = xx, xy, xt
     to[3], to[4], to[5] = yy, yt, tt
+    f.mean[0], f.mean[1], f.mean[2] = mean[0], mean[1], mean[2]
     total = xx + yy + tt
-    if not (_is_finite(total) and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and total > 0.0):
+    if not (abs(mean[0]) < math.inf and abs(mean[1]) < math.inf and abs(mean[2]) < math.inf
+            and xx >= 0.0 and yy >= 0.0 and tt >= 0.0 and 0.0 < total <= 1e300):
         return False
     sx, sy, st = math.sqrt(xx), math.sqrt(yy), math.sqrt(tt)
     skew = max(abs(w[0, 1] - w[1, 0]) - tolerance * sx * sy,
@@ -148,26 +145,11 @@ def _pack_information(to, w):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _copy_pose(to, pose):  # type: ignore[no-untyped-def]
-    """Write a pose; return whether it is finite."""
-    to[0], to[1], to[2] = pose[0], pose[1], pose[2]
-    return _is_finite(pose[0]) and _is_finite(pose[1]) and _is_finite(pose[2])
-
-
-@kernel
-def write_measurement(f, mean, information):  # type: ignore[no-untyped-def]
-    """Write mean and information of a factor; return whether both are valid."""
-    valid = _copy_pose(f.mean, mean)
-    return _pack_information(f.information, information) and valid
-
-
-@kernel
 def write_row(head, e, i, j, mean, information, kind, weight):  # type: ignore[no-untyped-def]
     """Write a factor; return whether it is valid, its nodes, kind and constants apart."""
     f = tb.factors(head)[e]
     f.ends[0], f.ends[1], f.ends[2], f.kind, f.weight = i, j, -1, kind, weight
-    valid = _is_finite(weight) and weight >= 0.0 and i != j
-    return write_measurement(f, mean, information) and valid
+    return write_measurement(f, mean, information) and 0.0 <= weight < math.inf and i != j
 
 
 @kernel
@@ -175,36 +157,23 @@ def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
     """Write poses of new hidden nodes, headings wrapped; return whether all are finite."""
     valid = True
     for k in range(len(poses)):
-        f = tb.nodes(head)[first + k]
-        valid = _copy_pose(f.pose, poses[k]) and valid
-        f.pose[2] = factors.wrap(f.pose[2])
+        pose = tb.nodes(head)[first + k].pose
+        for m in range(3):
+            pose[m] = poses[k, m]
+            valid = valid and abs(poses[k, m]) < math.inf
+        pose[2] = factors.wrap(pose[2])
     return valid
 
 
 @kernel
-def kind_and_dimension(code):  # type: ignore[no-untyped-def]
-    """Return `NodeKind` and number of coordinates from what `checks.node_types` returns."""
-    return code & 3, 3 - (code >> 2)
-
-
-@kernel
 def _node(head, v, first_other, types):  # type: ignore[no-untyped-def]
-    """Return kind and dimension of a node, new ones as in `write_rows`; _NO_NODE, 0 for -1."""
+    """Return kind and dimension of a node, new ones as in `write_rows`; _NO_NODE, 3 for -1."""
     if v < 0:
-        return _NO_NODE, 0
+        return _NO_NODE, 3
     if v < head[tb.N_NODES]:
         return np.int64(tb.nodes(head)[v].kind), np.int64(tb.nodes(head)[v].dimension)
-    return kind_and_dimension(types[v - first_other] if v >= first_other else 0)
-
-
-@kernel
-def _has_rows_only(f, rows, of_mean):  # type: ignore[no-untyped-def]
-    """Tell whether information, and the mean if asked for, are zero but in some rows (bits)."""
-    for m in range(3):
-        if (rows >> m) & 1 == 0 and (
-                f.information[(0, 3, 5)[m]] != 0.0 or (of_mean and f.mean[m] != 0.0)):
-            return False
-    return True
+    code = np.int64(types[v - first_other]) if v >= first_other else 0
+    return code & 3, 3 - (code >> 2)
 
 
 @kernel
@@ -212,42 +181,35 @@ def write_rows(head, n_nodes, first_other, types, records):  # type: ignore[no-u
     """
     Write new factors, records of `Factors`, behind the last row; return whether all are valid.
 
-    The graph will have n_nodes nodes, from row `first_other` on with these `checks.node_types`.
+    The graph will have n_nodes nodes, from row `first_other` on with these types, see
+    `checks.other_nodes`.
     """
     valid = True
     for k in range(len(records)):
-        e, new = head[tb.N_FACTORS] + k, records[k]
-        a, b, c = node_row(head, new.i), _end_row(head, new.j), _end_row(head, new.k)
-        valid = write_row(
-            head, e, a, b, new.mean, new.information, new.kind, new.weight) and valid
-        f, kind = tb.factors(head)[e], new.kind
+        e, new, kind = head[tb.N_FACTORS] + k, records[k], records[k].kind
+        a, b, c = node_row(head, new.i), node_row(head, new.j), node_row(head, new.k)
+        valid = write_row(head, e, a, b, new.mean, new.information, kind, new.weight) and valid
+        f = tb.factors(head)[e]
         f.ends[2] = c
         for m in range(4):
             f.constants[m] = new.constants[m]
-            valid = _is_finite(new.constants[m]) and valid
-        valid = (valid and 0 <= a < n_nodes and -1 <= b < n_nodes and -1 <= c < n_nodes
-                 and 0 <= kind < len(_ROWS))
-        if valid:
-            ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
-                    _node(head, c, first_other, types))
-            for m in range(3):
-                valid = valid and (_ENDS[kind, m] >> ends[m][0]) & 1 == 1
-            if kind < factors.BIAS and c >= 0:  # bias and error of the scale
-                valid = valid and ends[2][1] > 1
-            elif kind == factors.BIAS:     # of the rows that both nodes have
-                valid = valid and _has_rows_only(
-                    f, (1 << min(ends[0][1], ends[1][1])) - 1, False)
-            elif kind >= factors.OBSERVED:
-                valid = valid and _has_rows_only(f, (1 << ends[0][1]) - 1, False)
-            elif kind > factors.BIAS:
-                valid = valid and _has_rows_only(f, _ROWS[kind], True)
+            valid = valid and abs(new.constants[m]) < math.inf
+        # an id that is not in the graph has a negative row, too
+        valid = (valid and 0 <= kind < len(_ROWS) and max(a, b, c) < n_nodes
+                 and (b >= 0 or new.j == -1) and (c >= 0 or new.k == -1))
+        if not valid:
+            continue
+        ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
+                _node(head, c, first_other, types))
+        for m in range(3):
+            valid = valid and (_ENDS[kind, m] >> ends[m][0]) & 1 == 1
+        if kind < factors.BIAS and c >= 0:  # bias and error of the scale
+            valid = valid and ends[2][1] > 1
+        # the rows that the error has; of one on a bias, or on a single node, those of the nodes
+        by_nodes = kind == factors.BIAS or kind >= factors.OBSERVED
+        rows = (1 << min(ends[0][1], ends[1][1])) - 1 if by_nodes else _ROWS[kind]
+        for m in range(3):
+            if (rows >> m) & 1 == 0:
+                valid = (valid and f.information[(0, 3, 5)[m]] == 0.0
+                         and (by_nodes or f.mean[m] == 0.0))
     return valid
-
-
-@kernel
-def _end_row(head, node):  # type: ignore[no-untyped-def]
-    """Return the row of a node that is an end; -1 for none, -2 if it is not in the graph."""
-    if node == -1:
-        return -1
-    row = node_row(head, node)
-    return row if row >= 0 else -2

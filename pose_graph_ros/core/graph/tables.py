@@ -51,7 +51,7 @@ NODE: Final = np.dtype([
     ('reference', 'f8', (3,)),  # constant until all nodes are linearized anew [m, m, rad]
     ('clique', 'i4'),           # row of the clique that the node is frontal in
     # head of the list of its factors with a weight above 0, whose entries are 4 * factor + the
-    # index of the end; LEAVES if `removal.compact` takes the node out later
+    # index of the end; LEAVES if `editing.compact` takes the node out later
     ('factor_list', 'i4'),
     ('index', 'i4'),            # place of the node in the present front; work space
     ('front', 'i4'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
@@ -191,7 +191,7 @@ ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index
 #   ROUND: number of iterations of the refinement so far
 #   INTERRUPT: set to 1 by another thread to end a refinement
 #   NEXT_NODE, NEXT_FACTOR: ids of the next new rows
-#   N_LEAVING: number of rows that `removal.compact` takes out after the update, without those that
+#   N_LEAVING: number of rows that `editing.compact` takes out after the update, without those that
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
 (N_NODES, N_FACTORS, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
@@ -245,8 +245,7 @@ def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
             array = context.make_array(array_type)(context, builder)
             rest = () if columns == 1 else (columns,)
             shape = [rows, *(context.get_constant(types.intp, n) for n in rest)]
-            strides = [context.get_constant(types.intp, n)
-                       for n in (size, *(WORD for _ in rest))]
+            strides = [context.get_constant(types.intp, n) for n in (size, *(WORD for _ in rest))]
             populate_array(
                 array, builder.inttoptr(address, array.data.type), shape, strides,
                 context.get_constant(types.intp, size // columns), None)
@@ -257,25 +256,11 @@ def _array(name: str, number: types.Type | None = None) -> Callable[[Any], Any]:
     return made
 
 
-nodes = _array('nodes')
-factors = _array('factors')
-cliques = _array('cliques')
-scalars = _array('scalars')
-pool_f = _array('pool_f')
-work_f = _array('work_f')
-log = _array('log')
-pool_i = _array('pool_i')
-work_i = _array('work_i')
-touched = _array('touched')
-freed = _array('freed')
-waiting = _array('waiting')
-node_id = _array('node_id')
-factor_id = _array('factor_id')
+(nodes, factors, cliques, scalars, pool_f, work_f, log, pool_i, work_i, touched, freed, waiting,
+ node_id, factor_id) = map(_array, NAMES)
 # the same memory as numbers of eight bytes
-node_words = _array('nodes', types.int64)
-factor_words = _array('factors', types.int64)
-clique_words = _array('cliques', types.int64)
-scalar_words = _array('scalars', types.int64)
+node_words, factor_words, clique_words, scalar_words = (
+    _array(name, types.int64) for name in NAMES[:4])
 log_numbers = _array('log', types.float64)
 
 

@@ -124,8 +124,8 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     row.n_frontal, row.n_separator = n_frontal, n_separator
     if n_frontal == 0:
         head[tb.N_PRIORS] += 1
-    row.members = pools.take_nodes(head, n_frontal + n_separator)
-    row.values = pools.take_values(head, pools.n_values(n_frontal, n_separator))
+    row.members = pools.take(head, pools.NODES, n_frontal + n_separator)
+    row.values = pools.take(head, pools.VALUES, pools.n_values(n_frontal, n_separator))
     row.marked = row.anchored = 0
     row.built = head[tb.ITERATION]
     row.drift = 0.0
@@ -138,8 +138,8 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
 def give_clique(head, c):  # type: ignore[no-untyped-def]
     """Give the row of a clique and its memory back."""
     row = tb.cliques(head)[c]
-    pools.give_nodes(head, row.members, row.n_frontal + row.n_separator)
-    pools.give_values(head, row.values, pools.n_values(row.n_frontal, row.n_separator))
+    pools.give(head, pools.NODES, row.members, row.n_frontal + row.n_separator)
+    pools.give(head, pools.VALUES, row.values, pools.n_values(row.n_frontal, row.n_separator))
     if row.n_frontal == 0:
         head[tb.N_PRIORS] -= 1
     row.n_frontal, row.n_separator = -1, 0
@@ -152,17 +152,9 @@ def drop_clique(head, c):  # type: ignore[no-untyped-def]
     """Give a clique back: at once if this update has made it, else on commit."""
     if tb.cliques(head)[c].born == head[tb.UPDATE]:
         give_clique(head, c)
-    else:
-        _give_on_commit(head, c, -1)
-
-
-@kernel
-def _give_on_commit(head, c, values):  # type: ignore[no-untyped-def]
-    """List a clique (values = -1), or the index of its old values, to be given back on commit."""
-    freed = tb.freed(head)
-    end = head[tb.N_FREED]
-    freed[end], freed[end + 1] = c, values
-    head[tb.N_FREED] = end + 2
+        return
+    freed, end = tb.freed(head), head[tb.N_FREED]
+    freed[end], freed[end + 1], head[tb.N_FREED] = c, -1, end + 2
 
 
 @kernel
@@ -172,8 +164,9 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
     if row.values_born == head[tb.UPDATE]:
         return
     log_clique(head, c)
-    _give_on_commit(head, c, row.values)
-    row.values = pools.take_values(head, pools.n_values(row.n_frontal, row.n_separator))
+    freed, end = tb.freed(head), head[tb.N_FREED]
+    freed[end], freed[end + 1], head[tb.N_FREED] = c, row.values, end + 2
+    row.values = pools.take(head, pools.VALUES, pools.n_values(row.n_frontal, row.n_separator))
     row.values_born = head[tb.UPDATE]
 
 
@@ -200,20 +193,6 @@ def begin(head):  # type: ignore[no-untyped-def]
     return head[tb.FRONT_SERIAL] <= tb.LAST_STAMP and head[tb.UPDATE] <= tb.LAST_STAMP + 1
 
 
-@kernel
-def _restore_start(head):  # type: ignore[no-untyped-def]
-    """Restore counters, scalars and lists from the first entry, the only one left in the log."""
-    log, at = tb.log(head), head[tb.LOG_END] - 1 - len(STARTED_WITH)
-    for counter in STARTED_WITH:
-        head[counter] = log[at]
-        at += 1
-    scalars, n_touched = tb.scalar_words(head)[0], head[tb.N_TOUCHED]
-    copied(log, scalars)
-    lists = log[len(scalars):]
-    copied(lists, tb.touched(head)[:n_touched])
-    copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
-
-
 @kernel(signature=(tb.HEAD,))
 def commit(head):  # type: ignore[no-untyped-def]
     """End an update: keep its changes, and give the memory of replaced values and cliques back."""
@@ -224,7 +203,7 @@ def commit(head):  # type: ignore[no-untyped-def]
             give_clique(head, c)
         else:
             row = tb.cliques(head)[c]
-            pools.give_values(head, values, pools.n_values(row.n_frontal, row.n_separator))
+            pools.give(head, pools.VALUES, values, pools.n_values(row.n_frontal, row.n_separator))
     head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 
@@ -236,36 +215,38 @@ def _entry(head, end):  # type: ignore[no-untyped-def]
     return end - 2 - len(_words(head, kind, row)), row, kind
 
 
-@kernel
-def _restore_clique(head, c, words):  # type: ignore[no-untyped-def]
-    """Restore a clique and its values from the words of its record."""
-    pool_f, row = tb.pool_f(head), tb.cliques(head)[c]
-    values, size = row.values, pools.n_values(row.n_frontal, row.n_separator)
-    if row.n_frontal == 0 and row.values_born == head[tb.UPDATE]:
-        # where a prior was linearized before; see `prior_rows`
-        end, n = values + size, 3 * row.n_separator
-        copied(pool_f[end - n:], pool_f[end - 2 * n:end - n])
-    copied(words, tb.clique_words(head)[c])
-    if row.values != values:
-        pools.give_values(head, values, size)
-
-
 @kernel(signature=(tb.HEAD,))
 def rollback(head):  # type: ignore[no-untyped-def]
     """End an update: restore all that was logged since `begin`, the newest entry first."""
-    log, end = tb.log(head), head[tb.LOG_END]
-    while end > 0:
-        if log[end - 1] == START:
-            head[tb.LOG_END] = end
-            _restore_start(head)
-            break
-        end, row, kind = _entry(head, end)
-        if kind == CLIQUE:
-            _restore_clique(head, row, log[end:])
-        elif kind != TAKEN_CLIQUE:
-            copied(log[end:], _words(head, kind, row))
-        elif tb.cliques(head)[row].n_frontal >= 0:  # else the same update has given it back
-            give_clique(head, row)
+    log, pool_f, end = tb.log(head), tb.pool_f(head), head[tb.LOG_END]
+    while end > 0 and log[end - 1] != START:
+        end, at, kind = _entry(head, end)
+        if kind == TAKEN_CLIQUE:
+            if tb.cliques(head)[at].n_frontal >= 0:     # else the same update has given it back
+                give_clique(head, at)
+            continue
+        if kind != CLIQUE:
+            copied(log[end:], _words(head, kind, at))
+            continue
+        row = tb.cliques(head)[at]
+        values, size = row.values, pools.n_values(row.n_frontal, row.n_separator)
+        if row.n_frontal == 0 and row.values_born == head[tb.UPDATE]:
+            # where a prior was linearized before; see `prior_rows`
+            last, n = values + size, 3 * row.n_separator
+            copied(pool_f[last - n:], pool_f[last - 2 * n:last - n])
+        copied(log[end:], tb.clique_words(head)[at])
+        if row.values != values:
+            pools.give(head, pools.VALUES, values, size)
+    if end > 0:
+        at = end - 1 - len(STARTED_WITH)
+        for counter in STARTED_WITH:
+            head[counter] = log[at]
+            at += 1
+        scalars, n_touched = tb.scalar_words(head)[0], head[tb.N_TOUCHED]
+        copied(log, scalars)
+        lists = log[len(scalars):]
+        copied(lists, tb.touched(head)[:n_touched])
+        copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
     head[tb.N_FREED] = head[tb.LOG_END] = 0
 
 

@@ -57,23 +57,9 @@ from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, compose_one, FloatArray, IntArray, Pose
 from pose_graph_ros.core.graph.checks import check, RowError, scaled
-from pose_graph_ros.core.graph.constraints import (
-    FactorKind,
-    FACTORS,
-    Factors,
-    full,
-    NodeKind,
-    upper,
-)
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
-from pose_graph_ros.core.io.g2o_text import (
-    AMBIGUOUS,
-    GraphText,
-    Lines,
-    MEASURED,
-    read_lines,
-    TAGS,
-)
+from pose_graph_ros.core.io import g2o_text as gt
 from pose_graph_ros.core.odometry.motion import as_calibrated
 
 if TYPE_CHECKING:
@@ -134,8 +120,8 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     """
     if edge2_order is not None and edge2_order not in EDGE2_ORDERS:
         raise ValueError(f'edge2_order: expected one of {EDGE2_ORDERS}, got {edge2_order!r}')
-    text = read_lines(path)
-    if edge2_order is not None or not any(len(text.rows[tag]) for tag in AMBIGUOUS):
+    text = gt.lines_of(path, gt.read_text(path))
+    if edge2_order is not None or not any(len(text.rows[tag]) for tag in gt.AMBIGUOUS):
         return _graph_of(text, edge2_order)
     files: dict[str, GraphFile] = {}
     refused: list[FileFormatError] = []
@@ -153,7 +139,9 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
 
 def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
     """Return in which order the numbers of a file make more sense, and why."""
-    definite = [order for order, file in files.items() if _smallest(file.rows) > 1e-9]
+    # by the smallest eigenvalue of a matrix, its diagonal scaled to 1
+    definite = [order for order, file in files.items() if np.min(np.linalg.eigvalsh(
+        scaled(file.rows.factors.edges.information)), initial=1.0) > 1e-9]
     if len(definite) == 1:
         other = next(order for order in EDGE2_ORDERS if order != definite[0])
         return definite[0], (
@@ -164,11 +152,6 @@ def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
     order, other = sorted(EDGE2_ORDERS, key=lambda each: spread[each])
     return order, (f'at the optimum the mean energy of an edge is {spread[order]:.3g} times the '
                    f'median, in the order of {other} {spread[other]:.3g} times')
-
-
-def _smallest(rows: GraphRows) -> float:
-    """Return the smallest eigenvalue of an information matrix, its diagonal scaled to 1."""
-    return float(np.min(np.linalg.eigvalsh(scaled(rows.factors.edges.information)), initial=1.0))
 
 
 def _spread(rows: GraphRows) -> float:
@@ -185,12 +168,12 @@ def _spread(rows: GraphRows) -> float:
     return float(np.mean(energies)) / median if median > 0.0 else np.inf
 
 
-def _graph_of(text: GraphText, edge2_order: str | None) -> GraphFile:
+def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
     """Return the graph in the lines of a file."""
     rows, loops = _without_loops(text.rows)
     rows['LANDMARK'], notes = _numbered(text, rows)
     points = rows['VERTEX_XY']
-    vertices = Lines.joined((*(rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX')), Lines(
+    vertices = gt.Lines.joined((rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'], gt.Lines(
         points.ids, np.pad(points.numbers, ((0, 0), (0, 1))), points.lines)))
     # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
     ids, _ = np.unique(np.concatenate([
@@ -204,15 +187,15 @@ def _graph_of(text: GraphText, edge2_order: str | None) -> GraphFile:
         raise FileFormatError(f'{text.where(vertices.lines[again])}: vertex '
                               f'{vertices.ids[again, 0]} is in the file twice')
     factors = Factors.joined([
-        factors_of(tag, rows[tag], edge2_order if tag in AMBIGUOUS else None, ids)
-        for tag in MEASURED])
+        factors_of(tag, rows[tag], edge2_order if tag in gt.AMBIGUOUS else None, ids)
+        for tag in gt.MEASURED])
     is_landmark = np.isin(ids, points.ids)
     is_landmark[factors.j[np.isin(factors.kind, _TO_LANDMARKS)]] = True
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
     try:
         check(factors, kind)
     except RowError as error:
-        line = np.concatenate([rows[tag].lines for tag in MEASURED])[error.row]
+        line = np.concatenate([rows[tag].lines for tag in gt.MEASURED])[error.row]
         raise FileFormatError(f'{text.where(line)}: {error}') from error
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
     poses[known] = vertices.numbers[first]
@@ -232,17 +215,17 @@ def _graph_of(text: GraphText, edge2_order: str | None) -> GraphFile:
         graph, ids, bool(len(given) == n), text.skipped, (*loops, *notes), edge2_order)
 
 
-def _without_loops(rows: dict[str, Lines]) -> tuple[dict[str, Lines], tuple[str, ...]]:
+def _without_loops(rows: dict[str, gt.Lines]) -> tuple[dict[str, gt.Lines], tuple[str, ...]]:
     """Return lines without edges from a node to itself, which tell nothing, and a note of them."""
     kept, n = dict(rows), 0
     for tag, table in rows.items():
-        if TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
+        if gt.TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
             kept[tag] = table.rows(np.flatnonzero(table.ids[:, 0] != table.ids[:, 1]))
             n += len(table) - len(kept[tag])
     return kept, () if n == 0 else (f'{n} edges from a node to itself are skipped',)
 
 
-def _numbered(text: GraphText, rows: dict[str, Lines]) -> tuple[Lines, tuple[str, ...]]:
+def _numbered(text: gt.GraphText, rows: dict[str, gt.Lines]) -> tuple[gt.Lines, tuple[str, ...]]:
     """Return the lines of `LANDMARK`, landmarks with other numbers than poses, and a note."""
     seen = rows['LANDMARK']
     if len(seen) == 0:
@@ -256,20 +239,20 @@ def _numbered(text: GraphText, rows: dict[str, Lines]) -> tuple[Lines, tuple[str
     if first + int(np.max(names)) > np.iinfo(np.int64).max:
         raise FileFormatError(f'{text.where(seen.lines[0])}: LANDMARK: the ids are too large')
     moved = np.column_stack((seen.ids[:, 0], names + first))
-    return Lines(moved, seen.numbers, seen.lines), (
+    return gt.Lines(moved, seen.numbers, seen.lines), (
         f'landmark 0 of iSAM is node {first} here, 1 is {first + 1} and so on, as poses have the '
         f'same numbers',)
 
 
 def factors_of(
-    tag: str, lines: Lines, order: str | None = None, nodes: IntArray | None = None,
+    tag: str, lines: gt.Lines, order: str | None = None, nodes: IntArray | None = None,
 ) -> Factors:
     """
     Return the factors in the lines of a tag.
 
     Their ends are ids of the file, or the places of these among the sorted ids of all nodes.
     """
-    layout, n, size = TAGS[tag], len(lines), TAGS[tag].rows
+    layout, n, size = gt.TAGS[tag], len(lines), gt.TAGS[tag].rows
     order, begin = order or layout.order, 3 * layout.has_offset
     mean, information, constants = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 4))
     constants[:, :begin] = lines.numbers[:, :begin]
@@ -325,7 +308,7 @@ def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> No
     poses[:] = found
 
 
-def _fixed(text: GraphText, ids: IntArray) -> BoolArray:
+def _fixed(text: gt.GraphText, ids: IntArray) -> BoolArray:
     """Return which nodes are fixed."""
     fixed, names = np.zeros(len(ids), dtype=bool), text.rows['FIX'].ids.ravel()
     rows = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
@@ -372,7 +355,7 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
                      f'{np.sum(~is_edge & ~written)} observed biases')
     is_landmark = ~rows.is_pose & ~rows.is_bias
     for tag, chosen in (('VERTEX_SE2', rows.is_pose), ('VERTEX_XY', is_landmark)):
-        numbers = _texts(rows.poses[chosen, :TAGS[tag].rows])
+        numbers = _texts(rows.poses[chosen, :gt.TAGS[tag].rows])
         lines += [f'{tag} {name} {text}' for name, text in zip(
             ids[chosen].tolist(), numbers, strict=True)]
     lines += [f'FIX {name}' for name in ids[rows.fixed & ~rows.is_bias].tolist()]
@@ -414,12 +397,12 @@ def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]
             placed, 'EDGE_PRIOR_SE2_XY', 'EDGE_PRIOR_SE2')))
     lines = np.empty(len(factors), dtype=object)
     for tag in np.unique(tags).tolist():
-        layout, chosen = TAGS[tag], np.flatnonzero(tags == tag)
+        layout, chosen = gt.TAGS[tag], np.flatnonzero(tags == tag)
         some = factors.rows(chosen)
         row, column = np.triu_indices(layout.rows)
         numbers = _texts(np.hstack((
             some.offset[:, :3 * layout.has_offset], some.mean[:, :layout.rows],
-            full(upper(some.information))[:, row, column])))
+            0.5 * (some.information + np.swapaxes(some.information, 1, 2))[:, row, column])))
         ends = np.column_stack((ids[some.i], ids[some.j]))[:, :layout.n_ids]
         lines[chosen] = [
             f'{"" if is_used else NOT_USED}{tag} {" ".join(map(str, names))} {text}'

@@ -109,13 +109,8 @@ def read_text(path: Path) -> str:
         raise FileFormatError(f'{path}: cannot be read as text ({error})') from error
 
 
-def read_lines(path: Path) -> GraphText:
-    """Return what is in a file; FileFormatError with file and line if a line is malformed."""
-    return lines_of(path, read_text(path))
-
-
 def lines_of(path: Path, text: str) -> GraphText:
-    """Return what is in the text of a file, as `read_lines`."""
+    """Return what is in the text of a file; FileFormatError with the line if one is malformed."""
     found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in TAGS}
     skipped: dict[str, list[list[str]]] = {}
     for line, content in enumerate(text.splitlines(), 1):
@@ -132,7 +127,12 @@ def lines_of(path: Path, text: str) -> GraphText:
             lines += [line] * len(several)
         elif tag not in _SWITCHES:
             skipped.setdefault(tag, []).append([str(line), *words[1:2]])
-    found['FIX'] = _without_skipped(*found['FIX'], skipped)
+    # without those of vertices that were skipped
+    names = {words[1] for tag, some in skipped.items() if tag.startswith('VERTEX')
+             for words in some if len(words) > 1}
+    fixes = [*zip(*found['FIX'], strict=True)]
+    found['FIX'] = ([words for words, _ in fixes if words[1] not in names],
+                    [line for words, line in fixes if words[1] not in names])
     if not any(lines for tag, (_, lines) in found.items() if tag != 'FIX'):
         _raise_empty(path, skipped)
     try:
@@ -171,16 +171,6 @@ def _raise_first(path: Path, found: dict[str, tuple[list[list[str]], list[int]]]
                 f'others finite'
             ) from error
     raise AssertionError('no line is malformed')
-
-
-def _without_skipped(
-    fixes: list[list[str]], lines: list[int], skipped: dict[str, list[list[str]]],
-) -> tuple[list[list[str]], list[int]]:
-    """Return the lines of FIX without those of vertices that were skipped."""
-    names = {words[1] for tag, found in skipped.items() if tag.startswith('VERTEX')
-             for words in found if len(words) > 1}
-    kept = [k for k, (_, name) in enumerate(fixes) if name not in names]
-    return [fixes[k] for k in kept], [lines[k] for k in kept]
 
 
 def _raise_empty(path: Path, skipped: dict[str, list[list[str]]]) -> NoReturn:

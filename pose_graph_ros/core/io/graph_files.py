@@ -20,17 +20,11 @@ from typing import Any
 import numpy as np
 
 from pose_graph_ros import __version__
+from pose_graph_ros.core import saved_columns as sc
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import (
-    FactorKinds,
-    FACTORS,
-    Factors,
-    full,
-    NodeKind,
-    upper,
-)
+from pose_graph_ros.core.graph import constraints as ct
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.io.atomic_files import write_files
@@ -39,18 +33,6 @@ from pose_graph_ros.core.io.g2o_text import GraphText, lines_of, MEASURED, TAGS
 from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.saved_columns import (
-    annotations,
-    decoded,
-    encoded,
-    Flags,
-    Integers,
-    MISMATCHES,
-    Numbers,
-    Rows3,
-    Rows4,
-    Rows6,
-)
 
 FORMAT = 'pose_graph_ros graph'
 VERSION = 7
@@ -58,7 +40,7 @@ VERSION = 7
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
 _DIGITS = 64
-IN_G2O = [kind for kind, factor in FACTORS.items() if factor.tag == 'EDGE_SE2']
+IN_G2O = [kind for kind, factor in ct.FACTORS.items() if factor.tag == 'EDGE_SE2']
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,40 +48,40 @@ class SavedPriors:
     """Dense priors, one behind the other."""
 
     # number k of nodes of each prior
-    sizes: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    anchored: Flags = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    sizes: sc.Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    anchored: sc.Flags = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     # ids of the nodes of all priors
-    nodes: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    nodes: sc.Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     # of each prior the upper triangle of its information row by row, each row followed by the
     # number of the vector, then the reference poses and the energy
-    numbers: Numbers = field(default_factory=lambda: np.empty(0))
+    numbers: sc.Numbers = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True, slots=True)
 class SavedRows:
     """What the g2o file lacks of the rows of a graph."""
 
-    fixed: Integers  # ids of the fixed hidden nodes
-    biases: Integers  # ids of the hidden nodes that are no poses; poses are in the g2o file
-    bias_values: Rows3
-    factor_kind: FactorKinds  # of all factors
-    factor_weight: Numbers
+    fixed: sc.Integers  # ids of the fixed hidden nodes
+    biases: sc.Integers  # ids of the hidden nodes that are no poses; poses are in the g2o file
+    bias_values: sc.Rows3
+    factor_kind: ct.FactorKinds  # of all factors
+    factor_weight: sc.Numbers
     # rows of the factors that are given here; edges of `IN_G2O` without a third node, and observed
     # nodes on no bias, are in the g2o file
-    others: Integers
-    other_i: Integers
-    other_j: Integers
-    other_mean: Rows3
-    other_information: Rows6
-    other_constants: Rows4
-    other_k: Integers
+    others: sc.Integers
+    other_i: sc.Integers
+    other_j: sc.Integers
+    other_mean: sc.Rows3
+    other_information: sc.Rows6
+    other_constants: sc.Rows4
+    other_k: sc.Integers
     # ids of all, in order; None where they are 0, 1 and so on, without a gap
-    node_ids: Integers | None = None
-    factor_ids: Integers | None = None
+    node_ids: sc.Integers | None = None
+    factor_ids: sc.Integers | None = None
     next_ids: NextIds | None = None  # of the next new rows; None where they follow on the last
     priors: SavedPriors = field(default_factory=SavedPriors)
-    bias_dimensions: Integers | None = None  # of `biases`; None if all have 3 coordinates
-    landmarks: Integers | None = None  # ids of those of `biases` that are landmarks
+    bias_dimensions: sc.Integers | None = None  # of `biases`; None if all have 3 coordinates
+    landmarks: sc.Integers | None = None  # ids of those of `biases` that are landmarks
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -125,8 +107,9 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
     tum = tum_text(Trajectory(nodes.stamps_ns, saved.path)).encode('ascii')
     members = {
         'format': FORMAT, 'version': VERSION, 'created_by': f'pose_graph_ros {__version__}',
-        'g2o_sha256': hashlib.sha256(g2o).hexdigest(), 'graph': encoded(_saved_rows(saved.rows)),
-        **{name: encoded(getattr(saved, name)) for name in _members()}}
+        'g2o_sha256': hashlib.sha256(g2o).hexdigest(),
+        'graph': sc.encoded(_saved_rows(saved.rows)),
+        **{name: sc.encoded(getattr(saved, name)) for name in _members()}}
     body = (',\n'.join(_lines(members)) + '\n}\n').encode('ascii')
     side = _OPENING + hashlib.sha256(body).hexdigest().encode('ascii') + _MIDDLE + body
     g2o_path, side_path, tum_path = paths
@@ -143,13 +126,13 @@ def read_graph(path: Path) -> SavedGraph:
     """
     g2o_path, path, members, g2o = _verified(path)
     try:
-        hints = annotations(SavedGraph)
-        rest = {name: decoded(hints[name], members[name]) for name in _members()
+        hints = sc.annotations(SavedGraph)
+        rest = {name: sc.decoded(hints[name], members[name]) for name in _members()
                 if name in members}
-        rows: SavedRows = decoded(SavedRows, members['graph'])
+        rows: SavedRows = sc.decoded(SavedRows, members['graph'])
         text = g2o.decode('ascii').partition(STANDING_FOR)[0].replace(NOT_USED, '')
         return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, text)), **rest)
-    except MISMATCHES as error:
+    except sc.MISMATCHES as error:
         raise FileFormatError(f'{path}, with {g2o_path.name}: {error!r}') from error
 
 
@@ -162,11 +145,10 @@ def read_datum(path: Path) -> MapOrigin | None:
     """
     _, path, members, _ = _verified(path)
     try:
-        datum: MapOrigin | None = decoded(
-            annotations(SavedGraph)['datum'], members['datum'])
+        datum: MapOrigin | None = sc.decoded(sc.annotations(SavedGraph)['datum'], members['datum'])
         if datum is not None:
             TangentPlane(*datum)  # raises if it is no point on the Earth
-    except MISMATCHES as error:
+    except sc.MISMATCHES as error:
         raise FileFormatError(f'{path}: expected a datum ({error})') from error
     return datum
 
@@ -226,7 +208,7 @@ def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
             f'this one is of version {version!r}, created by {members.get("created_by")!r}')
     try:
         return upgraded(members, version)
-    except MISMATCHES as error:
+    except sc.MISMATCHES as error:
         raise FileFormatError(f'{path}: expected other members: {error!r}') from error
 
 
@@ -240,11 +222,11 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
         None if len(ids) == end else ids for ids, end in zip(
             (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
     dimensions = None if rows.dimension is None else rows.dimension[others].astype(np.int64)
-    landmarks = rows.node_ids[rows.node_kind == NodeKind.LANDMARK]
+    landmarks = rows.node_ids[rows.node_kind == ct.NodeKind.LANDMARK]
     return SavedRows(
         rows.node_ids[rows.fixed], rows.node_ids[others], rows.poses[others],
         factors.kind.astype(np.int64), factors.weight, in_json, given.i, given.j, given.mean,
-        upper(given.information), given.constants, given.k, node_ids, factor_ids, rows.next_ids,
+        ct.upper(given.information), given.constants, given.k, node_ids, factor_ids, rows.next_ids,
         _saved_priors(rows.priors),
         None if dimensions is None or np.all(dimensions == 3) else dimensions,
         landmarks if len(landmarks) > 0 else None)
@@ -259,10 +241,10 @@ def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
     is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
     poses = np.zeros((len(node_ids), 3))
     poses[is_pose], poses[~is_pose] = vertices.numbers, rows.bias_values
-    kind = np.where(is_pose, NodeKind.POSE, NodeKind.BIAS).astype(np.uint8)
+    kind = np.where(is_pose, ct.NodeKind.POSE, ct.NodeKind.BIAS).astype(np.uint8)
     if rows.landmarks is not None:
-        kind[np.isin(node_ids, rows.landmarks)] = NodeKind.LANDMARK
-    dimension = np.where(kind == NodeKind.LANDMARK, 2, 3)
+        kind[np.isin(node_ids, rows.landmarks)] = ct.NodeKind.LANDMARK
+    dimension = np.where(kind == ct.NodeKind.LANDMARK, 2, 3)
     if rows.bias_dimensions is not None:
         dimension[~is_pose] = rows.bias_dimensions
     return GraphRows(
@@ -271,22 +253,21 @@ def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
         _restored_priors(rows.priors))
 
 
-def _factors(rows: SavedRows, text: GraphText) -> Factors:
+def _factors(rows: SavedRows, text: GraphText) -> ct.Factors:
     """Return the factors from both files."""
-    in_json = Factors(
-        rows.other_i, rows.other_j, rows.other_mean, full(rows.other_information),
+    in_json = ct.Factors(
+        rows.other_i, rows.other_j, rows.other_mean, ct.full(rows.other_information),
         np.zeros(len(rows.others), np.int64), constants=rows.other_constants, k=rows.other_k)
     # others are in the JSON file
     tags = [tag for tag in MEASURED if TAGS[tag].kind is None]
-    in_g2o = Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
+    in_g2o = ct.Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
     # in which those of edges come first
     lines = np.concatenate([text.rows[tag].lines for tag in tags])
-    table = Factors.joined([in_g2o.rows(np.argsort(lines)), in_json])
+    table = ct.Factors.joined([in_g2o.rows(np.argsort(lines)), in_json])
     others = np.delete(np.arange(len(table)), rows.others)
     is_edge = np.isin(rows.factor_kind[others], IN_G2O)
     place = np.concatenate((others[is_edge], others[~is_edge], rows.others))
-    return table.rows(np.argsort(place)).replaced(
-        kind=rows.factor_kind, weight=rows.factor_weight)
+    return table.rows(np.argsort(place)).replaced(kind=rows.factor_kind, weight=rows.factor_weight)
 
 
 def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:

@@ -133,8 +133,7 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     """Return members in which edges and observed nodes have the same ids."""
     rows = members['graph']
     n_edges, n_observed = (len(rows[f'{name}_weight']) for name in ('edge', 'observed'))
-    end = rows.get('next_ids') or {
-        'node': None, 'edge': n_edges, 'observed': n_observed}
+    end = rows.get('next_ids') or {'node': None, 'edge': n_edges, 'observed': n_observed}
     first = end['edge']
 
     def moved(ids: list[int]) -> list[int]:
@@ -150,7 +149,10 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     members = {name: members[name] for name in members
                if name not in {'edge_losses', 'observed_losses'}} | {
         'graph': {name: rows[name] for name in _KEPT if name in rows} | {
-            'factor_kind': _joined(rows['edge_kind'], _renamed(rows['observed_kind'])),
+            'factor_kind': _joined(rows['edge_kind'], {
+                **rows['observed_kind'], 'names': [
+                    'node_prior' if name == 'prior' else name
+                    for name in rows['observed_kind']['names']]}),
             'factor_weight': rows['edge_weight'] + rows['observed_weight'],
             'others': given + [n_edges + row for row in rows['observed_on_bias']],
             'other_i': rows['bias_edge_i'] + rows['bias_observed_node'],
@@ -176,9 +178,7 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     return members
 
 
-def _with_ids(
-    table: dict[str, Any], moved: Callable[[list[int]], list[int]],
-) -> dict[str, Any]:
+def _with_ids(table: dict[str, Any], moved: Callable[[list[int]], list[int]]) -> dict[str, Any]:
     """Return the columns of judged constraints with the new ids of observed nodes."""
     held = [number if is_edge else moved([number])[0]
             for number, is_edge in zip(table['held'], table['edge'], strict=True)]
@@ -202,11 +202,6 @@ def _joined(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
     """Return one column of names for two."""
     n = len(one['names'])
     return {'names': one['names'] + other['names'], 'of': one['of'] + [n + k for k in other['of']]}
-
-
-def _renamed(kinds: dict[str, Any]) -> dict[str, Any]:
-    return {**kinds, 'names': [
-        'node_prior' if name == 'prior' else name for name in kinds['names']]}
 
 
 def _with_states(members: dict[str, Any]) -> dict[str, Any]:
@@ -276,9 +271,7 @@ def _state_of_gyro(
         'bias': _chain({'width_ns': width_ns, 'numbers': numbers}, ids, len(ids) * [-1], 0)}
 
 
-def _chain(
-    bins: dict[str, Any], nodes: list[int], ties: list[int], anchor: int,
-) -> dict[str, Any]:
+def _chain(bins: dict[str, Any], nodes: list[int], ties: list[int], anchor: int) -> dict[str, Any]:
     return {'begins_ns': [number * bins['width_ns'] for number in bins['numbers']],
             'nodes': nodes, 'ties': ties[:len(nodes)], 'bin_ns': bins['width_ns'],
             'anchor': nodes[anchor] if len(nodes) > 0 else -1}

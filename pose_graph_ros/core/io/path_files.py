@@ -48,21 +48,16 @@ def csv_lines(path: Trajectory, covariances: Covariances) -> Iterator[str]:
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
     """Write a trajectory; stamps and positions read back bit for bit, headings to rounding."""
-    with path.open('w', encoding='ascii') as file:
-        file.writelines(f'{line}\n' for line in _lines(trajectory))
+    path.write_text(tum_text(trajectory), encoding='ascii')
 
 
 def tum_text(trajectory: Trajectory) -> str:
     """Return the text of a TUM file with a trajectory."""
-    return '\n'.join(_lines(trajectory)) + '\n'
-
-
-def _lines(trajectory: Trajectory) -> Iterator[str]:
-    yield '# timestamp tx ty tz qx qy qz qw'
     half = trajectory.poses[:, 2] / 2
-    for stamp, (x, y, _), qz, qw in _rows(
-            trajectory.stamps_ns, trajectory.poses, np.sin(half), np.cos(half)):
-        yield f'{seconds_text(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}'
+    return ''.join(('# timestamp tx ty tz qx qy qz qw\n', *(
+        f'{seconds_text(stamp)} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n'
+        for stamp, (x, y, _), qz, qw in _rows(
+            trajectory.stamps_ns, trajectory.poses, np.sin(half), np.cos(half)))))
 
 
 def seconds_text(stamp_ns: int) -> str:

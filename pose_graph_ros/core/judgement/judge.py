@@ -135,7 +135,7 @@ class Judge:
             later[one.held] = wanted.pop(one.held, float(weights[row]))
             weights[row] = 0.0
         for number in list(wanted):
-            if self._reweighting.knows(number):
+            if self._reweighting.base_weight(number) is not None:
                 later[number] = wanted.pop(number)
         return change._replace(
             factors=change.factors.replaced(weight=weights), weigh=wanted), later
@@ -274,7 +274,8 @@ class Judge:
         graph = self._smoother.graph
         undo.callback(graph.set_poses, graph.poses.copy())
         undo.callback(graph.set_weights, graph.weights)
-        undo.callback(self._reweighting.set_base_weights, self._reweighting.base_weights())
+        base_weights = self._reweighting['base']
+        undo.callback(np.copyto, base_weights, base_weights.copy())
         for judge in (self._closures, self.fixes, self._odometry):
             undo.callback(judge.state())
         # each part believes one more, or leaves fewer to be tested

@@ -17,7 +17,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import IntArray
-from pose_graph_ros.core.graph.error_functions import energies
+from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import (

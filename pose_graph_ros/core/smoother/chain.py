@@ -17,11 +17,11 @@ from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padde
 from pose_graph_ros.core.graph import (
     factors,
     normal_equations,
-    pools,
     rows,
     tables as tb,
     transaction_log,
 )
+from pose_graph_ros.core.graph.pools import give, NODES, take, VALUES
 from pose_graph_ros.core.graph.rows import scale_by
 from pose_graph_ros.core.smoother.tree_update import lacks_memory
 
@@ -137,8 +137,8 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         nodes[last].scale_t, nodes[last].scale_r = scale_t, scale_r
         return NOT_A_CHAIN
     # nothing can fail from here on
-    pools.give_values(head, old.values, _ROOT)
-    pools.give_nodes(head, old.members, 1)
+    give(head, VALUES, old.values, _ROOT)
+    give(head, NODES, old.members, 1)
     r = transaction_log.take_clique(head, 1, 0)
     new = cliques[r]
     pool_i[new.members] = v
@@ -147,7 +147,7 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     _clear_frame(new)
     _clear_frame(old)
     old.parent, old.sibling, old.n_separator = r, -1, 1
-    old.members, old.values = pools.take_nodes(head, 2), pools.take_values(head, _PAIR)
+    old.members, old.values = take(head, NODES, 2), take(head, VALUES, _PAIR)
     pool_i[old.members], pool_i[old.members + 1] = last, v
     write_rows(front, 6, ld, pool_f, old.values)
     nodes[v].clique = r

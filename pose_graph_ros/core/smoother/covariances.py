@@ -34,7 +34,7 @@ from pose_graph_ros.core.elimination.ordering import grown
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.graph.error_functions import write_data
+from pose_graph_ros.core.graph.factors import write_data
 from pose_graph_ros.core.graph.pools import row_start
 
 _FAST = {'reassoc', 'contract', 'nsz'}

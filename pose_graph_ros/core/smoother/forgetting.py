@@ -17,7 +17,7 @@ from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import unlink
-from pose_graph_ros.core.graph.pools import row_start, triangle_size
+from pose_graph_ros.core.graph.pools import add_product, row_start, triangle_size
 from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
 from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_MEMORY, ORDERED_FIRST
 
@@ -191,11 +191,11 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
     for i in range(size):
         minus_x[i] = -nodes[members[i // 3]].delta[i % 3]
         right[i] = work_f[row_start(i, size) + size]
-    clique_frames.add_product(work_f, size, minus_x, right)
+    add_product(work_f, size, minus_x, right)
     for i in range(size):
         work_f[row_start(i, size) + size] = right[i]
-    row.members = pools.take_nodes(head, n)
-    row.values = pools.take_values(head, pools.n_values(0, n))
+    row.members = pools.take(head, pools.NODES, n)
+    row.values = pools.take(head, pools.VALUES, pools.n_values(0, n))
     for k in range(n):
         pool_i[row.members + k] = members[k]
     at = row.values
@@ -206,8 +206,8 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
         for m in range(3):
             pool_f[at + 3 * k + m] = nodes[members[k]].pose[m]
     pool_f[at + size] = energy
-    pools.give_nodes(head, old_nodes, n_frontal + n)
-    pools.give_values(head, old_values, pools.n_values(n_frontal, n))
+    pools.give(head, pools.NODES, old_nodes, n_frontal + n)
+    pools.give(head, pools.VALUES, old_values, pools.n_values(n_frontal, n))
     row.n_frontal = 0
     head[tb.N_PRIORS] += 1
     prior_rows.start(head, c, row.anchored != 0)

@@ -118,8 +118,7 @@ class Beacons:
 
 def _held(place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return mean and information of a place, one row each."""
-    return (np.append(place, 0.0)[None],
-            np.diag((sigma**-2, sigma**-2, 0.0))[None])
+    return (np.append(place, 0.0)[None], np.diag((sigma**-2, sigma**-2, 0.0))[None])
 
 
 def located(points: FloatArray, ranges: FloatArray, sigmas: FloatArray) -> FloatArray | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
-from pose_graph_ros.core.geometry.se2 import BoolArray, Covariance, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import Covariance, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -19,16 +19,7 @@ from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, PoseMeasur
 from pose_graph_ros.core.odometry.hidden_nodes import NewNode
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.saved_columns import Records
-from pose_graph_ros.core.sources import source_report
-from pose_graph_ros.core.sources.bias import (
-    Additions,
-    BiasChain,
-    Calibration,
-    CorrelatedErrors,
-    held_by_bias,
-    next_node,
-    Process,
-)
+from pose_graph_ros.core.sources import bias as bs, source_report
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -55,8 +46,8 @@ class SourceState:
     edges: Annotated[GrowingArray, Records(EDGE)] = field(
         default_factory=lambda: GrowingArray((), EDGE))  # but those of primary odometry
     # of errors that are correlated, of a gyroscope, or of what an odometry is calibrated by
-    bias: BiasChain | None = None
-    errors: CorrelatedErrors | None = None  # found ones in use; None for white or given ones
+    bias: bs.BiasChain | None = None
+    errors: bs.CorrelatedErrors | None = None  # found ones in use; None for white or given ones
     n_otherwise: int = 0  # constraints of a loaded graph that were added under other settings
     n_gone: int = 0  # number of measurements that have left the graph
 
@@ -75,12 +66,9 @@ class SourceState:
         else:
             self.measured.append_one((queued.stamp_ns, number, held_by, queued.noise.tolist()))
 
-    def leaving(self, factors: IntArray) -> BoolArray:
-        return np.isin(self.measured['id'], factors)
-
     def forget(self, nodes: IntArray, factors: IntArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
-        kept = np.flatnonzero(~self.leaving(factors))
+        kept = np.flatnonzero(~np.isin(self.measured['id'], factors))
         self.n_gone += len(self) - len(kept)
         for table in (self.measured, self.edges):
             gone = np.isin(table['id'], factors)
@@ -94,11 +82,6 @@ class SourceState:
         """Return the ids of the factors that hold some measurements."""
         some = self.measured.values[which]
         return np.where(some['held_by'] >= 0, some['held_by'], some['id'])
-
-    def are_used(self, graph: Graph, weights: FloatArray | None = None) -> BoolArray:
-        """Tell which measurements have a weight, in the graph or given by row."""
-        weights = graph.weights if weights is None else weights
-        return np.asarray(weights[graph.factor_rows(self.held())] > 0.0)
 
 
 class Origin(NamedTuple):
@@ -141,7 +124,7 @@ class FactorBuilder:
         self.new: list[NewConstraint] = []  # constraints of the update that was built last
         # what it was built from, as far as a source keeps it, and the chains that it makes
         self._queued: list[Queued] = []
-        self._chains: dict[str, BiasChain] = {}
+        self._chains: dict[str, bs.BiasChain] = {}
         self._abandoned: list[int] = []  # ids of biases that hold no measurement any more
         # of each source the newest report, and the number of measurements when it was made, 0 if
         # none of them was used
@@ -154,7 +137,7 @@ class FactorBuilder:
 
     def build(self, queue: Sequence[Queued], graph: Graph) -> GraphUpdate:
         """Return the update that adds a queue to the graph, to be followed by `commit`."""
-        additions = Additions(graph.next_ids)
+        additions = bs.Additions(graph.next_ids)
         queue = sorted(queue, key=_order)
         self._chains = self._with_bins(queue, graph, additions)
         self.new, self._queued = [], []
@@ -162,11 +145,12 @@ class FactorBuilder:
             source, factor, edge = queued.source, queued.factor, None
             errors = self._errors(queued) if queued.is_in_map else None
             if errors is not None:
-                edge = held_by_bias(queued, self._chains[source], errors)
+                edge = bs.held_by_bias(queued, self._chains[source], errors)
                 if not self._settings(source, queued.measured).finds_correlation:
                     factor, edge = edge, None
             elif queued.needs_bias:
-                factor = queued.on_bias(self._chains[source].state(queued.stamp_ns))
+                factor = factor.replaced(**{'i' if len(queued.nodes) == 0 else 'k': [
+                    self._chains[source].state(queued.stamp_ns)]})
             number = int(additions.add(factor if edge is None else factor.replaced(weight=0.0))[0])
             if len(queued.nodes) == 0:
                 continue    # it has a say on the bias alone
@@ -177,23 +161,23 @@ class FactorBuilder:
         return additions.update()
 
     def _with_bins(
-        self, queue: Sequence[Queued], graph: Graph, additions: Additions,
-    ) -> dict[str, BiasChain]:
+        self, queue: Sequence[Queued], graph: Graph, additions: bs.Additions,
+    ) -> dict[str, bs.BiasChain]:
         """Return the chains of sources with the states that a queue needs, which are added."""
-        needed: dict[tuple[str, Process], list[Queued]] = {}
+        needed: dict[tuple[str, bs.Process], list[Queued]] = {}
         for queued in queue:
             errors = self._errors(queued) if queued.is_in_map else None
             if errors is not None:
-                process = Process.correlated(errors)
+                process = bs.Process.correlated(errors)
             elif queued.needs_bias:
-                process = Process.of_gyro(self.config.gyro(queued.source))
+                process = bs.Process.of_gyro(self.config.gyro(queued.source))
             else:
                 continue
             needed.setdefault((queued.source, process), []).append(queued)
-        chains = dict[str, BiasChain]()
+        chains = dict[str, bs.BiasChain]()
         for (source, process), some in needed.items():
             known, value = chains.get(source, self._state(source).bias), np.zeros(3)
-            chain = BiasChain() if known is None else known
+            chain = bs.BiasChain() if known is None else known
             if len(process.growth) > 0 and len(chain) > 0:
                 value = graph.poses_of(chain.nodes[-1])
             elif len(process.growth) > 0:
@@ -202,13 +186,12 @@ class FactorBuilder:
             chains[source] = chain.with_bins(stamps_ns, process, additions, value)
         return chains
 
-    def next_node(self, made: NewNode, graph: Graph) -> tuple[GraphUpdate, BiasChain]:
+    def next_node(self, made: NewNode, graph: Graph) -> tuple[GraphUpdate, bs.BiasChain]:
         """Return an update with a node by calibrated odometry, and the chain, for `keep`."""
-        known = self._state(made.source).bias
-        return next_node(made, BiasChain() if known is None else known, Process.of_odometry(
-            self.config.odometry_source(made.source)), graph)
+        process = bs.Process.of_odometry(self.config.odometry_source(made.source))
+        return bs.next_node(made, self._state(made.source).bias or bs.BiasChain(), process, graph)
 
-    def keep(self, source: str, chain: BiasChain) -> None:
+    def keep(self, source: str, chain: bs.BiasChain) -> None:
         """Keep the chain of an update that the graph has taken."""
         self.sources.setdefault(source, SourceState()).bias = chain
 
@@ -243,7 +226,7 @@ class FactorBuilder:
         state = self._state(source)
         return state.n_ever + state.n_otherwise > 0
 
-    def _errors(self, queued: Queued) -> CorrelatedErrors | None:
+    def _errors(self, queued: Queued) -> bs.CorrelatedErrors | None:
         """Return the correlated errors that a measurement is treated with; None for white ones."""
         settings = self._settings(queued.source, queued.measured)
         return (self._state(queued.source).errors if settings.finds_correlation
@@ -251,9 +234,9 @@ class FactorBuilder:
 
     def preview(self, queued: Queued) -> Factors:
         """Return a measurement as an edge to the last state of the bias before it, or to -1."""
-        return held_by_bias(queued, self._state(queued.source).bias, self._errors(queued))
+        return bs.held_by_bias(queued, self._state(queued.source).bias, self._errors(queued))
 
-    def errors_in_use(self, source: str) -> CorrelatedErrors | None:
+    def errors_in_use(self, source: str) -> bs.CorrelatedErrors | None:
         """Return the statistics of the errors of a source in use; None for white errors."""
         state = self._state(source)
         if state.bias is None or state.errors is not None:
@@ -261,7 +244,7 @@ class FactorBuilder:
         return _given(self._settings(source))
 
     def set_errors(
-        self, source: str, errors: CorrelatedErrors | None, bias: BiasChain | None,
+        self, source: str, errors: bs.CorrelatedErrors | None, bias: bs.BiasChain | None,
     ) -> None:
         """Treat the measurements of a source with other errors, whose bias is in the graph."""
         state = self.sources[source]
@@ -269,7 +252,7 @@ class FactorBuilder:
         state.errors, state.bias = errors, bias
         self._reports.pop(source, None)
 
-    def abandon(self, bias: BiasChain | None) -> None:
+    def abandon(self, bias: bs.BiasChain | None) -> None:
         """Let the states of a bias that holds no measurement leave with the next nodes."""
         self._abandoned += [] if bias is None else bias.nodes.tolist()
 
@@ -287,15 +270,15 @@ class FactorBuilder:
 
     def calibrations(
         self, graph: Graph, covariance: Callable[[int], Covariance],
-    ) -> dict[str, Calibration]:
+    ) -> dict[str, bs.Calibration]:
         """Return what each odometry is calibrated by, given covariances of nodes."""
-        found = dict[str, Calibration]()
+        found = dict[str, bs.Calibration]()
         if graph.has_touched:
             return found    # until an update that failed is followed by one that does not
         for source, node in self._newest_states(graph, 2).items():
             rate, scale, _ = graph.poses_of(node).tolist()
             sigmas = np.sqrt(np.diagonal(covariance(node)))
-            found[source] = Calibration(rate, float(sigmas[0]), scale, float(sigmas[1]))
+            found[source] = bs.Calibration(rate, float(sigmas[0]), scale, float(sigmas[1]))
         return found
 
     def calibration(self, source: str, graph: Graph) -> OdometryErrors:
@@ -322,7 +305,7 @@ class FactorBuilder:
                 for source, state in self.sources.items() if self.has(source)}
 
     def leaving_biases(
-        self, factors: IntArray, others: Mapping[str, BiasChain], graph: Graph,
+        self, factors: IntArray, others: Mapping[str, bs.BiasChain], graph: Graph,
     ) -> list[int]:
         """Return the ids of the biases that nothing needs once constraints have left the graph."""
         biases = [*self._abandoned]
@@ -380,7 +363,7 @@ class FactorBuilder:
             settings = self._settings(source)
             errors = state.errors if settings.finds_correlation else _given(settings)
             wanted_ns, bin_ns = (
-                0 if errors is None else Process.correlated(errors).bin_ns,
+                0 if errors is None else bs.Process.correlated(errors).bin_ns,
                 0 if state.bias is None else state.bias.bin_ns)
             found = state.errors is not None
             if bin_ns != wanted_ns or found > settings.finds_correlation:
@@ -400,17 +383,17 @@ class FactorBuilder:
     def report(self, source: str, graph: Graph) -> SourceReport:
         """Return how well the newest measurements of a source fit the estimate."""
         state = self.sources[source]
-        used = state.measured.values[state.are_used(graph)]
+        used = state.measured.values[graph.weights[graph.factor_rows(state.held())] > 0.0]
         return source_report.report(
             graph, used['stamp_ns'], used['id'], in_use=self.errors_in_use(source),
             found=self._settings(source).finds_correlation)
 
 
-def _given(settings: MeasurementSource) -> CorrelatedErrors | None:
+def _given(settings: MeasurementSource) -> bs.CorrelatedErrors | None:
     """Return the statistics of errors with a given time constant; None without."""
     if settings.finds_correlation or settings.correlation_time == 0.0:
         return None
-    return CorrelatedErrors(settings.correlation_time, 1.0, SOURCES.white_share)
+    return bs.CorrelatedErrors(settings.correlation_time, 1.0, SOURCES.white_share)
 
 
 def _order(queued: Queued) -> tuple[int, int]:

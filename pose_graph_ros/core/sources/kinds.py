@@ -15,37 +15,16 @@ import zlib
 
 import numpy as np
 
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import CovariancePolicy
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.measurements import (
-    Absolute,
-    ACCEPTED,
-    Answer,
-    Fix,
-    GlobalPose,
-    HeadingOnly,
-    LARGEST_STAMP,
-    LoopClosure,
-    PoseMeasurement,
-    Position,
-    Range,
-    rejected,
-    value_defect,
-)
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.sources import validation
 from pose_graph_ros.core.sources.beacons import Beacons, WaitingRange
 from pose_graph_ros.core.sources.queued import Queued
-from pose_graph_ros.core.sources.validation import (
-    check_closure,
-    check_heading,
-    check_pose,
-    check_position,
-    check_range,
-    Validated,
-)
 
 
 class Target(Protocol):
@@ -66,11 +45,11 @@ class MeasurementKind:
 
     numbers: Callable[[Any], FloatArray]  # that must be valid coordinates
     # what is left of it with a valid covariance, or why it is rejected
-    check: Callable[[Any, CovariancePolicy], Validated | Answer]
+    check: Callable[[Any, CovariancePolicy], validation.Validated | ms.Answer]
     # hands its constraint over, given its source and how its stamp is attached
-    attach: Callable[[Any, str, Attachment, Target], Answer]
+    attach: Callable[[Any, str, Attachment, Target], ms.Answer]
     # what it says of the robot in the map; None if that is nothing, or not valid
-    in_map: Callable[[Any], Absolute | None] = lambda measurement: measurement
+    in_map: Callable[[Any], ms.Absolute | None] = lambda measurement: measurement
     # of those in the map, the observed node, and the variances of position and heading that the
     # motion since that node adds
     observed: Callable[[Any, Attachment], tuple[Factors, FloatArray]] | None = None
@@ -78,109 +57,108 @@ class MeasurementKind:
     key: Callable[[Any], int] = lambda _: 0
 
 
-def validate(measurement: PoseMeasurement, policy: CovariancePolicy) -> Validated | Answer:
+def validate(
+    measurement: ms.PoseMeasurement, policy: CovariancePolicy,
+) -> validation.Validated | ms.Answer:
     """Return a measurement without what it has no information on, or why it is rejected."""
     kind, name = KINDS[type(measurement)], type(measurement).__name__
     numbers = kind.numbers(measurement)
-    defect = value_defect(numbers)
+    defect = ms.value_defect(numbers)
     if defect is not None:
-        return rejected(defect, f'{name}: {numbers.tolist()}')
+        return ms.rejected(defect, f'{name}: {numbers.tolist()}')
     stamps = measurement.stamp_ns, kind.key(measurement)
-    if stamps[0] <= 0 or any(abs(stamp) > LARGEST_STAMP for stamp in stamps):
-        return rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
+    if stamps[0] <= 0 or any(abs(stamp) > ms.LARGEST_STAMP for stamp in stamps):
+        return ms.rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
                         f'{name}: expected stamps above 0, got {stamps} ns')
     return kind.check(measurement, policy)
 
 
-def key(measurement: PoseMeasurement) -> int:
+def key(measurement: ms.PoseMeasurement) -> int:
     """Return what tells measurements of one stamp apart; see `MeasurementKind.key`."""
     return KINDS[type(measurement)].key(measurement)
 
 
-def due_ns(measurement: PoseMeasurement) -> int:
+def due_ns(measurement: ms.PoseMeasurement) -> int:
     """Return the stamp that odometry must have reached to attach a measurement [ns]."""
     return max(measurement.stamp_ns, key(measurement))
 
 
 # --- how they are attached
 
-def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | Answer:
+def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | ms.Answer:
     """Return the motion from the last hidden node before a stamp, or why there is none."""
     first_ns = int(nodes.stamps_ns[0])
     if stamp_ns < first_ns:
-        return rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
+        return ms.rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
                                            f'{1e-9 * first_ns:.3f} s')
     if stamp_ns < nodes.last_frozen_ns:
         return _before_window(stamp_ns, nodes)
     attachment = nodes.attach(stamp_ns)
     if attachment is None:
-        return rejected(
+        return ms.rejected(
             'no_odometry', f'no odometry covers the motion up to {1e-9 * stamp_ns:.3f} s')
     return attachment
 
 
-def _before_window(stamp_ns: int, nodes: HiddenNodes) -> Answer:
-    return rejected('before_window', f'stamp {1e-9 * stamp_ns:.3f} s, the graph begins at '
+def _before_window(stamp_ns: int, nodes: HiddenNodes) -> ms.Answer:
+    return ms.rejected('before_window', f'stamp {1e-9 * stamp_ns:.3f} s, the graph begins at '
                                      f'{1e-9 * nodes.last_frozen_ns:.3f} s')
 
 
-def attach_reference(nodes: HiddenNodes, closure: LoopClosure) -> Attachment | Answer:
+def attach_reference(nodes: HiddenNodes, closure: ms.LoopClosure) -> Attachment | ms.Answer:
     """Return the attachment of the reference pose of a loop closure, or why it has none."""
     if closure.reference_ns is not None:
         return attach(nodes, closure.reference_ns)
     node = closure.reference_node
     if node is None or not 0 <= node < len(nodes):
-        return rejected('unknown_node', f'there is no hidden node {node}')
+        return ms.rejected('unknown_node', f'there is no hidden node {node}')
     if node < nodes.n_frozen:
         return _before_window(int(nodes.stamps_ns[node]), nodes)
     return nodes.attachment(node, np.zeros(3), np.zeros((3, 3)))
 
 
-def _observe(
-    measurement: Absolute, source: str, attachment: Attachment, to: Target,
-) -> Answer:
-    to.queue.append(observed(source, measurement, attachment))
-    return ACCEPTED
+def _observe(given: ms.Absolute, source: str, at: Attachment, to: Target) -> ms.Answer:
+    to.queue.append(observed(source, given, at))
+    return ms.ACCEPTED
 
 
-def _observe_fix(measurement: Fix, source: str, attachment: Attachment, to: Target) -> Answer:
+def _observe_fix(fix: ms.Fix, source: str, at: Attachment, to: Target) -> ms.Answer:
     # the last step: only a fix that nothing else is wrong with may become the datum
-    position = measurement.placed()
-    if (defect := value_defect(position.position)) is not None:
-        return rejected(defect, f'Fix: {position.position.tolist()} m from the datum')
-    return _observe(position, source, attachment, to)
+    position = fix.placed()
+    if (defect := ms.value_defect(position.position)) is not None:
+        return ms.rejected(defect, f'Fix: {position.position.tolist()} m from the datum')
+    return _observe(position, source, at, to)
 
 
-def _join(closure: LoopClosure, source: str, attachment: Attachment, to: Target) -> Answer:
+def _join(closure: ms.LoopClosure, source: str, at: Attachment, to: Target) -> ms.Answer:
     reference = attach_reference(to.nodes, closure)
-    if isinstance(reference, Answer):
+    if isinstance(reference, ms.Answer):
         return reference
-    if reference.node == attachment.node:
-        return rejected('same_node', f'both ends are attached to hidden node {attachment.node}')
+    if reference.node == at.node:
+        return ms.rejected('same_node', f'both ends are attached to hidden node {at.node}')
     reference_ns = closure.reference_ns
     if reference_ns is None:
         reference_ns = int(to.nodes.stamps_ns[closure.reference_node])
     to.queue.append(Queued(
-        source, loop_closure_constraint(closure, reference, attachment), closure.stamp_ns,
+        source, loop_closure_constraint(closure, reference, at), closure.stamp_ns,
         reference_ns))
-    return ACCEPTED
+    return ms.ACCEPTED
 
 
-def _reach(measurement: Range, source: str, attachment: Attachment, to: Target) -> Answer:
-    variance = measurement.variance + swept_variance(measurement, attachment)
-    antenna = se2.compose(attachment.motion, np.append(measurement.lever_arm, 0.0))
+def _reach(given: ms.Range, source: str, at: Attachment, to: Target) -> ms.Answer:
+    variance = given.variance + swept_variance(given, at)
+    antenna = se2.compose(at.motion, np.append(given.lever_arm, 0.0))
     edge = Factors(     # to a landmark that there need not be yet
-        [attachment.node], [-1], [(measurement.distance, 0.0, 0.0)],
+        [at.node], [-1], [(given.distance, 0.0, 0.0)],
         [np.diag((1.0 / variance, 0.0, 0.0))], [FactorKind.RANGE],
         constants=[(antenna[0], antenna[1], 0.0, 0.0)])
-    to.beacons.add(WaitingRange(
-        Queued(source, edge, measurement.stamp_ns), measurement))
-    return ACCEPTED
+    to.beacons.add(WaitingRange(Queued(source, edge, given.stamp_ns), given))
+    return ms.ACCEPTED
 
 
 # --- their constraints
 
-def observed(source: str, measurement: Absolute, attachment: Attachment) -> Queued:
+def observed(source: str, measurement: ms.Absolute, attachment: Attachment) -> Queued:
     """Return the constraint of a measurement in the map, if its error is treated as white."""
     of_kind = KINDS[type(measurement)].observed
     assert of_kind is not None, 'it is in the map'
@@ -188,40 +166,34 @@ def observed(source: str, measurement: Absolute, attachment: Attachment) -> Queu
     return Queued(source, factor, measurement.stamp_ns, noise=noise)
 
 
-def _observed_position(
-    measurement: Position, attachment: Attachment,
-) -> tuple[Factors, FloatArray]:
+def _observed_position(given: ms.Position, at: Attachment) -> tuple[Factors, FloatArray]:
     # it has no information on the heading, and lies in map axes
-    variance, information = swept_variance(measurement, attachment), np.zeros((3, 3))
-    information[:2, :2] = covariance.information(measurement.covariance + variance * np.eye(2))
-    offset = se2.compose(attachment.motion, np.append(measurement.lever_arm, 0.0))
+    variance, information = swept_variance(given, at), np.zeros((3, 3))
+    information[:2, :2] = covariance.information(given.covariance + variance * np.eye(2))
+    offset = se2.compose(at.motion, np.append(given.lever_arm, 0.0))
     return Factors.on(
-        [attachment.node], [offset], [np.append(measurement.position, 0.0)], [information],
+        [at.node], [offset], [np.append(given.position, 0.0)], [information],
         [FactorKind.POSITION]), np.array((variance, 0.0))
 
 
-def _observed_heading(
-    measurement: HeadingOnly, attachment: Attachment,
-) -> tuple[Factors, FloatArray]:
-    variance, information = float(attachment.noise[2, 2]), np.zeros((3, 3))
-    information[2, 2] = 1.0 / (measurement.variance + variance)
+def _observed_heading(given: ms.HeadingOnly, at: Attachment) -> tuple[Factors, FloatArray]:
+    variance, information = float(at.noise[2, 2]), np.zeros((3, 3))
+    information[2, 2] = 1.0 / (given.variance + variance)
     return Factors.on(
-        [attachment.node], [attachment.motion], [(0.0, 0.0, measurement.heading)], [information],
+        [at.node], [at.motion], [(0.0, 0.0, given.heading)], [information],
         [FactorKind.HEADING]), np.array((0.0, variance))
 
 
-def _observed_pose(
-    measurement: GlobalPose, attachment: Attachment,
-) -> tuple[Factors, FloatArray]:
-    noise, pose = attachment.noise, measurement.pose
+def _observed_pose(given: ms.GlobalPose, at: Attachment) -> tuple[Factors, FloatArray]:
+    noise, pose = at.noise, given.pose
     information = covariance.information(    # (3.51)-(3.53)
-        covariance.turned(measurement.covariance, float(pose[2])) + noise)
+        covariance.turned(given.covariance, float(pose[2])) + noise)
     return Factors.on(
-        [attachment.node], [attachment.motion], [pose], [information], [FactorKind.GLOBAL_POSE],
+        [at.node], [at.motion], [pose], [information], [FactorKind.GLOBAL_POSE],
         ), np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
 
 
-def swept_variance(measurement: Position | Range, attachment: Attachment) -> float:
+def swept_variance(measurement: ms.Position | ms.Range, attachment: Attachment) -> float:
     """
     Return the variance that the motion since the node adds to a position [m^2].
 
@@ -235,7 +207,7 @@ def swept_variance(measurement: Position | Range, attachment: Attachment) -> flo
 
 
 def loop_closure_constraint(
-    measurement: LoopClosure, reference: Attachment, attachment: Attachment,
+    measurement: ms.LoopClosure, reference: Attachment, attachment: Attachment,
 ) -> Factors:
     """
     Return the edge of a loop closure between the hidden nodes before its two stamps.
@@ -263,30 +235,30 @@ def closure_covariance(
 ) -> FloatArray:
     """Return the covariance of a closure with that of the motions since its nodes."""
     back, out = se2.adjoint(se2.inverse(pose)), se2.adjoint(attachment.motion)
-    return np.asarray(
-        out @ (own + attachment.noise + back @ reference.noise @ back.T) @ out.T)
+    return np.asarray(out @ (own + attachment.noise + back @ reference.noise @ back.T) @ out.T)
 
 
-KINDS: dict[type[PoseMeasurement], MeasurementKind] = {
-    GlobalPose: MeasurementKind(
-        lambda each: each.pose, check_pose, _observe, observed=_observed_pose),
-    Position: MeasurementKind(
-        lambda each: np.concatenate((each.position, each.lever_arm)), check_position, _observe,
-        lambda each: each if value_defect(each.position) is None else None, _observed_position),
-    Fix: MeasurementKind(   # its position is checked when it is placed
-        lambda each: each.lever_arm, check_position, _observe_fix,
-        lambda each: KINDS[Position].in_map(each.placed())),
-    HeadingOnly: MeasurementKind(
-        lambda each: np.array([each.heading]), check_heading, _observe,
+KINDS: dict[type[ms.PoseMeasurement], MeasurementKind] = {
+    ms.GlobalPose: MeasurementKind(
+        lambda each: each.pose, validation.check_pose, _observe, observed=_observed_pose),
+    ms.Position: MeasurementKind(
+        lambda each: np.concatenate((each.position, each.lever_arm)), validation.check_position,
+        _observe, lambda each: each if ms.value_defect(each.position) is None else None,
+        _observed_position),
+    ms.Fix: MeasurementKind(   # its position is checked when it is placed
+        lambda each: each.lever_arm, validation.check_position, _observe_fix,
+        lambda each: KINDS[ms.Position].in_map(each.placed())),
+    ms.HeadingOnly: MeasurementKind(
+        lambda each: np.array([each.heading]), validation.check_heading, _observe,
         observed=_observed_heading),
-    LoopClosure: MeasurementKind(
-        lambda each: each.pose, check_closure, _join, lambda _: None,
+    ms.LoopClosure: MeasurementKind(
+        lambda each: each.pose, validation.check_closure, _join, lambda _: None,
         key=lambda each: each.reference_ns if each.reference_ns is not None else (
             -1 if each.reference_node is None else -2 - each.reference_node)),
-    Range: MeasurementKind(
+    ms.Range: MeasurementKind(
         lambda each: np.concatenate((
             (each.distance,), each.lever_arm, () if each.place is None else each.place)),
-        check_range, _reach, lambda _: None,
+        validation.check_range, _reach, lambda _: None,
         key=lambda each: -2**40 - zlib.crc32(each.beacon.encode())),
 }
 """What the engine asks of each kind of measurements, by its class."""

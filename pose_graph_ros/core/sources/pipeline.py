@@ -12,18 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph.constraints import FactorKind
-from pose_graph_ros.core.measurements import (
-    Absolute,
-    Answer,
-    AnswerStatus,
-    LoopClosure,
-    Measurement,
-    PoseMeasurement,
-    rejected,
-    YawRate,
-)
 from pose_graph_ros.core.odometry.gyro import Gyros
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
@@ -39,7 +30,7 @@ class WaitingMeasurement(NamedTuple):
     due_ns: int  # stamp that odometry must reach [ns]
     arrival: int  # number of measurements that arrived before it
     source: str
-    measurement: PoseMeasurement
+    measurement: ms.PoseMeasurement
 
 
 class WaitingMeasurements:
@@ -52,20 +43,19 @@ class WaitingMeasurements:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def push(self, source: str, measurement: PoseMeasurement) -> WaitingMeasurement | None:
+    def push(self, source: str, measurement: ms.PoseMeasurement) -> WaitingMeasurement | None:
         """Add a measurement; of too many the one due last is dropped, and returned."""
         waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
         bisect.insort(self._waiting, waiting)
         return self._waiting.pop() if len(self) > SOURCES.most_waiting else None
 
     @property
-    def measurements(self) -> list[tuple[str, PoseMeasurement]]:
+    def measurements(self) -> list[tuple[str, ms.PoseMeasurement]]:
         return [(waiting.source, waiting.measurement) for waiting in self._waiting]
 
-    def until(self, stamp_ns: int) -> list[tuple[str, PoseMeasurement]]:
+    def until(self, stamp_ns: int) -> list[tuple[str, ms.PoseMeasurement]]:
         """Return the measurements due up to a stamp [ns], with their sources, earliest first."""
-        return [(each.source, each.measurement)
-                for each in self._waiting[:self._n_due(stamp_ns)]]
+        return [(each.source, each.measurement) for each in self._waiting[:self._n_due(stamp_ns)]]
 
     def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
         """Remove and return the measurements due up to a stamp [ns], the earliest first."""
@@ -94,7 +84,7 @@ class SeenStamps:
         self._seen = defaultdict[str, tuple['array[int]', 'array[int]']](
             lambda: (array('q'), array('q')))
 
-    def has(self, source: str, measurement: PoseMeasurement) -> bool:
+    def has(self, source: str, measurement: ms.PoseMeasurement) -> bool:
         """Tell whether a measurement with the same stamp and reference was added."""
         return self._find(source, measurement) >= 0
 
@@ -104,13 +94,13 @@ class SeenStamps:
         at = bisect.bisect_right(stamps, stamp_ns - period_ns)
         return at < len(stamps) and stamps[at] < stamp_ns + period_ns
 
-    def add(self, source: str, measurement: PoseMeasurement) -> None:
+    def add(self, source: str, measurement: ms.PoseMeasurement) -> None:
         stamps, references = self._seen[source]
         at = bisect.bisect_right(stamps, measurement.stamp_ns)
         stamps.insert(at, measurement.stamp_ns)
         references.insert(at, key(measurement))
 
-    def remove(self, source: str, measurement: PoseMeasurement) -> None:
+    def remove(self, source: str, measurement: ms.PoseMeasurement) -> None:
         at = self._find(source, measurement)
         for column in self._seen[source] if at >= 0 else ():
             del column[at]
@@ -121,7 +111,7 @@ class SeenStamps:
             n = bisect.bisect_left(stamps, before_ns)
             del stamps[:n], references[:n]
 
-    def saved(self, without: list[tuple[str, PoseMeasurement]]) -> dict[str, SavedStamps]:
+    def saved(self, without: list[tuple[str, ms.PoseMeasurement]]) -> dict[str, SavedStamps]:
         """Return stamps and references, by source, without some measurements."""
         rows = defaultdict[str, list[int]](list)
         for source, measurement in without:
@@ -136,7 +126,7 @@ class SeenStamps:
             self._seen[source] = (
                 array('q', each.stamps_ns.tolist()), array('q', each.references.tolist()))
 
-    def _find(self, source: str, measurement: PoseMeasurement) -> int:
+    def _find(self, source: str, measurement: ms.PoseMeasurement) -> int:
         stamps, references = self._seen[source]
         same = range(bisect.bisect_left(stamps, measurement.stamp_ns),
                      bisect.bisect_right(stamps, measurement.stamp_ns))
@@ -161,15 +151,14 @@ class MeasurementPipeline:
         # detail of the newest refusal by source and reason
         self.refusals: dict[tuple[str, str], str] = {}
         # source and stamps [ns] of the newest loop closures that could not be attached
-        self.refused_closures = deque[tuple[str, int, int | None]](
-            maxlen=SOURCES.most_refused)
+        self.refused_closures = deque[tuple[str, int, int | None]](maxlen=SOURCES.most_refused)
 
     def configure(self, config: BackendConfig) -> None:
         self._config = config
         self.gyros.configure(config)
 
-    def add(self, measurement: Measurement, source: str) -> Answer:
-        if isinstance(measurement, YawRate):
+    def add(self, measurement: ms.Measurement, source: str) -> ms.Answer:
+        if isinstance(measurement, ms.YawRate):
             answer = self.count(source, self.gyros.add(measurement, source))
             self._take_turns()
             return answer
@@ -190,37 +179,38 @@ class MeasurementPipeline:
         gyros.counts.clear()
         self.count_sorted(gyros.streams)
 
-    def _add(self, measurement: PoseMeasurement, source: str) -> Answer:
+    def _add(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         settings = self._config.measurement_source(source, type(measurement))
         validated = validate(measurement, settings.covariance)
-        if isinstance(validated, Answer):
+        if isinstance(validated, ms.Answer):
             return validated
         checked = validated.measurement
         if self.seen.has(source, checked):
-            return rejected('duplicate_stamp', f'{source} at {1e-9 * checked.stamp_ns:.3f} s was '
-                                               'received before')
+            return ms.rejected('duplicate_stamp', f'{source} at {1e-9 * checked.stamp_ns:.3f} s '
+                                                  'was received before')
         if settings.minimum_period > 0.0 and self.seen.near(
                 source, checked.stamp_ns, round(settings.minimum_period * 1e9)):
-            return rejected('thinned', f'less than {settings.minimum_period} s from another')
+            return ms.rejected('thinned', f'less than {settings.minimum_period} s from another')
         answer = (self._attach(checked, source) if due_ns(checked) <= self.nodes.covered_ns
                   else self._wait(checked, source))
-        if answer.status is not AnswerStatus.REJECTED:
+        if answer.status is not ms.AnswerStatus.REJECTED:
             self.seen.add(source, checked)
             for repair in validated.repairs:
                 self.counts[source, repair] += 1
         return answer
 
-    def _wait(self, measurement: PoseMeasurement, source: str) -> Answer:
+    def _wait(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         """Let a measurement wait for odometry; if too many wait, drop the one due last."""
         excess = self.waiting.push(source, measurement)
         if excess is not None:
-            answer = rejected('too_many_pending',
-                              f'{SOURCES.most_waiting} measurements wait for odometry')
+            answer = ms.rejected(
+                'too_many_pending', f'{SOURCES.most_waiting} measurements wait for odometry')
             if excess.measurement is measurement:
                 return answer
             self.count(excess.source, answer)
             self.seen.remove(excess.source, excess.measurement)
-        return Answer(AnswerStatus.PENDING, 'pending', 'waits for odometry to reach its stamp')
+        return ms.Answer(
+            ms.AnswerStatus.PENDING, 'pending', 'waits for odometry to reach its stamp')
 
     def attach_due(self) -> None:
         """Attach the measurements whose stamps odometry has reached, and make rotations."""
@@ -230,19 +220,15 @@ class MeasurementPipeline:
             for waiting in self.waiting.pop_due(self.nodes.covered_ns):
                 self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
 
-    def _attach(self, measurement: PoseMeasurement, source: str) -> Answer:
-        answer = self._try_to_attach(measurement, source)
-        if answer.status is AnswerStatus.REJECTED and isinstance(measurement, LoopClosure):
+    def _attach(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
+        attachment = attach(self.nodes, measurement.stamp_ns)
+        answer = attachment if isinstance(attachment, ms.Answer) else KINDS[
+            type(measurement)].attach(measurement, source, attachment, self)
+        if answer.status is ms.AnswerStatus.REJECTED and isinstance(measurement, ms.LoopClosure):
             self.refused_closures.append((source, measurement.stamp_ns, measurement.reference_ns))
         return answer
 
-    def _try_to_attach(self, measurement: PoseMeasurement, source: str) -> Answer:
-        attachment = attach(self.nodes, measurement.stamp_ns)
-        if isinstance(attachment, Answer):
-            return attachment
-        return KINDS[type(measurement)].attach(measurement, source, attachment, self)
-
-    def attach_to_node(self, measurement: Absolute, source: str, node: int) -> None:
+    def attach_to_node(self, measurement: ms.Absolute, source: str, node: int) -> None:
         """Attach a measurement to a hidden node, with no motion in between."""
         self.queue.append(observed(
             source, measurement, Attachment(node, np.zeros(3), np.zeros((3, 3)))))
@@ -272,7 +258,7 @@ class MeasurementPipeline:
         begin_ns = max(self.nodes.last_frozen_ns, 0)
         return min((stamp_ns for stamp_ns in needed if stamp_ns >= begin_ns), default=None)
 
-    def _stamps_of(self, measurement: PoseMeasurement) -> Iterator[int]:
+    def _stamps_of(self, measurement: ms.PoseMeasurement) -> Iterator[int]:
         """Yield the stamps that a measurement is attached at, as far as they are known [ns]."""
         yield measurement.stamp_ns
         other = key(measurement)
@@ -289,10 +275,10 @@ class MeasurementPipeline:
                 if count > 0:
                     self.counts[source, reason] = count
 
-    def count(self, source: str, answer: Answer) -> Answer:
-        if answer.status is AnswerStatus.ACCEPTED:
+    def count(self, source: str, answer: ms.Answer) -> ms.Answer:
+        if answer.status is ms.AnswerStatus.ACCEPTED:
             self.counts[source, 'accepted'] += 1
-        elif answer.status is AnswerStatus.REJECTED:
+        elif answer.status is ms.AnswerStatus.REJECTED:
             self.counts[source, answer.reason] += 1
             self.refusals[source, answer.reason] = answer.detail
         return answer

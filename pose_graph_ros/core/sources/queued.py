@@ -8,16 +8,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.measurements import (
-    GlobalPose,
-    HeadingOnly,
-    LoopClosure,
-    PoseMeasurement,
-    Position,
-    Range,
-)
 from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.saved_columns import Pairs, Rows2
 
@@ -39,11 +32,11 @@ class Queued(NamedTuple):
     noise: FloatArray = NO_NOISE
 
     @property
-    def measured(self) -> type[PoseMeasurement]:
+    def measured(self) -> type[ms.PoseMeasurement]:
         """What was measured; `LoopClosure` for all edges between poses."""
-        kinds = {FactorKind.GLOBAL_POSE: GlobalPose, FactorKind.POSITION: Position,
-                 FactorKind.HEADING: HeadingOnly, FactorKind.RANGE: Range}
-        return kinds.get(FactorKind(int(self.factor.kind[0])), LoopClosure)
+        kinds = {FactorKind.GLOBAL_POSE: ms.GlobalPose, FactorKind.POSITION: ms.Position,
+                 FactorKind.HEADING: ms.HeadingOnly, FactorKind.RANGE: ms.Range}
+        return kinds.get(FactorKind(int(self.factor.kind[0])), ms.LoopClosure)
 
     @property
     def nodes(self) -> list[int]:
@@ -64,12 +57,6 @@ class Queued(NamedTuple):
     def needs_bias(self) -> bool:
         """Whether one of its ends is a state of the bias, as those of a gyroscope."""
         return len(self.nodes) == 0 or int(self.factor.kind[0]) == FactorKind.TURN
-
-    def on_bias(self, state: int) -> Factors:
-        """Return its factor with a state of the bias, by its id."""
-        if len(self.nodes) == 0:
-            return self.factor.replaced(i=[state])
-        return self.factor.replaced(k=[state])
 
 
 @dataclass(frozen=True, slots=True)

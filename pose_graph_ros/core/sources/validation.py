@@ -13,50 +13,40 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import CovariancePolicy, Heading
 from pose_graph_ros.core.geometry import covariance
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
-from pose_graph_ros.core.measurements import (
-    Answer,
-    Fix,
-    GlobalPose,
-    HeadingOnly,
-    LoopClosure,
-    PoseMeasurement,
-    Position,
-    Range,
-    rejected,
-)
 
 # Lower bound of the eigenvalues of a repaired correlation matrix.
 LEAST_EIGENVALUE = 1e-6
 
 
 class Validated(NamedTuple):
-    measurement: PoseMeasurement
+    measurement: ms.PoseMeasurement
     repairs: tuple[str, ...]  # keys for counting, such as `default_covariance`
 
 
 def check_position(
-    measurement: Position | Fix, policy: CovariancePolicy,
-) -> Validated | Answer:
+    measurement: ms.Position | ms.Fix, policy: CovariancePolicy,
+) -> Validated | ms.Answer:
     """Return a position with a valid covariance, or why it is rejected."""
     return _finished(measurement, *_given(measurement.covariance, policy), policy)
 
 
-def check_pose(measurement: GlobalPose, policy: CovariancePolicy) -> Validated | Answer:
+def check_pose(measurement: ms.GlobalPose, policy: CovariancePolicy) -> Validated | ms.Answer:
     """Return a pose, or its position or heading if it has no information on the other."""
     never = policy.heading is Heading.NEVER
-    if _lacks_position(measurement.covariance):
+    if np.all(_is_uninformative(measurement.covariance)[:2]):
         variance = None if never else _heading_variance(measurement.covariance, policy)
         return _no_information(measurement) if variance is None else Validated(
-            HeadingOnly(measurement.stamp_ns, float(measurement.pose[2]), variance), ())
+            ms.HeadingOnly(measurement.stamp_ns, float(measurement.pose[2]), variance), ())
     cov, repairs = _given(measurement.covariance, policy)
     if len(repairs) > 0 and policy.heading is not Heading.ALWAYS:
         cov[2, 2] = np.inf  # a sender that does not know its covariance knows no heading
     is_known = _is_known_heading(cov[2, 2])
     if never or (policy.heading is Heading.AUTO and not is_known):
-        return _finished(Position(measurement.stamp_ns, measurement.pose[:2], cov[:2, :2],
+        return _finished(ms.Position(measurement.stamp_ns, measurement.pose[:2], cov[:2, :2],
                                   np.zeros(2)), cov[:2, :2], repairs, policy)
     if not is_known:
         cov[2, :] = cov[:, 2] = 0.0
@@ -64,33 +54,33 @@ def check_pose(measurement: GlobalPose, policy: CovariancePolicy) -> Validated |
     return _finished(measurement, cov, repairs, policy)
 
 
-def check_closure(measurement: LoopClosure, policy: CovariancePolicy) -> Validated | Answer:
+def check_closure(measurement: ms.LoopClosure, policy: CovariancePolicy) -> Validated | ms.Answer:
     """Return a loop closure; without information on the position, that is infinite."""
-    if not _lacks_position(measurement.covariance):
+    if not np.all(_is_uninformative(measurement.covariance)[:2]):
         return _finished(measurement, *_given(measurement.covariance, policy), policy)
     variance = _heading_variance(measurement.covariance, policy)
     return _no_information(measurement) if variance is None else Validated(
         replace(measurement, covariance=np.diag((np.inf, np.inf, variance))), ())
 
 
-def check_heading(measurement: HeadingOnly, policy: CovariancePolicy) -> Validated | Answer:
+def check_heading(measurement: ms.HeadingOnly, policy: CovariancePolicy) -> Validated | ms.Answer:
     """Return a heading with a valid variance, or why it is rejected."""
     variance, repairs = measurement.variance, list[str]()
     if not variance > 0.0 and len(policy.override) < 2:
         if not policy.repair:
-            return rejected('covariance_not_positive', f'variance of a heading: {variance}')
+            return ms.rejected('covariance_not_positive', f'variance of a heading: {variance}')
         variance = policy.default_heading**2
         repairs.append('default_covariance')
     valid = _heading_variance(np.diag((0.0, 0.0, variance)), policy)
     if valid is None:
-        return rejected('no_information', f'variance of a heading: {variance}')
+        return ms.rejected('no_information', f'variance of a heading: {variance}')
     return Validated(replace(measurement, variance=valid), tuple(repairs))
 
 
-def check_range(measurement: Range, policy: CovariancePolicy) -> Validated | Answer:
+def check_range(measurement: ms.Range, policy: CovariancePolicy) -> Validated | ms.Answer:
     """Return a range with a valid variance, or why it is rejected."""
     if measurement.distance <= 0.0:
-        return rejected('no_information', f'a range of {measurement.distance} m')
+        return ms.rejected('no_information', f'a range of {measurement.distance} m')
     variance = np.array([[measurement.variance]])
     cov, repairs = _given(variance, policy)
     if not 0.0 < cov[0, 0] <= covariance.LARGEST_VARIANCE:
@@ -104,28 +94,33 @@ def _given(given: FloatArray, policy: CovariancePolicy) -> tuple[FloatArray, lis
     """Return a covariance as a policy overrides it, or its default, and what was repaired."""
     cov = np.array(given, dtype=np.float64)
     if len(policy.override) > 0:
-        return _overridden(cov, policy), []
+        variances = np.diagonal(cov).copy()
+        variances[:2] = policy.override[0]**2
+        variances[2:] = policy.override[-1]**2 if len(policy.override) == 2 else variances[2:]
+        return np.diag(variances), []
     if not np.any(cov) and policy.repair:
         return np.diag(_defaults(policy)[:len(cov)]), ['default_covariance']
     return cov, []
 
 
 def _finished(
-    measurement: GlobalPose | Position | LoopClosure | Fix, cov: FloatArray, repairs: list[str],
-    policy: CovariancePolicy,
-) -> Validated | Answer:
+    measurement: ms.GlobalPose | ms.Position | ms.LoopClosure | ms.Fix, cov: FloatArray,
+    repairs: list[str], policy: CovariancePolicy,
+) -> Validated | ms.Answer:
     """Return a measurement with a covariance that is repaired, scaled and within the bounds."""
     defect = covariance.defect(cov)
     if defect is not None:
         if not policy.repair:
-            return rejected(
+            return ms.rejected(
                 f'covariance_{defect}', f'{type(measurement).__name__}: expected a positive '
                 f'definite matrix, got {cov.tolist()}; covariance_override replaces it')
         cov = repaired(cov, policy)
         repairs.append(f'repaired_covariance_{defect}')
     floors = np.array([policy.position_floor, policy.position_floor, policy.heading_floor])
     cov = covariance.floored(policy.scale * cov, floors[:len(cov)]**2)
-    return Validated(replace(measurement, covariance=_capped(cov, policy)), tuple(repairs))
+    factor = np.minimum(1.0, np.sqrt(_ceilings(policy)[:len(cov)] / np.diagonal(cov)))
+    return Validated(
+        replace(measurement, covariance=cov * factor * factor[:, None]), tuple(repairs))
 
 
 def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
@@ -156,20 +151,8 @@ def repaired(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
     return 0.5 * (result + result.T)
 
 
-def _overridden(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
-    variances = np.diagonal(cov).copy()
-    variances[:2] = policy.override[0]**2
-    if len(policy.override) == 2:
-        variances[2:] = policy.override[1]**2
-    return np.diag(variances)
-
-
-def _lacks_position(cov: FloatArray) -> bool:
-    return bool(np.all(_is_uninformative(np.asarray(cov))[:2]))
-
-
-def _no_information(measurement: GlobalPose | LoopClosure) -> Answer:
-    return rejected('no_information', (
+def _no_information(measurement: ms.GlobalPose | ms.LoopClosure) -> ms.Answer:
+    return ms.rejected('no_information', (
         f'{type(measurement).__name__}: {np.asarray(measurement.covariance).tolist()}'))
 
 
@@ -198,8 +181,3 @@ def _defaults(policy: CovariancePolicy) -> FloatArray:
 def _ceilings(policy: CovariancePolicy) -> FloatArray:
     return np.array([policy.position_ceiling**2, policy.position_ceiling**2,
                      covariance.UNKNOWN_HEADING_VARIANCE])
-
-
-def _capped(cov: FloatArray, policy: CovariancePolicy) -> FloatArray:
-    factor = np.minimum(1.0, np.sqrt(_ceilings(policy)[:len(cov)] / np.diagonal(cov)))
-    return np.asarray(cov * factor * factor[:, None])

@@ -21,7 +21,7 @@ from pose_graph_ros.core.config import (
 )
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import costs_and_weights
@@ -96,9 +96,9 @@ def robust_cost(backend: PoseGraphBackend, loss: Loss, threshold: float,
                 poses: FloatArray) -> float:
     """Sum up rho over the fixes and plain energies over the rest."""
     edges, observed = backend.graph.factors.edges, backend.graph.factors.observed
-    fixes = error_functions.energies(
-        error_functions.errors(poses, observed), observed.information)
-    rest = error_functions.energies(error_functions.errors(poses, edges), edges.information)
+    fixes = factors.energies(
+        factors.errors(poses, observed), observed.information)
+    rest = factors.energies(factors.errors(poses, edges), edges.information)
     has_loss = observed.kind == FactorKind.POSITION
     return float(np.sum(rest) + np.sum(fixes[~has_loss])
                  + np.sum(costs_and_weights(loss, fixes[has_loss], threshold)[0]))

@@ -98,7 +98,7 @@ def test_what_overflows_is_no_result_and_no_warning(start: Start) -> None:
         rng = np.random.default_rng(seed)
         scale = 10.0 ** rng.uniform(-140.0, 140.0, (len(edges), 1, 1))
         mean = edges.mean * [*10.0 ** rng.uniform(0.0, 90.0, 2), 1.0]
-        plain = PlainGraph(graph.rows().with_factors(Factors.joined([
+        plain = PlainGraph(graph.rows()._replace(factors=Factors.joined([
             edges.replaced(information=scale * edges.information, mean=mean),
             graph.factors.observed])))
         before = plain.poses.copy()

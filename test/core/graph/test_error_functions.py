@@ -16,7 +16,7 @@ from random_graphs import (
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 
 # Tolerance for coordinates of about 10 m after three or four rotations, each rounded to 2e-15.
@@ -52,8 +52,8 @@ def test_angles_are_wrapped_once_and_at_the_end() -> None:
     # th_j - th_i = -2 pi + 0.2 and z = 0.3: wrapping only a part would leave 2 pi in the error
     poses = np.array([[0.0, 0.0, np.pi - 0.1], [0.0, 0.0, -np.pi + 0.1]])
     edges = Factors([0], [1], [[0.0, 0.0, 0.3]], [np.eye(3)], [FactorKind.ODOMETRY])
-    assert error_functions.errors(poses, edges)[0, 2] == pytest.approx(-0.1, abs=ROUNDING)
+    assert factors.errors(poses, edges)[0, 2] == pytest.approx(-0.1, abs=ROUNDING)
     observed = Factors.on([1], [[0.0, 0.0, -0.3]], [[0.0, 0.0, np.pi - 0.1]], [np.eye(3)],
                              [FactorKind.GLOBAL_POSE])
-    assert error_functions.errors(poses, observed)[0, 2] == pytest.approx(
+    assert factors.errors(poses, observed)[0, 2] == pytest.approx(
         -0.1, abs=ROUNDING)

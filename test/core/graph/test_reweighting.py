@@ -11,7 +11,7 @@ from random_graphs import random_graph
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.config import Loss
-from pose_graph_ros.core.graph import error_functions, reweighting
+from pose_graph_ros.core.graph import factors, reweighting
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import costs_and_weights, Reweighting
 
@@ -32,7 +32,7 @@ def registered(chosen: list[tuple[Loss, float, float]], graph: Graph) -> Reweigh
 
 def energies(graph: Graph) -> np.ndarray:
     """Return the energies without weights of all factors."""
-    return error_functions.energies(graph.errors(graph.factors), graph.factors.information)
+    return factors.energies(graph.errors(graph.factors), graph.factors.information)
 
 
 @given(seeds, some_losses, st.sampled_from([1.0, 4.0]))

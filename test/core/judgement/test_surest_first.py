@@ -10,7 +10,7 @@ from pose_graph_ros.core.batch.optimizer import to_the_end
 from pose_graph_ros.core.batch.truncated import TruncatedProblem
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import Factors
-from pose_graph_ros.core.graph.error_functions import energies, errors
+from pose_graph_ros.core.graph.factors import energies, errors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.judgement import closure_search
 from pose_graph_ros.core.judgement.closures import forward

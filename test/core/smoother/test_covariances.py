@@ -9,7 +9,7 @@ import pytest
 from slow_smoother import driven, EXACT, SlowGraph
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -139,7 +139,7 @@ def test_innovations_are_those_of_the_dense_inverse(seed: int, steps: int) -> No
     edges = candidates(smoother, np.random.default_rng(seed), 5)
     linear = jacobians.linearize_edges(poses, edges)
     errors, actual = smoother.innovations(edges)
-    np.testing.assert_allclose(errors, error_functions.errors(poses, edges), atol=1e-12)
+    np.testing.assert_allclose(errors, factors.errors(poses, edges), atol=1e-12)
     for k, (i, j) in enumerate(zip(edges.i, edges.j, strict=True)):
         J = np.hstack((linear.jacobian_i[k], linear.jacobian_j[k]))
         joint = np.block([[P[i, :, i], P[i, :, j]], [P[j, :, i], P[j, :, j]]])

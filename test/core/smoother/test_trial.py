@@ -12,7 +12,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.error_functions import energies
+from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import Trial

@@ -17,7 +17,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o, write_g2o
@@ -91,7 +91,7 @@ def test_a_chain_of_biases_is_noise_with_its_full_covariance(*, late: bool) -> N
 
     def errors(x: FloatArray) -> FloatArray:
         poses = x.reshape(-1, 3)
-        moves = error_functions.errors(poses, Factors(
+        moves = factors.errors(poses, Factors(
             np.arange(n - 1), np.arange(1, n), odometry, np.tile(ODOMETRY, (n - 1, 1, 1)),
             [FactorKind.ODOMETRY] * (n - 1)))
         off = fixes - se2.transform(poses, np.tile(lever, (n, 1)))

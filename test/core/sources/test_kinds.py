@@ -9,7 +9,7 @@ import pytest
 from pose_graph_ros.core.config import BackendConfig, NodePolicy, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph import error_functions
+from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import (
     GlobalPose,
@@ -104,10 +104,10 @@ def test_a_true_measurement_in_the_map_has_no_error_at_the_true_nodes(
             (HeadingOnly(stamp, float(pose[2]), 1.0), FactorKind.HEADING, [2])):
         constraint = kinds.observed('source', measurement, anchored(stamp)).factor
         assert constraint.kind[0] == kind
-        error = error_functions.errors(NODES, constraint)
+        error = factors.errors(NODES, constraint)
         np.testing.assert_allclose(error[:, rows], 0.0, atol=ROUNDING)
         np.testing.assert_allclose(
-            error_functions.energies(error, constraint.information), 0.0, atol=ROUNDING)
+            factors.energies(error, constraint.information), 0.0, atol=ROUNDING)
         assert np.flatnonzero(np.diagonal(constraint.information[0])).tolist() == rows
 
 
@@ -117,7 +117,7 @@ def test_a_true_loop_closure_has_no_error_at_the_true_nodes(stamp: int, other: i
     constraint = kinds.loop_closure_constraint(
         LoopClosure(stamp, z, np.eye(3), reference_ns=other), anchored(other), anchored(stamp))
     assert constraint.kind[0] == FactorKind.LOOP_CLOSURE
-    np.testing.assert_allclose(error_functions.errors(NODES, constraint), 0.0, atol=ROUNDING)
+    np.testing.assert_allclose(factors.errors(NODES, constraint), 0.0, atol=ROUNDING)
 
 
 # --- the right noise -------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def test_a_relative_heading_does_not_constrain_the_position(stamp: int, other: i
     closure = LoopClosure(stamp, np.array([7.0, -9.0, turn]), np.diag([np.inf, np.inf, 1e-4]),
                           reference_ns=other)
     constraint = kinds.loop_closure_constraint(closure, reference, attachment)
-    error = error_functions.errors(NODES, constraint)
+    error = factors.errors(NODES, constraint)
     assert error[0, 2] == pytest.approx(0.0, abs=ROUNDING)
     information = constraint.information[0].copy()
     expected = np.var(0.01 * rng.standard_normal(N_SAMPLES)

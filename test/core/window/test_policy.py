@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.config import WindowConfig
-from pose_graph_ros.core.forgetting import LIMITS, n_leaving
+from pose_graph_ros.core.forgetting import n_leaving
 from pose_graph_ros.core.odometry.node_table import NodeTable
+from pose_graph_ros.core.window.sparse_removal import LIMITS
 
 SECOND = 1_000_000_000
 
