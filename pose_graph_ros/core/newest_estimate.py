@@ -117,7 +117,7 @@ def _turned(
 
 def _of_other_hypotheses(parts: Parts, newest: FloatArray) -> FloatArray:
     """Return the covariance at a pose by what may have happened, but is not believed."""
-    pose, spread = parts.judge.fixes.spread
+    pose, spread = parts.judge.fixes.bank.spread
     moved = np.eye(3)
     moved[0, 2], moved[1, 2] = pose[1] - newest[1], newest[0] - pose[0]
     return np.asarray(moved @ spread @ moved.T)

@@ -18,9 +18,7 @@ from pose_graph_ros.core.belief.filter import (
     correct,
     density,
     ERROR,
-    fade,
     FAULT_SIZE2,
-    forget_error,
     heading_density,
     innovation,
     LN_NO_OUTLIER,
@@ -33,7 +31,6 @@ from pose_graph_ros.core.belief.filter import (
     RATE,
     SCALE,
     SLIP_HEADING2,
-    WANDER2,
 )
 from pose_graph_ros.core.belief.rows import TABLE
 from pose_graph_ros.core.belief.settings import BANK
@@ -53,7 +50,7 @@ HYPOTHESIS = np.dtype([
     ('state', 'f8', (N_STATES,)),
     ('covariance', 'f8', (N_STATES, N_STATES))])
 
-# What a hypothesis says of a measurement. That a noisy fault begins is told as any beginning.
+# What a hypothesis says of a measurement.
 GOOD, ALONE, BEGINS, GOES_ON, SLIPPED, BEGINS_NOISY = range(6)
 N_CHOICES = 6
 LN_KINDS = math.log(0.5)  # either kind of fault is as likely
@@ -90,16 +87,22 @@ def _white(white, one, r):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _off(one, row):  # type: ignore[no-untyped-def]
-    """Return by what a measured heading is off."""
-    return factors.wrap(row.mean[2] - row.offset[2] - one.state[2])
+def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-def]
+    """
+    Write the hypotheses on a first measurement: any heading, good or in a fault.
 
-
-@kernel
-def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
-    """Write the hypotheses on a first measurement: any heading, good or in a fault."""
-    seen, noise = table[row], noises[0]
-    r = seen.source
+    After others it is as if nothing were known of where the robot is, after the best of them.
+    """
+    best, before, r = 0, 0.0, seen.source
+    for k in range(1, n):
+        if bank[k].weight > bank[best].weight:
+            best = k
+    if n > 0:
+        # where it is seen is as likely as a fault makes it, so that to be lost gains nothing
+        one = bank[best]
+        predict(one.state, one.covariance, n_sources, seen, noise, one.in_fault)
+        ex, ey, xx, _, yy, _, _ = innovation(one.state, one.covariance, seen, -1, 1.0, seen.slow)
+        before = one.weight + cauchy(ex * ex + ey * ey, FAULT_SIZE2 + 0.5 * (xx + yy))
     in_fault = FAULT / (FAULT + BETWEEN_FAULTS)
     n, n_faults = 0, 0
     if seen.judged != 0:
@@ -120,11 +123,10 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
             x[2] = heading
             p[2, 2] = variance
             one.turned[:] = 0.0
-            one.turned[r] = _off(one, seen)
+            one.turned[r] = factors.wrap(seen.mean[2] - seen.offset[2] - heading)
             p[RATE, RATE], p[SCALE, SCALE] = RATE2, SCALE2
-            for other in range(n_sources):
-                for i in range(ERROR + 2 * other, ERROR + 2 * other + 2):
-                    p[i, i] = noise.slow[other] * seen.slow
+            for i in range(ERROR, ERROR + 2 * n_sources):
+                p[i, i] = noise.slow[(i - ERROR) // 2] * seen.slow
             slow = noise.slow[r] * seen.slow
             if fault > 0:
                 slow = NEAR2 if fault % 2 == 1 else FAR2
@@ -140,54 +142,16 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
                 p[i, j] = -slow
                 p[j, i] = -slow
             share = 1.0 - in_fault if fault == 0 else in_fault / n_faults
-            one.weight = math.log(share / n_headings)
+            one.weight = before + math.log(share / n_headings)
+            leaf = leaves[n]
+            leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
+            leaf.choice = GOOD if fault == 0 else BEGINS
             n += 1
     return n
 
 
 @kernel
-def _prepare(one, row, noise, n_sources):  # type: ignore[no-untyped-def]
-    """Move a hypothesis to a measurement."""
-    n = ERROR + 2 * n_sources
-    x, p = one.state, one.covariance
-    predict(x, p, n, row, noise)
-    seconds = row.lever[2]
-    for r in range(n_sources):
-        part = math.exp(-seconds / noise.tau[r])
-        more = (1.0 - part * part) * noise.slow[r] * row.slow
-        if one.in_fault[r] != 0:
-            fade(x, p, n, ERROR + 2 * r, 1.0, more + WANDER2 * seconds)
-        else:
-            fade(x, p, n, ERROR + 2 * r, part, more)
-
-
-@kernel
-def _begin_again(  # type: ignore[no-untyped-def]
-    bank, n, table, row_number, n_sources, noises, leaves,
-):
-    """Begin anew, as if nothing were known of where the robot is, after the best hypothesis."""
-    best, weight = 0, 0.0
-    for k in range(1, n):
-        if bank[k].weight > bank[best].weight:
-            best = k
-    if n > 0:
-        # where it is seen is as likely as a fault makes it, so that to be lost gains nothing
-        row = table[row_number]
-        one = bank[best]
-        _prepare(one, row, noises[0], n_sources)
-        ex, ey, xx, _, yy, _, _ = innovation(one.state, one.covariance, row, -1, 1.0, row.slow)
-        weight = one.weight + cauchy(ex * ex + ey * ey, FAULT_SIZE2 + 0.5 * (xx + yy))
-    n = _begin(bank, table, row_number, n_sources, noises)
-    for k in range(n):
-        bank[k].weight += weight
-        leaf = leaves[k]
-        leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
-        leaf.choice = GOOD if bank[k].in_fault[table[row_number].source] == 0 else BEGINS
-    return n
-
-
-@kernel
-def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
+def _weigh(one, number, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     """Write the weights of the choices of a hypothesis, and how far the measurement is off."""
     x, p, r = one.state, one.covariance, row.source
     white, slow = noise.white[r], noise.slow[r] * row.slow
@@ -222,7 +186,7 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
         weights[BEGINS] += stays
         if row.heading_variance > 0.0:
             # in a fault the heading stays off by what it was, or is any
-            e = factors.wrap(_off(one, row) - one.turned[r])
+            e = factors.wrap(row.mean[2] - row.offset[2] - x[2] - one.turned[r])
             variance = 2.0 * row.heading_variance + noise.turn * row.turn[5]
             heading = max(-0.5 * (LOG_2PI + math.log(variance) + e * e / variance), any_heading)
         weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + LN_NO_OUTLIER
@@ -241,9 +205,8 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
         if not weights[choice] > LEAST:
             weights[choice] = LEAST
         branch = branches[choice]
-        branch.choice = choice
-        branch.far = math.sqrt(fresh_square)
-        branch.d2 = d2
+        branch.before, branch.choice = number, choice
+        branch.far, branch.d2 = math.sqrt(fresh_square), d2
 
 
 @kernel(allocates=True)
@@ -254,7 +217,8 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     first, choice = ERROR + 2 * r, branch.choice
     if choice == ALONE:
         return
-    one.slips, one.turned[r] = 1 if choice == SLIPPED else 0, _off(one, row)
+    one.slips = 1 if choice == SLIPPED else 0
+    one.turned[r] = factors.wrap(row.mean[2] - row.offset[2] - x[2])
     if choice in (BEGINS, BEGINS_NOISY):
         ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
         more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
@@ -264,7 +228,13 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
             one.in_fault[r] = QUIET if choice == BEGINS else NOISY
     elif choice != GOES_ON:
         if one.in_fault[r] != 0:
-            forget_error(x, p, n, first, noise.slow[r] * row.slow)
+            # nothing is known of the slow error but its variance
+            for i in range(first, first + 2):
+                x[i] = 0.0
+                for j in range(n):
+                    p[i, j] = 0.0
+                    p[j, i] = 0.0
+                p[i, i] = noise.slow[r] * row.slow
         one.in_fault[r] = 0
         if choice == SLIPPED:
             more = (SLIP_SIZE2 + branch.far * branch.far) / 3.0
@@ -317,18 +287,6 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
     return -1 if n_alike < ALIKE else -2
 
 
-@kernel
-def _copy(bank, n, other, m, n_states):  # type: ignore[no-untyped-def]
-    one, from_one = bank[n], other[m]
-    one.weight, one.slips = from_one.weight, from_one.slips
-    for r in range(N_SOURCES):
-        one.in_fault[r], one.turned[r] = from_one.in_fault[r], from_one.turned[r]
-    for i in range(n_states):
-        one.state[i] = from_one.state[i]
-        for j in range(n_states):
-            one.covariance[i, j] = from_one.covariance[i, j]
-
-
 @kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, NOISES, TREE),
         allocates=True)
 def advance(  # type: ignore[no-untyped-def]
@@ -339,59 +297,43 @@ def advance(  # type: ignore[no-untyped-def]
 
     The branches of all hypotheses after each row are written to the tree.
     """
-    noise, n_states = noises[0], ERROR + 2 * n_sources
+    noise = noises[0]
     before, branches = np.empty_like(bank), np.empty((MOST, N_CHOICES), tree.dtype)
     weights = np.empty((MOST, N_CHOICES))
     for at in range(first, end):
         row = table[at]
         if n == 0 or row.turn[5] * noise.turn > LOST:
-            n = _begin_again(bank, n, table, at, n_sources, noises, tree[at])
+            n = _begin(bank, n, row, n_sources, noise, tree[at])
             continue
         for k in range(n):
-            _prepare(bank[k], row, noise, n_sources)
-            _weigh(bank[k], row, noise, weights[k], branches[k])
+            one = bank[k]
+            predict(one.state, one.covariance, n_sources, row, noise, one.in_fault)
+            _weigh(one, k, row, noise, weights[k], branches[k])
         if row.decides == 0:
-            _stay(bank, n, row, weights, branches, tree[at])
+            # what follows so closely has mostly the same error, so that it tells nothing: it is
+            # what the one before it of its source is, unless it alone is wrong
+            for k in range(n):
+                choice = GOES_ON if bank[k].in_fault[row.source] != 0 else GOOD
+                if weights[k, ALONE] > weights[k, choice]:
+                    choice = ALONE
+                tree[at, k] = branches[k, choice]
             continue
         for k in range(n):
-            _copy(before, k, bank, k, n_states)
+            before[k] = bank[k]
         flat, n = weights[:n].copy().reshape(-1), 0
         least = max(np.max(flat) - HOPELESS, LEAST)
         for place in np.argsort(-flat, kind='mergesort'):
             weight = flat[place]
             if n == MOST or not weight > least:
                 break
-            k, choice = place // N_CHOICES, place % N_CHOICES
-            _copy(bank, n, before, k, n_states)
+            branch = branches[place // N_CHOICES, place % N_CHOICES]
+            bank[n] = before[branch.before]
             bank[n].weight = weight
-            _follow(bank[n], row, branches[k, choice], noise, n_sources)
+            _follow(bank[n], row, branch, noise, n_sources)
             other = _joins(bank, n, n_sources)
             if other >= 0:
                 bank[other].weight += math.log1p(math.exp(weight - bank[other].weight))
             if other == -1:
-                _note(tree[at], n, branches[k, choice], k)
+                tree[at, n] = branch
                 n += 1
     return n
-
-
-@kernel
-def _stay(bank, n, row, weights, branches, leaves):  # type: ignore[no-untyped-def]
-    """
-    Let a measurement be what the one before it of its source is, unless it alone is wrong.
-
-    Errors of measurements that follow one another so closely are mostly the same, so that it
-    tells the hypotheses nothing.
-    """
-    for k in range(n):
-        choice = GOES_ON if bank[k].in_fault[row.source] != 0 else GOOD
-        if weights[k, ALONE] > weights[k, choice]:
-            choice = ALONE
-        _note(leaves, k, branches[k, choice], k)
-
-
-@kernel
-def _note(leaves, n, branch, before):  # type: ignore[no-untyped-def]
-    leaf = leaves[n]
-    leaf.before = before
-    leaf.choice = BEGINS if branch.choice == BEGINS_NOISY else branch.choice
-    leaf.far, leaf.d2 = branch.far, branch.d2

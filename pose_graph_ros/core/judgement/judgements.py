@@ -7,7 +7,8 @@ Loop closures have one, positions and poses in the map another.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -42,6 +43,8 @@ from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 # State of a constraint before it came.
 NEW = -1
+# Instead of the row of a constraint: it was in the graph, or never was.
+LEFT, UNKNOWN = -1, -2
 # Of each source, the newest of those that are not simply believed.
 MOST_OTHERS = 500
 COLUMNS: list[Any] = [
@@ -92,12 +95,11 @@ class Judgements:
     stamps_ns, state, since_ns = Column(), Column(), Column()
     decision, distance = Column(), Column()
 
-    def __init__(self, kind: Judged, **more: int) -> None:
-        """Make an empty table; more columns, with the values of new constraints, are not saved."""
+    def __init__(self, kind: Judged, more: Sequence[Any] = (), **new: int) -> None:
+        """Make an empty table; more columns are not saved, and `new` or 0 in new constraints."""
         self.sources: list[str] = []
-        self._kind, self._more = kind, more
-        self._records = GrowingArray((), np.dtype(
-            [*COLUMNS, *((name, type(default)) for name, default in more.items())]))
+        self._kind, self._new = kind, {'decision': AUTO, 'distance': np.nan, **new}
+        self._records = GrowingArray((), np.dtype([*COLUMNS, *more]))
         # of each source, how many have left the graph, by their states then, and the next number
         self._left: list[IntArray] = []
         self._next: list[int] = []
@@ -123,14 +125,14 @@ class Judgements:
             self._next.append(0)
         return self.sources.index(source)
 
-    def append(
-        self, one: NewConstraint, now_ns: int, state: int, distance: float = np.nan, **more: int,
-    ) -> None:
-        source = self.index_of(one.source)
-        self._records.append_one(np.array((
-            one.held, one.number, source, self._next[source],
-            (one.stamp_ns, one.reference_ns), state, now_ns, AUTO, distance,
-            *{**self._more, **more}.values()), dtype=self.records.dtype))
+    def append(self, one: NewConstraint, now_ns: int, state: int, **more: float) -> None:
+        record, source = np.zeros((), self.records.dtype), self.index_of(one.source)
+        for name, value in {
+                'held': one.held, 'added': one.number, 'source': source,
+                'number': self._next[source], 'stamps_ns': (one.stamp_ns, one.reference_ns),
+                'state': state, 'since_ns': now_ns, **self._new, **more}.items():
+            record[name] = value
+        self._records.append_one(record)
         self._next[source] += 1
 
     def truncate(self, size: int) -> None:
@@ -149,29 +151,23 @@ class Judgements:
 
     def counts(self, source: int) -> IntArray:
         """Return how many of a source are or were in each state, by its index."""
-        return self._counts(source) + self._left[source]
-
-    def _counts(self, source: int) -> IntArray:
-        return np.bincount(self.state[self.source == source], minlength=len(STATES))
+        return self._left[source] + np.bincount(
+            self.state[self.source == source], minlength=len(STATES))
 
     def name(self, row: int) -> str:
         record = self.records[row]
         return f'{self.sources[record["source"]]}/{record["number"]}'
 
     def find(self, name: str) -> int:
-        """Return the row of the constraint with a name, -1 if there is none in the graph."""
+        """Return the row of the constraint with a name, or `LEFT`, or `UNKNOWN`."""
         source, _, text = name.rpartition('/')
         if source not in self.sources or not text.isdecimal():
-            return -1
-        found = np.flatnonzero(
-            (self.source == self.sources.index(source)) & (self.number == int(text)))
-        return int(found[0]) if len(found) > 0 else -1
-
-    def has_left(self, name: str) -> bool:
-        """Return whether the constraint with a name was in the graph, and is no more."""
-        source, _, text = name.rpartition('/')
-        return (source in self.sources and text.isdecimal() and self.find(name) < 0
-                and int(text) < self._next[self.sources.index(source)])
+            return UNKNOWN
+        index, number = self.sources.index(source), int(text)
+        found = np.flatnonzero((self.source == index) & (self.number == number))
+        if len(found) > 0:
+            return int(found[0])
+        return LEFT if number < self._next[index] else UNKNOWN
 
     def announce(self, row: int, before: int, now_ns: int) -> None:
         """Note that the state of a constraint is another one than before."""
@@ -193,15 +189,10 @@ class Judgements:
         self._changes.clear()
         return changes
 
-    def snapshot(self) -> Callable[[], None]:
-        """Return what brings the present records and changes back, as long as none is added."""
-        records, changes = self.records.copy(), list(self._changes)
-
-        def bring_back() -> None:
-            self.records[:] = records
-            self._changes.clear()
-            self._changes.extend(changes)
-        return bring_back
+    def keep(self, undo: ExitStack[bool]) -> None:
+        """Have the present records and changes brought back, as long as none is added."""
+        undo.callback(np.copyto, self.records, self.records.copy())
+        undo.callback(setattr, self, '_changes', self._changes.copy())
 
     def verdict(
         self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
@@ -235,7 +226,7 @@ class Judgements:
         for index, source in enumerate(self.sources):
             left, newest = self._left[index], self.state[self.source == index][-BELIEF.newest:]
             totals[source] = SourceVerdicts(
-                dict(zip(STATES, self._counts(index).tolist(), strict=True)),
+                dict(zip(STATES, (self.counts(index) - left).tolist(), strict=True)),
                 # wrong closures among right ones are what place recognition is like
                 doubting=(self._kind is not Judged.LOOP_CLOSURE and len(newest) > 0
                           and not bool(np.any(USED[newest]))),
@@ -255,10 +246,11 @@ class Judgements:
         for source in saved.sources:
             self.index_of(source)
         records = np.zeros(len(saved.held), dtype=self.records.dtype)
-        for column in COLUMNS:
-            records[column[0]] = getattr(saved, column[0])
-        for name, default in self._more.items():
-            records[name] = default
+        columns = {column[0] for column in COLUMNS}
+        for name in columns:
+            records[name] = getattr(saved, name)
+        for name in self._new.keys() - columns:
+            records[name] = self._new[name]
         records['distance'][records['distance'] < 0.0] = np.nan
         self._records.append(records)
         for index, left in enumerate(saved.left):

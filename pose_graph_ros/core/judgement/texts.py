@@ -20,8 +20,7 @@ from pose_graph_ros.core.quantities import NANOSECONDS
 
 PLAUSIBLE = 3.37  # distance up to which a pose may be right: 99 % of right ones are nearer [sigma]
 NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
-PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
-           Judged.ODOMETRY: 'odometry edges'}
+PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes', Judged.ODOMETRY: 'odometry edges'}
 # states in the order in which people want to read of them
 ORDER = (State.DOUBTED, State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED)
 
@@ -61,9 +60,9 @@ def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
     Of a drive that is over, its start [ns] is given: times are since then, `12.3 s`, else stamps.
     """
     since, far = _time(verdict.since_ns, start_ns), _far(verdict.distance)
-    reason = _jump(verdict, start_ns) or _doubt(verdict)
-    supported = '' if len(verdict.supported_by) == 0 else (
-        f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
+    reason, n_supporting = _doubt(verdict, start_ns), len(verdict.supported_by)
+    supported = '' if n_supporting == 0 else (
+        f'; {joined(verdict.supported_by)} {"agrees" if n_supporting == 1 else "agree"} with it')
     # that odometry contradicts it is what its distance tells
     others = [name for name in verdict.contradicted_by if name != ODOMETRY]
     contradicted = '' if len(others) == 0 else f'; it contradicts {joined(others)}'
@@ -92,28 +91,18 @@ def _time(stamp_ns: int, start_ns: int | None) -> str:
     return seconds(stamp_ns) if start_ns is None else f'{(stamp_ns - start_ns) * 1e-9:.1f} s'
 
 
-def _jump(verdict: Verdict, start_ns: int | None) -> str:
-    """Return by how much odometry is wrong, and where; nothing of other constraints."""
-    if verdict.kind is not Judged.ODOMETRY or verdict.reference_ns is None:
-        return ''
-    x, y, theta = verdict.residual.tolist()
-    return (f'it is wrong by {math.hypot(x, y):.2f} m and {abs(theta):.2f} rad, somewhere '
-            f'between {_time(verdict.reference_ns, start_ns)} and '
-            f'{_time(verdict.stamp_ns, start_ns)}')
-
-
-def _agree(names: Sequence[str]) -> str:
-    return 'agrees' if len(names) == 1 else 'agree'
-
-
 def _far(distance: float) -> str:
     return 'it has not been compared with the path yet' if math.isnan(distance) else (
         f'it was {distance:.1f} sigma from the path without it')
 
 
-def _doubt(verdict: Verdict) -> str:
+def _doubt(verdict: Verdict, start_ns: int | None) -> str:
     """Return why a constraint is doubted."""
     distance, (x, y, theta) = verdict.distance, verdict.residual.tolist()
+    if verdict.kind is Judged.ODOMETRY and verdict.reference_ns is not None:
+        return (f'it is wrong by {math.hypot(x, y):.2f} m and {abs(theta):.2f} rad, somewhere '
+                f'between {_time(verdict.reference_ns, start_ns)} and '
+                f'{_time(verdict.stamp_ns, start_ns)}')
     if verdict.kind is Judged.FIX and math.isfinite(x + y):
         # what was expected when it came may have been as wrong
         turned = '' if math.isnan(theta) else f' and {abs(theta):.2f} rad'

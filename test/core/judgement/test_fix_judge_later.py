@@ -149,7 +149,7 @@ def test_what_is_doubted_stays_doubted_when_the_error_model_changes() -> None:
     backend.optimize()
     assert_weights_are_as_decided(backend)
     # and back to white errors
-    backend._tuner._begin('fix', None)
+    backend._tuner._waiting['fix'] = None
     backend._tuner.finish_change()
     assert np.all(_held(backend).j < 0)
     assert_weights_are_as_decided(backend)
@@ -171,9 +171,9 @@ class Flaky(IncrementalSmoother):
 
 def everything(backend: PoseGraphBackend) -> list[object]:
     judge = backend._judge.fixes
-    return [judge.states.records.tobytes(), judge._loosened,
+    return [judge.states.records.tobytes(), judge.loosened,
             [base.tolist() for base in backend._reweighting.base_weights()],
-            judge._bank.rows['id'].tolist(), judge._slips]
+            judge.bank.rows['id'].tolist(), judge._slips]
 
 
 def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:
