@@ -231,11 +231,11 @@ def _extend(  # type: ignore[no-untyped-def]
                           i[1] * i[4] - i[2] * i[3])
             yy, yt, tt = (i[0] * i[5] - i[2] * i[2], i[1] * i[2] - i[0] * i[4],
                           i[0] * i[3] - i[1] * i[1])
-            scale = i[0] * xx + i[1] * xy + i[2] * xt
+            scale = 1.0 / (i[0] * xx + i[1] * xy + i[2] * xt)
             if weighted:
-                scale *= max(f.weight, _LEAST_WEIGHT)
+                scale /= max(f.weight, _LEAST_WEIGHT)
             xx, xy, xt, yy, yt, tt = (
-                xx / scale, xy / scale, xt / scale, yy / scale, yt / scale, tt / scale)
+                scale * xx, scale * xy, scale * xt, scale * yy, scale * yt, scale * tt)
         elif over_gaps:
             one, other = nodes[last].pose, nodes[v].pose
             c, s = math.cos(one[2]), math.sin(one[2])
