@@ -107,7 +107,7 @@ class ErrorTuner:
                 fixes.bank, fixes.known(), newest=BANK.most_learnt,
                 begins=() if self._in_use is None else (self._in_use,))
             self._next = fixes.n_seen + max(1, min(
-                int((BANK.next_learnt - 1.0) * fixes.n_seen), BANK.most_between))
+                int((BANK.next_learnt - 1.0) * fixes.n_seen), BANK.most_learnt // 6))
         if self._search is not None:
             try:
                 next(self._search)
@@ -223,9 +223,8 @@ class ErrorTuner:
         """Have all primary odometry in the graph know of the errors; all or nothing."""
         graph, before = self._smoother.graph, self._nodes.errors
         edges = graph.factors_at(ids := graph.factor_ids[self._primary_rows()])
-        stamps_ns = (self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, ends)]
-                     for ends in (edges.i, edges.j))
-        begin_ns, end_ns = stamps_ns
+        begin_ns, end_ns = (self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, ends)]
+                            for ends in (edges.i, edges.j))
         measured = Measured(ids, *changed(
             edges.mean, edges.information,
             np.asarray((end_ns - begin_ns) * 1e-9, dtype=np.float64), before, wanted))

@@ -104,27 +104,20 @@ class Bank:
                 for k in (ERROR + 2 * source, ERROR + 2 * source + 1):
                     hypotheses['covariance'][:, k, k] = variance
         self._begin_from(first + int(np.argmax(is_new)))
-        after_new = np.append(False, is_new[:-1])
-        for row in (first + np.flatnonzero(is_new | after_new)).tolist():
-            self._place(row, odometry)
-        count(self._rows.values, first, BANK.period_ns)
-
-    def _place(self, row: int, odometry: Odometry) -> None:
-        rows = self._rows.values
-        begin = int(rows['node'][row - 1]) if row > 0 else self._first_node
-        end = int(rows['node'][row])
-        nodes = odometry.nodes
-        places = [int(np.searchsorted(nodes, node)) for node in (begin, end)]
-        if begin < 0 or places[1] >= len(nodes):
-            places[0] = places[1] = min(places[1], len(nodes) - 1)
-        if places[0] < places[1]:
-            join_motions(odometry.poses, odometry.sums, odometry.stamps_ns,
-                         np.array(odometry.errors), rows, row, *places)
-        else:
-            for name in ('motion', 'turn', 'way', 'lever', 'travel'):
-                rows[name][row] = 0.0
-        if row > 0:     # slow errors change also while no node is passed
-            rows['lever'][row, 2] = 1e-9 * (rows['stamp_ns'][row] - rows['stamp_ns'][row - 1])
+        # the motions to the new rows, and to those behind them
+        rows, errors = self._rows.values, np.array(odometry.errors)
+        at = first + np.flatnonzero(is_new | np.append(False, is_new[:-1]))
+        from_node = np.where(at > 0, rows['node'][at - 1], self._first_node)
+        begins, ends = np.searchsorted(odometry.nodes, (from_node, rows['node'][at]))
+        # where the chain does not reach there is none
+        begins = np.where((from_node < 0) | (ends >= len(odometry.nodes)), ends, begins)
+        for row, begin, end in zip(at.tolist(), begins.tolist(), ends.tolist(), strict=True):
+            join_motions(odometry.poses, odometry.sums, odometry.stamps_ns, errors, rows, row,
+                         begin, end)
+        # slow errors change also while no node is passed
+        at = at[at > 0]
+        rows['lever'][at, 2] = 1e-9 * (rows['stamp_ns'][at] - rows['stamp_ns'][at - 1])
+        count(rows, first, BANK.period_ns)
 
     def remove(self, ids: IntArray) -> None:
         """Remove rows whose factors were not added after all, all of them the newest to come."""
@@ -159,7 +152,7 @@ class Bank:
             self.done = end
             if end % BANK.checkpoint == 0:
                 self._kept[end] = self._bank[:self._n].copy()
-        if len(self._kept) > BANK.checkpoints:
+        if len(self._kept) > 4 * BANK.checkpoint:
             old = sorted(self._kept)[1:len(self._kept) // 2]
             for at in old[::2]:
                 del self._kept[at]

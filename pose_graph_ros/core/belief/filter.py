@@ -39,7 +39,9 @@ NOISES = types.Array(from_dtype(NOISE), 1, 'C')
 # Copies of the settings that kernels use.
 LN_OUTLIER, LN_NO_OUTLIER = math.log(BANK.outliers), math.log(1.0 - BANK.outliers)
 FAULT_SIZE2, SLIP_HEADING2, WANDER2 = BANK.fault_size**2, BANK.slip_heading**2, BANK.wander**2
-LOST, ASTRAY = BANK.lost, BANK.astray
+ASTRAY = BANK.astray
+# Variance of a turn after which the heading is not known: it may be any of those tried [rad^2].
+LOST = 2.0 * (2.0 * math.pi / BANK.headings)**2
 # Variance of the heading and of a position where the filter begins, and of the heading again.
 BEGIN_HEADING, BEGIN_POSITION, NEW_HEADING = 0.1, 1e4, 1.0
 

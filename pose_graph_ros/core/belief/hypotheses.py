@@ -66,12 +66,12 @@ HYPOTHESES = types.Array(from_dtype(HYPOTHESIS), 1, 'C')
 TREE = types.Array(from_dtype(BRANCH), 2, 'C')
 
 # Copies of the settings that kernels use.
-BETWEEN_FAULTS, FAULT, BETWEEN_JUMPS = BANK.between_faults, BANK.fault, BANK.between_jumps
+BETWEEN_FAULTS, FAULT, BETWEEN_JUMPS = BANK.between_faults, BANK.fault, BANK.fault / 3.0
 BETWEEN_SLIPS, SLIP, SLIP_SIZE2 = BANK.between_slips, BANK.slip, BANK.slip_size**2
 JUMP_SIZE2 = BANK.jump_size**2
-UNMOVED_WAY, UNMOVED = BANK.unmoved_way, BANK.unmoved
+UNMOVED_WAY, UNMOVED = 5.0 * BANK.slip_size, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
-NEAR2, FAR2 = BANK.near_fault**2, BANK.far_fault**2
+NEAR2, FAR2 = (2.0 * BANK.fault_size)**2, BANK.far_fault**2
 RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
 HOPELESS, ALIKE = BANK.hopeless, BANK.alike
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place

@@ -48,7 +48,7 @@ TABLE = types.Array(from_dtype(MEASURED), 1, 'C')
 
 def measured(
     given: Factors, stamps_ns: Sequence[int], ids: Sequence[int],
-    least_position: float = BANK.least_position,
+    least_position: float = BANK.least_sigmas[0],
 ) -> Records:
     """
     Return rows for factors in the map or to biases, but for sources and motions.
@@ -73,7 +73,7 @@ def measured(
             rows['heading_variance'][which] = np.maximum(
                 noise[:, 2, 2] + np.where(
                     biased[which], given.constants[which, 3] / STRETCH, 0.0)**2,
-                BANK.least_heading**2)
+                BANK.least_sigmas[2]**2)
     rows['least'] = least_position**2
     rows['slow'] = np.where(biased, given.constants[:, 2]**2, 0.5 * (
         rows['noise'][:, 0] + rows['noise'][:, 2]))

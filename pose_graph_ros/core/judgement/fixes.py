@@ -149,7 +149,7 @@ class FixJudge:
             self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, chain.nodes)],
             self._nodes.errors)
 
-    def _records(self, source: str, least: float = BANK.least_position) -> Records:
+    def _records(self, source: str, least: float = BANK.least_sigmas[0]) -> Records:
         some = self._factors.sources[source].measured.values
         return measured(self._smoother.graph.factors_at(some['id']), some['stamp_ns'].tolist(),
                         some['id'].tolist(), least)
