@@ -13,25 +13,7 @@ import math
 from numba import from_dtype, types
 import numpy as np
 
-from pose_graph_ros.core.belief.filter import (
-    cauchy,
-    correct,
-    density,
-    ERROR,
-    FAULT_SIZE2,
-    heading_density,
-    innovation,
-    LN_NO_OUTLIER,
-    LN_OUTLIER,
-    LOG_2PI,
-    LOST,
-    N_STATES,
-    NOISES,
-    predict,
-    RATE,
-    SCALE,
-    SLIP_HEADING2,
-)
+from pose_graph_ros.core.belief import filter as ft
 from pose_graph_ros.core.belief.rows import TABLE
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
@@ -47,8 +29,8 @@ HYPOTHESIS = np.dtype([
     ('in_fault', 'i8', (N_SOURCES,)),  # whether a source is in a fault, `QUIET` or `NOISY`; or 0
     ('turned', 'f8', (N_SOURCES,)),  # by what the last heading of a source in a fault was off
     ('slips', 'i8'),  # whether odometry slipped before the last good measurement
-    ('state', 'f8', (N_STATES,)),
-    ('covariance', 'f8', (N_STATES, N_STATES))])
+    ('state', 'f8', (ft.N_STATES,)),
+    ('covariance', 'f8', (ft.N_STATES, ft.N_STATES))])
 
 # What a hypothesis says of a measurement.
 GOOD, ALONE, BEGINS, GOES_ON, SLIPPED, BEGINS_NOISY = range(6)
@@ -100,9 +82,10 @@ def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-
     if n > 0:
         # where it is seen is as likely as a fault makes it, so that to be lost gains nothing
         one = bank[best]
-        predict(one.state, one.covariance, n_sources, seen, noise, one.in_fault)
-        ex, ey, xx, _, yy, _, _ = innovation(one.state, one.covariance, seen, -1, 1.0, seen.slow)
-        before = one.weight + cauchy(ex * ex + ey * ey, FAULT_SIZE2 + 0.5 * (xx + yy))
+        ft.predict(one.state, one.covariance, n_sources, seen, noise, one.in_fault)
+        ex, ey, xx, _, yy, _, _ = ft.innovation(
+            one.state, one.covariance, seen, -1, 1.0, seen.slow)
+        before = one.weight + ft.cauchy(ex * ex + ey * ey, ft.FAULT_SIZE2 + 0.5 * (xx + yy))
     in_fault = FAULT / (FAULT + BETWEEN_FAULTS)
     n, n_faults = 0, 0
     if seen.judged != 0:
@@ -124,9 +107,9 @@ def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-
             p[2, 2] = variance
             one.turned[:] = 0.0
             one.turned[r] = factors.wrap(seen.mean[2] - seen.offset[2] - heading)
-            p[RATE, RATE], p[SCALE, SCALE] = RATE2, SCALE2
-            for i in range(ERROR, ERROR + 2 * n_sources):
-                p[i, i] = noise.slow[(i - ERROR) // 2] * seen.slow
+            p[ft.RATE, ft.RATE], p[ft.SCALE, ft.SCALE] = RATE2, SCALE2
+            for i in range(ft.ERROR, ft.ERROR + 2 * n_sources):
+                p[i, i] = noise.slow[(i - ft.ERROR) // 2] * seen.slow
             slow = noise.slow[r] * seen.slow
             if fault > 0:
                 slow = NEAR2 if fault % 2 == 1 else FAR2
@@ -137,7 +120,7 @@ def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-
             p[1, 0] = p[0, 1]
             p[1, 1] = max(white * seen.noise[2], seen.least) + slow
             for i in range(2):
-                j = ERROR + 2 * r + i
+                j = ft.ERROR + 2 * r + i
                 p[j, j] = slow
                 p[i, j] = -slow
                 p[j, i] = -slow
@@ -155,27 +138,27 @@ def _weigh(one, number, row, noise, weights, branches):  # type: ignore[no-untyp
     """Write the weights of the choices of a hypothesis, and how far the measurement is off."""
     x, p, r = one.state, one.covariance, row.source
     white, slow = noise.white[r], noise.slow[r] * row.slow
-    first, in_fault = ERROR + 2 * r, one.in_fault[r] != 0
-    ex, ey, xx, xy, yy, _, _ = innovation(x, p, row, first, _white(white, one, r), 0.0)
-    with_error, d2 = density(ex, ey, xx, xy, yy)
+    first, in_fault = ft.ERROR + 2 * r, one.in_fault[r] != 0
+    ex, ey, xx, xy, yy, _, _ = ft.innovation(x, p, row, first, _white(white, one, r), 0.0)
+    with_error, d2 = ft.density(ex, ey, xx, xy, yy)
     square, spread = ex * ex + ey * ey, 0.5 * (xx + yy)
     gx, gy, gxx, gxy, gyy, fresh = ex, ey, xx, xy, yy, with_error
     if in_fault:
-        gx, gy, gxx, gxy, gyy, _, _ = innovation(x, p, row, -1, white, slow)
-        fresh, d2 = density(gx, gy, gxx, gxy, gyy)
+        gx, gy, gxx, gxy, gyy, _, _ = ft.innovation(x, p, row, -1, white, slow)
+        fresh, d2 = ft.density(gx, gy, gxx, gxy, gyy)
     fresh_square, fresh_spread = gx * gx + gy * gy, 0.5 * (gxx + gyy)
-    heading = heading_density(x, p, row)
-    any_heading = -LOG_2PI if row.heading_variance > 0.0 else 0.0
-    size2 = JUMP_SIZE2 if in_fault else FAULT_SIZE2
+    heading = ft.heading_density(x, p, row)
+    any_heading = -ft.LOG_2PI if row.heading_variance > 0.0 else 0.0
+    size2 = JUMP_SIZE2 if in_fault else ft.FAULT_SIZE2
     begins = 1.0 - math.exp(-row.gap / (BETWEEN_JUMPS if in_fault else BETWEEN_FAULTS))
     ends = 1.0 - math.exp(-row.gap / FAULT)
     slips = math.exp(-row.gap / SLIP) if one.slips != 0 else (
         1.0 - math.exp(-row.gap / BETWEEN_SLIPS))
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
-    weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
-    weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
-    weights[BEGINS] = (math.log(max(begins, 1e-12)) + LN_NO_OUTLIER
-                       + cauchy(square, size2 + spread) + any_heading)
+    weights[GOOD] = changed + ft.LN_NO_OUTLIER + fresh + heading
+    weights[ALONE] = ft.LN_OUTLIER + ft.cauchy(square, ft.FAULT_SIZE2 + spread) + any_heading
+    weights[BEGINS] = (math.log(max(begins, 1e-12)) + ft.LN_NO_OUTLIER
+                       + ft.cauchy(square, size2 + spread) + any_heading)
     weights[BEGINS_NOISY] = LEAST
     if not in_fault and white < 1.0:
         weights[BEGINS] += LN_KINDS
@@ -188,11 +171,11 @@ def _weigh(one, number, row, noise, weights, branches):  # type: ignore[no-untyp
             # in a fault the heading stays off by what it was, or is any
             e = factors.wrap(row.mean[2] - row.offset[2] - x[2] - one.turned[r])
             variance = 2.0 * row.heading_variance + noise.turn * row.turn[5]
-            heading = max(-0.5 * (LOG_2PI + math.log(variance) + e * e / variance), any_heading)
-        weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + LN_NO_OUTLIER
+            heading = max(-0.5 * (ft.LOG_2PI + math.log(variance) + e * e / variance), any_heading)
+        weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + ft.LN_NO_OUTLIER
                             + with_error + heading)
-    weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + LN_NO_OUTLIER
-                        + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
+    weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + ft.LN_NO_OUTLIER
+                        + ft.cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
         weights[SLIPPED] -= UNMOVED
     holds = math.log(max(1.0 - slips, 1e-12))
@@ -212,16 +195,16 @@ def _weigh(one, number, row, noise, weights, branches):  # type: ignore[no-untyp
 @kernel(allocates=True)
 def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     """Let a hypothesis have made a choice."""
-    n, r = ERROR + 2 * n_sources, row.source
+    n, r = ft.ERROR + 2 * n_sources, row.source
     x, p = one.state, one.covariance
-    first, choice = ERROR + 2 * r, branch.choice
+    first, choice = ft.ERROR + 2 * r, branch.choice
     if choice == ALONE:
         return
     one.slips = 1 if choice == SLIPPED else 0
     one.turned[r] = factors.wrap(row.mean[2] - row.offset[2] - x[2])
     if choice in (BEGINS, BEGINS_NOISY):
-        ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
-        more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
+        ex, ey, _, _, _, _, _ = ft.innovation(x, p, row, first, 0.0, 0.0)
+        more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else ft.FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
         p[first, first] += more
         p[first + 1, first + 1] += more
         if one.in_fault[r] == 0:
@@ -240,8 +223,8 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
             more = (SLIP_SIZE2 + branch.far * branch.far) / 3.0
             p[0, 0] += more
             p[1, 1] += more
-            p[2, 2] += SLIP_HEADING2
-    correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
+            p[2, 2] += ft.SLIP_HEADING2
+    ft.correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
 
 
 @kernel
@@ -274,7 +257,7 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
         equal = (far2 < EQUAL2 * spread and turn < EQUAL
                  and max(one_spread, other_spread) < 2.0 * spread)
         for r in range(n_sources):
-            i = ERROR + 2 * r
+            i = ft.ERROR + 2 * r
             if one.in_fault[r] != 0:
                 # of pose and offset, what is seen is their sum, which is known much better
                 dx, dy = x[0] + x[i] - y[0] - y[i], x[1] + x[i + 1] - y[1] - y[i + 1]
@@ -287,7 +270,7 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
     return -1 if n_alike < ALIKE else -2
 
 
-@kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, NOISES, TREE),
+@kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, ft.NOISES, TREE),
         allocates=True)
 def advance(  # type: ignore[no-untyped-def]
     bank, n, table, first, end, n_sources, noises, tree,
@@ -302,12 +285,12 @@ def advance(  # type: ignore[no-untyped-def]
     weights = np.empty((MOST, N_CHOICES))
     for at in range(first, end):
         row = table[at]
-        if n == 0 or row.turn[5] * noise.turn > LOST:
+        if n == 0 or row.turn[5] * noise.turn > ft.LOST:
             n = _begin(bank, n, row, n_sources, noise, tree[at])
             continue
         for k in range(n):
             one = bank[k]
-            predict(one.state, one.covariance, n_sources, row, noise, one.in_fault)
+            ft.predict(one.state, one.covariance, n_sources, row, noise, one.in_fault)
             _weigh(one, k, row, noise, weights[k], branches[k])
         if row.decides == 0:
             # what follows so closely has mostly the same error, so that it tells nothing: it is

@@ -23,6 +23,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.closure_search import decide, Redecision
 from pose_graph_ros.core.judgement.closures import (
     as_edges,
@@ -37,18 +38,6 @@ from pose_graph_ros.core.judgement.closures import (
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    Decision,
-    DECISIONS,
-    DOUBTED,
-    OUT,
-    State,
-    STATES,
-    USED,
-    Verdict,
-    WAITING,
-)
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
@@ -74,12 +63,12 @@ class ClosureJudge:
         self._now_ns, self._n_staged = now_ns, n
         self.chain.extend(self._smoother.graph)
         for one in new:
-            self.states.append(one, now_ns, WAITING)
+            self.states.append(one, now_ns, vd.WAITING)
         self.states.measure(begin, claims(edges))
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
             for number, state in self._tested(numbers[:self._most]).items():
-                self.states.state[number] = STATES.index(state)
+                self.states.state[number] = vd.STATES.index(state)
         return self.states.in_graph[numbers].astype(np.float64)
 
     def withhold(self) -> FloatArray | None:
@@ -87,7 +76,7 @@ class ClosureJudge:
         numbers = np.arange(len(self.states) - self._n_staged, len(self.states))
         if not np.any(self.states.in_graph[numbers]):
             return None
-        self.states.state[numbers], self.states.round[numbers] = WAITING, NEVER
+        self.states.state[numbers], self.states.round[numbers] = vd.WAITING, NEVER
         return self.states.in_graph[numbers].astype(np.float64)
 
     def rollback(self) -> None:
@@ -116,7 +105,7 @@ class ClosureJudge:
         by_size = BELIEF.nodes_in_part // max(self._smoother.graph.n_nodes, 1)
         return max(min(BELIEF.tests_in_part, by_size), 1)
 
-    def _tested(self, numbers: IntArray) -> dict[int, State]:
+    def _tested(self, numbers: IntArray) -> dict[int, vd.State]:
         """Test closures that are not in the graph; return the states of those to believe."""
         some, states = self.states.rows(numbers), self.states
         errors, spread = self._smoother.innovations(as_edges(some))
@@ -125,22 +114,22 @@ class ClosureJudge:
         before = states.state[numbers].copy()
         states.distance[numbers] = np.sqrt(distance)
         states.round[numbers] = self._round
-        states.state[numbers] = np.where(distance < GATE, WAITING, DOUBTED)
+        states.state[numbers] = np.where(distance < GATE, vd.WAITING, vd.DOUBTED)
         chance = chances(spread + some.noise, self._smoother.graph.extent)
-        chosen = dict[int, State]()
+        chosen = dict[int, vd.State]()
         for k, number in enumerate(numbers.tolist()):
             if number < len(states) - self._n_staged:
                 states.announce(number, int(before[k]), self._now_ns)
             if distance[k] < GATE:
                 # how many of the source are or were used, and doubted
                 counts = states.counts(int(states.source[number]))
-                alone = (counts[DOUBTED] + 1.0) * chance[k] < BELIEF.wrong_odds * (
-                    np.sum(counts[USED]) + 1.0)
+                alone = (counts[vd.DOUBTED] + 1.0) * chance[k] < BELIEF.wrong_odds * (
+                    np.sum(counts[vd.USED]) + 1.0)
                 if (alone and chance[k] <= BELIEF.wrong_odds) or states.is_supported(
-                        number, (states.decision != OUT) & ~states.forgotten):
-                    chosen[number] = State.BELIEVED
+                        number, (states.decision != vd.OUT) & ~states.forgotten):
+                    chosen[number] = vd.State.BELIEVED
                 elif alone:
-                    chosen[number] = State.WEAKLY_BELIEVED
+                    chosen[number] = vd.State.WEAKLY_BELIEVED
         return chosen
 
     def after(self) -> None:
@@ -191,7 +180,7 @@ class ClosureJudge:
         inside = inside[factors['energy'][rows] > 0.5 * GATE * factors['weight'][rows]]
         some = states.rows(inside)
         bad = inside[squares(graph.errors(as_edges(some)), some.noise) > GATE]
-        thrown_out = self._change(dict.fromkeys(bad.tolist(), State.DOUBTED))
+        thrown_out = self._change(dict.fromkeys(bad.tolist(), vd.State.DOUBTED))
         # those that contradict one another would take turns in the graph for ever
         self._let_rest(bad)
         return thrown_out
@@ -213,7 +202,7 @@ class ClosureJudge:
             self._reweighting.set_base_weight(
                 int(self.states.held[number]), float(self.states.in_graph[number]))
 
-    def _change(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
+    def _change(self, changes: Mapping[int, vd.State], *, at_once: bool = False) -> bool:
         """Change states and weights; tell whether there were any, and it has not diverged."""
         if len(changes) == 0:
             return False
@@ -228,24 +217,24 @@ class ClosureJudge:
         self._note(changes)
         return True
 
-    def _note(self, changes: Mapping[int, State]) -> None:
+    def _note(self, changes: Mapping[int, vd.State]) -> None:
         """Change states, of which the graph has the weights already."""
         for number, state in sorted(changes.items()):
             before = int(self.states.state[number])
-            self.states.state[number] = STATES.index(state)
+            self.states.state[number] = vd.STATES.index(state)
             self.states.announce(number, before, self._now_ns)
         self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self._round += 1
         if not all(state.in_graph for state in changes.values()):
             self.states.spread[:] = UNKNOWN * np.eye(3)     # without them it is less certain
 
-    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, State]:
+    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, vd.State]:
         """Return the states of closures with a set of believed ones, both by the ids of edges."""
         states = self.states
         numbers = states.numbers(decided)
         now, later = states.in_graph, np.isin(states.held, believed)
-        return {k: (State.DOUBTED if not later[k] else
-                    STATES[states.state[k]] if now[k] else State.BELIEVED)
+        return {k: (vd.State.DOUBTED if not later[k] else
+                    vd.STATES[states.state[k]] if now[k] else vd.State.BELIEVED)
                 for k in numbers[states.judged[numbers] & (now | later)[numbers]].tolist()}
 
     # --- all closures together -------------------------------------------------------------------
@@ -309,7 +298,7 @@ class ClosureJudge:
 
     # --- what leaves the window ------------------------------------------------------------------
 
-    def decide_leaving(self, edges: IntArray) -> list[Verdict]:
+    def decide_leaving(self, edges: IntArray) -> list[vd.Verdict]:
         """
         Decide on closures that are about to leave the graph; return the verdicts on those unused.
         """
@@ -340,7 +329,7 @@ class ClosureJudge:
         self.states.restore(saved)
         self.states.measure(0, claims(self._smoother.graph.factors_at(saved.held)))
 
-    def decide(self, number: int, decision: Decision) -> bool:
+    def decide(self, number: int, decision: vd.Decision) -> bool:
         """
         Apply a person's decision at once; return whether the solver succeeded.
 
@@ -348,10 +337,10 @@ class ClosureJudge:
         """
         states = self.states
         before = int(states.decision[number])
-        state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
-                 Decision.AUTO: State.WAITING}[decision]
-        forced = decision is not Decision.AUTO or before != AUTO
-        states.decision[number] = DECISIONS.index(decision)
+        state = {vd.Decision.IN: vd.State.BELIEVED, vd.Decision.OUT: vd.State.DOUBTED,
+                 vd.Decision.AUTO: vd.State.WAITING}[decision]
+        forced = decision is not vd.Decision.AUTO or before != vd.AUTO
+        states.decision[number] = vd.DECISIONS.index(decision)
         states.forgotten[number] = False
         if forced and not self._change({number: state}, at_once=True):
             states.decision[number] = before

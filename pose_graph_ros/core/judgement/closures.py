@@ -18,18 +18,10 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judgements import Column, Judgements
 from pose_graph_ros.core.judgement.odometry_chain import moved, OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    DOUBTED,
-    Judged,
-    ODOMETRY,
-    SourceVerdicts,
-    USED,
-    Verdict,
-)
 
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
 GATE = float(LIMITS[3])
@@ -156,7 +148,7 @@ class ClosureTable(Judgements):
 
     def __init__(self, chain: OdometryChain) -> None:
         super().__init__(
-            Judged.LOOP_CLOSURE, [
+            vd.Judged.LOOP_CLOSURE, [
                 ('i', np.int64), ('j', np.int64), ('mean', np.float64, (3,)),   # as in `Closures`
                 ('noise', np.float64, (3, 3)),
                 ('spread', np.float64, (3, 3)),  # of the prediction when it was tested last
@@ -172,7 +164,7 @@ class ClosureTable(Judgements):
     @property
     def judged(self) -> BoolArray:
         """Whether they are judged: no person has decided on them, and they are not forgotten."""
-        return (self.decision == AUTO) & ~self.forgotten
+        return (self.decision == vd.AUTO) & ~self.forgotten
 
     def rows(self, numbers: IntArray) -> Closures:
         return Closures(*(np.take(self.records[name], numbers, axis=0)
@@ -200,11 +192,11 @@ class ClosureTable(Judgements):
         kept = np.flatnonzero((self.source == source) & ~self.in_graph & self.judged)
         if len(kept) <= BELIEF.most_waiting:
             return
-        order = np.lexsort((self.stamps_ns[kept, 0], self.state[kept] != DOUBTED))
+        order = np.lexsort((self.stamps_ns[kept, 0], self.state[kept] != vd.DOUBTED))
         # some more than need be, as this is not to be done for each new one
         self.forgotten[kept[order[:len(kept) - 9 * BELIEF.most_waiting // 10]]] = True
 
-    def totals(self) -> dict[str, SourceVerdicts]:
+    def totals(self) -> dict[str, vd.SourceVerdicts]:
         return {source: each._replace(n_forgotten=int(np.count_nonzero(
             self.forgotten[self.source == self.sources.index(source)])))
             for source, each in super().totals().items()}
@@ -249,7 +241,7 @@ class ClosureTable(Judgements):
         way = float(np.ptp(self.travel[members[clique], 1]))
         return len(clique) >= BELIEF.clique and way >= BELIEF.clique_travel
 
-    def verdicts(self, graph: Graph, numbers: IntArray) -> list[Verdict]:
+    def verdicts(self, graph: Graph, numbers: IntArray) -> list[vd.Verdict]:
         verdicts = []
         usable = ~self.forgotten
         near = [self.near(number, usable) for number in numbers.tolist()]
@@ -261,9 +253,9 @@ class ClosureTable(Judgements):
         for number, residual, around, agrees in zip(
                 numbers.tolist(), residuals, near, agree, strict=True):
             contradicted = [self.name(other) for other in around[~agrees]
-                            if USED[self.state[other]]]
+                            if vd.USED[self.state[other]]]
             if self.distance[number] > math.sqrt(GATE):
-                contradicted.insert(0, ODOMETRY)
+                contradicted.insert(0, vd.ODOMETRY)
             verdicts.append(self.verdict(
                 number, residual, supported_by=around[agrees].tolist(),
                 contradicted_by=contradicted))

@@ -21,21 +21,9 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.error_functions import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judgements import Column, Judgements
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    BELIEVED,
-    Change,
-    Decision,
-    DOUBTED,
-    Judged,
-    MOST_NAMED,
-    ODOMETRY,
-    SourceVerdicts,
-    State,
-    Verdict,
-)
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 
 # Run of a measurement that is wrong by itself, and of all that are good.
@@ -49,11 +37,11 @@ class FixStates(Judgements):
 
     def __init__(self) -> None:
         # id of the first one of its fault, `LONE` or `GOOD`
-        super().__init__(Judged.FIX, [('run', np.int64)], run=LONE)
+        super().__init__(vd.Judged.FIX, [('run', np.int64)], run=LONE)
 
     @property
     def believed(self) -> BoolArray:
-        return np.asarray(self.state == BELIEVED)
+        return np.asarray(self.state == vd.BELIEVED)
 
     def leaving(self, factors: IntArray) -> BoolArray:
         """Return which records leave with factors, shape (M,)."""
@@ -61,8 +49,8 @@ class FixStates(Judgements):
 
     def believe(self, which: IntArray, believed: BoolArray) -> None:
         """Believe or doubt some records, but not those that a person has decided on."""
-        free = self.decision[which] == AUTO
-        self.state[which[free]] = np.where(believed[free], BELIEVED, DOUBTED)
+        free = self.decision[which] == vd.AUTO
+        self.state[which[free]] = np.where(believed[free], vd.BELIEVED, vd.DOUBTED)
 
     def weights(
         self, before: IntArray, reweighting: Reweighting, *, base: bool = False,
@@ -76,7 +64,7 @@ class FixStates(Judgements):
             later = np.flatnonzero((self.stamps_ns[:, 0] >= np.min(again)) & self.believed)
         return {
             int(self.held[number]): self._base_weight(number, changed, reweighting)
-            if self.state[number] == BELIEVED else 0.0
+            if self.state[number] == vd.BELIEVED else 0.0
             for number in (*doubted.tolist(), *later.tolist(), *changed.tolist())}
 
     def changed(self, before: IntArray) -> IntArray:
@@ -107,20 +95,20 @@ class FixStates(Judgements):
     def believed_after(self, stamp_ns: int) -> tuple[str, ...]:
         """Return the ids of the first believed measurements from a stamp on."""
         after = np.flatnonzero(self.believed & (self.stamps_ns[:, 0] >= stamp_ns))
-        first = after[np.argsort(self.stamps_ns[after, 0], kind='stable')][:MOST_NAMED]
+        first = after[np.argsort(self.stamps_ns[after, 0], kind='stable')][:vd.MOST_NAMED]
         return tuple(map(self.name, first.tolist()))
 
-    def verdicts(self, graph: Graph, numbers: IntArray) -> list[Verdict]:
+    def verdicts(self, graph: Graph, numbers: IntArray) -> list[vd.Verdict]:
         factors, verdicts = graph.factors_at(self.held[numbers]), []
         measured = np.diagonal(factors.information, axis1=1, axis2=2) > 0.0
         residuals = np.where(measured, graph.errors(factors), np.nan)
         for number, residual in zip(numbers.tolist(), residuals, strict=True):
             # a person may force out what fits, and force in what does not
-            contradicted = (self.state[number] == DOUBTED if self.decision[number] == AUTO
+            contradicted = (self.state[number] == vd.DOUBTED if self.decision[number] == vd.AUTO
                             else self.distance[number]**2 > BELIEF.event)
             verdicts.append(self.verdict(
                 number, residual, supported_by=self._alike(number),
-                contradicted_by=(ODOMETRY,) if contradicted else ()))
+                contradicted_by=(vd.ODOMETRY,) if contradicted else ()))
         return verdicts
 
     def _alike(self, number: int) -> Sequence[int]:
@@ -137,7 +125,7 @@ class Doubt(NamedTuple):
     """Odometry is wrong somewhere along some edges; which of them it is cannot be told."""
 
     edges: tuple[int, ...]  # ids of those that are believed less
-    verdict: Verdict  # on all of them, but for what changes with the estimate
+    verdict: vd.Verdict  # on all of them, but for what changes with the estimate
 
 
 class OdometryStates:
@@ -145,7 +133,7 @@ class OdometryStates:
         self._nodes = nodes
         self._gaps: dict[int, Doubt] = {}  # by the id of the first edge, ascending
         self._loosened: Mapping[int, float] = {}
-        self._changes: list[Change] = []
+        self._changes: list[vd.Change] = []
         # number of edges of each source that have left the graph doubted
         self.left = Counter[str]()
 
@@ -168,8 +156,8 @@ class OdometryStates:
         self._gaps = self._found_gaps(graph, now_ns)
         for edge in sorted(before.keys() ^ self._gaps.keys()) if announce else ():
             verdict = {**before, **self._gaps}[edge].verdict
-            states = State.BELIEVED, State.DOUBTED
-            self._changes.append(Change(
+            states = vd.State.BELIEVED, vd.State.DOUBTED
+            self._changes.append(vd.Change(
                 verdict.id, verdict.kind, verdict.source, verdict.stamp_ns,
                 *(states[::-1] if edge in before else states)))
 
@@ -189,15 +177,15 @@ class OdometryStates:
                 self._nodes.ids, (edges.i[part[0]], edges.j[part[0]], edges.j[part[-1]])).tolist()
             reference_ns, stamp_ns = self._nodes.stamps_ns[[begin, end]].tolist()
             source = self._nodes.primary_at(stamp_ns)
-            gaps[first] = Doubt(tuple(ids[part].tolist()), Verdict(
-                id=f'{source}/{number - 1}', kind=Judged.ODOMETRY, source=source,
-                stamp_ns=stamp_ns, reference_ns=reference_ns, state=State.DOUBTED,
-                since_ns=since_ns.get(first, now_ns), decision=Decision.AUTO,
+            gaps[first] = Doubt(tuple(ids[part].tolist()), vd.Verdict(
+                id=f'{source}/{number - 1}', kind=vd.Judged.ODOMETRY, source=source,
+                stamp_ns=stamp_ns, reference_ns=reference_ns, state=vd.State.DOUBTED,
+                since_ns=since_ns.get(first, now_ns), decision=vd.Decision.AUTO,
                 residual=np.full(3, np.nan), distance=np.nan, supported_by=(),
                 contradicted_by=(), number=first))
         return gaps
 
-    def take_changes(self) -> list[Change]:
+    def take_changes(self) -> list[vd.Change]:
         changes, self._changes = self._changes, []
         return changes
 
@@ -207,7 +195,7 @@ class OdometryStates:
                             ('_changes', [*self._changes])):
             undo.callback(setattr, self, name, value)
 
-    def verdicts(self, graph: Graph, fixes: FixStates) -> list[Verdict]:
+    def verdicts(self, graph: Graph, fixes: FixStates) -> list[vd.Verdict]:
         verdicts = []
         for doubt in self._gaps.values():
             edges = graph.factors_at(np.array(doubt.edges))
@@ -219,12 +207,12 @@ class OdometryStates:
                 contradicted_by=fixes.believed_after(doubt.verdict.stamp_ns)))
         return verdicts
 
-    def totals(self) -> dict[str, SourceVerdicts]:
+    def totals(self) -> dict[str, vd.SourceVerdicts]:
         counts = Counter[str]()
         for doubt in self._gaps.values():
             counts[doubt.verdict.source] += len(doubt.edges)
         n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
-        return {source: SourceVerdicts(
-            {State.BELIEVED: n - n_left - counts[source], State.DOUBTED: counts[source]},
+        return {source: vd.SourceVerdicts(
+            {vd.State.BELIEVED: n - n_left - counts[source], vd.State.DOUBTED: counts[source]},
             doubting=False, n_left=n_left, n_left_unused=self.left[source])
             for source in (counts | self.left)}

@@ -23,21 +23,13 @@ from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.fix_states import OdometryStates
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.judgements import LEFT, MOST_OTHERS, SavedVerdicts
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
-from pose_graph_ros.core.judgement.verdicts import (
-    Change,
-    Decision,
-    DOUBTED,
-    SourceVerdicts,
-    Verdict,
-    WAITING,
-    WEAK,
-)
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
@@ -79,7 +71,7 @@ class Judge:
         self._staged = np.empty(0, dtype=np.int64)
         self._new: Sequence[NewConstraint] = ()  # all constraints of the last `before`
         # on the newest constraints that have left the graph unused
-        self._left: deque[Verdict] = deque(maxlen=MOST_OTHERS)
+        self._left: deque[vd.Verdict] = deque(maxlen=MOST_OTHERS)
 
     def configure(self, config: BackendConfig) -> None:
         self._config = config
@@ -175,7 +167,7 @@ class Judge:
         self._closures.rollback()
         self.fixes.rollback()
 
-    def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
+    def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
         """Return the verdicts that are listed, see `Judgements`, and on what left unused."""
         graph, closures, fixes = self._smoother.graph, self._closures.states, self.fixes.states
         return [*closures.verdicts(graph, closures.listed(most_believed)),
@@ -189,20 +181,20 @@ class Judge:
     def drawn_rows(self) -> DrawnRows:
         """Return the ids of factors that are drawn in another way than believed ones."""
         closures, fixes = self._closures.states, self.fixes.states
-        weak, waiting, doubted = (
-            closures.held[closures.state == state].tolist() for state in (WEAK, WAITING, DOUBTED))
+        weak, waiting, doubted = (closures.held[closures.state == state].tolist()
+                                  for state in (vd.WEAK, vd.WAITING, vd.DOUBTED))
         return DrawnRows(weak, waiting, doubted + self._odometry.edges,
                          fixes.held[~fixes.believed].tolist())
 
-    def changes(self) -> list[Change]:
+    def changes(self) -> list[vd.Change]:
         return [*self._closures.states.take_changes(), *self._odometry.take_changes(),
                 *self.fixes.states.take_changes()]
 
-    def totals(self) -> Mapping[str, SourceVerdicts]:
+    def totals(self) -> Mapping[str, vd.SourceVerdicts]:
         return {**self._odometry.totals(), **self._closures.states.totals(),
                 **self.fixes.states.totals()}
 
-    def decide(self, name: str, decision: Decision) -> Answer:
+    def decide(self, name: str, decision: vd.Decision) -> Answer:
         """Return the answer to a person's decision on a constraint, which is applied at once."""
         judges: tuple[ClosureJudge | FixJudge, ...] = self._closures, self.fixes
         number, at = max((judge.states.find(name), k) for k, judge in enumerate(judges))
@@ -214,7 +206,7 @@ class Judge:
         verdict, = states.verdicts(self._smoother.graph, np.array([number]))
         return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
 
-    def decide_leaving(self, factors: IntArray) -> list[Verdict]:
+    def decide_leaving(self, factors: IntArray) -> list[vd.Verdict]:
         """
         Return the verdicts on constraints that are about to leave the graph unused, for `forget`.
         """
@@ -226,7 +218,7 @@ class Judge:
                    if each.number in factors]
         return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
-    def forget(self, nodes: IntArray, factors: IntArray, leaving: Sequence[Verdict]) -> None:
+    def forget(self, nodes: IntArray, factors: IntArray, leaving: Sequence[vd.Verdict]) -> None:
         self._closures.forget(nodes, factors)
         self.fixes.forget(nodes, factors)
         self._odometry.forget(factors)

@@ -17,21 +17,8 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    BELIEVED,
-    Change,
-    Decision,
-    DECISIONS,
-    Judged,
-    MOST_NAMED,
-    SourceVerdicts,
-    State,
-    STATES,
-    USED,
-    Verdict,
-)
 from pose_graph_ros.core.saved_columns import (
     Choices,
     Column as SavedColumn,
@@ -68,15 +55,15 @@ class SavedVerdicts:
     sources: tuple[str, ...]
     scales: Numbers  # of each source, 1: older versions had a factor on its sigmas
     # of each source, how many have left the graph, by their states then
-    left: Annotated[IntArray, SavedColumn(int, (len(State),))]
+    left: Annotated[IntArray, SavedColumn(int, (len(vd.State),))]
     held: Integers
     added: Integers
     source: Integers
     number: Integers
     stamps_ns: Pairs
-    state: Annotated[IntArray, Choices(State)]
+    state: Annotated[IntArray, Choices(vd.State)]
     since_ns: Integers
-    decision: Annotated[IntArray, Choices(Decision)]
+    decision: Annotated[IntArray, Choices(vd.Decision)]
     distance: Numbers  # -1 if it was not judged
 
 
@@ -95,15 +82,15 @@ class Judgements:
     stamps_ns, state, since_ns = Column(), Column(), Column()
     decision, distance = Column(), Column()
 
-    def __init__(self, kind: Judged, more: Sequence[Any] = (), **new: int) -> None:
+    def __init__(self, kind: vd.Judged, more: Sequence[Any] = (), **new: int) -> None:
         """Make an empty table; more columns are not saved, and `new` or 0 in new constraints."""
         self.sources: list[str] = []
-        self._kind, self._new = kind, {'decision': AUTO, 'distance': np.nan, **new}
+        self._kind, self._new = kind, {'decision': vd.AUTO, 'distance': np.nan, **new}
         self._records = GrowingArray((), np.dtype([*COLUMNS, *more]))
         # of each source, how many have left the graph, by their states then, and the next number
         self._left: list[IntArray] = []
         self._next: list[int] = []
-        self._changes: deque[Change] = deque(maxlen=BELIEF.most_changes)
+        self._changes: deque[vd.Change] = deque(maxlen=BELIEF.most_changes)
 
     def __len__(self) -> int:
         return len(self._records)
@@ -115,13 +102,13 @@ class Judgements:
 
     @property
     def in_graph(self) -> BoolArray:
-        return np.asarray(USED[self.state])
+        return np.asarray(vd.USED[self.state])
 
     def index_of(self, source: str) -> int:
         """Return the index of a source, which may be new."""
         if source not in self.sources:
             self.sources.append(source)
-            self._left.append(np.zeros(len(STATES), dtype=np.int64))
+            self._left.append(np.zeros(len(vd.STATES), dtype=np.int64))
             self._next.append(0)
         return self.sources.index(source)
 
@@ -152,7 +139,7 @@ class Judgements:
     def counts(self, source: int) -> IntArray:
         """Return how many of a source are or were in each state, by its index."""
         return self._left[source] + np.bincount(
-            self.state[self.source == source], minlength=len(STATES))
+            self.state[self.source == source], minlength=len(vd.STATES))
 
     def name(self, row: int) -> str:
         record = self.records[row]
@@ -172,18 +159,18 @@ class Judgements:
     def announce(self, row: int, before: int, now_ns: int) -> None:
         """Note that the state of a constraint is another one than before."""
         record = self.records[row]
-        new = STATES[record['state']]
+        new = vd.STATES[record['state']]
         if before == record['state']:
             return
         # one that has waited is as little used if it is doubted
-        if before == NEW or new.in_graph != STATES[before].in_graph:
+        if before == NEW or new.in_graph != vd.STATES[before].in_graph:
             record['since_ns'] = now_ns
         if before != NEW or not new.in_graph:
-            self._changes.append(Change(
+            self._changes.append(vd.Change(
                 self.name(row), self._kind, self.sources[record['source']],
-                int(record['stamps_ns'][0]), None if before == NEW else STATES[before], new))
+                int(record['stamps_ns'][0]), None if before == NEW else vd.STATES[before], new))
 
-    def take_changes(self) -> list[Change]:
+    def take_changes(self) -> list[vd.Change]:
         """Return the changes since the last call."""
         changes = list(self._changes)
         self._changes.clear()
@@ -197,23 +184,23 @@ class Judgements:
     def verdict(
         self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
         contradicted_by: Sequence[str],
-    ) -> Verdict:
+    ) -> vd.Verdict:
         record = self.records[row]
         stamp, reference = record['stamps_ns'].tolist()
-        return Verdict(
+        return vd.Verdict(
             id=self.name(row), kind=self._kind, source=self.sources[record['source']],
-            stamp_ns=stamp, reference_ns=reference if self._kind is Judged.LOOP_CLOSURE else None,
-            state=STATES[record['state']], since_ns=int(record['since_ns']),
-            decision=DECISIONS[record['decision']], residual=residual,
+            stamp_ns=stamp, since_ns=int(record['since_ns']), state=vd.STATES[record['state']],
+            reference_ns=reference if self._kind is vd.Judged.LOOP_CLOSURE else None,
+            decision=vd.DECISIONS[record['decision']], residual=residual,
             distance=float(record['distance']),
-            supported_by=tuple(self.name(other) for other in supported_by[:MOST_NAMED]),
-            contradicted_by=tuple(contradicted_by[:MOST_NAMED]), number=int(record['held']))
+            supported_by=tuple(self.name(other) for other in supported_by[:vd.MOST_NAMED]),
+            contradicted_by=tuple(contradicted_by[:vd.MOST_NAMED]), number=int(record['held']))
 
     def listed(self, most_believed: int | None) -> IntArray:
         """Return which are listed: all that a person has decided on, and the newest of sources."""
         if most_believed is None:
             return np.arange(len(self))
-        believed, decided = self.state == BELIEVED, self.decision != AUTO
+        believed, decided = self.state == vd.BELIEVED, self.decision != vd.AUTO
         chosen = decided.copy()
         for source in range(len(self.sources)):
             for most, those in ((most_believed, believed), (MOST_OTHERS, ~believed)):
@@ -221,16 +208,16 @@ class Judgements:
                 chosen[rows[max(len(rows) - most, 0):]] = True
         return np.flatnonzero(chosen)
 
-    def totals(self) -> dict[str, SourceVerdicts]:
+    def totals(self) -> dict[str, vd.SourceVerdicts]:
         totals = {}
         for index, source in enumerate(self.sources):
             left, newest = self._left[index], self.state[self.source == index][-BELIEF.newest:]
-            totals[source] = SourceVerdicts(
-                dict(zip(STATES, (self.counts(index) - left).tolist(), strict=True)),
+            totals[source] = vd.SourceVerdicts(
+                dict(zip(vd.STATES, (self.counts(index) - left).tolist(), strict=True)),
                 # wrong closures among right ones are what place recognition is like
-                doubting=(self._kind is not Judged.LOOP_CLOSURE and len(newest) > 0
-                          and not bool(np.any(USED[newest]))),
-                n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~USED])))
+                doubting=(self._kind is not vd.Judged.LOOP_CLOSURE and len(newest) > 0
+                          and not bool(np.any(vd.USED[newest]))),
+                n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~vd.USED])))
         return totals
 
     def saved(self) -> SavedVerdicts:
@@ -239,7 +226,7 @@ class Judgements:
         return SavedVerdicts(
             tuple(self.sources),
             np.ones(len(self.sources)),
-            np.array(self._left, dtype=np.int64).reshape(-1, len(STATES)), **columns)
+            np.array(self._left, dtype=np.int64).reshape(-1, len(vd.STATES)), **columns)
 
     def restore(self, saved: SavedVerdicts) -> None:
         """Fill the empty table with saved columns."""
