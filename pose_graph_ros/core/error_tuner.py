@@ -82,27 +82,26 @@ class ErrorTuner:
         graph = self._smoother.graph
         if graph.has_touched:
             return 0.0  # an update has failed
-        ends = graph.factor_records['ends'][:, 1]
+        wanted, ends = self._wanted(), graph.factor_records['ends'][:, 1]
         if self._change is not None or (
-                self._odometry_is_due() and np.count_nonzero(ends >= 0) <= most_edges):
+                wanted is not None and np.count_nonzero(ends >= 0) <= most_edges):
             before = graph.poses.copy()
             if self._change is not None:
                 self._move(PART)
-            else:
-                self._correct_odometry(self._wanted())
+            elif wanted is not None:
+                self._correct_odometry(wanted)
             moved = np.abs(graph.poses[:len(before)] - before)[graph.is_pose[:len(before)], :2]
             return float(np.max(moved, initial=0.0))
-        if self._begin_next() or self._judge.fixes.step():
+        fixes = self._judge.fixes
+        if self._begin_next() or fixes.step():
             return 0.0
-        if self._search is None and self._is_due:
-            fixes = self._judge.fixes
+        if self._search is None and fixes.n_seen >= self._next:
             fixes.prepare()
             self._search = learning.search(
-                fixes.bank, known := fixes.known(), newest=BANK.most_learnt,
-                begins=() if self._in_use is None else (
-                    learning.widened(self._in_use, known),))
-            self._next = self._judge.fixes.n_seen + max(1, min(
-                int((BANK.next_learnt - 1.0) * self._judge.fixes.n_seen), BANK.most_between))
+                fixes.bank, fixes.known(), newest=BANK.most_learnt,
+                begins=() if self._in_use is None else (self._in_use,))
+            self._next = fixes.n_seen + max(1, min(
+                int((BANK.next_learnt - 1.0) * fixes.n_seen), BANK.most_learnt // 6))
         if self._search is not None:
             try:
                 next(self._search)
@@ -113,15 +112,12 @@ class ErrorTuner:
         return 0.0
 
     @property
-    def _is_due(self) -> bool:
-        return self._judge.fixes.n_seen >= self._next
-
-    @property
     def is_idle(self) -> bool:
         """Whether `step` has nothing to do."""
+        fixes = self._judge.fixes
         return (self._change is None and self._search is None and len(self._waiting) == 0
-                and not self._odometry_is_due() and not self._judge.fixes.decides_anew
-                and not self._is_due)
+                and self._wanted() is None and fixes.next_bank is None
+                and fixes.n_seen < self._next)
 
     def _use(self, learnt: learning.Learnt, newest: int | None = None) -> None:
         """
@@ -138,7 +134,10 @@ class ErrorTuner:
         for source in self._factors.finding():
             before, number = self._factors.errors_in_use(source), fixes.source(source)
             errors = None if number is None else learnt.errors(number)
-            if errors != before and (newest is None or _differ(before, errors)):
+            # by more than the factor `ALIKE` in a number
+            differs = before is None or errors is None or any(
+                max(a, b) > ALIKE * min(a, b) for a, b in zip(before, errors, strict=True))
+            if errors != before and (newest is None or differs):
                 self._waiting[source] = errors
 
     def finish_change(self) -> None:
@@ -146,8 +145,9 @@ class ErrorTuner:
         while self._change is not None or self._begin_next():
             if not self._move(WHOLE):
                 break
-        if self._odometry_is_due() and not self._smoother.graph.has_touched:
-            self._correct_odometry(self._wanted())
+        wanted = self._wanted()
+        if wanted is not None and not self._smoother.graph.has_touched:
+            self._correct_odometry(wanted)
 
     def decide(self) -> None:
         """Use the noise that all measurements show if they are enough, at the end of a stream."""
@@ -202,31 +202,23 @@ class ErrorTuner:
         self._reweighting['base'][np.isin(self._reweighting['id'], ids)] *= 1.0 / weight
         self._nodes.errors = self._odometry = OdometryErrors.scaled(weight**-0.5)
 
-    def _wanted(self) -> OdometryErrors:
-        """Return the errors of odometry that are given, or that were learnt."""
-        scale = self._factors.config.odometry_scale
-        if scale > 0.0:
-            return OdometryErrors.scaled(scale)     # set by a person
+    def _wanted(self) -> OdometryErrors | None:
+        """Return the errors that the odometry in the graph is to have; None if it has them."""
+        config, wanted = self._factors.config, self._odometry
         # constant errors are those of one odometry; states of the graph are what calibrates it
-        calibrated = self._factors.config.odometry_source(self._nodes.primary).calibrate
-        if self._nodes.n_primaries > 1 or calibrated:
-            return OdometryErrors(self._odometry.way, self._odometry.turn)
-        return self._odometry
-
-    def _odometry_is_due(self) -> bool:
-        """Tell whether the odometry in the graph is to have other errors."""
-        wanted = self._wanted()
-        return not wanted.is_close(self._nodes.errors) and wanted != self._failed
+        calibrated = config.odometry_source(self._nodes.primary).calibrate
+        if config.odometry_scale > 0.0:
+            wanted = OdometryErrors.scaled(config.odometry_scale)
+        elif self._nodes.n_primaries > 1 or calibrated:
+            wanted = OdometryErrors(wanted.way, wanted.turn)
+        return None if wanted.is_close(self._nodes.errors) or wanted == self._failed else wanted
 
     def _correct_odometry(self, wanted: OdometryErrors) -> None:
         """Have all primary odometry in the graph know of the errors; all or nothing."""
         graph, before = self._smoother.graph, self._nodes.errors
-        if wanted.is_close(before):
-            return
         edges = graph.factors_at(ids := graph.factor_ids[self._primary_rows()])
-        stamps_ns = (self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, ends)]
-                     for ends in (edges.i, edges.j))
-        begin_ns, end_ns = stamps_ns
+        begin_ns, end_ns = (self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, ends)]
+                            for ends in (edges.i, edges.j))
         measured = Measured(ids, *changed(
             edges.mean, edges.information,
             np.asarray((end_ns - begin_ns) * 1e-9, dtype=np.float64), before, wanted))
@@ -317,10 +309,3 @@ class ErrorTuner:
         for one, to in zip(held.tolist(), after.tolist(), strict=True):
             self._reweighting.move(one, to)
         return True
-
-
-def _differ(one: bs.CorrelatedErrors | None, other: bs.CorrelatedErrors | None) -> bool:
-    """Tell whether two sets of errors differ by more than the factor `ALIKE` in a number."""
-    if one is None or other is None:
-        return one is not other
-    return any(max(a, b) > ALIKE * min(a, b) for a, b in zip(one, other, strict=True))

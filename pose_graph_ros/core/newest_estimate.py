@@ -46,7 +46,7 @@ def estimate(
     cov = covariance.propagated(*node, motion, motion_noise)
     if state is AlignmentState.ALIGNED:
         # by what may have happened, but is not believed
-        (x, y, _), spread = parts.judge.fixes.spread
+        (x, y, _), spread = parts.judge.fixes.bank.spread
         moved = np.array(((1.0, 0.0, y - newest[1]), (0.0, 1.0, newest[0] - x), (0.0, 0.0, 1.0)))
         cov = cov + moved @ spread @ moved.T
     shift = np.zeros(3)

@@ -13,14 +13,9 @@ from typing import NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core.belief import hypotheses as hy
 from pose_graph_ros.core.belief.filter import ERROR, NOISE, RATE, SCALE
-from pose_graph_ros.core.belief.hypotheses import (
-    advance,
-    BRANCH,
-    GOOD,
-    HYPOTHESIS,
-    SLIPPED,
-)
+from pose_graph_ros.core.belief.hypotheses import BRANCH, HYPOTHESIS
 from pose_graph_ros.core.belief.rows import count, join_motions, MEASURED, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
@@ -37,14 +32,6 @@ class Odometry(NamedTuple):
     sums: FloatArray  # upper triangles of the summed covariances up to them, shape (N, 6)
     stamps_ns: IntArray  # shape (N,)
     errors: OdometryErrors
-
-
-class Prior(NamedTuple):
-    """Where the robot is at a node by what is not in the bank."""
-
-    node: int
-    pose: FloatArray  # in the map, shape (3,) [m, m, rad]
-    covariance: FloatArray  # in map axes, shape (3, 3)
 
 
 class Spread(NamedTuple):
@@ -70,7 +57,7 @@ class Bank:
     def __init__(self, noise: Records | None = None) -> None:
         self.noise = as_claimed() if noise is None else noise
         self._rows = GrowingArray((), MEASURED)
-        self._done, self._traced, self._n = 0, 0, 0
+        self.done, self._traced, self._n = 0, 0, 0
         self._bank = np.zeros(BANK.hypotheses, HYPOTHESIS)
         self._begin_at({0: np.zeros(0, HYPOTHESIS)})
         self._first_node = -1  # node that the motion to the first row begins at, if it is known
@@ -85,15 +72,14 @@ class Bank:
         """Rows of measurements, by stamp, read-only."""
         return self._rows.read_only
 
-    def begin_with(self, prior: Prior) -> None:
-        """Begin an empty bank with where the robot is known to be."""
+    def begin_with(self, node: int, pose: FloatArray, covariance: FloatArray) -> None:
+        """Begin an empty bank with where the robot is known to be at a node, in the map."""
         one = np.zeros(1, HYPOTHESIS)
-        one['state'][0, :3] = prior.pose
-        one['covariance'][0, :3, :3] = prior.covariance
+        one['state'][0, :3], one['covariance'][0, :3, :3] = pose, covariance
         for k, sigma in ((RATE, BANK.rate), (SCALE, BANK.scale)):
             one['covariance'][0, k, k] = sigma**2
         self._begin_at({0: one})
-        self._first_node = prior.node
+        self._first_node = node
 
     def insert(self, new: Records, odometry: Odometry) -> None:
         """Insert rows, but for their motions, into the order of stamps."""
@@ -108,15 +94,7 @@ class Bank:
         is_new = order >= len(self) - first
         self._rows.truncate(first)
         self._rows.append(later[order])
-        self._add_sources(new)
-        self._begin_from(first + int(np.argmax(is_new)))
-        after_new = np.append(False, is_new[:-1])
-        for row in (first + np.flatnonzero(is_new | after_new)).tolist():
-            self._place(row, odometry)
-        count(self._rows.values, first, BANK.period_ns)
-
-    def _add_sources(self, new: Records) -> None:
-        """Let all hypotheses know that nothing is known of the slow errors of new sources."""
+        # nothing is known of the slow errors of new sources
         before, self.n_sources = self.n_sources, max(
             self.n_sources, int(np.max(new['source'])) + 1)
         for source in range(before, self.n_sources):
@@ -125,23 +103,21 @@ class Bank:
             for hypotheses in (self._bank, *self._kept.values()):
                 for k in (ERROR + 2 * source, ERROR + 2 * source + 1):
                     hypotheses['covariance'][:, k, k] = variance
-
-    def _place(self, row: int, odometry: Odometry) -> None:
-        rows = self._rows.values
-        begin = int(rows['node'][row - 1]) if row > 0 else self._first_node
-        end = int(rows['node'][row])
-        nodes = odometry.nodes
-        places = [int(np.searchsorted(nodes, node)) for node in (begin, end)]
-        if begin < 0 or places[1] >= len(nodes):
-            places[0] = places[1] = min(places[1], len(nodes) - 1)
-        if places[0] < places[1]:
-            join_motions(odometry.poses, odometry.sums, odometry.stamps_ns,
-                         np.array(odometry.errors), rows, row, *places)
-        else:
-            for name in ('motion', 'turn', 'way', 'lever', 'travel'):
-                rows[name][row] = 0.0
-        if row > 0:     # slow errors change also while no node is passed
-            rows['lever'][row, 2] = 1e-9 * (rows['stamp_ns'][row] - rows['stamp_ns'][row - 1])
+        self._begin_from(first + int(np.argmax(is_new)))
+        # the motions to the new rows, and to those behind them
+        rows, errors = self._rows.values, np.array(odometry.errors)
+        at = first + np.flatnonzero(is_new | np.append(False, is_new[:-1]))
+        from_node = np.where(at > 0, rows['node'][at - 1], self._first_node)
+        begins, ends = np.searchsorted(odometry.nodes, (from_node, rows['node'][at]))
+        # where the chain does not reach there is none
+        begins = np.where((from_node < 0) | (ends >= len(odometry.nodes)), ends, begins)
+        for row, begin, end in zip(at.tolist(), begins.tolist(), ends.tolist(), strict=True):
+            join_motions(odometry.poses, odometry.sums, odometry.stamps_ns, errors, rows, row,
+                         begin, end)
+        # slow errors change also while no node is passed
+        at = at[at > 0]
+        rows['lever'][at, 2] = 1e-9 * (rows['stamp_ns'][at] - rows['stamp_ns'][at - 1])
+        count(rows, first, BANK.period_ns)
 
     def remove(self, ids: IntArray) -> None:
         """Remove rows whose factors were not added after all, all of them the newest to come."""
@@ -154,29 +130,29 @@ class Bank:
 
     def _begin_from(self, row: int) -> None:
         """Take the bank back to before a row."""
-        if row >= self._done:
+        if row >= self.done:
             return
         for at in [at for at in self._kept if at > row]:
             del self._kept[at]
-        self._done = max(self._kept)
-        kept = self._kept[self._done]
+        self.done = max(self._kept)
+        kept = self._kept[self.done]
         self._n = len(kept)
         self._bank[:self._n] = kept
-        self._tree.truncate(self._done)
-        self._traced = min(self._traced, self._done)
+        self._tree.truncate(self.done)
+        self._traced = min(self._traced, self.done)
 
     def advance(self, most: int) -> bool:
         """Take the bank along at most so many rows; return whether some are left."""
-        n = min(self._done + most, len(self))
-        self._tree.append(np.zeros((n - self._done, BANK.hypotheses), BRANCH))
-        while self._done < n:
-            end = min(n, (self._done // BANK.checkpoint + 1) * BANK.checkpoint)
-            self._n = advance(self._bank, self._n, self._rows.values, self._done, end,
-                              self.n_sources, self.noise, self._tree.values)
-            self._done = end
+        n = min(self.done + most, len(self))
+        self._tree.append(np.zeros((n - self.done, BANK.hypotheses), BRANCH))
+        while self.done < n:
+            end = min(n, (self.done // BANK.checkpoint + 1) * BANK.checkpoint)
+            self._n = hy.advance(self._bank, self._n, self._rows.values, self.done, end,
+                                 self.n_sources, self.noise, self._tree.values)
+            self.done = end
             if end % BANK.checkpoint == 0:
                 self._kept[end] = self._bank[:self._n].copy()
-        if len(self._kept) > BANK.checkpoints:
+        if len(self._kept) > 4 * BANK.checkpoint:
             old = sorted(self._kept)[1:len(self._kept) // 2]
             for at in old[::2]:
                 del self._kept[at]
@@ -185,11 +161,8 @@ class Bank:
     def decide(self) -> Decided:
         """Take the bank along all rows that it has not seen; return what is decided anew."""
         self.advance(len(self))
-        self.spread = self._spread()
-        return self._trace()
-
-    def _trace(self) -> Decided:
-        """Follow the best hypothesis back to where it meets the one that was the best before."""
+        self._note_spread()
+        # the best hypothesis is followed back to where it meets the one that was the best before
         n, branches, first = len(self), self._tree.values, 0
         self._path.truncate(n)
         self._path.append(np.zeros(n - len(self._path), dtype=np.int64))
@@ -207,7 +180,9 @@ class Bank:
     def told(self, first: int) -> Decided:
         """Return what the best hypothesis says of the rows from one on."""
         leaves = self._tree.values[np.arange(first, len(self)), self._path.values[first:]]
-        return Decided(first, leaves['choice'].astype(np.int64), leaves['far'].astype(np.float64),
+        choice = leaves['choice'].astype(np.int64)
+        choice[choice == hy.BEGINS_NOISY] = hy.BEGINS     # it is told as any beginning
+        return Decided(first, choice, leaves['far'].astype(np.float64),
                        leaves['d2'].astype(np.float64))
 
     @property
@@ -215,20 +190,18 @@ class Bank:
         """Logarithm of the probability density of all measurements."""
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
 
-    def _spread(self) -> Spread:
-        """Return how far what else may have happened is from the best, at the newest row."""
-        some = self._bank[:self._n]
+    def _note_spread(self) -> None:
+        """Note how far what else may have happened is from the best, at the newest row."""
+        some, self.spread = self._bank[:self._n], NO_SPREAD
         if len(some) == 0:
-            return NO_SPREAD
+            return
         likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
         best = int(np.argmax(likely))
         off = se2.wrapped(some['state'][:, :3] - some['state'][best, :3])
         likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
-        return Spread(some['state'][best, :3].copy(), (off.T * likely) @ off)
+        self.spread = Spread(some['state'][best, :3].copy(), (off.T * likely) @ off)
 
-    def again(
-        self, noise: Records, newest: int | None = None, least: float | None = None,
-    ) -> Self:
+    def again(self, noise: Records, newest: int | None = None, least: float | None = None) -> Self:
         """
         Return a bank with the same rows and another noise, before the first of them.
 
@@ -237,20 +210,14 @@ class Bank:
         """
         begin = 0 if newest is None else max(
             (at for at in self._kept if at <= len(self) - newest), default=0)
-        other = copy(self)
-        other._take(self, begin, noise)  # noqa: SLF001
+        other: Self = copy(self)
+        other.noise, other._rows = noise, GrowingArray.of(self._rows.values)
+        other._begin_at({at: kept for at, kept in self._kept.items() if at <= begin}, begin)
+        other._tree.append(self._tree.values[:begin])
+        other._path.append(self._path.values[:begin])
         if least is not None:
-            other._rows.values['least'] = least  # noqa: SLF001
+            other._rows.values['least'] = least
         return other
-
-    def _take(self, other: Self, begin: int, noise: Records) -> None:
-        """Take over the rows of another bank, and what it says of those before one."""
-        self.noise, self._rows = noise, GrowingArray.of(other._rows.values)
-        tree, path = other._tree.values, other._path.values
-        self._begin_at({at: kept for at, kept in other._kept.items()
-                        if at <= begin}, begin)
-        self._tree.append(tree[:begin])
-        self._path.append(path[:begin])
 
     def _begin_at(self, kept: dict[int, Records], begin: int = 0) -> None:
         # hypotheses before some rows; those before the first one are never dropped
@@ -258,15 +225,10 @@ class Bank:
         self._tree = GrowingArray((BANK.hypotheses,), BRANCH)
         # the best hypothesis after each row, by number, and up to which row it is known
         self._path, self._traced = GrowingArray((), np.int64), begin
-        # rows that the bank was taken along, and hypotheses that it has
-        self._done, self._n = begin, len(kept[begin])
+        # number of rows that the bank was taken along, and of hypotheses that it has
+        self.done, self._n = begin, len(kept[begin])
         self._bank = np.zeros(BANK.hypotheses, HYPOTHESIS)
         self._bank[:self._n] = kept[begin]
-
-    @property
-    def begin(self) -> int:
-        """The first row that the bank has not been taken along."""
-        return self._done
 
     def forget(self, left: IntArray, least: int) -> None:
         """
@@ -276,24 +238,23 @@ class Bank:
         """
         gone = ~np.isin(self._rows['id'], left)
         n_gone = int(np.argmin(gone)) if not np.all(gone) else len(gone)
-        most = min(n_gone, self._done, len(self) - least)
+        most = min(n_gone, self.done, len(self) - least)
         begin = max((at for at in self._kept if at <= most), default=0)
         if begin == 0:
             return
         self._first_node = int(self._rows['node'][begin - 1])
         for column in (self._rows, self._tree, self._path):
             column.drop_first(begin)
-        self._done, self._traced = self._done - begin, self._traced - begin
+        self.done, self._traced = self.done - begin, self._traced - begin
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
 
 
 def is_believed(choice: IntArray) -> npt.NDArray[np.bool_]:
-    return np.asarray((choice == GOOD) | (choice == SLIPPED))
+    return np.asarray((choice == hy.GOOD) | (choice == hy.SLIPPED))
 
 
 def as_claimed() -> Records:
     """Return the noise of odometry and of sources that are as good as they claim."""
     noise = np.zeros(1, NOISE)
-    for name in ('way', 'turn', 'white', 'tau'):
-        noise[name] = 1.0
+    noise['way'] = noise['turn'] = noise['white'] = noise['tau'] = 1.0
     return noise

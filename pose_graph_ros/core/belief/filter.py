@@ -39,14 +39,17 @@ NOISES = types.Array(from_dtype(NOISE), 1, 'C')
 # Copies of the settings that kernels use.
 LN_OUTLIER, LN_NO_OUTLIER = math.log(BANK.outliers), math.log(1.0 - BANK.outliers)
 FAULT_SIZE2, SLIP_HEADING2, WANDER2 = BANK.fault_size**2, BANK.slip_heading**2, BANK.wander**2
-LOST, ASTRAY = BANK.lost, BANK.astray
+ASTRAY = BANK.astray
+# Variance of a turn after which the heading is not known: it may be any of those tried [rad^2].
+LOST = 2.0 * (2.0 * math.pi / BANK.headings)**2
 # Variance of the heading and of a position where the filter begins, and of the heading again.
 BEGIN_HEADING, BEGIN_POSITION, NEW_HEADING = 0.1, 1e4, 1.0
 
 
 @kernel
-def predict(x, p, n, row, noise):  # type: ignore[no-untyped-def]
-    """Move the pose along odometry; n states are used."""
+def predict(x, p, n_sources, row, noise, in_fault):  # type: ignore[no-untyped-def]
+    """Move the pose along odometry, and let slow errors fade, or wander where in a fault."""
+    n = ERROR + 2 * n_sources
     m, lever = row.motion, row.lever
     bx, by = (1.0 + x[SCALE]) * m[0] + x[RATE] * lever[0], (
         (1.0 + x[SCALE]) * m[1] + x[RATE] * lever[1])
@@ -82,29 +85,19 @@ def predict(x, p, n, row, noise):  # type: ignore[no-untyped-def]
     p[1, 2] += yt
     p[2, 1] += yt
     p[2, 2] += noise.turn * turn[5]
-
-
-@kernel
-def fade(x, p, n, first, part, more):  # type: ignore[no-untyped-def]
-    """Let a part of the slow error of a source be left, and add a variance."""
-    for i in range(first, first + 2):
-        x[i] *= part
-        for j in range(n):
-            p[i, j] *= part
-        for j in range(n):
-            p[j, i] *= part
-        p[i, i] += more
-
-
-@kernel
-def forget_error(x, p, n, first, variance):  # type: ignore[no-untyped-def]
-    """Let nothing be known of the slow error of a source but its variance."""
-    for i in range(first, first + 2):
-        x[i] = 0.0
-        for j in range(n):
-            p[i, j] = 0.0
-            p[j, i] = 0.0
-        p[i, i] = variance
+    seconds = lever[2]
+    for r in range(n_sources):
+        part = math.exp(-seconds / noise.tau[r])
+        more = (1.0 - part * part) * noise.slow[r] * row.slow
+        if in_fault[r] != 0:
+            part, more = 1.0, more + WANDER2 * seconds
+        for i in range(ERROR + 2 * r, ERROR + 2 * r + 2):
+            x[i] *= part
+            for j in range(n):
+                p[i, j] *= part
+            for j in range(n):
+                p[j, i] *= part
+            p[i, i] += more
 
 
 @kernel
@@ -165,8 +158,7 @@ def correct(x, p, n, row, first, white, with_heading):  # type: ignore[no-untype
         gain_y[i] = p[i, 1] + ox * p[i, 2] + p[i, first + 1]
     for i in range(n):
         x[i] += gain_x[i] * ax + gain_y[i] * ay
-        kx, ky = ((yy * gain_x[i] - xy * gain_y[i]) / det,
-                  (xx * gain_y[i] - xy * gain_x[i]) / det)
+        kx, ky = ((yy * gain_x[i] - xy * gain_y[i]) / det, (xx * gain_y[i] - xy * gain_x[i]) / det)
         for j in range(i, n):
             p[i, j] -= kx * gain_x[j] + ky * gain_y[j]
             p[j, i] = p[i, j]
@@ -188,24 +180,6 @@ def cauchy(square, scale2):  # type: ignore[no-untyped-def]
     return 0.5 * math.log(scale2) - LOG_2PI - 1.5 * math.log(square + scale2)
 
 
-@kernel
-def _begin(x, p, n, row, heading, variance):  # type: ignore[no-untyped-def]
-    """Begin at a measured position, with what is known of constant and slow errors."""
-    if row.heading_variance > 0.0:
-        heading, variance = row.mean[2] - row.offset[2], row.heading_variance
-    c, s = math.cos(heading), math.sin(heading)
-    x[0] = row.mean[0] - c * row.offset[0] + s * row.offset[1]
-    x[1] = row.mean[1] - s * row.offset[0] - c * row.offset[1]
-    x[2] = heading
-    for i in range(3):
-        for j in range(n):
-            p[i, j] = 0.0
-            p[j, i] = 0.0
-    p[0, 0] = BEGIN_POSITION * row.slow
-    p[1, 1] = p[0, 0]
-    p[2, 2] = variance
-
-
 @kernel(signature=(TABLE, NUMBERS, INTEGER, NOISES, NUMBER, NUMBERS), allocates=True)
 def log_density(rows, slips, n_sources, noises, heading, constants):  # type: ignore[no-untyped-def]
     """
@@ -215,28 +189,33 @@ def log_density(rows, slips, n_sources, noises, heading, constants):  # type: ig
     with such a variance. The constants are rate and scale of odometry with their variances: in,
     before the first position; out, after the last one.
     """
-    noise, n = noises[0], ERROR + 2 * n_sources
+    noise, n, in_fault = noises[0], ERROR + 2 * n_sources, np.zeros(n_sources, np.int64)
     x, p = np.zeros(N_STATES), np.zeros((N_STATES, N_STATES))
     x[RATE], x[SCALE], p[RATE, RATE], p[SCALE, SCALE] = constants
     total, n_wrong, has_begun = 0.0, 0, False
     for k in range(len(rows)):
         row = rows[k]
         if has_begun:
-            predict(x, p, n, row, noise)
-            for r in range(n_sources):
-                part = math.exp(-row.lever[2] / noise.tau[r])
-                fade(x, p, n, ERROR + 2 * r, part,
-                     (1.0 - part * part) * noise.slow[r] * row.slow)
+            predict(x, p, n_sources, row, noise, in_fault)
             if row.turn[5] * noise.turn > LOST:
                 n_wrong = ASTRAY
         if slips[k] < 0.0:
             continue
         if not has_begun:
-            for r in range(n_sources):
-                forget_error(x, p, n, ERROR + 2 * r, noise.slow[r] * row.slow)
+            x[2] = heading
+            for i in range(ERROR, n):
+                p[i, i] = noise.slow[(i - ERROR) // 2] * row.slow
         if not has_begun or n_wrong >= ASTRAY:
-            _begin(x, p, n, row, heading if not has_begun else x[2],
-                   NEW_HEADING if has_begun else BEGIN_HEADING)
+            # nothing is known of where it is, but what the measurement says
+            variance = NEW_HEADING if has_begun else BEGIN_HEADING
+            if row.heading_variance > 0.0:
+                x[2], variance = row.mean[2] - row.offset[2], row.heading_variance
+            c, s = math.cos(x[2]), math.sin(x[2])
+            x[0] = row.mean[0] - c * row.offset[0] + s * row.offset[1]
+            x[1] = row.mean[1] - s * row.offset[0] - c * row.offset[1]
+            p[:3], p[:, :3] = 0.0, 0.0
+            p[0, 0] = p[1, 1] = BEGIN_POSITION * row.slow
+            p[2, 2] = variance
             has_begun, n_wrong = True, 0
         if slips[k] > 0.0:
             p[0, 0] += slips[k]

@@ -13,28 +13,7 @@ import math
 from numba import from_dtype, types
 import numpy as np
 
-from pose_graph_ros.core.belief.filter import (
-    cauchy,
-    correct,
-    density,
-    ERROR,
-    fade,
-    FAULT_SIZE2,
-    forget_error,
-    heading_density,
-    innovation,
-    LN_NO_OUTLIER,
-    LN_OUTLIER,
-    LOG_2PI,
-    LOST,
-    N_STATES,
-    NOISES,
-    predict,
-    RATE,
-    SCALE,
-    SLIP_HEADING2,
-    WANDER2,
-)
+from pose_graph_ros.core.belief import filter as ft
 from pose_graph_ros.core.belief.rows import TABLE
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
@@ -50,10 +29,10 @@ HYPOTHESIS = np.dtype([
     ('in_fault', 'i8', (N_SOURCES,)),  # whether a source is in a fault, `QUIET` or `NOISY`; or 0
     ('turned', 'f8', (N_SOURCES,)),  # by what the last heading of a source in a fault was off
     ('slips', 'i8'),  # whether odometry slipped before the last good measurement
-    ('state', 'f8', (N_STATES,)),
-    ('covariance', 'f8', (N_STATES, N_STATES))])
+    ('state', 'f8', (ft.N_STATES,)),
+    ('covariance', 'f8', (ft.N_STATES, ft.N_STATES))])
 
-# What a hypothesis says of a measurement. That a noisy fault begins is told as any beginning.
+# What a hypothesis says of a measurement.
 GOOD, ALONE, BEGINS, GOES_ON, SLIPPED, BEGINS_NOISY = range(6)
 N_CHOICES = 6
 LN_KINDS = math.log(0.5)  # either kind of fault is as likely
@@ -69,12 +48,12 @@ HYPOTHESES = types.Array(from_dtype(HYPOTHESIS), 1, 'C')
 TREE = types.Array(from_dtype(BRANCH), 2, 'C')
 
 # Copies of the settings that kernels use.
-BETWEEN_FAULTS, FAULT, BETWEEN_JUMPS = BANK.between_faults, BANK.fault, BANK.between_jumps
+BETWEEN_FAULTS, FAULT, BETWEEN_JUMPS = BANK.between_faults, BANK.fault, BANK.fault / 3.0
 BETWEEN_SLIPS, SLIP, SLIP_SIZE2 = BANK.between_slips, BANK.slip, BANK.slip_size**2
 JUMP_SIZE2 = BANK.jump_size**2
-UNMOVED_WAY, UNMOVED = BANK.unmoved_way, BANK.unmoved
+UNMOVED_WAY, UNMOVED = 5.0 * BANK.slip_size, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
-NEAR2, FAR2 = BANK.near_fault**2, BANK.far_fault**2
+NEAR2, FAR2 = (2.0 * BANK.fault_size)**2, BANK.far_fault**2
 RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
 HOPELESS, ALIKE = BANK.hopeless, BANK.alike
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
@@ -90,16 +69,23 @@ def _white(white, one, r):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _off(one, row):  # type: ignore[no-untyped-def]
-    """Return by what a measured heading is off."""
-    return factors.wrap(row.mean[2] - row.offset[2] - one.state[2])
+def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-def]
+    """
+    Write the hypotheses on a first measurement: any heading, good or in a fault.
 
-
-@kernel
-def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
-    """Write the hypotheses on a first measurement: any heading, good or in a fault."""
-    seen, noise = table[row], noises[0]
-    r = seen.source
+    After others it is as if nothing were known of where the robot is, after the best of them.
+    """
+    best, before, r = 0, 0.0, seen.source
+    for k in range(1, n):
+        if bank[k].weight > bank[best].weight:
+            best = k
+    if n > 0:
+        # where it is seen is as likely as a fault makes it, so that to be lost gains nothing
+        one = bank[best]
+        ft.predict(one.state, one.covariance, n_sources, seen, noise, one.in_fault)
+        ex, ey, xx, _, yy, _, _ = ft.innovation(
+            one.state, one.covariance, seen, -1, 1.0, seen.slow)
+        before = one.weight + ft.cauchy(ex * ex + ey * ey, ft.FAULT_SIZE2 + 0.5 * (xx + yy))
     in_fault = FAULT / (FAULT + BETWEEN_FAULTS)
     n, n_faults = 0, 0
     if seen.judged != 0:
@@ -120,11 +106,10 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
             x[2] = heading
             p[2, 2] = variance
             one.turned[:] = 0.0
-            one.turned[r] = _off(one, seen)
-            p[RATE, RATE], p[SCALE, SCALE] = RATE2, SCALE2
-            for other in range(n_sources):
-                for i in range(ERROR + 2 * other, ERROR + 2 * other + 2):
-                    p[i, i] = noise.slow[other] * seen.slow
+            one.turned[r] = factors.wrap(seen.mean[2] - seen.offset[2] - heading)
+            p[ft.RATE, ft.RATE], p[ft.SCALE, ft.SCALE] = RATE2, SCALE2
+            for i in range(ft.ERROR, ft.ERROR + 2 * n_sources):
+                p[i, i] = noise.slow[(i - ft.ERROR) // 2] * seen.slow
             slow = noise.slow[r] * seen.slow
             if fault > 0:
                 slow = NEAR2 if fault % 2 == 1 else FAR2
@@ -135,83 +120,45 @@ def _begin(bank, table, row, n_sources, noises):  # type: ignore[no-untyped-def]
             p[1, 0] = p[0, 1]
             p[1, 1] = max(white * seen.noise[2], seen.least) + slow
             for i in range(2):
-                j = ERROR + 2 * r + i
+                j = ft.ERROR + 2 * r + i
                 p[j, j] = slow
                 p[i, j] = -slow
                 p[j, i] = -slow
             share = 1.0 - in_fault if fault == 0 else in_fault / n_faults
-            one.weight = math.log(share / n_headings)
+            one.weight = before + math.log(share / n_headings)
+            leaf = leaves[n]
+            leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
+            leaf.choice = GOOD if fault == 0 else BEGINS
             n += 1
     return n
 
 
 @kernel
-def _prepare(one, row, noise, n_sources):  # type: ignore[no-untyped-def]
-    """Move a hypothesis to a measurement."""
-    n = ERROR + 2 * n_sources
-    x, p = one.state, one.covariance
-    predict(x, p, n, row, noise)
-    seconds = row.lever[2]
-    for r in range(n_sources):
-        part = math.exp(-seconds / noise.tau[r])
-        more = (1.0 - part * part) * noise.slow[r] * row.slow
-        if one.in_fault[r] != 0:
-            fade(x, p, n, ERROR + 2 * r, 1.0, more + WANDER2 * seconds)
-        else:
-            fade(x, p, n, ERROR + 2 * r, part, more)
-
-
-@kernel
-def _begin_again(  # type: ignore[no-untyped-def]
-    bank, n, table, row_number, n_sources, noises, leaves,
-):
-    """Begin anew, as if nothing were known of where the robot is, after the best hypothesis."""
-    best, weight = 0, 0.0
-    for k in range(1, n):
-        if bank[k].weight > bank[best].weight:
-            best = k
-    if n > 0:
-        # where it is seen is as likely as a fault makes it, so that to be lost gains nothing
-        row = table[row_number]
-        one = bank[best]
-        _prepare(one, row, noises[0], n_sources)
-        ex, ey, xx, _, yy, _, _ = innovation(one.state, one.covariance, row, -1, 1.0, row.slow)
-        weight = one.weight + cauchy(ex * ex + ey * ey, FAULT_SIZE2 + 0.5 * (xx + yy))
-    n = _begin(bank, table, row_number, n_sources, noises)
-    for k in range(n):
-        bank[k].weight += weight
-        leaf = leaves[k]
-        leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
-        leaf.choice = GOOD if bank[k].in_fault[table[row_number].source] == 0 else BEGINS
-    return n
-
-
-@kernel
-def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
+def _weigh(one, number, row, noise, weights, branches):  # type: ignore[no-untyped-def]
     """Write the weights of the choices of a hypothesis, and how far the measurement is off."""
     x, p, r = one.state, one.covariance, row.source
     white, slow = noise.white[r], noise.slow[r] * row.slow
-    first, in_fault = ERROR + 2 * r, one.in_fault[r] != 0
-    ex, ey, xx, xy, yy, _, _ = innovation(x, p, row, first, _white(white, one, r), 0.0)
-    with_error, d2 = density(ex, ey, xx, xy, yy)
+    first, in_fault = ft.ERROR + 2 * r, one.in_fault[r] != 0
+    ex, ey, xx, xy, yy, _, _ = ft.innovation(x, p, row, first, _white(white, one, r), 0.0)
+    with_error, d2 = ft.density(ex, ey, xx, xy, yy)
     square, spread = ex * ex + ey * ey, 0.5 * (xx + yy)
     gx, gy, gxx, gxy, gyy, fresh = ex, ey, xx, xy, yy, with_error
     if in_fault:
-        gx, gy, gxx, gxy, gyy, _, _ = innovation(x, p, row, -1, white, slow)
-        fresh, d2 = density(gx, gy, gxx, gxy, gyy)
+        gx, gy, gxx, gxy, gyy, _, _ = ft.innovation(x, p, row, -1, white, slow)
+        fresh, d2 = ft.density(gx, gy, gxx, gxy, gyy)
     fresh_square, fresh_spread = gx * gx + gy * gy, 0.5 * (gxx + gyy)
-    heading = heading_density(x, p, row)
-    any_heading = -LOG_2PI if row.heading_variance > 0.0 else 0.0
-    size2 = JUMP_SIZE2 if in_fault else FAULT_SIZE2
+    heading = ft.heading_density(x, p, row)
+    any_heading = -ft.LOG_2PI if row.heading_variance > 0.0 else 0.0
+    size2 = JUMP_SIZE2 if in_fault else ft.FAULT_SIZE2
     begins = 1.0 - math.exp(-row.gap / (BETWEEN_JUMPS if in_fault else BETWEEN_FAULTS))
     ends = 1.0 - math.exp(-row.gap / FAULT)
     slips = math.exp(-row.gap / SLIP) if one.slips != 0 else (
         1.0 - math.exp(-row.gap / BETWEEN_SLIPS))
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
-    weights[GOOD] = changed + LN_NO_OUTLIER + fresh + heading
-    weights[ALONE] = LN_OUTLIER + cauchy(square, FAULT_SIZE2 + spread) + any_heading
-    weights[BEGINS] = (math.log(max(begins, 1e-12)) + LN_NO_OUTLIER
-                       + cauchy(square, size2 + spread) + any_heading)
+    weights[GOOD] = changed + ft.LN_NO_OUTLIER + fresh + heading
+    weights[ALONE] = ft.LN_OUTLIER + ft.cauchy(square, ft.FAULT_SIZE2 + spread) + any_heading
+    weights[BEGINS] = (math.log(max(begins, 1e-12)) + ft.LN_NO_OUTLIER
+                       + ft.cauchy(square, size2 + spread) + any_heading)
     weights[BEGINS_NOISY] = LEAST
     if not in_fault and white < 1.0:
         weights[BEGINS] += LN_KINDS
@@ -222,13 +169,13 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
         weights[BEGINS] += stays
         if row.heading_variance > 0.0:
             # in a fault the heading stays off by what it was, or is any
-            e = factors.wrap(_off(one, row) - one.turned[r])
+            e = factors.wrap(row.mean[2] - row.offset[2] - x[2] - one.turned[r])
             variance = 2.0 * row.heading_variance + noise.turn * row.turn[5]
-            heading = max(-0.5 * (LOG_2PI + math.log(variance) + e * e / variance), any_heading)
-        weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + LN_NO_OUTLIER
+            heading = max(-0.5 * (ft.LOG_2PI + math.log(variance) + e * e / variance), any_heading)
+        weights[GOES_ON] = (stays + math.log(max(1.0 - begins, 1e-12)) + ft.LN_NO_OUTLIER
                             + with_error + heading)
-    weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + LN_NO_OUTLIER
-                        + cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
+    weights[SLIPPED] = (math.log(max(slips, 1e-12)) + changed + ft.LN_NO_OUTLIER
+                        + ft.cauchy(fresh_square, SLIP_SIZE2 + fresh_spread) + any_heading)
     if math.sqrt(fresh_square) > row.travel + UNMOVED_WAY:
         weights[SLIPPED] -= UNMOVED
     holds = math.log(max(1.0 - slips, 1e-12))
@@ -241,37 +188,43 @@ def _weigh(one, row, noise, weights, branches):  # type: ignore[no-untyped-def]
         if not weights[choice] > LEAST:
             weights[choice] = LEAST
         branch = branches[choice]
-        branch.choice = choice
-        branch.far = math.sqrt(fresh_square)
-        branch.d2 = d2
+        branch.before, branch.choice = number, choice
+        branch.far, branch.d2 = math.sqrt(fresh_square), d2
 
 
 @kernel(allocates=True)
 def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     """Let a hypothesis have made a choice."""
-    n, r = ERROR + 2 * n_sources, row.source
+    n, r = ft.ERROR + 2 * n_sources, row.source
     x, p = one.state, one.covariance
-    first, choice = ERROR + 2 * r, branch.choice
+    first, choice = ft.ERROR + 2 * r, branch.choice
     if choice == ALONE:
         return
-    one.slips, one.turned[r] = 1 if choice == SLIPPED else 0, _off(one, row)
+    one.slips = 1 if choice == SLIPPED else 0
+    one.turned[r] = factors.wrap(row.mean[2] - row.offset[2] - x[2])
     if choice in (BEGINS, BEGINS_NOISY):
-        ex, ey, _, _, _, _, _ = innovation(x, p, row, first, 0.0, 0.0)
-        more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
+        ex, ey, _, _, _, _, _ = ft.innovation(x, p, row, first, 0.0, 0.0)
+        more = ((JUMP_SIZE2 if one.in_fault[r] != 0 else ft.FAULT_SIZE2) + ex * ex + ey * ey) / 3.0
         p[first, first] += more
         p[first + 1, first + 1] += more
         if one.in_fault[r] == 0:
             one.in_fault[r] = QUIET if choice == BEGINS else NOISY
     elif choice != GOES_ON:
         if one.in_fault[r] != 0:
-            forget_error(x, p, n, first, noise.slow[r] * row.slow)
+            # nothing is known of the slow error but its variance
+            for i in range(first, first + 2):
+                x[i] = 0.0
+                for j in range(n):
+                    p[i, j] = 0.0
+                    p[j, i] = 0.0
+                p[i, i] = noise.slow[r] * row.slow
         one.in_fault[r] = 0
         if choice == SLIPPED:
             more = (SLIP_SIZE2 + branch.far * branch.far) / 3.0
             p[0, 0] += more
             p[1, 1] += more
-            p[2, 2] += SLIP_HEADING2
-    correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
+            p[2, 2] += ft.SLIP_HEADING2
+    ft.correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
 
 
 @kernel
@@ -304,7 +257,7 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
         equal = (far2 < EQUAL2 * spread and turn < EQUAL
                  and max(one_spread, other_spread) < 2.0 * spread)
         for r in range(n_sources):
-            i = ERROR + 2 * r
+            i = ft.ERROR + 2 * r
             if one.in_fault[r] != 0:
                 # of pose and offset, what is seen is their sum, which is known much better
                 dx, dy = x[0] + x[i] - y[0] - y[i], x[1] + x[i + 1] - y[1] - y[i + 1]
@@ -317,19 +270,7 @@ def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
     return -1 if n_alike < ALIKE else -2
 
 
-@kernel
-def _copy(bank, n, other, m, n_states):  # type: ignore[no-untyped-def]
-    one, from_one = bank[n], other[m]
-    one.weight, one.slips = from_one.weight, from_one.slips
-    for r in range(N_SOURCES):
-        one.in_fault[r], one.turned[r] = from_one.in_fault[r], from_one.turned[r]
-    for i in range(n_states):
-        one.state[i] = from_one.state[i]
-        for j in range(n_states):
-            one.covariance[i, j] = from_one.covariance[i, j]
-
-
-@kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, NOISES, TREE),
+@kernel(signature=(HYPOTHESES, INTEGER, TABLE, INTEGER, INTEGER, INTEGER, ft.NOISES, TREE),
         allocates=True)
 def advance(  # type: ignore[no-untyped-def]
     bank, n, table, first, end, n_sources, noises, tree,
@@ -339,59 +280,43 @@ def advance(  # type: ignore[no-untyped-def]
 
     The branches of all hypotheses after each row are written to the tree.
     """
-    noise, n_states = noises[0], ERROR + 2 * n_sources
+    noise = noises[0]
     before, branches = np.empty_like(bank), np.empty((MOST, N_CHOICES), tree.dtype)
     weights = np.empty((MOST, N_CHOICES))
     for at in range(first, end):
         row = table[at]
-        if n == 0 or row.turn[5] * noise.turn > LOST:
-            n = _begin_again(bank, n, table, at, n_sources, noises, tree[at])
+        if n == 0 or row.turn[5] * noise.turn > ft.LOST:
+            n = _begin(bank, n, row, n_sources, noise, tree[at])
             continue
         for k in range(n):
-            _prepare(bank[k], row, noise, n_sources)
-            _weigh(bank[k], row, noise, weights[k], branches[k])
+            one = bank[k]
+            ft.predict(one.state, one.covariance, n_sources, row, noise, one.in_fault)
+            _weigh(one, k, row, noise, weights[k], branches[k])
         if row.decides == 0:
-            _stay(bank, n, row, weights, branches, tree[at])
+            # what follows so closely has mostly the same error, so that it tells nothing: it is
+            # what the one before it of its source is, unless it alone is wrong
+            for k in range(n):
+                choice = GOES_ON if bank[k].in_fault[row.source] != 0 else GOOD
+                if weights[k, ALONE] > weights[k, choice]:
+                    choice = ALONE
+                tree[at, k] = branches[k, choice]
             continue
         for k in range(n):
-            _copy(before, k, bank, k, n_states)
+            before[k] = bank[k]
         flat, n = weights[:n].copy().reshape(-1), 0
         least = max(np.max(flat) - HOPELESS, LEAST)
         for place in np.argsort(-flat, kind='mergesort'):
             weight = flat[place]
             if n == MOST or not weight > least:
                 break
-            k, choice = place // N_CHOICES, place % N_CHOICES
-            _copy(bank, n, before, k, n_states)
+            branch = branches[place // N_CHOICES, place % N_CHOICES]
+            bank[n] = before[branch.before]
             bank[n].weight = weight
-            _follow(bank[n], row, branches[k, choice], noise, n_sources)
+            _follow(bank[n], row, branch, noise, n_sources)
             other = _joins(bank, n, n_sources)
             if other >= 0:
                 bank[other].weight += math.log1p(math.exp(weight - bank[other].weight))
             if other == -1:
-                _note(tree[at], n, branches[k, choice], k)
+                tree[at, n] = branch
                 n += 1
     return n
-
-
-@kernel
-def _stay(bank, n, row, weights, branches, leaves):  # type: ignore[no-untyped-def]
-    """
-    Let a measurement be what the one before it of its source is, unless it alone is wrong.
-
-    Errors of measurements that follow one another so closely are mostly the same, so that it
-    tells the hypotheses nothing.
-    """
-    for k in range(n):
-        choice = GOES_ON if bank[k].in_fault[row.source] != 0 else GOOD
-        if weights[k, ALONE] > weights[k, choice]:
-            choice = ALONE
-        _note(leaves, k, branches[k, choice], k)
-
-
-@kernel
-def _note(leaves, n, branch, before):  # type: ignore[no-untyped-def]
-    leaf = leaves[n]
-    leaf.before = before
-    leaf.choice = BEGINS if branch.choice == BEGINS_NOISY else branch.choice
-    leaf.far, leaf.d2 = branch.far, branch.d2

@@ -13,13 +13,14 @@ Searches are generators: each step takes a bounded time.
 """
 
 from collections.abc import Collection, Generator, Sequence
+from itertools import product
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief.bank import Bank, Decided, is_believed
-from pose_graph_ros.core.belief.filter import log_density, NOISE
+from pose_graph_ros.core.belief.bank import as_claimed, Bank, is_believed
+from pose_graph_ros.core.belief.filter import log_density
 from pose_graph_ros.core.belief.hypotheses import SLIPPED
 from pose_graph_ros.core.belief.rows import Records
 from pose_graph_ros.core.belief.settings import BANK
@@ -31,7 +32,6 @@ from pose_graph_ros.core.sources.bias import CorrelatedErrors
 # slow errors, with the time constant.
 Point = tuple[float, ...]
 WAY, TURN = 0, 1
-ODOMETRY = WAY, TURN
 NO_SLOW = -math.inf  # exponent of a source without slow errors
 LN_2 = math.log(2.0)
 # Steps on the lattice, and bounds.
@@ -61,12 +61,6 @@ class Known(NamedTuple):
     point: Point  # what is given; what is to be found is as claimed here
     odometry: bool
     sources: tuple[int, ...]  # numbers of the sources whose errors are to be found
-
-    @property
-    def free(self) -> tuple[int, ...]:
-        """Axes of white noise that is to be found."""
-        return (*(ODOMETRY if self.odometry else ()),
-                *(axes_of(source)[0] for source in self.sources))
 
 
 class Learnt(NamedTuple):
@@ -102,15 +96,9 @@ class Found(NamedTuple):
 
     def instead_of(self, point: Point | None, needed: float) -> Learnt:
         """Return the best, or what is as good up to so much evidence with noise that is in use."""
-        used = None if point is None else self.every.get(
-            (*point, *self.best.point[len(point):]))
+        used = None if point is None else self.every.get((*point, *self.best.point[len(point):]))
         return used if used is not None and (
             self.best.evidence - used.evidence <= needed) else self.best
-
-
-def widened(point: Point, known: Known) -> Point:
-    """Return a point with what is known of sources that have come since."""
-    return (*point, *known.point[len(point):])
 
 
 def claimed(n_sources: int) -> Point:
@@ -120,36 +108,26 @@ def claimed(n_sources: int) -> Point:
 
 def noise_at(point: Point) -> Records:
     """Return the noise at a point, as the filters take it."""
-    noise = np.zeros(1, NOISE)
+    noise = as_claimed()
     noise['way'], noise['turn'] = 2.0**point[WAY], 2.0**point[TURN]
-    noise['white'] = noise['tau'] = 1.0
     for source in range((len(point) - 2) // 3):
         for name, axis in zip(('white', 'slow', 'tau'), axes_of(source), strict=True):
             noise[name][0, source] = 2.0**point[axis]
     return noise
 
 
-def log_prior(
-    point: Point, known: Known, spread: tuple[float, float] = BANK.spread,
-) -> float:
+def log_prior(point: Point, known: Known, spread: tuple[float, float] = BANK.spread) -> float:
     """Return the logarithm of the prior of what is to be found, with its Occam factor."""
-    total = 0.0
-
-    def add(axis: int, median: float, sigma: float) -> None:
-        nonlocal total
-        total -= 0.5 * ((LN_2 * point[axis] - math.log(median)) / sigma)**2
-    if known.odometry:
-        add(WAY, *BANK.way)
-        add(TURN, *BANK.turn)
+    total, known_by = 0.0, [(WAY, *BANK.way), (TURN, *BANK.turn)] if known.odometry else []
     for source in known.sources:
         white, slow, tau = axes_of(source)
         size = math.log(2.0**point[white] + 2.0**point[slow])
         total -= 0.5 * (size / spread[size > 0.0])**2
         if point[slow] > NO_SLOW:
-            add(slow, *BANK.slow)
-            add(tau, *BANK.tau)
+            known_by += [(slow, *BANK.slow), (tau, *BANK.tau)]
             total -= BANK.slow_evidence
-    return total
+    return total - sum(0.5 * ((LN_2 * point[axis] - math.log(median)) / sigma)**2
+                       for axis, median, sigma in known_by)
 
 
 class Minimum(NamedTuple):
@@ -173,7 +151,7 @@ class Posterior:
         finest: float = FINEST,
     ) -> None:
         """Take slips as `log_density` does."""
-        self._least = dict.fromkeys(
+        self.least = dict.fromkeys(
             (axes_of(source)[0] for source in known.sources), math.log2(least_white))
         self.rows, self.slips, self.known = np.ascontiguousarray(rows), slips, known
         self._spread, self.finest = spread, finest
@@ -184,14 +162,10 @@ class Posterior:
     def _density(
         self, point: Point, heading: float, has_rate: bool = True, has_scale: bool = True,
     ) -> tuple[float, FloatArray]:
-        constants = np.array((
-            0.0, 0.0, (BANK.rate * has_rate)**2, (BANK.scale * has_scale)**2))
+        constants = np.array((0.0, 0.0, (BANK.rate * has_rate)**2, (BANK.scale * has_scale)**2))
         n_sources = (len(point) - 2) // 3
         return float(log_density(self.rows, self.slips, n_sources, noise_at(point), heading,
                                  constants)), constants
-
-    def clipped(self, axis: int, exponent: float) -> float:
-        return min(max(exponent, self._least.get(axis, LEAST)), MOST)
 
     def heading(self) -> Generator[None, None, float]:
         """Return the heading at the first position that makes all as claimed the most likely."""
@@ -215,14 +189,13 @@ class Posterior:
     def shown(self, point: Point) -> Generator[None, None, Shown]:
         """Return the constant errors of odometry that the measurements show; the others are 0."""
         heading, best = (yield from self.heading()), Shown(math.inf, np.zeros(4))
-        prior, some = log_prior(point, self.known, self._spread), (False, True)
-        for has_rate in some if self.known.odometry else (False,):
-            for has_scale in some if self.known.odometry else (False,):
-                density, constants = self._density(point, heading, has_rate, has_scale)
-                yield from self._pause()
-                cost = BANK.constant_evidence * (has_rate + has_scale) - density - prior
-                if cost < best.cost:
-                    best = Shown(cost, constants)
+        prior = log_prior(point, self.known, self._spread)
+        for shown in product((False, True) if self.known.odometry else (False,), repeat=2):
+            density, constants = self._density(point, heading, *shown)
+            yield from self._pause()
+            cost = BANK.constant_evidence * sum(shown) - density - prior
+            if cost < best.cost:
+                best = Shown(cost, constants)
         return best
 
     def _pause(self) -> Generator[None, None, None]:
@@ -244,8 +217,8 @@ def descend(
         before = best
         for axis in axes:
             for move in (step, -step):
-                point = moved(best.point, {
-                    axis: posterior.clipped(axis, best.point[axis] + move)})
+                point = moved(best.point, {axis: min(max(
+                    best.point[axis] + move, posterior.least.get(axis, LEAST)), MOST)})
                 value = yield from posterior.value(point)
                 if value < best.value:
                     best = Minimum(value, point)
@@ -263,8 +236,8 @@ def moved(point: Point, to: dict[int, float]) -> Point:
 def most_likely(posterior: Posterior) -> Generator[None, None, list[Minimum]]:
     """Return the best point, after the best ones with slow errors of fewer sources."""
     known = posterior.known
-    axes, best = known.free, Minimum(math.inf, known.point)
-    white = axes[2 if known.odometry else 0:]
+    white, best = [axes_of(source)[0] for source in known.sources], Minimum(math.inf, known.point)
+    axes: Sequence[int] = (WAY, TURN, *white) if known.odometry else white
     begins = [moved(known.point, dict.fromkeys(white, at)) for at in (-3.0, 3.0)]
     if known.odometry:
         begins += [moved(known.point, {WAY: way, TURN: turn}) for way, turn in ODOMETRY_BEGINS]
@@ -287,26 +260,18 @@ def most_likely(posterior: Posterior) -> Generator[None, None, list[Minimum]]:
     return every if every[-1] is best else [*every, best]
 
 
-def _as_given(posterior: Posterior, best: Minimum) -> Generator[None, None, Minimum]:
-    """Return the best point by which odometry is as noisy as it is given."""
-    known = posterior.known
-    axes = [axis for source in known.sources for axis in axes_of(source)
-            if best.point[axis] > NO_SLOW]
-    return (yield from descend(posterior, [moved(
-        best.point, {WAY: known.point[WAY], TURN: known.point[TURN]})], axes))
-
-
 def search(
     bank: Bank, known: Known, *, begins: Collection[Point] = (), newest: int | None = None,
 ) -> Search:
     """
     Return the noise that explains the measurements of a bank best, or the newest ones.
 
-    It begins also with some points. The bank stays as it is.
+    It begins also with some points, which may be of before some sources have come. The bank stays
+    as it is.
     """
     # how exact receivers are is learnt as it is
     same, found = bank.again(bank.noise, newest, least=0.0), dict[Point, Learnt]()
-    first, rows = same.begin, same.rows[same.begin:].copy()
+    first, rows = same.done, same.rows[same.done:].copy()
     posteriors, learnt = dict[bytes, Posterior](), dict[bytes, list[Point]]()  # by the slips
 
     def posterior(slips: FloatArray) -> Posterior:
@@ -318,7 +283,11 @@ def search(
             for best in (yield from most_likely(every)):
                 better = best
                 if known.odometry:
-                    given = yield from _as_given(every, best)
+                    # the best one by which odometry is as noisy as it is given
+                    given = yield from descend(
+                        every, [(*known.point[:2], *best.point[2:])],
+                        [axis for source in known.sources for axis in axes_of(source)
+                         if best.point[axis] > NO_SLOW])
                     gained = (yield from every.shown(given.point)).cost - (
                         yield from every.shown(best.point)).cost
                     better = best if gained >= BANK.noise_evidence else given
@@ -330,7 +299,8 @@ def search(
         for axis, value in zip(axes_of(source), UNLEARNT, strict=True)})
     as_all = yield from learn(np.zeros(len(rows)))
     waiting = [(point, 0) for point in dict.fromkeys((
-        *as_all, known.point, unlearnt, *begins))]
+        *as_all, known.point, unlearnt,
+        *((*point, *known.point[len(point):]) for point in begins)))]
     for point, n_rounds in waiting:
         if point in found:
             continue
@@ -338,7 +308,10 @@ def search(
         while trial.advance(BANK_ROWS_IN_STEP):
             yield
         trial.decide()
-        slips = _slips(trial.told(first))
+        told = trial.told(first)
+        # what is believed, and the slips before it, for `log_density`
+        slips = np.where(told.choice == SLIPPED, (BANK.slip_size**2 + told.far**2) / 3.0, 0.0)
+        slips[~is_believed(told.choice)] = -1.0
         # the bank has the evidence of what decides; of the others, that of what it believes
         more = yield from _others(rows, slips, point, posterior(slips))
         found[point] = Learnt(point, trial.evidence + more + log_prior(point, known), (
@@ -363,10 +336,3 @@ def _others(
     deciding = Posterior(rows, np.where(decides, slips, -1.0), believed.known)
     more = (yield from deciding.value(point)) - (yield from believed.value(point))
     return more * np.count_nonzero(~decides) / n_believed
-
-
-def _slips(decided: Decided) -> FloatArray:
-    """Return what is believed, and the slips before it, for `log_density`."""
-    far = np.where(decided.choice == SLIPPED, decided.far, 0.0)
-    slips = np.where(decided.choice == SLIPPED, (BANK.slip_size**2 + far**2) / 3.0, 0.0)
-    return np.where(is_believed(decided.choice), slips, -1.0)

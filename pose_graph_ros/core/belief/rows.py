@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.jit import INTEGER, INTEGERS, kernel, NUMBERS, ROWS
-from pose_graph_ros.core.geometry.se2 import FloatArray
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.sources.bias import STRETCH
@@ -48,7 +48,7 @@ TABLE = types.Array(from_dtype(MEASURED), 1, 'C')
 
 def measured(
     given: Factors, stamps_ns: Sequence[int], ids: Sequence[int],
-    least_position: float = BANK.least_position,
+    least_position: float = BANK.least_sigmas[0],
 ) -> Records:
     """
     Return rows for factors in the map or to biases, but for sources and motions.
@@ -60,33 +60,24 @@ def measured(
     rows['stamp_ns'], rows['id'], rows['node'] = stamps_ns, ids, given.i
     rows['offset'], rows['mean'] = given.constants[:, :3], given.mean
     rows['offset'][biased, 2] = 0.0
-    has_heading = np.where(
-        biased, information[:, 2, 2] > 0.0, given.kind != FactorKind.POSITION)
+    has_heading = np.where(biased, information[:, 2, 2] > 0.0, given.kind != FactorKind.POSITION)
     placed = (information[:, 0, 0] > 0.0) & np.isin(
         given.kind, (FactorKind.GLOBAL_POSE, FactorKind.POSITION, FactorKind.BIAS))
+    # from the axes of measured poses to those of the map
+    axes = se2.adjoint(given.mean * (0.0, 0.0, 1.0) * ~biased[:, None])
     for n, which in ((2, placed & ~has_heading), (3, placed & has_heading)):
-        noise = _turned(np.linalg.inv(information[which, :n, :n]),
-                        np.where(biased[which], 0.0, given.mean[which, 2]))
+        turned = axes[which, :n, :n]
+        noise = turned @ np.linalg.inv(information[which, :n, :n]) @ np.swapaxes(turned, 1, 2)
         rows['noise'][which] = noise[:, (0, 0, 1), (0, 1, 1)]
         if n == 3:
             rows['heading_variance'][which] = np.maximum(
                 noise[:, 2, 2] + np.where(
                     biased[which], given.constants[which, 3] / STRETCH, 0.0)**2,
-                BANK.least_heading**2)
+                BANK.least_sigmas[2]**2)
     rows['least'] = least_position**2
     rows['slow'] = np.where(biased, given.constants[:, 2]**2, 0.5 * (
         rows['noise'][:, 0] + rows['noise'][:, 2]))
     return np.asarray(rows[placed])
-
-
-def _turned(noise: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return covariances in the axes of poses with headings theta, shape (M,), in map axes."""
-    axes = np.zeros(noise.shape)
-    axes[:, -1, -1] = 1.0
-    axes[:, 0, 0] = axes[:, 1, 1] = np.cos(theta)
-    axes[:, 1, 0] = np.sin(theta)
-    axes[:, 0, 1] = -axes[:, 1, 0]
-    return np.asarray(axes @ noise @ np.swapaxes(axes, 1, 2))
 
 
 @kernel(signature=(ROWS, ROWS, INTEGERS, NUMBERS, TABLE, INTEGER, INTEGER, INTEGER))

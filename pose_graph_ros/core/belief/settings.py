@@ -21,25 +21,23 @@ class BankSettings:
     slip_heading: float = 0.3  # sigma of the heading after a slip [rad]
     # the offset in a fault is as mobile as the error of a good receiver, and wanders [m/sqrt(s)]
     wander: float = 0.1
-    # reflections change: in a fault the offset jumps, about so often [s] and so far [m]
-    between_jumps: float = 10.0
+    # reflections change: in a fault the offset jumps, about three times, and so far [m]
     jump_size: float = 3.0
     # wheels that spin make the way too long, so a robot that must have moved farther than its
-    # odometry says by so much has hardly slipped: that is less likely by so many nats
-    unmoved_way: float = 5.0
+    # odometry says by five `slip_size` has hardly slipped: that is less likely by so many nats
     unmoved: float = 7.0
 
     # --- what is known at the beginning
-    headings: int = 16  # headings that are tried, with
+    headings: int = 16  # headings that are tried, also after a turn that is less known, with
     heading: float = 0.15  # such a sigma [rad]
-    near_fault: float = 40.0  # how far a receiver is off that begins in a fault [m]: as mostly,
-    far_fault: float = 1000.0  # or as after a cold start
+    # how far a receiver is off that begins in a fault: mostly twice `fault_size`, or as after a
+    # cold start [m]
+    far_fault: float = 1000.0
     rate: float = 0.005  # sigma of the constant error of the yaw rate [rad/s]
     scale: float = 0.01  # sigma of that of the scale of the way
-    lost: float = 0.3  # variance of a turn after which the heading is not known [rad^2]
-    # least sigmas of a measurement to decide by, as maps and mountings are not exact [m], [rad]
-    least_position: float = 0.3
-    least_heading: float = 0.05
+    # least sigmas to decide by, as maps and mountings are not exact, and covariances mostly too
+    # small [m, m, rad]
+    least_sigmas: tuple[float, float, float] = (0.3, 0.3, 0.05)
 
     # --- how noisy all is
     # evidence that is needed for slow errors of a source, for odometry that is not as noisy as it
@@ -58,12 +56,11 @@ class BankSettings:
     tau: tuple[float, float] = (40.0, 1.0)  # of the time constant of slow errors [s]
     least_white: float = 0.01  # least white part of what a source claims, as a variance
     astray: int = 8  # successive measurements that are wrong after which a filter begins again
-    # at which numbers of measurements noise is learnt: the first, the ratio of the next one, and
-    # the most between
+    # at which numbers of measurements noise is learnt: the first, and the ratio of the next one
     first_learnt: int = 10
     next_learnt: float = 1.3
-    most_between: int = 500
-    most_learnt: int = 3000  # newest ones that it is learnt from while measurements come
+    # newest ones that it is learnt from while measurements come, as soon as a sixth of them is new
+    most_learnt: int = 3000
 
     # --- the bank
     hypotheses: int = 96  # at least 5 for each heading that is tried
@@ -74,8 +71,9 @@ class BankSettings:
     alike_spread: float = 10.0  # with variances within such a factor
     equal: float = 0.3  # within so many sigmas two become one
     period_ns: int = 1_000_000_000  # of each source one measurement in such a time decides [ns]
-    checkpoint: int = 16  # rows from one state that is kept to the next
-    checkpoints: int = 64  # states that are kept; of older ones, every second is dropped
+    # rows from one state that is kept to the next; four times as many states are kept, of older
+    # ones every second is dropped
+    checkpoint: int = 16
 
 
 BANK = BankSettings()

@@ -13,7 +13,8 @@ the record q of the source speaks for it: it is believed weakly. One that does n
 looks for a set of closures that costs less.
 """
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -22,32 +23,21 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.closure_search import decide, Redecision
-from pose_graph_ros.core.judgement.closure_states import ClosureStates, NEVER
 from pose_graph_ros.core.judgement.closures import (
     as_edges,
     chances,
     claims,
     ClosureTable,
     GATE,
+    NEVER,
     squares,
+    UNKNOWN,
 )
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.texts import sentence, unknown
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    Decision,
-    DECISIONS,
-    DOUBTED,
-    OUT,
-    State,
-    STATES,
-    Verdict,
-    WAITING,
-)
-from pose_graph_ros.core.measurements import Answer, AnswerStatus, rejected
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
@@ -57,8 +47,7 @@ class ClosureJudge:
     def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
         self._smoother, self._reweighting = smoother, reweighting
         self.chain = OdometryChain()
-        self._table = ClosureTable(self.chain)
-        self.states = ClosureStates()
+        self.states = ClosureTable(self.chain)
         self.redecision = Redecision(smoother)
         # increases when more or less is believed, so that those that wait are tested again
         self._round = 0
@@ -68,34 +57,31 @@ class ClosureJudge:
 
     # --- new closures ----------------------------------------------------------------------------
 
-    def before(
-        self, new: Sequence[NewConstraint], edges: Factors, now_ns: int,
-    ) -> FloatArray:
+    def before(self, new: Sequence[NewConstraint], edges: Factors, now_ns: int) -> FloatArray:
         """Return the weights with which closures are to be added, shape (M,)."""
         begin, n = len(self.states), len(new)
         self._now_ns, self._n_staged = now_ns, n
         self.chain.extend(self._smoother.graph)
-        self._table.append(claims(edges))
         for one in new:
-            self.states.append(one, now_ns, WAITING)
+            self.states.append(one, now_ns, vd.WAITING)
+        self.states.measure(begin, claims(edges))
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
             for number, state in self._tested(numbers[:self._most]).items():
-                self.states.state[number] = STATES.index(state)
-        return self._weights(numbers)
+                self.states.state[number] = vd.STATES.index(state)
+        return self.states.in_graph[numbers].astype(np.float64)
 
     def withhold(self) -> FloatArray | None:
         """Return the weights of the last `before` without belief; None if they had none."""
         numbers = np.arange(len(self.states) - self._n_staged, len(self.states))
         if not np.any(self.states.in_graph[numbers]):
             return None
-        self.states.state[numbers], self.states.round[numbers] = WAITING, NEVER
-        return self._weights(numbers)
+        self.states.state[numbers], self.states.round[numbers] = vd.WAITING, NEVER
+        return self.states.in_graph[numbers].astype(np.float64)
 
     def rollback(self) -> None:
-        size, self._n_staged = len(self.states) - self._n_staged, 0
-        self._table.truncate(size)
-        self.states.truncate(size)
+        self.states.truncate(len(self.states) - self._n_staged)
+        self._n_staged = 0
 
     def commit(self) -> None:
         begin, self._n_staged = len(self.states) - self._n_staged, 0
@@ -119,34 +105,32 @@ class ClosureJudge:
         by_size = BELIEF.nodes_in_part // max(self._smoother.graph.n_nodes, 1)
         return max(min(BELIEF.tests_in_part, by_size), 1)
 
-    def _tested(self, numbers: IntArray) -> dict[int, State]:
+    def _tested(self, numbers: IntArray) -> dict[int, vd.State]:
         """Test closures that are not in the graph; return the states of those to believe."""
-        some, states = self._table.rows(numbers), self.states
+        some, states = self.states.rows(numbers), self.states
         errors, spread = self._smoother.innovations(as_edges(some))
         distance = squares(errors, spread + some.noise)
-        self._table.spread[numbers] = spread
+        states.spread[numbers] = spread
         before = states.state[numbers].copy()
         states.distance[numbers] = np.sqrt(distance)
         states.round[numbers] = self._round
-        states.state[numbers] = np.where(distance < GATE, WAITING, DOUBTED)
+        states.state[numbers] = np.where(distance < GATE, vd.WAITING, vd.DOUBTED)
         chance = chances(spread + some.noise, self._smoother.graph.extent)
-        chosen = dict[int, State]()
+        chosen = dict[int, vd.State]()
         for k, number in enumerate(numbers.tolist()):
             if number < len(states) - self._n_staged:
                 states.announce(number, int(before[k]), self._now_ns)
             if distance[k] < GATE:
-                chosen[number] = self._belief(number, float(chance[k]))
-        return {number: state for number, state in chosen.items() if state.in_graph}
-
-    def _belief(self, number: int, chance: float) -> State:
-        """Return whether to believe a closure that has passed the gate."""
-        states = self.states
-        good, bad = states.record(int(states.source[number]))
-        alone = (bad + 1.0) * chance < BELIEF.wrong_odds * (good + 1.0)
-        usable = (states.decision != OUT) & ~states.forgotten
-        if (alone and chance <= BELIEF.wrong_odds) or self._table.is_supported(number, usable):
-            return State.BELIEVED
-        return State.WEAKLY_BELIEVED if alone else State.WAITING
+                # how many of the source are or were used, and doubted
+                counts = states.counts(int(states.source[number]))
+                alone = (counts[vd.DOUBTED] + 1.0) * chance[k] < BELIEF.wrong_odds * (
+                    np.sum(counts[vd.USED]) + 1.0)
+                if (alone and chance[k] <= BELIEF.wrong_odds) or states.is_supported(
+                        number, (states.decision != vd.OUT) & ~states.forgotten):
+                    chosen[number] = vd.State.BELIEVED
+                elif alone:
+                    chosen[number] = vd.State.WEAKLY_BELIEVED
+        return chosen
 
     def after(self) -> None:
         """Judge again, within bounds, after an update of a graph that is not large."""
@@ -160,9 +144,22 @@ class ClosureJudge:
         return self._throw_out(np.flatnonzero(self.states.in_graph)) or self.test()
 
     def test(self) -> bool:
-        """Do a bounded part of the tests that are left; tell whether there was any."""
-        return (len(self.states) > 0 and not self._smoother.graph.has_touched
-                and self._test_again())
+        """Do a bounded part of the tests that are left; tell whether some are left."""
+        states = self.states
+        if self._smoother.graph.has_touched:
+            return False
+        waiting = np.flatnonzero(~states.in_graph & states.judged & (states.round < self._round))
+        waiting = waiting[~self._rest(waiting)]
+        if len(waiting) == 0:
+            return False
+        some = states.rows(waiting)
+        # covariances shrink while more is believed, so this is about the least that it can be
+        least = squares(self._smoother.graph.errors(as_edges(some)),
+                        states.spread[waiting] + some.noise)
+        hopeless = ~(least < GATE)
+        states.round[waiting[hopeless]] = self._round
+        rest = waiting[~hopeless][np.argsort(least[~hopeless], kind='stable')]
+        return self._change(self._tested(rest[:self._most])) or len(rest) > self._most
 
     def work(self) -> bool:
         """Do a part on a copy, or of the tests that are left; tell whether there was any."""
@@ -181,28 +178,12 @@ class ClosureJudge:
         # the smoother knows the energies; raised covariances make the residuals only smaller
         rows, factors = graph.factor_rows(states.held[inside]), graph.factor_records
         inside = inside[factors['energy'][rows] > 0.5 * GATE * factors['weight'][rows]]
-        some = self._table.rows(inside)
+        some = states.rows(inside)
         bad = inside[squares(graph.errors(as_edges(some)), some.noise) > GATE]
-        thrown_out = self._change(dict.fromkeys(bad.tolist(), State.DOUBTED))
+        thrown_out = self._change(dict.fromkeys(bad.tolist(), vd.State.DOUBTED))
         # those that contradict one another would take turns in the graph for ever
         self._let_rest(bad)
         return thrown_out
-
-    def _test_again(self) -> bool:
-        """Test some closures that wait; tell whether some are left."""
-        states = self.states
-        waiting = np.flatnonzero(~states.in_graph & states.judged & (states.round < self._round))
-        waiting = waiting[~self._rest(waiting)]
-        if len(waiting) == 0:
-            return False
-        some = self._table.rows(waiting)
-        # covariances shrink while more is believed, so this is about the least that it can be
-        least = squares(self._smoother.graph.errors(as_edges(some)),
-                        self._table.spread[waiting] + some.noise)
-        hopeless = ~(least < GATE)
-        states.round[waiting[hopeless]] = self._round
-        rest = waiting[~hopeless][np.argsort(least[~hopeless], kind='stable')]
-        return self._change(self._tested(rest[:self._most])) or len(rest) > self._most
 
     def _rest(self, numbers: IntArray) -> BoolArray:
         return np.asarray(self.states.resting[numbers] > self._smoother.graph.next_ids.node)
@@ -215,15 +196,13 @@ class ClosureJudge:
 
     # --- changes ---------------------------------------------------------------------------------
 
-    def _weights(self, numbers: IntArray) -> FloatArray:
-        return self.states.in_graph[numbers].astype(np.float64)
-
     def _set_base_weights(self, numbers: IntArray) -> None:
         """Tell robust losses the weights of closures, which the graph has already."""
-        for number, weight in zip(numbers.tolist(), self._weights(numbers).tolist(), strict=True):
-            self._reweighting.set_base_weight(int(self.states.held[number]), weight)
+        for number in numbers.tolist():
+            self._reweighting.set_base_weight(
+                int(self.states.held[number]), float(self.states.in_graph[number]))
 
-    def _change(self, changes: Mapping[int, State], *, at_once: bool = False) -> bool:
+    def _change(self, changes: Mapping[int, vd.State], *, at_once: bool = False) -> bool:
         """Change states and weights; tell whether there were any, and it has not diverged."""
         if len(changes) == 0:
             return False
@@ -238,24 +217,24 @@ class ClosureJudge:
         self._note(changes)
         return True
 
-    def _note(self, changes: Mapping[int, State]) -> None:
+    def _note(self, changes: Mapping[int, vd.State]) -> None:
         """Change states, of which the graph has the weights already."""
         for number, state in sorted(changes.items()):
             before = int(self.states.state[number])
-            self.states.state[number] = STATES.index(state)
+            self.states.state[number] = vd.STATES.index(state)
             self.states.announce(number, before, self._now_ns)
         self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self._round += 1
         if not all(state.in_graph for state in changes.values()):
-            self._table.forget_spread()     # without them the graph is less certain
+            self.states.spread[:] = UNKNOWN * np.eye(3)     # without them it is less certain
 
-    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, State]:
+    def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, vd.State]:
         """Return the states of closures with a set of believed ones, both by the ids of edges."""
         states = self.states
         numbers = states.numbers(decided)
         now, later = states.in_graph, np.isin(states.held, believed)
-        return {k: (State.DOUBTED if not later[k] else
-                    STATES[states.state[k]] if now[k] else State.BELIEVED)
+        return {k: (vd.State.DOUBTED if not later[k] else
+                    vd.STATES[states.state[k]] if now[k] else vd.State.BELIEVED)
                 for k in numbers[states.judged[numbers] & (now | later)[numbers]].tolist()}
 
     # --- all closures together -------------------------------------------------------------------
@@ -267,7 +246,7 @@ class ClosureJudge:
             yield
             # closures may have left or been believed meanwhile
             outside = states.judged & ~states.in_graph
-            if number < len(states) and self._table.is_supported(number, outside):
+            if number < len(states) and states.is_supported(number, outside):
                 break
         else:
             return
@@ -284,10 +263,9 @@ class ClosureJudge:
         weights = {int(states.held[k]): float(each.in_graph) for k, each in changes.items()}
         changed = np.array([*weights], dtype=np.int64)
 
-        def is_still_judged() -> bool:
-            return bool(np.all(states.judged[states.numbers(changed)]))
         if (yield from self.redecision.tried(
-                weights, continued(graph, choice.poses, nodes), is_still_judged)):
+                weights, continued(graph, choice.poses, nodes),
+                lambda: bool(np.all(states.judged[states.numbers(changed)])))):
             self._note(self._changes_to(changed, believed))
 
     def decide_finally(self) -> None:
@@ -312,23 +290,15 @@ class ClosureJudge:
         states.round[:] = self._round
         self._final = *present[:-1], self._round
 
-    def state(self) -> Callable[[], None]:
-        """Return what brings the present state back, as long as no closure is added."""
-        states_back = self.states.snapshot()
-
-        def bring_back() -> None:
-            states_back()
-            self.redecision.drop()
-            self._test_all_again()
-        return bring_back
-
-    def _test_all_again(self) -> None:
-        self.states.round[:], self.states.resting[:] = NEVER, 0
-        self._table.forget_spread()
+    def keep(self, undo: ExitStack[bool]) -> None:
+        """Have the present state brought back, as long as no closure is added."""
+        undo.callback(self.states.test_all_again)
+        undo.callback(setattr, self.redecision, 'job', None)
+        self.states.keep(undo)
 
     # --- what leaves the window ------------------------------------------------------------------
 
-    def decide_leaving(self, edges: IntArray) -> list[Verdict]:
+    def decide_leaving(self, edges: IntArray) -> list[vd.Verdict]:
         """
         Decide on closures that are about to leave the graph; return the verdicts on those unused.
         """
@@ -342,45 +312,38 @@ class ClosureJudge:
             waiting = leaving[~states.in_graph[leaving] & states.judged[leaving]
                               & ~self._rest(leaving) & (states.round[leaving] < self._round)]
             self._change(self._tested(waiting[:self._most]))
-        return self.verdicts(leaving[~states.in_graph[leaving]][-MOST_OTHERS:])
+        return states.verdicts(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:])
 
     def forget(self, nodes: IntArray, edges: IntArray) -> None:
         gone = self.states.numbers(edges)
         if len(gone) > 0:
             # all others get other numbers
-            kept = np.setdiff1d(np.arange(len(self.states)), gone)
-            self.states.select(kept)
-            self._table.select(kept)
+            self.states.select(np.setdiff1d(np.arange(len(self.states)), gone))
         self.chain.forget(nodes)
 
-    # --- what is told ----------------------------------------------------------------------------
-
-    def verdicts(self, numbers: IntArray) -> list[Verdict]:
-        return self.states.reports(self._smoother.graph, self._table, numbers.tolist())
+    # --- from outside ----------------------------------------------------------------------------
 
     def restore(self, saved: SavedVerdicts, now_ns: int) -> None:
         self._now_ns = now_ns
         self.chain.extend(self._smoother.graph)
-        self._table.append(claims(self._smoother.graph.factors_at(saved.held)))
         self.states.restore(saved)
+        self.states.measure(0, claims(self._smoother.graph.factors_at(saved.held)))
 
-    def decide(self, name: str, decision: Decision) -> Answer:
+    def decide(self, number: int, decision: vd.Decision) -> bool:
         """
-        Apply a decision at once; a closure that had been forced in waits when that is taken back.
+        Apply a person's decision at once; return whether the solver succeeded.
+
+        A closure that had been forced in waits when that is taken back.
         """
         states = self.states
-        number = states.find(name)
-        if number < 0:
-            return unknown(name, has_left=states.has_left(name))
         before = int(states.decision[number])
-        state = {Decision.IN: State.BELIEVED, Decision.OUT: State.DOUBTED,
-                 Decision.AUTO: State.WAITING}[decision]
-        forced = decision is not Decision.AUTO or before != AUTO
-        states.decision[number] = DECISIONS.index(decision)
+        state = {vd.Decision.IN: vd.State.BELIEVED, vd.Decision.OUT: vd.State.DOUBTED,
+                 vd.Decision.AUTO: vd.State.WAITING}[decision]
+        forced = decision is not vd.Decision.AUTO or before != vd.AUTO
+        states.decision[number] = vd.DECISIONS.index(decision)
         states.forgotten[number] = False
         if forced and not self._change({number: state}, at_once=True):
             states.decision[number] = before
-            return rejected('failed', 'the solver failed with it')
-        self._test_all_again()
-        verdict, = self.verdicts(np.array([number]))
-        return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
+            return False
+        states.test_all_again()
+        return True

@@ -19,12 +19,11 @@ from pose_graph_ros.core.batch import final_optimization, optimizer
 from pose_graph_ros.core.batch.optimizer import Start, Status
 from pose_graph_ros.core.batch.truncated import Choice, Choosing, TruncatedProblem
 from pose_graph_ros.core.config import SolverConfig
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.closures import floored, forward, GATE
-from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.judgement.odometry_chain import moved, OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.smoother.covariances import Innovations, innovations
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
@@ -56,7 +55,10 @@ def select(problem: TruncatedProblem) -> Generator[None, None, BoolArray | None]
     gates, thrown = _Gates(problem), np.zeros(len(problem), dtype=np.int64)
     limits, seen = problem.limits, np.zeros(len(problem))
     for _ in range(BELIEF.most_rounds):
-        waiting = gates.plausible(np.flatnonzero(~believed & (thrown < BELIEF.thrown_out)))
+        waiting = np.flatnonzero(~believed & (thrown < BELIEF.thrown_out))
+        # those outside of old gates cannot pass now: S only shrinks
+        old = np.nan_to_num(gates.squares(waiting, problem.errors(waiting)), nan=0.0)
+        waiting = waiting[old <= problem.limits[waiting]]
         waiting = waiting[np.argsort(gates.volume[waiting], kind='stable')]
         # volumes only shrink, so what is widest now is looked at where nothing else passes
         passing = yield from gates.passing(waiting[:BELIEF.first_volumes])
@@ -98,11 +100,8 @@ class _Gates:
         self._covariances = np.full((len(problem), 3, 3), np.nan)
         self.volume = np.zeros(len(problem))
         self.squared = np.zeros(len(problem))  # Mahalanobis distances
-        self._begin_with_odometry()
-
-    def _begin_with_odometry(self) -> None:
-        """Set gates by odometry, the largest: it is quicker than the tree without closures."""
-        problem, chain = self._problem, OdometryChain(weighted=True)
+        # gates by odometry, the largest: it is quicker than the tree without closures
+        chain = OdometryChain(weighted=True)
         chain.extend(problem.graph)
         numbers = np.flatnonzero(np.isin(problem.edges.i, chain.nodes)
                                  & np.isin(problem.edges.j, chain.nodes))
@@ -111,13 +110,7 @@ class _Gates:
         # from the axes of the predicted pose to those of the measured one
         turn = np.zeros((len(numbers), 3))
         turn[:, 2] = pose[:, 2] - some.mean[:, 2]
-        axes = se2.adjoint(turn)
-        self._set(numbers, axes @ covariance @ np.swapaxes(axes, 1, 2))
-
-    def plausible(self, numbers: IntArray) -> IntArray:
-        """Return constraints inside of old gates: S only shrinks, so no others can pass now."""
-        old = np.nan_to_num(self._squared(numbers, self._problem.errors(numbers)), nan=0.0)
-        return numbers[old <= self._problem.limits[numbers]]
+        self._set(numbers, moved(covariance, turn))
 
     def passing(self, waiting: IntArray) -> Generator[None, None, IntArray]:
         """Return which of some constraints pass their gates by what is believed now."""
@@ -128,12 +121,12 @@ class _Gates:
             errors, covariances = innovations(
                 self._problem.graph.memory.head, self._edges.rows(part))
             self._set(part, covariances)
-            self.squared[part] = self._squared(part, errors)
+            self.squared[part] = self.squares(part, errors)
             inside[begin:begin + len(part)] = self.squared[part] <= self._problem.limits[part]
             yield
         return waiting[inside]
 
-    def _squared(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
+    def squares(self, numbers: IntArray, errors: FloatArray) -> FloatArray:
         return Innovations(errors, self._covariances[numbers]).squared_distances(
             self._information[numbers])
 
@@ -239,7 +232,7 @@ class Redecision:
 
     def __init__(self, smoother: IncrementalSmoother) -> None:
         self._smoother = smoother
-        self._job: Job | None = None
+        self.job: Job | None = None
         self._solves = False  # whether the job solves for what an update has diverged with
         # next id of a node from which on there may be another one
         self._next_search = self._next_solution = 0
@@ -247,14 +240,14 @@ class Redecision:
     def search(self, job: Job) -> None:
         """Begin a search, unless there is a job or the graph has not grown since the last one."""
         graph = self._smoother.graph
-        if self._job is None and graph.next_ids.node >= self._next_search:
+        if self.job is None and graph.next_ids.node >= self._next_search:
             self._next_search = _grown(graph, BELIEF.search_again)
-            self._job, self._solves = job, False
+            self.job, self._solves = job, False
 
     def solve_later(self, weights: Mapping[int, float]) -> None:
         """Solve for weights, by id, with which an update diverges, but during a pause."""
         if self.may_solve():
-            self._job, self._solves = self.tried(weights), True
+            self.job, self._solves = self.tried(weights), True
 
     def may_solve(self) -> bool:
         """Tell whether all may be solved for now that an update has diverged; else in a pause."""
@@ -267,7 +260,7 @@ class Redecision:
     def is_due_or_pausing(self) -> bool:
         """Whether a copy is solved, or has to wait until the graph has grown."""
         graph = self._smoother.graph
-        return (self._job is not None and self._solves) or (
+        return (self.job is not None and self._solves) or (
             graph.n_nodes > BELIEF.small and graph.next_ids.node < self._next_solution)
 
     def tried(
@@ -283,16 +276,13 @@ class Redecision:
 
     def work(self) -> bool:
         """Do a part of the job; tell whether there was one."""
-        if self._job is None:
+        if self.job is None:
             return False
         try:
-            next(self._job)
+            next(self.job)
         except StopIteration:
-            self._job = None
+            self.job = None
         return True
-
-    def drop(self) -> None:
-        self._job = None
 
 
 def _grown(graph: Graph, share: float) -> int:

@@ -1,7 +1,7 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Loop closures that are judged: how far from the estimate, and which of them agree with each other.
+Loop closures that are judged: how far from the estimate, which of them agree, what is decided.
 
 A closure is a measured pose z of a later node in an earlier one. Its error (3.48) is in the frame
 of the measured pose, and so are all covariances here.
@@ -13,18 +13,21 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.batch.truncated import LIMITS
-from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.compiled.jit import kernel, MATRICES, NUMBERS, ROWS
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
+from pose_graph_ros.core.graph.graph import Graph
+from pose_graph_ros.core.judgement import verdicts as vd
+from pose_graph_ros.core.judgement.judgements import Column, Judgements
+from pose_graph_ros.core.judgement.odometry_chain import moved, OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 
 # Squared Mahalanobis distance that 99 % of errors with three components are within.
 GATE = float(LIMITS[3])
 # Least sigmas of closures to decide by [m, m, rad].
 FLOORS = np.array(BELIEF.closure_floors)
+NEVER = -1  # round of the last test of one that was not tested
 # Variance of a prediction that was not tested: anything may be right.
 UNKNOWN = 1e12
 
@@ -36,8 +39,7 @@ class Closures(NamedTuple):
     noise: FloatArray  # covariances in the frames of the measured poses, shape (M, 3, 3)
 
     def rows(self, chosen: IntArray | BoolArray) -> 'Closures':
-        return Closures(
-            self.i[chosen], self.j[chosen], self.mean[chosen], self.noise[chosen])
+        return Closures(self.i[chosen], self.j[chosen], self.mean[chosen], self.noise[chosen])
 
 
 def squared_distances(chain: OdometryChain, a: Closures, b: Closures) -> FloatArray:
@@ -59,30 +61,10 @@ def squared_distances(chain: OdometryChain, a: Closures, b: Closures) -> FloatAr
     behind = se2.compose(b.mean, after)
     error = se2.between(a.mean, se2.compose(before, behind))
     # in the frame at the end of the prediction, then in the axes of the error
-    noise = noise_after + _moved(b.noise, after) + _moved(noise_before, behind)
-    turn = np.zeros_like(error)
-    turn[:, 2] = -error[:, 2]
-    out[known] = squares(error, a.noise + _moved(noise, turn))
+    noise = noise_after + moved(b.noise, se2.inverse(after)) + moved(
+        noise_before, se2.inverse(behind))
+    out[known] = squares(error, a.noise + moved(noise, error * (0.0, 0.0, 1.0)))
     return out
-
-
-def _moved(covariances: FloatArray, motions: FloatArray) -> FloatArray:
-    """Return covariances of poses as those of what is rigidly some motions further."""
-    adjoint = se2.adjoint(se2.inverse(motions))
-    return np.asarray(adjoint @ covariances @ np.swapaxes(adjoint, 1, 2))
-
-
-@kernel
-def _solved_form(m, e):  # type: ignore[no-untyped-def]
-    """Return `e^T M^-1 e` for a positive definite matrix, shape (3, 3)."""
-    l00 = math.sqrt(m[0, 0])
-    l10, l20 = m[1, 0] / l00, m[2, 0] / l00
-    l11 = math.sqrt(m[1, 1] - l10 * l10)
-    l21 = (m[2, 1] - l20 * l10) / l11
-    x = e[0] / l00
-    y = (e[1] - l10 * x) / l11
-    z = e[2] - l20 * x - l21 * y
-    return x * x + y * y + z * z / (m[2, 2] - l20 * l20 - l21 * l21)
 
 
 def floored(edges: Factors, sigmas: FloatArray = FLOORS) -> Factors:
@@ -123,7 +105,16 @@ def squares(errors: FloatArray, covariances: FloatArray) -> FloatArray:
 @kernel(signature=(ROWS, MATRICES, NUMBERS))
 def _write_squares(errors, covariances, out):  # type: ignore[no-untyped-def]
     for k in range(len(errors)):
-        out[k] = _solved_form(covariances[k], errors[k])
+        m, e = covariances[k], errors[k]
+        # m = L L^T, and L^-1 e
+        l00 = math.sqrt(m[0, 0])
+        l10, l20 = m[1, 0] / l00, m[2, 0] / l00
+        l11 = math.sqrt(m[1, 1] - l10 * l10)
+        l21 = (m[2, 1] - l20 * l10) / l11
+        x = e[0] / l00
+        y = (e[1] - l10 * x) / l11
+        z = e[2] - l20 * x - l21 * y
+        out[k] = x * x + y * y + z * z / (m[2, 2] - l20 * l20 - l21 * l21)
 
 
 def as_edges(some: Closures) -> Factors:
@@ -150,61 +141,70 @@ def chances(covariance: FloatArray, extent: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(ellipse / area, 1.0) * np.minimum(arc, 1.0))
 
 
-class ClosureTable:
-    """Closures by their numbers, in the order of addition."""
+class ClosureTable(Judgements):
+    i, j, mean, noise = Column(), Column(), Column(), Column()
+    spread, travel = Column(), Column()
+    forgotten, round, resting = Column(), Column(), Column()
 
     def __init__(self, chain: OdometryChain) -> None:
+        super().__init__(
+            vd.Judged.LOOP_CLOSURE, [
+                ('i', np.int64), ('j', np.int64), ('mean', np.float64, (3,)),   # as in `Closures`
+                ('noise', np.float64, (3, 3)),
+                ('spread', np.float64, (3, 3)),  # of the prediction when it was tested last
+                ('travel', np.float64, (2,)),  # way along the path to both ends [m]
+                ('forgotten', np.bool_),  # hopeless, and not judged again
+                ('round', np.int64),  # of its last test
+                ('resting', np.int64)],  # id of the node until which it is not tested
+            round=NEVER)
         self.chain = chain
-        self._rows = GrowingArray((), np.dtype([
-            ('i', np.int64), ('j', np.int64), ('mean', np.float64, (3,)),
-            ('noise', np.float64, (3, 3)),
-            # of the prediction when it was tested last
-            ('spread', np.float64, (3, 3))]))
-        # way along the path to both ends [m]
-        self._travel = GrowingArray((2,), np.float64)
         # numbers by the way to the later end, and these ways; none after a change
         self._by_end: tuple[IntArray, FloatArray] | None = None
 
-    def __len__(self) -> int:
-        return len(self._rows)
+    @property
+    def judged(self) -> BoolArray:
+        """Whether they are judged: no person has decided on them, and they are not forgotten."""
+        return (self.decision == vd.AUTO) & ~self.forgotten
 
     def rows(self, numbers: IntArray) -> Closures:
-        rows = self._rows.values[numbers]
-        return Closures(*(rows[name].copy() for name in Closures._fields))
+        return Closures(*(np.take(self.records[name], numbers, axis=0)
+                          for name in Closures._fields))
 
-    @property
-    def spread(self) -> FloatArray:
-        """Covariances of the predictions when they were tested last, writeable."""
-        return np.asarray(self._rows.values['spread'])
+    def measure(self, begin: int, some: Closures) -> None:
+        """Note what those from a number on measure, between nodes of the chain."""
+        for name, column in zip(Closures._fields, some, strict=True):
+            self.records[name][begin:] = column
+        self.spread[begin:] = UNKNOWN * np.eye(3)
+        for k, nodes in enumerate((some.i, some.j)):
+            self.travel[begin:, k] = self.chain.travel(nodes)
+        self._by_end = None
 
-    def forget_spread(self) -> None:
+    def test_all_again(self) -> None:
+        self.round[:], self.resting[:] = NEVER, 0
         self.spread[:] = UNKNOWN * np.eye(3)
 
-    def append(self, new: Closures) -> None:
-        """Append closures between nodes of the chain."""
-        rows = np.zeros(len(new.i), self._rows.values.dtype)
-        for name, column in zip(Closures._fields, new, strict=True):
-            rows[name] = column
-        rows['spread'] = UNKNOWN * np.eye(3)
-        self._rows.append(rows)
-        self._travel.append(
-            np.column_stack((self.chain.travel(new.i), self.chain.travel(new.j))))
-        self._by_end = None
+    def numbers(self, edges: IntArray) -> IntArray:
+        """Return the numbers of those of some edges, given by their ids, that are closures."""
+        return np.flatnonzero(np.isin(self.held, edges))
 
-    def truncate(self, size: int) -> None:
-        for array in (self._rows, self._travel):
-            array.truncate(size)
-        self._by_end = None
+    def forget(self, source: int) -> None:
+        """Forget closures of a source if too many are not believed, the oldest doubted first."""
+        kept = np.flatnonzero((self.source == source) & ~self.in_graph & self.judged)
+        if len(kept) <= BELIEF.most_waiting:
+            return
+        order = np.lexsort((self.stamps_ns[kept, 0], self.state[kept] != vd.DOUBTED))
+        # some more than need be, as this is not to be done for each new one
+        self.forgotten[kept[order[:len(kept) - 9 * BELIEF.most_waiting // 10]]] = True
 
-    def select(self, kept: IntArray) -> None:
-        for array in (self._rows, self._travel):
-            array.select(kept)
-        self._by_end = None
+    def totals(self) -> dict[str, vd.SourceVerdicts]:
+        return {source: each._replace(n_forgotten=int(np.count_nonzero(
+            self.forgotten[self.source == self.sources.index(source)])))
+            for source, each in super().totals().items()}
 
     def near(self, number: int, usable: BoolArray) -> IntArray:
         """Return usable closures with both ends near those of one, at most `most_compared`."""
-        travel = self._travel.values
-        if self._by_end is None:
+        travel = self.travel
+        if self._by_end is None or len(self._by_end[0]) != len(self):
             order = np.argsort(travel[:, 1], kind='stable')
             self._by_end = order, travel[order, 1]
         order, ends = self._by_end
@@ -238,5 +238,25 @@ class ClosureTable:
         for k in np.argsort(-np.sum(pairs[:, pairs[0]], axis=1), kind='stable').tolist():
             if np.all(pairs[k, clique]):
                 clique.append(k)
-        way = float(np.ptp(self._travel.values[members[clique], 1]))
+        way = float(np.ptp(self.travel[members[clique], 1]))
         return len(clique) >= BELIEF.clique and way >= BELIEF.clique_travel
+
+    def verdicts(self, graph: Graph, numbers: IntArray) -> list[vd.Verdict]:
+        verdicts = []
+        usable = ~self.forgotten
+        near = [self.near(number, usable) for number in numbers.tolist()]
+        sizes = np.array([len(each) for each in near], dtype=np.int64)
+        others = np.concatenate([np.empty(0, np.int64), *near])
+        agree = np.split(self.agree(np.repeat(numbers, sizes), others),
+                         np.cumsum(sizes)[:-1]) if len(sizes) > 0 else []
+        residuals = graph.errors(graph.factors_at(self.held[numbers]))
+        for number, residual, around, agrees in zip(
+                numbers.tolist(), residuals, near, agree, strict=True):
+            contradicted = [self.name(other) for other in around[~agrees]
+                            if vd.USED[self.state[other]]]
+            if self.distance[number] > math.sqrt(GATE):
+                contradicted.insert(0, vd.ODOMETRY)
+            verdicts.append(self.verdict(
+                number, residual, supported_by=around[agrees].tolist(),
+                contradicted_by=contradicted))
+        return verdicts

@@ -1,25 +1,30 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What is decided on each position and pose in the map, why, and the weights that follow."""
+"""
+What is decided on each position and pose in the map, why, and the weights that follow.
 
-from collections.abc import Sequence
+Where they win against odometry, it is believed less over a gap between them; `fixes` decides that,
+and keeps the weights. Here it is told which odometry is doubted.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
+from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judgements import Column, Judgements
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    BELIEVED,
-    DOUBTED,
-    Judged,
-    MOST_NAMED,
-    ODOMETRY,
-    Verdict,
-)
+from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 
 # Run of a measurement that is wrong by itself, and of all that are good.
 LONE, GOOD = -1, 0
@@ -32,57 +37,39 @@ class FixStates(Judgements):
 
     def __init__(self) -> None:
         # id of the first one of its fault, `LONE` or `GOOD`
-        super().__init__(Judged.FIX, run=LONE)
+        super().__init__(vd.Judged.FIX, [('run', np.int64)], run=LONE)
 
     @property
     def believed(self) -> BoolArray:
-        return np.asarray(self.state == BELIEVED)
-
-    @property
-    def unused(self) -> IntArray:
-        """Ids of what holds those that are not believed."""
-        return np.asarray(self.held[~self.believed])
+        return np.asarray(self.state == vd.BELIEVED)
 
     def leaving(self, factors: IntArray) -> BoolArray:
         """Return which records leave with factors, shape (M,)."""
         return np.isin(self.held, factors) | np.isin(self.added, factors)
 
-    def by_stamp(self) -> IntArray:
-        """Return the numbers of all records, by stamp, then by the name of the source."""
-        names = np.argsort(np.argsort(np.array(self.sources)))
-        return np.lexsort((names[self.source], self.stamps_ns[:, 0]))
-
-    def believe(self, which: IntArray, *, believed: bool) -> None:
+    def believe(self, which: IntArray, believed: BoolArray) -> None:
         """Believe or doubt some records, but not those that a person has decided on."""
-        self.state[which[self.decision[which] == AUTO]] = BELIEVED if believed else DOUBTED
+        free = self.decision[which] == vd.AUTO
+        self.state[which[free]] = np.where(believed[free], vd.BELIEVED, vd.DOUBTED)
 
-    def weights(self, before: IntArray, reweighting: Reweighting) -> dict[int, float]:
-        """Return weights that change, by the ids of factors."""
-        changed = self.changed(before)
+    def weights(
+        self, before: IntArray, reweighting: Reweighting, *, base: bool = False,
+    ) -> dict[int, float]:
+        """Return weights that change, or `base` weights, by the ids of factors."""
+        changed, later = self.changed(before), np.empty(0, dtype=np.int64)
         doubted = np.flatnonzero(~self.believed[len(before):]) + len(before)
-        # losses have lowered the weights of the believed ones since one that returns
         again = self.stamps_ns[changed[self.believed[changed]], 0]
-        since = np.min(again) if len(again) > 0 else np.inf
-        later = np.flatnonzero((self.stamps_ns[:, 0] >= since) & self.believed)
+        if not base and len(again) > 0:
+            # losses have lowered the weights of the believed ones since one that returns
+            later = np.flatnonzero((self.stamps_ns[:, 0] >= np.min(again)) & self.believed)
         return {
             int(self.held[number]): self._base_weight(number, changed, reweighting)
-            if self.state[number] == BELIEVED else 0.0
+            if self.state[number] == vd.BELIEVED else 0.0
             for number in (*doubted.tolist(), *later.tolist(), *changed.tolist())}
 
     def changed(self, before: IntArray) -> IntArray:
         """Return the numbers of records that had another state, given all that there were."""
         return np.flatnonzero(self.state[:len(before)] != before)
-
-    def set_base_weights(self, before: IntArray, reweighting: Reweighting) -> None:
-        """Tell what is not believed any more, or again."""
-        changed = self.changed(before)
-        for number in (*range(len(before), len(self)), *changed.tolist()):
-            held = int(self.held[number])
-            if self.state[number] == DOUBTED:
-                reweighting.set_base_weight(held, 0.0)
-            elif number < len(before):
-                reweighting.set_base_weight(
-                    held, self._base_weight(number, changed, reweighting))
 
     def _base_weight(self, number: int, changed: IntArray, reweighting: Reweighting) -> float:
         """Return the base weight of a believed record, or else that of one next to it."""
@@ -92,8 +79,7 @@ class FixStates(Judgements):
             return own
         first = max(number - BELIEF.records_near, 0)
         near = slice(first, number + BELIEF.records_near)
-        alike = first + np.flatnonzero(
-            self.believed[near] & (self.source[near] == source))
+        alike = first + np.flatnonzero(self.believed[near] & (self.source[near] == source))
         alike = np.setdiff1d(alike, changed)
         if len(alike) == 0:
             return 1.0
@@ -109,18 +95,20 @@ class FixStates(Judgements):
     def believed_after(self, stamp_ns: int) -> tuple[str, ...]:
         """Return the ids of the first believed measurements from a stamp on."""
         after = np.flatnonzero(self.believed & (self.stamps_ns[:, 0] >= stamp_ns))
-        first = after[np.argsort(self.stamps_ns[after, 0], kind='stable')][:MOST_NAMED]
+        first = after[np.argsort(self.stamps_ns[after, 0], kind='stable')][:vd.MOST_NAMED]
         return tuple(map(self.name, first.tolist()))
 
-    def verdicts(self, graph: Graph, numbers: IntArray) -> list[Verdict]:
-        verdicts, residuals = [], _residuals(graph, self.held[numbers])
+    def verdicts(self, graph: Graph, numbers: IntArray) -> list[vd.Verdict]:
+        factors, verdicts = graph.factors_at(self.held[numbers]), []
+        measured = np.diagonal(factors.information, axis1=1, axis2=2) > 0.0
+        residuals = np.where(measured, graph.errors(factors), np.nan)
         for number, residual in zip(numbers.tolist(), residuals, strict=True):
             # a person may force out what fits, and force in what does not
-            contradicted = (self.state[number] == DOUBTED if self.decision[number] == AUTO
+            contradicted = (self.state[number] == vd.DOUBTED if self.decision[number] == vd.AUTO
                             else self.distance[number]**2 > BELIEF.event)
             verdicts.append(self.verdict(
                 number, residual, supported_by=self._alike(number),
-                contradicted_by=(ODOMETRY,) if contradicted else ()))
+                contradicted_by=(vd.ODOMETRY,) if contradicted else ()))
         return verdicts
 
     def _alike(self, number: int) -> Sequence[int]:
@@ -128,14 +116,103 @@ class FixStates(Judgements):
         if self.run[number] == LONE:
             return ()
         first = max(number - ALIKE_WITHIN, 0)
-        alike = first + np.flatnonzero(
-            self.run[first:number + ALIKE_WITHIN] == self.run[number])
+        alike = first + np.flatnonzero(self.run[first:number + ALIKE_WITHIN] == self.run[number])
         alike = alike[alike != number]
         return alike[np.argsort(np.abs(alike - number), kind='stable')].tolist()
 
 
-def _residuals(graph: Graph, held: IntArray) -> FloatArray:
-    """Return the errors at the estimate, shape (K, 3), nan where nothing is measured."""
-    factors = graph.factors_at(held)
-    measured = np.diagonal(factors.information, axis1=1, axis2=2) > 0.0
-    return np.where(measured, graph.errors(factors), np.nan)
+class Doubt(NamedTuple):
+    """Odometry is wrong somewhere along some edges; which of them it is cannot be told."""
+
+    edges: tuple[int, ...]  # ids of those that are believed less
+    verdict: vd.Verdict  # on all of them, but for what changes with the estimate
+
+
+class OdometryStates:
+    def __init__(self, nodes: HiddenNodes) -> None:
+        self._nodes = nodes
+        self._gaps: dict[int, Doubt] = {}  # by the id of the first edge, ascending
+        self._loosened: Mapping[int, float] = {}
+        self._changes: list[vd.Change] = []
+        # number of edges of each source that have left the graph doubted
+        self.left = Counter[str]()
+
+    @property
+    def edges(self) -> list[int]:
+        """The ids of doubted edges."""
+        return [edge for doubt in self._gaps.values() for edge in doubt.edges]
+
+    def forget(self, edges: IntArray) -> None:
+        for doubt in self._gaps.values():
+            self.left[doubt.verdict.source] += int(np.sum(np.isin(doubt.edges, edges)))
+
+    def follow(
+        self, loosened: Mapping[int, float], graph: Graph, now_ns: int, *, announce: bool = True,
+    ) -> None:
+        """Follow which odometry is believed less because of fixes, and note what has changed."""
+        if announce and loosened is self._loosened:
+            return
+        before, self._loosened = self._gaps, loosened
+        self._gaps = self._found_gaps(graph, now_ns)
+        for edge in sorted(before.keys() ^ self._gaps.keys()) if announce else ():
+            verdict = {**before, **self._gaps}[edge].verdict
+            states = vd.State.BELIEVED, vd.State.DOUBTED
+            self._changes.append(vd.Change(
+                verdict.id, verdict.kind, verdict.source, verdict.stamp_ns,
+                *(states[::-1] if edge in before else states)))
+
+    def _found_gaps(self, graph: Graph, now_ns: int) -> dict[int, Doubt]:
+        """Return the stretches of odometry that is believed much less, by their first edges."""
+        since_ns = {edge: doubt.verdict.since_ns
+                    for doubt in self._gaps.values() for edge in doubt.edges}
+        ids = np.array(sorted(edge for edge, factor in self._loosened.items()
+                              if factor < BELIEF.much_less), dtype=np.int64)
+        edges = graph.factors_at(ids)
+        cuts = np.flatnonzero(edges.i[1:] != edges.j[:-1]) + 1
+        gaps = {}
+        for part in np.split(np.arange(len(ids)), cuts) if len(ids) > 0 else ():
+            first = int(ids[part[0]])
+            # edges are counted along the path
+            begin, number, end = np.searchsorted(
+                self._nodes.ids, (edges.i[part[0]], edges.j[part[0]], edges.j[part[-1]])).tolist()
+            reference_ns, stamp_ns = self._nodes.stamps_ns[[begin, end]].tolist()
+            source = self._nodes.primary_at(stamp_ns)
+            gaps[first] = Doubt(tuple(ids[part].tolist()), vd.Verdict(
+                id=f'{source}/{number - 1}', kind=vd.Judged.ODOMETRY, source=source,
+                stamp_ns=stamp_ns, reference_ns=reference_ns, state=vd.State.DOUBTED,
+                since_ns=since_ns.get(first, now_ns), decision=vd.Decision.AUTO,
+                residual=np.full(3, np.nan), distance=np.nan, supported_by=(),
+                contradicted_by=(), number=first))
+        return gaps
+
+    def take_changes(self) -> list[vd.Change]:
+        changes, self._changes = self._changes, []
+        return changes
+
+    def keep(self, undo: ExitStack[bool]) -> None:
+        """Have the present state brought back, but for weights."""
+        for name, value in (('_gaps', self._gaps), ('_loosened', self._loosened),
+                            ('_changes', [*self._changes])):
+            undo.callback(setattr, self, name, value)
+
+    def verdicts(self, graph: Graph, fixes: FixStates) -> list[vd.Verdict]:
+        verdicts = []
+        for doubt in self._gaps.values():
+            edges = graph.factors_at(np.array(doubt.edges))
+            begin, end = graph.poses_of((edges.i[0], edges.j[-1]))
+            chi2 = np.sum(energies(graph.errors(edges), edges.information))
+            verdicts.append(replace(
+                doubt.verdict, distance=float(np.sqrt(chi2)), residual=se2.between(
+                    reduce(se2.compose, edges.mean), se2.between(begin, end)),
+                contradicted_by=fixes.believed_after(doubt.verdict.stamp_ns)))
+        return verdicts
+
+    def totals(self) -> dict[str, vd.SourceVerdicts]:
+        counts = Counter[str]()
+        for doubt in self._gaps.values():
+            counts[doubt.verdict.source] += len(doubt.edges)
+        n, n_left = len(self._nodes) - 1, self._nodes.n_frozen + len(self._nodes.thinned)
+        return {source: vd.SourceVerdicts(
+            {vd.State.BELIEVED: n - n_left - counts[source], vd.State.DOUBTED: counts[source]},
+            doubting=False, n_left=n_left, n_left_unused=self.left[source])
+            for source in (counts | self.left)}

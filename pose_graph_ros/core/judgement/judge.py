@@ -23,18 +23,14 @@ from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DrawnRows
 from pose_graph_ros.core.graph.reweighting import Reweighting
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
+from pose_graph_ros.core.judgement.fix_states import OdometryStates
 from pose_graph_ros.core.judgement.fixes import FixJudge
-from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, SavedVerdicts
-from pose_graph_ros.core.judgement.odometry_states import OdometryStates
+from pose_graph_ros.core.judgement.judgements import LEFT, MOST_OTHERS, SavedVerdicts
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    Change,
-    Decision,
-    SourceVerdicts,
-    Verdict,
-)
-from pose_graph_ros.core.measurements import Answer, LoopClosure
+from pose_graph_ros.core.judgement.texts import sentence, unknown
+from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3
@@ -65,16 +61,21 @@ class Judge:
         self._nodes = nodes
         self.fixes = FixJudge(smoother, reweighting, config, nodes, factors)
         self._odometry = OdometryStates(nodes)
-        self._closures = ClosureJudge(smoother, reweighting)
+        self._closures = closures = ClosureJudge(smoother, reweighting)
+        self.after, self.test, self.work = closures.after, closures.test, closures.work
+        # solves the graph with some weights between the updates, as these diverge
+        self.solve_later = closures.redecision.solve_later
+        # follows measurements that other factors hold now, with the same weights; by ids
+        self.moved = self.fixes.states.moved
         # the judged closures of the last `before`, by their numbers among its factors
         self._staged = np.empty(0, dtype=np.int64)
         self._new: Sequence[NewConstraint] = ()  # all constraints of the last `before`
         # on the newest constraints that have left the graph unused
-        self._left: deque[Verdict] = deque(maxlen=MOST_OTHERS)
+        self._left: deque[vd.Verdict] = deque(maxlen=MOST_OTHERS)
 
     def configure(self, config: BackendConfig) -> None:
         self._config = config
-        self.fixes.configure(config)
+        self.fixes.config = config
 
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
@@ -82,8 +83,12 @@ class Judge:
         """Return an update in which the new rows have the weights that they begin with."""
         self._new = new
         change = self.fixes.before(new, change, now_ns)
-        first = self._smoother.graph.next_ids.factor
-        closures = [one for one in new if self._is_judged_closure(one, change, first)]
+        first, factors = self._smoother.graph.next_ids.factor, change.factors
+        # one without a position, such as of the walls of a building, recognises no place
+        may_be = (factors.kind == FactorKind.LOOP_CLOSURE) & (factors.information[:, 0, 0] > 0.0)
+        closures = [one for one in new if may_be[one.number - first]
+                    and self._config.measurement_source(
+                        one.source, LoopClosure).robust is Robust.JUDGED]
         if len(closures) == 0:
             return change
         self._staged = np.array([one.number - first for one in closures])
@@ -146,49 +151,27 @@ class Judge:
         is_large = self._smoother.graph.n_nodes > BELIEF.large
         return not is_large and redecision.may_solve()
 
-    def solve_later(self, weights: Mapping[int, float]) -> None:
-        """Solve the graph with some weights as a copy between the updates, as these diverge."""
-        self._closures.redecision.solve_later(weights)
-
     @property
     def solves_later(self) -> bool:
         return self._closures.redecision.is_due_or_pausing
 
-    def _is_judged_closure(self, one: NewConstraint, change: GraphUpdate, first: int) -> bool:
-        number = one.number - first
-        # one without a position, such as of the walls of a building, recognises no place
-        return (change.factors.kind[number] == FactorKind.LOOP_CLOSURE
-                and bool(change.factors.information[number, 0, 0] > 0.0)
-                and self._config.measurement_source(
-                    one.source, LoopClosure).robust is Robust.JUDGED)
-
     def commit(self) -> None:
         self._closures.commit()
         self.fixes.commit()
-        self._keep_gaps()
+        self._follow_odometry(self._nodes.newest_ns)
 
-    def _keep_gaps(self) -> None:
-        self._odometry.keep_gaps(
-            self.fixes.loosened, self._smoother.graph, self._nodes.newest_ns)
+    def _follow_odometry(self, now_ns: int, *, announce: bool = True) -> None:
+        self._odometry.follow(self.fixes.loosened, self._smoother.graph, now_ns, announce=announce)
 
     def rollback(self) -> None:
         self._closures.rollback()
         self.fixes.rollback()
 
-    def after(self) -> None:
-        self._closures.after()
-
-    def test(self) -> bool:
-        return self._closures.test()
-
-    def work(self) -> bool:
-        return self._closures.work()
-
-    def verdicts(self, most_believed: int | None = None) -> list[Verdict]:
+    def verdicts(self, most_believed: int | None = None) -> list[vd.Verdict]:
         """Return the verdicts that are listed, see `Judgements`, and on what left unused."""
-        graph, closures, fixes = self._smoother.graph, self._closures, self.fixes.states
-        return [*closures.verdicts(closures.states.listed(most_believed)),
-                *self._odometry.verdicts(graph, fixes.believed_after),
+        graph, closures, fixes = self._smoother.graph, self._closures.states, self.fixes.states
+        return [*closures.verdicts(graph, closures.listed(most_believed)),
+                *self._odometry.verdicts(graph, fixes),
                 *fixes.verdicts(graph, fixes.listed(most_believed)), *self._left]
 
     def closures(self) -> tuple[IntArray, IntArray]:
@@ -197,44 +180,49 @@ class Judge:
 
     def drawn_rows(self) -> DrawnRows:
         """Return the ids of factors that are drawn in another way than believed ones."""
-        weak, waiting, doubted = self._closures.states.drawn_ids()
-        doubted = np.append(doubted, self._odometry.doubted_edges).astype(np.int64)
-        return DrawnRows(*(each.tolist() for each in (
-            weak, waiting, doubted, self.fixes.states.unused)))
+        closures, fixes = self._closures.states, self.fixes.states
+        weak, waiting, doubted = (closures.held[closures.state == state].tolist()
+                                  for state in (vd.WEAK, vd.WAITING, vd.DOUBTED))
+        return DrawnRows(weak, waiting, doubted + self._odometry.edges,
+                         fixes.held[~fixes.believed].tolist())
 
-    def changes(self) -> list[Change]:
+    def changes(self) -> list[vd.Change]:
         return [*self._closures.states.take_changes(), *self._odometry.take_changes(),
                 *self.fixes.states.take_changes()]
 
-    def totals(self) -> Mapping[str, SourceVerdicts]:
+    def totals(self) -> Mapping[str, vd.SourceVerdicts]:
         return {**self._odometry.totals(), **self._closures.states.totals(),
                 **self.fixes.states.totals()}
 
-    def decide(self, name: str, decision: Decision) -> Answer:
+    def decide(self, name: str, decision: vd.Decision) -> Answer:
         """Return the answer to a person's decision on a constraint, which is applied at once."""
-        fixes = self.fixes.states
-        is_fix = fixes.find(name) >= 0 or fixes.has_left(name)
-        judge = self.fixes if is_fix else self._closures
-        return judge.decide(name, decision)
+        judges: tuple[ClosureJudge | FixJudge, ...] = self._closures, self.fixes
+        number, at = max((judge.states.find(name), k) for k, judge in enumerate(judges))
+        if number < 0:
+            return unknown(name, has_left=number == LEFT)
+        states = judges[at].states
+        if not judges[at].decide(number, decision):
+            return rejected('failed', 'the solver failed with it')
+        verdict, = states.verdicts(self._smoother.graph, np.array([number]))
+        return Answer(AnswerStatus.ACCEPTED, detail=f'{name}: {sentence(verdict)}')
 
-    def decide_leaving(self, factors: IntArray) -> list[Verdict]:
+    def decide_leaving(self, factors: IntArray) -> list[vd.Verdict]:
         """
         Return the verdicts on constraints that are about to leave the graph unused, for `forget`.
         """
-        graph = self._smoother.graph
-        closures = self._closures.decide_leaving(factors)
-        fixes = self.fixes.decide_leaving(factors)
-        unused = [*closures, *fixes,
-                  *self._odometry.decide_leaving(
-                      graph, factors, self.fixes.states.believed_after)]
+        graph, fixes = self._smoother.graph, self.fixes.states
+        unused = self._closures.decide_leaving(factors)
+        leaving = np.flatnonzero(fixes.leaving(factors) & ~fixes.believed)
+        unused += fixes.verdicts(graph, leaving[-MOST_OTHERS:])
+        unused += [each for each in self._odometry.verdicts(graph, fixes)
+                   if each.number in factors]
         return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
-    def forget(
-        self, nodes: IntArray, factors: IntArray, leaving: Sequence[Verdict],
-    ) -> None:
+    def forget(self, nodes: IntArray, factors: IntArray, leaving: Sequence[vd.Verdict]) -> None:
         self._closures.forget(nodes, factors)
         self.fixes.forget(nodes, factors)
-        self._odometry.forget(self._smoother.graph, factors, self.fixes.loosened)
+        self._odometry.forget(factors)
+        self._follow_odometry(self._nodes.newest_ns, announce=False)
         self._left.extend(leaving)
 
     def saved(self) -> SavedJudgement:
@@ -242,15 +230,14 @@ class Judge:
         return SavedJudgement(
             self._closures.states.saved(), self.fixes.states.saved(),
             np.array([*loosened], dtype=np.int64), np.array([*loosened.values()]),
-            dict(self._odometry.left), np.vstack(self.fixes.spread))
+            dict(self._odometry.left), np.vstack(self.fixes.bank.spread))
 
     def restore(self, saved: SavedJudgement, now_ns: int) -> None:
         self._closures.restore(saved.closures, now_ns)
         self.fixes.restore(saved.fixes, dict(zip(
             saved.loosened.tolist(), saved.weights.tolist(), strict=True)), saved.spread, now_ns)
         self._odometry.left.update(saved.odometry_left)
-        self._odometry.keep_gaps(self.fixes.loosened, self._smoother.graph, now_ns)
-        self._odometry.take_changes()   # which were told before
+        self._follow_odometry(now_ns, announce=False)
 
     def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
         """Follow the edges of odometry, which know of other errors of it now."""
@@ -259,10 +246,6 @@ class Judge:
                 before, after, self._nodes.stamps_ns[
                     np.searchsorted(self._nodes.ids, chain.nodes)],
                 ~np.isin(chain.nodes[1:], self._nodes.relocated_ids))
-
-    def moved(self, before: IntArray, after: IntArray) -> None:
-        """Follow measurements that other factors hold now, with the same weights; by ids."""
-        self.fixes.states.moved(before, after)
 
     def finish(self, undo: ExitStack[bool]) -> None:
         """
@@ -277,12 +260,12 @@ class Judge:
         base_weights = self._reweighting['base']
         undo.callback(np.copyto, base_weights, base_weights.copy())
         for judge in (self._closures, self.fixes, self._odometry):
-            undo.callback(judge.state())
+            judge.keep(undo)
         # each part believes one more, or leaves fewer to be tested
         while self._closures.test():
             pass
         self.fixes.finish()
-        self._keep_gaps()
+        self._follow_odometry(self._nodes.newest_ns)
         self._closures.decide_finally()
 
 

@@ -7,7 +7,8 @@ Loop closures have one, positions and poses in the map another.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -16,21 +17,8 @@ import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import (
-    AUTO,
-    BELIEVED,
-    Change,
-    Decision,
-    DECISIONS,
-    Judged,
-    MOST_NAMED,
-    SourceVerdicts,
-    State,
-    STATES,
-    USED,
-    Verdict,
-)
 from pose_graph_ros.core.saved_columns import (
     Choices,
     Column as SavedColumn,
@@ -42,6 +30,8 @@ from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 # State of a constraint before it came.
 NEW = -1
+# Instead of the row of a constraint: it was in the graph, or never was.
+LEFT, UNKNOWN = -1, -2
 # Of each source, the newest of those that are not simply believed.
 MOST_OTHERS = 500
 COLUMNS: list[Any] = [
@@ -65,15 +55,15 @@ class SavedVerdicts:
     sources: tuple[str, ...]
     scales: Numbers  # of each source, 1: older versions had a factor on its sigmas
     # of each source, how many have left the graph, by their states then
-    left: Annotated[IntArray, SavedColumn(int, (len(State),))]
+    left: Annotated[IntArray, SavedColumn(int, (len(vd.State),))]
     held: Integers
     added: Integers
     source: Integers
     number: Integers
     stamps_ns: Pairs
-    state: Annotated[IntArray, Choices(State)]
+    state: Annotated[IntArray, Choices(vd.State)]
     since_ns: Integers
-    decision: Annotated[IntArray, Choices(Decision)]
+    decision: Annotated[IntArray, Choices(vd.Decision)]
     distance: Numbers  # -1 if it was not judged
 
 
@@ -92,16 +82,15 @@ class Judgements:
     stamps_ns, state, since_ns = Column(), Column(), Column()
     decision, distance = Column(), Column()
 
-    def __init__(self, kind: Judged, **more: int) -> None:
-        """Make an empty table; more columns, with the values of new constraints, are not saved."""
+    def __init__(self, kind: vd.Judged, more: Sequence[Any] = (), **new: int) -> None:
+        """Make an empty table; more columns are not saved, and `new` or 0 in new constraints."""
         self.sources: list[str] = []
-        self._kind, self._more = kind, more
-        self._records = GrowingArray((), np.dtype(
-            [*COLUMNS, *((name, type(default)) for name, default in more.items())]))
+        self._kind, self._new = kind, {'decision': vd.AUTO, 'distance': np.nan, **new}
+        self._records = GrowingArray((), np.dtype([*COLUMNS, *more]))
         # of each source, how many have left the graph, by their states then, and the next number
         self._left: list[IntArray] = []
         self._next: list[int] = []
-        self._changes: deque[Change] = deque(maxlen=BELIEF.most_changes)
+        self._changes: deque[vd.Change] = deque(maxlen=BELIEF.most_changes)
 
     def __len__(self) -> int:
         return len(self._records)
@@ -113,24 +102,24 @@ class Judgements:
 
     @property
     def in_graph(self) -> BoolArray:
-        return np.asarray(USED[self.state])
+        return np.asarray(vd.USED[self.state])
 
     def index_of(self, source: str) -> int:
         """Return the index of a source, which may be new."""
         if source not in self.sources:
             self.sources.append(source)
-            self._left.append(np.zeros(len(STATES), dtype=np.int64))
+            self._left.append(np.zeros(len(vd.STATES), dtype=np.int64))
             self._next.append(0)
         return self.sources.index(source)
 
-    def append(
-        self, one: NewConstraint, now_ns: int, state: int, distance: float = np.nan, **more: int,
-    ) -> None:
-        source = self.index_of(one.source)
-        self._records.append_one(np.array((
-            one.held, one.number, source, self._next[source],
-            (one.stamp_ns, one.reference_ns), state, now_ns, AUTO, distance,
-            *{**self._more, **more}.values()), dtype=self.records.dtype))
+    def append(self, one: NewConstraint, now_ns: int, state: int, **more: float) -> None:
+        record, source = np.zeros((), self.records.dtype), self.index_of(one.source)
+        for name, value in {
+                'held': one.held, 'added': one.number, 'source': source,
+                'number': self._next[source], 'stamps_ns': (one.stamp_ns, one.reference_ns),
+                'state': state, 'since_ns': now_ns, **self._new, **more}.items():
+            record[name] = value
+        self._records.append_one(record)
         self._next[source] += 1
 
     def truncate(self, size: int) -> None:
@@ -149,80 +138,69 @@ class Judgements:
 
     def counts(self, source: int) -> IntArray:
         """Return how many of a source are or were in each state, by its index."""
-        return self._counts(source) + self._left[source]
-
-    def _counts(self, source: int) -> IntArray:
-        return np.bincount(self.state[self.source == source], minlength=len(STATES))
+        return self._left[source] + np.bincount(
+            self.state[self.source == source], minlength=len(vd.STATES))
 
     def name(self, row: int) -> str:
         record = self.records[row]
         return f'{self.sources[record["source"]]}/{record["number"]}'
 
     def find(self, name: str) -> int:
-        """Return the row of the constraint with a name, -1 if there is none in the graph."""
+        """Return the row of the constraint with a name, or `LEFT`, or `UNKNOWN`."""
         source, _, text = name.rpartition('/')
         if source not in self.sources or not text.isdecimal():
-            return -1
-        found = np.flatnonzero(
-            (self.source == self.sources.index(source)) & (self.number == int(text)))
-        return int(found[0]) if len(found) > 0 else -1
-
-    def has_left(self, name: str) -> bool:
-        """Return whether the constraint with a name was in the graph, and is no more."""
-        source, _, text = name.rpartition('/')
-        return (source in self.sources and text.isdecimal() and self.find(name) < 0
-                and int(text) < self._next[self.sources.index(source)])
+            return UNKNOWN
+        index, number = self.sources.index(source), int(text)
+        found = np.flatnonzero((self.source == index) & (self.number == number))
+        if len(found) > 0:
+            return int(found[0])
+        return LEFT if number < self._next[index] else UNKNOWN
 
     def announce(self, row: int, before: int, now_ns: int) -> None:
         """Note that the state of a constraint is another one than before."""
         record = self.records[row]
-        new = STATES[record['state']]
+        new = vd.STATES[record['state']]
         if before == record['state']:
             return
         # one that has waited is as little used if it is doubted
-        if before == NEW or new.in_graph != STATES[before].in_graph:
+        if before == NEW or new.in_graph != vd.STATES[before].in_graph:
             record['since_ns'] = now_ns
         if before != NEW or not new.in_graph:
-            self._changes.append(Change(
+            self._changes.append(vd.Change(
                 self.name(row), self._kind, self.sources[record['source']],
-                int(record['stamps_ns'][0]), None if before == NEW else STATES[before], new))
+                int(record['stamps_ns'][0]), None if before == NEW else vd.STATES[before], new))
 
-    def take_changes(self) -> list[Change]:
+    def take_changes(self) -> list[vd.Change]:
         """Return the changes since the last call."""
         changes = list(self._changes)
         self._changes.clear()
         return changes
 
-    def snapshot(self) -> Callable[[], None]:
-        """Return what brings the present records and changes back, as long as none is added."""
-        records, changes = self.records.copy(), list(self._changes)
-
-        def bring_back() -> None:
-            self.records[:] = records
-            self._changes.clear()
-            self._changes.extend(changes)
-        return bring_back
+    def keep(self, undo: ExitStack[bool]) -> None:
+        """Have the present records and changes brought back, as long as none is added."""
+        undo.callback(np.copyto, self.records, self.records.copy())
+        undo.callback(setattr, self, '_changes', self._changes.copy())
 
     def verdict(
         self, row: int, residual: FloatArray, *, supported_by: Sequence[int],
         contradicted_by: Sequence[str],
-    ) -> Verdict:
+    ) -> vd.Verdict:
         record = self.records[row]
         stamp, reference = record['stamps_ns'].tolist()
-        return Verdict(
+        return vd.Verdict(
             id=self.name(row), kind=self._kind, source=self.sources[record['source']],
-            stamp_ns=stamp, reference_ns=reference if self._kind is Judged.LOOP_CLOSURE else None,
-            state=STATES[record['state']], since_ns=int(record['since_ns']),
-            decision=DECISIONS[record['decision']], residual=residual,
+            stamp_ns=stamp, since_ns=int(record['since_ns']), state=vd.STATES[record['state']],
+            reference_ns=reference if self._kind is vd.Judged.LOOP_CLOSURE else None,
+            decision=vd.DECISIONS[record['decision']], residual=residual,
             distance=float(record['distance']),
-            supported_by=tuple(self.name(other) for other in supported_by[:MOST_NAMED]),
-            contradicted_by=tuple(contradicted_by[:MOST_NAMED]), number=int(record['held']))
+            supported_by=tuple(self.name(other) for other in supported_by[:vd.MOST_NAMED]),
+            contradicted_by=tuple(contradicted_by[:vd.MOST_NAMED]), number=int(record['held']))
 
     def listed(self, most_believed: int | None) -> IntArray:
         """Return which are listed: all that a person has decided on, and the newest of sources."""
         if most_believed is None:
             return np.arange(len(self))
-        believed, decided = self.state == BELIEVED, self.decision != AUTO
+        believed, decided = self.state == vd.BELIEVED, self.decision != vd.AUTO
         chosen = decided.copy()
         for source in range(len(self.sources)):
             for most, those in ((most_believed, believed), (MOST_OTHERS, ~believed)):
@@ -230,16 +208,16 @@ class Judgements:
                 chosen[rows[max(len(rows) - most, 0):]] = True
         return np.flatnonzero(chosen)
 
-    def totals(self) -> dict[str, SourceVerdicts]:
+    def totals(self) -> dict[str, vd.SourceVerdicts]:
         totals = {}
         for index, source in enumerate(self.sources):
             left, newest = self._left[index], self.state[self.source == index][-BELIEF.newest:]
-            totals[source] = SourceVerdicts(
-                dict(zip(STATES, self._counts(index).tolist(), strict=True)),
+            totals[source] = vd.SourceVerdicts(
+                dict(zip(vd.STATES, (self.counts(index) - left).tolist(), strict=True)),
                 # wrong closures among right ones are what place recognition is like
-                doubting=(self._kind is not Judged.LOOP_CLOSURE and len(newest) > 0
-                          and not bool(np.any(USED[newest]))),
-                n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~USED])))
+                doubting=(self._kind is not vd.Judged.LOOP_CLOSURE and len(newest) > 0
+                          and not bool(np.any(vd.USED[newest]))),
+                n_left=int(np.sum(left)), n_left_unused=int(np.sum(left[~vd.USED])))
         return totals
 
     def saved(self) -> SavedVerdicts:
@@ -248,17 +226,18 @@ class Judgements:
         return SavedVerdicts(
             tuple(self.sources),
             np.ones(len(self.sources)),
-            np.array(self._left, dtype=np.int64).reshape(-1, len(STATES)), **columns)
+            np.array(self._left, dtype=np.int64).reshape(-1, len(vd.STATES)), **columns)
 
     def restore(self, saved: SavedVerdicts) -> None:
         """Fill the empty table with saved columns."""
         for source in saved.sources:
             self.index_of(source)
         records = np.zeros(len(saved.held), dtype=self.records.dtype)
-        for column in COLUMNS:
-            records[column[0]] = getattr(saved, column[0])
-        for name, default in self._more.items():
-            records[name] = default
+        columns = {column[0] for column in COLUMNS}
+        for name in columns:
+            records[name] = getattr(saved, name)
+        for name in self._new.keys() - columns:
+            records[name] = self._new[name]
         records['distance'][records['distance'] < 0.0] = np.nan
         self._records.append(records)
         for index, left in enumerate(saved.left):

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
-from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, INTEGERS, kernel, NUMBERS, ROWS
+from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, INTEGERS, kernel, ROWS
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
@@ -38,8 +38,13 @@ def integrated(motions: FloatArray) -> FloatArray:
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
     x, y = motions[:, 0], motions[:, 1]
     steps = np.column_stack((c * x - s * y, s * x + c * y))
-    return np.column_stack((np.vstack((np.zeros(2), np.cumsum(steps, axis=0))),
-                            se2.wrap(heading)))
+    return np.column_stack((np.vstack((np.zeros(2), np.cumsum(steps, axis=0))), se2.wrap(heading)))
+
+
+def moved(covariances: FloatArray, motions: FloatArray) -> FloatArray:
+    """Return covariances of poses, given in frames that motions lead to, where these begin."""
+    adjoint = se2.adjoint(motions)
+    return np.asarray(adjoint @ covariances @ np.swapaxes(adjoint, -1, -2))
 
 
 class OdometryChain:
@@ -82,14 +87,19 @@ class OdometryChain:
     def extend(self, graph: Graph) -> None:
         """Append the nodes that were added to the graph since; the work is linear in these."""
         if len(self) == 0:
-            first = _first(graph)
+            # the pose that odometry begins at
+            first = np.flatnonzero(graph.is_pose)[:1]
             if len(first) == 0:
                 return
+            ends = graph.factor_records['ends'][
+                graph.factor_records['kind'] == FactorKind.ODOMETRY]
+            if len(ends) > 0 and not _has_left(graph):
+                first = ends[np.argmin(ends[:, 1]), :1]
             self._nodes.append(graph.node_ids[first])
             self._poses.append(np.zeros((1, 3)))
             self._sums.append(np.zeros((1, 6)))
             self._travel.append(np.zeros(1))
-        head, begin = graph.memory.head, int(np.searchsorted(graph.factor_ids, self._next_edge))
+        begin = int(np.searchsorted(graph.factor_ids, self._next_edge))
         self._next_edge = graph.next_ids.factor
         factors = graph.factor_records[begin:]
         last = len(self) - 1
@@ -99,19 +109,18 @@ class OdometryChain:
         if len(new) == 0:
             return
         new = begin + new[np.argsort(later[new], kind='stable')]
-        size = graph.n_nodes - end - 1
-        rows, travel = np.empty(size, np.int64), np.empty(size)
+        size, rows = graph.n_nodes - end, np.empty(graph.n_nodes - end, np.int64)
         poses, sums = np.empty((size, 3)), np.empty((size, 6))
+        poses[0], sums[0] = self.poses[last], self.sums[last]
         newest = int(graph.node_rows(graph.newest_pose))
         for over_gaps in (False, True):
-            n = _extend(head, new, end, self._poses.values[last], self._sums.values[last],
-                        self._weighted, over_gaps, rows, poses, sums, travel)
+            n = _extend(graph.memory.head, new, end, self._weighted, over_gaps, rows, poses, sums)
             if (n > 0 and rows[n - 1] == newest) or not _has_left(graph):
                 break
         self._nodes.append(graph.node_ids[rows[:n]])
-        self._poses.append(poses[:n])
-        self._sums.append(sums[:n])
-        self._travel.append(self._travel.values[last] + travel[:n])
+        self._poses.append(poses[1:n + 1])
+        self._sums.append(sums[1:n + 1])
+        self._travel.append(self._travel.values[last] + _lengths(poses[:n + 1]))
 
     def correct(
         self, before: OdometryErrors, after: OdometryErrors, stamps_ns: IntArray,
@@ -123,19 +132,16 @@ class OdometryChain:
         poses, sums = self._poses.values, full(self._sums.values)
         seconds = np.asarray(np.diff(stamps_ns) * 1e-9, dtype=np.float64)
         motions = se2.between(poses[:-1], poses[1:])
-        back = se2.adjoint(se2.inverse(poses[1:]))
-        noises = back @ np.diff(sums, axis=0) @ np.swapaxes(back, 1, 2)
+        noises = moved(np.diff(sums, axis=0), se2.inverse(poses[1:]))
         motions = np.where(by_odometry[:, None], after.motions(
             before.as_odometry_says(motions, seconds), seconds), motions)
         noises = np.where(by_odometry[:, None, None], after.covariances(
             before.inverse_noise.covariances(noises)), noises)
-        moved = se2.compose(poses[:1], integrated(motions))
-        forth = se2.adjoint(moved[1:])
-        steps = forth @ noises @ np.swapaxes(forth, 1, 2)
-        length = np.hypot(motions[:, 0], motions[:, 1])
-        self._poses.values[:] = moved
+        poses = se2.compose(poses[:1], integrated(motions))
+        steps = moved(noises, poses[1:])
+        self._poses.values[:] = poses
         self._sums.values[1:] = upper(sums[:1] + np.cumsum(steps, axis=0))
-        self._travel.values[1:] = self._travel.values[0] + np.cumsum(length)
+        self._travel.values[1:] = self._travel.values[0] + _lengths(poses)
 
     def forget(self, nodes: IntArray) -> None:
         """Forget nodes that have left the graph; the motion between all others stays known."""
@@ -149,24 +155,16 @@ class OdometryChain:
             else:
                 column.select(np.flatnonzero(~gone))
         self._n_gone += n
-        if self._n_gone > len(self):
-            self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        """Make poses and sums those in the first node, as they lose digits far away from it."""
+        if self._n_gone <= len(self):
+            return
+        # poses and sums become those in the first node, as they lose digits far away from it
         self._n_gone = 0
         if len(self) == 0:
             self._next_edge = 0
             return
         first, sums = self._poses.values[:1].copy(), self._sums.values
-        adjoint = se2.adjoint(se2.inverse(first))
         self._poses.values[:] = se2.between(first, self._poses.values)
-        self._sums.values[:] = upper(
-            adjoint @ full(sums - sums[0]) @ np.swapaxes(adjoint, 1, 2))
-
-    @property
-    def travelled(self) -> FloatArray:
-        return self._travel.values
+        self._sums.values[:] = upper(moved(full(sums - sums[0]), se2.inverse(first)))
 
     def travel(self, nodes: IntArray) -> FloatArray:
         return np.asarray(self._travel.values[self.places(nodes)])
@@ -178,10 +176,9 @@ class OdometryChain:
             if np.any(at < 0):
                 raise KeyError('expected nodes that are chained by odometry')
         ahead = np.sign(at_j - at_i)[:, None]
-        adjoint = se2.adjoint(se2.inverse(self._poses.values[at_j]))
-        total = full(ahead * (self._sums.values[at_j] - self._sums.values[at_i]))
-        return (se2.between(self._poses.values[at_i], self._poses.values[at_j]),
-                adjoint @ total @ np.swapaxes(adjoint, 1, 2))
+        total = full(ahead * (self.sums[at_j] - self.sums[at_i]))
+        return (se2.between(self.poses[at_i], self.poses[at_j]),
+                moved(total, se2.inverse(self.poses[at_j])))
 
     def places(self, nodes: IntArray) -> IntArray:
         """Return the places of nodes in the chain, -1 for those that are not in it."""
@@ -192,37 +189,27 @@ class OdometryChain:
         return np.where(own[at] == nodes, at, -1)
 
 
-def _first(graph: Graph) -> IntArray:
-    """Return the row of the pose that odometry begins at, shape (1,), or (0,) without poses."""
-    factors = graph.factor_records
-    ends = factors['ends'][factors['kind'] == FactorKind.ODOMETRY]
-    if len(ends) == 0 or _has_left(graph):
-        return np.flatnonzero(graph.is_pose)[:1]
-    return ends[np.argmin(ends[:, 1]), :1].copy()
+def _lengths(poses: FloatArray) -> FloatArray:
+    """Return the way from the first of some poses to each of the others."""
+    return np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))
 
 
 def _has_left(graph: Graph) -> bool:
-    return graph.n_priors > 0 or bool(np.any(
-        graph.factor_records['kind'] == FactorKind.PRIOR))
+    return graph.n_priors > 0 or bool(np.any(graph.factor_records['kind'] == FactorKind.PRIOR))
 
 
-@kernel(signature=(
-    tb.HEAD, INTEGERS, INTEGER, NUMBERS, NUMBERS, FLAG, FLAG, INTEGERS, ROWS, ROWS, NUMBERS),
-    allocates=True)
+@kernel(signature=(tb.HEAD, INTEGERS, INTEGER, FLAG, FLAG, INTEGERS, ROWS, ROWS))
 def _extend(  # type: ignore[no-untyped-def]
-    head, edges, last, pose, before, weighted, over_gaps, rows, poses, sums, travel,
+    head, edges, last, weighted, over_gaps, rows, poses, sums,
 ):
     """
-    Return the number of nodes that were appended to a chain.
+    Write rows, poses and prefix sums of nodes behind the last of a chain; return how many.
 
-    Edges are the rows of odometry, by their later ends; `last`, `pose` and `before` are row, pose
-    and prefix sum of the last node. With `over_gaps` a pose without odometry is appended as well.
-    Rows, poses, sums, and travel since the last node are written.
+    Edges are the rows of odometry, by their later ends; `last` is the row of the last node, the
+    first pose and sum are its own. With `over_gaps` a pose without odometry is appended as well.
     """
     factors, nodes = tb.factors(head), tb.nodes(head)
-    n, m, length = 0, 0, 0.0
-    x, y, th = pose[0], pose[1], pose[2]
-    noise = np.empty(6)
+    n, m = 0, 0
     for v in range(last + 1, head[tb.N_NODES]):
         if nodes[v].kind != NodeKind.POSE:
             continue
@@ -235,70 +222,47 @@ def _extend(  # type: ignore[no-untyped-def]
             m += 1
         if edge >= 0:
             f = factors[edge]
-            step = f.mean[0], f.mean[1], f.mean[2]
+            dx, dy, turn = f.mean[0], f.mean[1], f.mean[2]
             if f.ends[2] >= 0:
-                step = motion(nodes, f)
-            noise[:] = _inverse(f.information)
+                dx, dy, turn = motion(nodes, f)
+            # the inverse of the information
+            i = f.information
+            xx, xy, xt = (i[3] * i[5] - i[4] * i[4], i[2] * i[4] - i[1] * i[5],
+                          i[1] * i[4] - i[2] * i[3])
+            yy, yt, tt = (i[0] * i[5] - i[2] * i[2], i[1] * i[2] - i[0] * i[4],
+                          i[0] * i[3] - i[1] * i[1])
+            scale = 1.0 / (i[0] * xx + i[1] * xy + i[2] * xt)
             if weighted:
-                noise /= max(f.weight, _LEAST_WEIGHT)
+                scale /= max(f.weight, _LEAST_WEIGHT)
+            xx, xy, xt, yy, yt, tt = (
+                scale * xx, scale * xy, scale * xt, scale * yy, scale * yt, scale * tt)
         elif over_gaps:
-            step = composed(inverted(_pose(head, last)), _pose(head, v))
-            far = math.sqrt(step[0] * step[0] + step[1] * step[1])
-            noise[:] = 0.0
-            noise[0] = GAP_ALONG * far + GAP_FLOOR
-            noise[3] = GAP_ACROSS * far + GAP_FLOOR
-            noise[5] = GAP_BY_WAY * far + GAP_BY_TURN * abs(step[2]) + GAP_FLOOR
+            one, other = nodes[last].pose, nodes[v].pose
+            c, s = math.cos(one[2]), math.sin(one[2])
+            far_x, far_y, turn = other[0] - one[0], other[1] - one[1], wrap(other[2] - one[2])
+            dx, dy = c * far_x + s * far_y, c * far_y - s * far_x
+            far = math.sqrt(dx * dx + dy * dy)
+            xy = xt = yt = 0.0
+            xx, yy = GAP_ALONG * far + GAP_FLOOR, GAP_ACROSS * far + GAP_FLOOR
+            tt = GAP_BY_WAY * far + GAP_BY_TURN * abs(turn) + GAP_FLOOR
         else:
             continue
-        last = v
-        x, y, th = composed((x, y, th), step)
-        length += math.sqrt(step[0] * step[0] + step[1] * step[1])
-        rows[n], travel[n] = last, length
+        last, before, into = v, sums[n], sums[n + 1]
+        c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
+        x, y = poses[n, 0] + c * dx - s * dy, poses[n, 1] + s * dx + c * dy
+        th = wrap(poses[n, 2] + turn)
+        rows[n], n = v, n + 1
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, th
-        xx, xy, xt, yy, yt, tt = noise
         # Ad Q Ad^T: rotated, then with the arm (y, -x) of the heading
         c, s = math.cos(th), math.sin(th)
         xt, yt = c * xt - s * yt, s * xt + c * yt
         xx, xy, yy = (c * c * xx - 2.0 * c * s * xy + s * s * yy,
                       c * s * (xx - yy) + (c * c - s * s) * xy,
                       s * s * xx + 2.0 * c * s * xy + c * c * yy)
-        into = sums[n]
         into[0] = before[0] + xx + 2.0 * y * xt + y * y * tt
         into[1] = before[1] + xy - x * xt + y * yt - x * y * tt
         into[2] = before[2] + xt + y * tt
         into[3] = before[3] + yy - 2.0 * x * yt + x * x * tt
         into[4] = before[4] + yt - x * tt
         into[5] = before[5] + tt
-        before = into
-        n += 1
     return n
-
-
-@kernel
-def _pose(head, v):  # type: ignore[no-untyped-def]
-    pose = tb.nodes(head)[v].pose
-    return pose[0], pose[1], pose[2]
-
-
-@kernel
-def inverted(a):  # type: ignore[no-untyped-def]
-    """Return the inverse of a pose, as tuples of numbers."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return -c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]
-
-
-@kernel
-def _inverse(m):  # type: ignore[no-untyped-def]
-    """Return the upper triangle of the inverse of a symmetric matrix, given as its own."""
-    a, b, c, d, e, f = m[0], m[1], m[2], m[3], m[4], m[5]
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    scale = 1.0 / (a * aa + b * bb + c * cc)
-    return (scale * aa, scale * bb, scale * cc, scale * (a * f - c * c),
-            scale * (b * c - a * e), scale * (a * d - b * b))
-
-
-@kernel
-def composed(a, b):  # type: ignore[no-untyped-def]
-    """Return the composition of two poses, as tuples of numbers."""
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])

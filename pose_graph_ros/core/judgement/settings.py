@@ -5,6 +5,8 @@
 from dataclasses import dataclass
 import math
 
+from pose_graph_ros.core.belief.settings import BANK
+
 
 @dataclass(frozen=True, slots=True)
 class BeliefSettings:
@@ -26,7 +28,7 @@ class BeliefSettings:
 
     # --- when a closure is believed
     # least sigmas to decide by, as claimed covariances are mostly too small [m, m, rad]
-    closure_floors: tuple[float, float, float] = (0.3, 0.3, 0.05)
+    closure_floors: tuple[float, float, float] = BANK.least_sigmas
     clique: int = 3  # members of a clique that supports it
     clique_travel: float = 1.0  # way from the first to the last of them [m]
     near: float = 10.0  # closures are neighbours if both ends are so near along the path [m]

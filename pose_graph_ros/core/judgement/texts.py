@@ -6,24 +6,15 @@ from collections.abc import Iterable, Mapping, Sequence
 import math
 import re
 
-from pose_graph_ros.core.judgement.verdicts import (
-    Decision,
-    Judged,
-    MOST_NAMED,
-    ODOMETRY,
-    SourceVerdicts,
-    State,
-    Verdict,
-)
+from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.measurements import Answer, rejected
 from pose_graph_ros.core.quantities import NANOSECONDS
 
 PLAUSIBLE = 3.37  # distance up to which a pose may be right: 99 % of right ones are nearer [sigma]
-NOUNS = {Judged.LOOP_CLOSURE: 'closure', Judged.FIX: 'fix', Judged.ODOMETRY: 'odometry edge'}
-PLURALS = {Judged.LOOP_CLOSURE: 'closures', Judged.FIX: 'fixes',
-           Judged.ODOMETRY: 'odometry edges'}
+NOUNS = {vd.Judged.LOOP_CLOSURE: ('closure', 'closures'), vd.Judged.FIX: ('fix', 'fixes'),
+         vd.Judged.ODOMETRY: ('odometry edge', 'odometry edges')}
 # states in the order in which people want to read of them
-ORDER = (State.DOUBTED, State.WAITING, State.WEAKLY_BELIEVED, State.BELIEVED)
+ORDER = (vd.State.DOUBTED, vd.State.WAITING, vd.State.WEAKLY_BELIEVED, vd.State.BELIEVED)
 
 
 def seconds(stamp_ns: int, digits: int = 3) -> str:
@@ -43,48 +34,48 @@ def short(value: float, digits: int = 2) -> str:
     return text.rstrip('0').rstrip('.') if '.' in text else text
 
 
-def number_of(n: int, kind: Judged) -> str:
+def number_of(n: int, kind: vd.Judged) -> str:
     """Return `1 closure` or `2 closures`."""
-    return f'{n} {NOUNS[kind] if n == 1 else PLURALS[kind]}'
+    return f'{n} {NOUNS[kind][n != 1]}'
 
 
 def joined(names: Sequence[str]) -> str:
     """Return names separated by commas, and how many there are above `MOST_NAMED`."""
-    more = len(names) - MOST_NAMED
-    return ', '.join(names[:MOST_NAMED]) + (f' and {more} more' if more > 0 else '')
+    more = len(names) - vd.MOST_NAMED
+    return ', '.join(names[:vd.MOST_NAMED]) + (f' and {more} more' if more > 0 else '')
 
 
-def sentence(verdict: Verdict, start_ns: int | None = None) -> str:
+def sentence(verdict: vd.Verdict, start_ns: int | None = None) -> str:
     """
     Return state and reason of a verdict as a sentence.
 
     Of a drive that is over, its start [ns] is given: times are since then, `12.3 s`, else stamps.
     """
     since, far = _time(verdict.since_ns, start_ns), _far(verdict.distance)
-    reason = _jump(verdict, start_ns) or _doubt(verdict)
-    supported = '' if len(verdict.supported_by) == 0 else (
-        f'; {joined(verdict.supported_by)} {_agree(verdict.supported_by)} with it')
+    reason, n_supporting = _doubt(verdict, start_ns), len(verdict.supported_by)
+    supported = '' if n_supporting == 0 else (
+        f'; {joined(verdict.supported_by)} {"agrees" if n_supporting == 1 else "agree"} with it')
     # that odometry contradicts it is what its distance tells
-    others = [name for name in verdict.contradicted_by if name != ODOMETRY]
+    others = [name for name in verdict.contradicted_by if name != vd.ODOMETRY]
     contradicted = '' if len(others) == 0 else f'; it contradicts {joined(others)}'
     if verdict.left:
-        how = 'doubted' if verdict.kind is Judged.ODOMETRY else 'unused'
+        how = 'doubted' if verdict.kind is vd.Judged.ODOMETRY else 'unused'
         return f'Left the window {how} at {since}: {reason}{contradicted}{supported}.'
-    if verdict.decision is not Decision.AUTO:
-        used = 'Used' if verdict.decision is Decision.IN else 'Not used'
+    if verdict.decision is not vd.Decision.AUTO:
+        used = 'Used' if verdict.decision is vd.Decision.IN else 'Not used'
         return f'{used} since {since}, as a person has decided: {far}{contradicted}{supported}.'
     match verdict.state:
-        case State.BELIEVED:
+        case vd.State.BELIEVED:
             # of a drive that is over, the path is that with it
             when = f' since {since}' if start_ns is None else ''
             return f'Believed and used{when}: {far}{supported}{contradicted}.'
-        case State.WEAKLY_BELIEVED:
+        case vd.State.WEAKLY_BELIEVED:
             return (f'Believed weakly, but used since {since}: {far}, and little else speaks for '
                     f'it{supported}{contradicted}.')
-        case State.WAITING:
+        case vd.State.WAITING:
             return (f'Waits since {since} and is not used: too little is known yet to believe or '
                     f'to doubt it; {far}{supported}{contradicted}.')
-        case State.DOUBTED:
+        case vd.State.DOUBTED:
             return f'Doubted and not used since {since}: {reason}{contradicted}{supported}.'
 
 
@@ -92,29 +83,19 @@ def _time(stamp_ns: int, start_ns: int | None) -> str:
     return seconds(stamp_ns) if start_ns is None else f'{(stamp_ns - start_ns) * 1e-9:.1f} s'
 
 
-def _jump(verdict: Verdict, start_ns: int | None) -> str:
-    """Return by how much odometry is wrong, and where; nothing of other constraints."""
-    if verdict.kind is not Judged.ODOMETRY or verdict.reference_ns is None:
-        return ''
-    x, y, theta = verdict.residual.tolist()
-    return (f'it is wrong by {math.hypot(x, y):.2f} m and {abs(theta):.2f} rad, somewhere '
-            f'between {_time(verdict.reference_ns, start_ns)} and '
-            f'{_time(verdict.stamp_ns, start_ns)}')
-
-
-def _agree(names: Sequence[str]) -> str:
-    return 'agrees' if len(names) == 1 else 'agree'
-
-
 def _far(distance: float) -> str:
     return 'it has not been compared with the path yet' if math.isnan(distance) else (
         f'it was {distance:.1f} sigma from the path without it')
 
 
-def _doubt(verdict: Verdict) -> str:
+def _doubt(verdict: vd.Verdict, start_ns: int | None) -> str:
     """Return why a constraint is doubted."""
     distance, (x, y, theta) = verdict.distance, verdict.residual.tolist()
-    if verdict.kind is Judged.FIX and math.isfinite(x + y):
+    if verdict.kind is vd.Judged.ODOMETRY and verdict.reference_ns is not None:
+        return (f'it is wrong by {math.hypot(x, y):.2f} m and {abs(theta):.2f} rad, somewhere '
+                f'between {_time(verdict.reference_ns, start_ns)} and '
+                f'{_time(verdict.stamp_ns, start_ns)}')
+    if verdict.kind is vd.Judged.FIX and math.isfinite(x + y):
         # what was expected when it came may have been as wrong
         turned = '' if math.isnan(theta) else f' and {abs(theta):.2f} rad'
         return f'it is {short(math.hypot(x, y))} m{turned} from the path that the others tell'
@@ -135,7 +116,7 @@ def unknown(name: str, *, has_left: bool) -> Answer:
                                   f'got {name!r}')
 
 
-def details(verdict: Verdict) -> dict[str, str]:
+def details(verdict: vd.Verdict) -> dict[str, str]:
     reference = verdict.reference_ns
     return {
         'kind': verdict.kind.value, 'stamp': seconds(verdict.stamp_ns, 9),
@@ -147,12 +128,12 @@ def details(verdict: Verdict) -> dict[str, str]:
         'decision': verdict.decision.value}
 
 
-def is_notable(verdict: Verdict) -> bool:
+def is_notable(verdict: vd.Verdict) -> bool:
     """Return whether a person has decided on a constraint, or it is not in the estimate."""
-    return verdict.decision is not Decision.AUTO or not verdict.state.in_graph
+    return verdict.decision is not vd.Decision.AUTO or not verdict.state.in_graph
 
 
-def as_json(verdict: Verdict) -> dict[str, object]:
+def as_json(verdict: vd.Verdict) -> dict[str, object]:
     far = verdict.distance
     return {
         'id': verdict.id, 'source': verdict.source, **details(verdict),
@@ -162,7 +143,7 @@ def as_json(verdict: Verdict) -> dict[str, object]:
         'contradicted_by': list(verdict.contradicted_by), 'sentence': sentence(verdict)}
 
 
-def totals_text(totals: SourceVerdicts) -> str:
+def totals_text(totals: vd.SourceVerdicts) -> str:
     """Return how many constraints of a source are in each state, such as `3 doubted`."""
     parts = [f'{totals.counts[state]} {state.value}' for state in ORDER
              if totals.counts.get(state, 0) > 0]
@@ -173,17 +154,17 @@ def totals_text(totals: SourceVerdicts) -> str:
     return ', '.join(parts)
 
 
-def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
+def total_values(totals: Mapping[str, vd.SourceVerdicts]) -> dict[str, str]:
     """Return the counts of all sources by the keys that the diagnostics have for them."""
     values: dict[str, str] = {}
     for source, each in totals.items():
         counts = each.counts
-        weakly = counts.get(State.WEAKLY_BELIEVED, 0)
+        weakly = counts.get(vd.State.WEAKLY_BELIEVED, 0)
         values |= {
-            f'{source}.believed': str(counts.get(State.BELIEVED, 0) + weakly),
+            f'{source}.believed': str(counts.get(vd.State.BELIEVED, 0) + weakly),
             f'{source}.believed_weakly': str(weakly),
-            f'{source}.doubted': str(counts.get(State.DOUBTED, 0)),
-            f'{source}.waiting': str(counts.get(State.WAITING, 0))}
+            f'{source}.doubted': str(counts.get(vd.State.DOUBTED, 0)),
+            f'{source}.waiting': str(counts.get(vd.State.WAITING, 0))}
         if each.n_forgotten > 0:
             values[f'{source}.forgotten'] = str(each.n_forgotten)
         if each.n_left > 0:
@@ -195,5 +176,5 @@ def total_values(totals: Mapping[str, SourceVerdicts]) -> dict[str, str]:
 Key = tuple[str, int, int | None]  # source, stamp and stamp of the other end of a measurement [ns]
 
 
-def states_by_stamps(verdicts: Iterable[Verdict]) -> dict[Key, State]:
+def states_by_stamps(verdicts: Iterable[vd.Verdict]) -> dict[Key, vd.State]:
     return {(each.source, each.stamp_ns, each.reference_ns): each.state for each in verdicts}

@@ -84,10 +84,9 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         if settled:
             _forget_waiting(head)
             break
-        # The iterations have diverged if the error is large, in sigma^2 and against the lowest chi2
-        # of the step (a false constraint raises chi2 and all linearization errors with it), and
-        # either no iteration remains, the last one has not halved it, or another can only increase
-        # it.
+        # The iterations have diverged if the error is large, in sigma^2 and against the lowest
+        # chi2 of the step (a false constraint raises chi2 and all errors with it), and either no
+        # iteration remains, the last one has not halved it, or another can only increase it.
         out_of_iterations = head[tb.N_ITERATIONS] >= max_iterations
         before, scalars.error2_before = scalars.error2_before, error2
         scalars.lowest = min(scalars.lowest, scalars.chi2)

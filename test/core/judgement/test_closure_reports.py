@@ -14,12 +14,13 @@ from pose_graph_ros.core.config import BackendConfig, LOOP_CLOSURES, Loss, Robus
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.judgement import closure_states
+from pose_graph_ros.core.judgement import closures
 from pose_graph_ros.core.judgement.closures import Closures, ClosureTable
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.judgement.verdicts import Decision
+from pose_graph_ros.core.judgement.verdicts import Decision, WAITING
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
+from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 SECOND = 10**9
 LAP = 60  # duration of a round [s]
@@ -157,7 +158,7 @@ def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(
-        closure_states, 'BELIEF', replace(BELIEF, most_waiting=6))
+        closures, 'BELIEF', replace(BELIEF, most_waiting=6))
     # each is so far off that none agrees with another one
     backend = driven(*(12.0 * (-1.0) ** k * (k + 2) for k in range(9)), 0.0, 0.0, 0.0, 0.0)
     total = backend.verdict_totals()['loop']
@@ -195,8 +196,11 @@ def test_neighbours_are_those_of_a_comparison_of_all(seed: int) -> None:
     for step in rng.choice(3, 8).tolist():
         if step == 0 or len(ends) < 2:
             new = np.sort(rng.integers(0, n, (int(rng.integers(1, 40)), 2)), axis=1)
-            table.append(Closures(new[:, 0], new[:, 1], np.zeros((len(new), 3)),
-                                  np.tile(np.eye(3), (len(new), 1, 1))))
+            for k in range(len(new)):
+                table.append(NewConstraint(k, 'scan', k, LoopClosure, 0), 0, WAITING)
+            table.measure(len(ends), Closures(
+                new[:, 0], new[:, 1], np.zeros((len(new), 3)),
+                np.tile(np.eye(3), (len(new), 1, 1))))
             ends = np.concatenate((ends, new))
         elif step == 1:
             ends = ends[:-1]

@@ -26,7 +26,7 @@ def test_every_residual_above_the_gate_is_looked_at(
         poses = backend.graph.poses + scale * rng.normal(size=backend.graph.poses.shape) * (
             1.0, 1.0, 0.1)
         backend.graph.set_poses(se2.wrapped(poses))
-        some = judge._table.rows(inside)
+        some = judge.states.rows(inside)
         bad = cl.squares(backend.graph.errors(cl.as_edges(some)), some.noise) > GATE
         thrown_out: dict[int, State] = {}
         monkeypatch.setattr(judge, '_change', thrown_out.update)

@@ -171,9 +171,9 @@ class Flaky(IncrementalSmoother):
 
 def everything(backend: PoseGraphBackend) -> list[object]:
     judge = backend._judge.fixes
-    return [judge.states.records.tobytes(), judge._loosened,
+    return [judge.states.records.tobytes(), judge.loosened,
             [base.tolist() for base in backend._reweighting['base']],
-            judge._bank.rows['id'].tolist(), judge._slips]
+            judge.bank.rows['id'].tolist(), judge._slips]
 
 
 def test_a_failed_update_that_would_turn_a_decision_changes_nothing() -> None:

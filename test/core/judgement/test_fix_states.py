@@ -20,13 +20,13 @@ def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
         for k in range(size, size + int(rng.integers(5))):
             source = ('fix', 'other', 'third')[rng.integers(3)]
             states.append(NewConstraint(k, source, k, Position), 0,
-                          (BELIEVED, DOUBTED)[rng.integers(2)], 0.5)
+                          (BELIEVED, DOUBTED)[rng.integers(2)], distance=0.5)
         if rng.random() < 0.4:
             states.truncate(size)
             np.testing.assert_array_equal(states.records, before)
             assert {name: states.totals()[name] for name in totals} == totals
         some = np.flatnonzero(rng.random(len(states)) < rng.random())
-        states.believe(some, believed=bool(rng.integers(2)))
+        states.believe(some, rng.random(len(some)) < rng.random())
         if rng.random() < 0.2:
             states.select(np.flatnonzero(rng.random(len(states)) < 0.8))
     again = FixStates()

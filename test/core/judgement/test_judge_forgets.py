@@ -6,7 +6,8 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from test_consistency import Drive
 
-from pose_graph_ros.core.judgement.closure_states import ClosureStates
+from pose_graph_ros.core.judgement.closures import ClosureTable
+from pose_graph_ros.core.judgement.judgements import LEFT, UNKNOWN
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED, State, WAITING
 from pose_graph_ros.core.measurements import LoopClosure
@@ -43,14 +44,14 @@ def test_the_motion_between_nodes_that_stay_is_known_as_before(seed: int) -> Non
         np.testing.assert_allclose(one, other, atol=1e-9)
 
 
-def added(states: ClosureStates, edges: range) -> None:
+def added(states: ClosureTable, edges: range) -> None:
     for edge in edges:
         states.append(
             NewConstraint(edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
 
 
 def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
-    states = ClosureStates()
+    states = ClosureTable(OdometryChain())
     added(states, range(10, 20))
     states.state[:] = [BELIEVED, DOUBTED] * 5
     assert states.numbers(np.array([10, 11, 12, 99])).tolist() == [0, 1, 2]
@@ -59,16 +60,16 @@ def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:
     assert states.totals()['scan'][-2:] == (3, 1)
     assert states.totals()['scan'].counts == {
         State.WAITING: 0, State.BELIEVED: 3, State.WEAKLY_BELIEVED: 0, State.DOUBTED: 4}
-    assert states.record(0) == (5, 5)
+    assert states.counts(0).tolist() == [0, 5, 0, 5]
     assert np.count_nonzero(states.in_graph) == 3
-    assert (states.find('scan/1'), states.has_left('scan/1')) == (-1, True)
+    assert states.find('scan/1') == LEFT
     assert states.name(states.find('scan/4')) == 'scan/4'
-    assert not states.has_left('scan/10')
-    saved, again = states.saved(), ClosureStates()
+    assert states.find('scan/10') == UNKNOWN
+    saved, again = states.saved(), ClosureTable(OdometryChain())
     again.restore(saved)
     for each in (states, again):
         added(each, range(30, 31))
         assert each.name(7) == 'scan/10'
-        assert each.record(0) == (5, 5)
+        assert each.counts(0).tolist() == [1, 5, 0, 5]
         assert each.totals()['scan'][-2:] == (3, 1)
-        assert each.has_left('scan/2')
+        assert each.find('scan/2') == LEFT
