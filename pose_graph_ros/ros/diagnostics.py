@@ -32,8 +32,7 @@ from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.ros.input import EXPECTED
-from pose_graph_ros.ros.topics import moved
-from pose_graph_ros.ros.transforms import other_publishers
+from pose_graph_ros.ros.topics import moved, other_publishers
 from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
