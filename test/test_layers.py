@@ -53,11 +53,9 @@ OFFLINE = {
     'offline.pattern': {
         'core.geometry', 'core.graph', 'core.elimination', 'offline.graph_views'},
     'offline.source_residuals': {
-        'core.geometry', 'core.graph', 'core.odometry', 'core.smoother', 'core.sources',
-        'core.disagreement'},
+        'core.geometry', 'core.graph', 'core.sources', 'core.disagreement', 'core.parts'},
     'offline.variance_components': {
-        'core.geometry', 'core.graph', 'core.odometry', 'core.sources', 'core.parts',
-        'offline.source_residuals'},
+        'core.geometry', 'core.graph', 'core.sources', 'core.parts', 'offline.source_residuals'},
     'offline.simulation': {'core.geometry', 'core.graph'},
     'offline.noise': {
         'core.batch', 'core.belief', 'core.geometry', 'core.sources', 'core.parts'},

@@ -93,9 +93,8 @@ def choose_inputs(
             logger.warning('%s: no topic %s for %s', reader.path, topic, name)
     topics = dict(chosen)
     for name, topic in chosen.items():
-        option, wanted_type = (
-            f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'), kinds[name].message_type
-        info = reader.topics.get(topic)
+        option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
+        info, wanted_type = reader.topics.get(topic), kinds[name].message_type
         if info is None:
             raise BagError(
                 f'{reader.path}: no topic {topic} ({option}); the bag has {reader.describe()}')

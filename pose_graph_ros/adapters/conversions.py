@@ -33,6 +33,7 @@ from pose_graph_ros.core.measurements import (
     rejected,
     YawRate,
 )
+from pose_graph_ros.core.odometry.motion import integrated
 from pose_graph_ros.core.quantities import NANOSECONDS
 
 if TYPE_CHECKING:
@@ -84,8 +85,8 @@ def odometry_sample(
         return rejected('too_large', f'odometry pose {pose.tolist()}')
     linear = message.twist.twist.linear
     speed = math.hypot(linear.x, linear.y)
-    integrated = source.integrate == Integrate.TWIST.value
-    twist = planar_twist(message.twist.twist) if integrated else None
+    by_twist = source.integrate == Integrate.TWIST.value
+    twist = planar_twist(message.twist.twist) if by_twist else None
     if isinstance(twist, Answer):
         return twist
     return OdometrySample(
@@ -262,8 +263,11 @@ def twist_odometry(
         twist = (c * x - s * y + rate * float(place[1]),
                  s * x + c * y - rate * float(place[0]), rate)
     stamp = stamp_ns(message, source.time_offset_ns)
-    whole = by.twists.get(source.name, IntegratedTwist()).then(stamp, twist)
-    by.twists[source.name] = whole
+    whole = by.twists.get(source.name, IntegratedTwist())
+    if stamp > whole.stamp_ns:  # one that is older changes nothing
+        time = (stamp - whole.stamp_ns) * 1e-9 if whole.stamp_ns > 0 else 0.0
+        moved = se2.compose_one(whole.pose, integrated(whole.twist, twist, time))
+        by.twists[source.name] = whole = IntegratedTwist(stamp, moved, twist)
     return OdometrySample(stamp, np.array(whole.pose), math.hypot(twist[0], twist[1]),
                           twist_variance(message.twist.covariance), twist)
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
-from pose_graph_ros.core.geometry.se2 import compose_one, FloatArray, Pose
-from pose_graph_ros.core.odometry.motion import integrated
+from pose_graph_ros.core.geometry.se2 import FloatArray, Pose
 
 if TYPE_CHECKING:
     from pose_graph_ros.adapters.sources import Source
@@ -171,14 +170,6 @@ class IntegratedTwist(NamedTuple):
     stamp_ns: int = 0
     pose: Pose = (0.0, 0.0, 0.0)
     twist: Pose = (0.0, 0.0, 0.0)
-
-    def then(self, stamp_ns: int, twist: Pose) -> 'IntegratedTwist':
-        """Return the same after another one; one that is older changes nothing."""
-        if stamp_ns <= self.stamp_ns:
-            return self
-        time = (stamp_ns - self.stamp_ns) * 1e-9 if self.stamp_ns > 0 else 0.0
-        return IntegratedTwist(
-            stamp_ns, compose_one(self.pose, integrated(self.twist, twist, time)), twist)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,11 +32,6 @@ class Exports(NamedTuple):
     formats: tuple[str, ...] = ()
     strict: bool = True  # whether it is an error if one of them cannot be written
 
-    @property
-    def on_earth(self) -> str:
-        """The formats that need a datum, as a text; empty if there are none."""
-        return ', '.join(name for name in self.formats if name in ON_EARTH)
-
 
 def replay(parser: argparse.ArgumentParser) -> None:
     """

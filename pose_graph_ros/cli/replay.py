@@ -27,7 +27,7 @@ from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, MessageReader
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli import shared
-from pose_graph_ros.cli.arguments import Exports
+from pose_graph_ros.cli.arguments import Exports, ON_EARTH
 from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import Recorder, Run, Update
@@ -63,9 +63,10 @@ class ExportError(PoseGraphError, ValueError):
 
 def require_datum(exports: Exports, *, known: bool) -> None:
     """Raise `ExportError` if a format needs a place on the Earth, and there is none."""
-    if exports.strict and exports.on_earth and not known:
+    on_earth = [name for name in exports.formats if name in ON_EARTH]
+    if exports.strict and len(on_earth) > 0 and not known:
         raise ExportError(
-            f'--export {exports.on_earth}: the place of the map on the Earth is unknown; give '
+            f'--export {", ".join(on_earth)}: the place of the map on the Earth is unknown; give '
             "fixes (--fix TOPIC), or poses in a map with a known datum (--global-pose TOPIC -p "
             "'datum:=[LATITUDE, LONGITUDE]')")
 

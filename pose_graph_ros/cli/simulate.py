@@ -266,11 +266,12 @@ def fix_messages(
 
     Sigma is that of east and of north; that of the height is twice as large.
     """
-    status, covariance = _TYPES['sensor_msgs/msg/NavSatStatus'], sigma**2 * np.diag((1., 1., 4.))
+    status = _TYPES['sensor_msgs/msg/NavSatStatus']
+    covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
     for stamp, fix in zip(stamps_ns.tolist(), geodetic.tolist(), strict=True):
         yield topic, _FIX, stamp, _TYPES[_FIX](
             _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
-            covariance.ravel(), _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
+            covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
 
 
 def loop_closure_messages(

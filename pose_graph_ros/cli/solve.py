@@ -95,12 +95,11 @@ class Problem:
 
 def solve(problem: Problem, start: str) -> Solution:
     """Return the result of optimising a graph in place."""
+    present, found = problem.graph.poses.copy(), list[tuple[Solution, FloatArray]]()
     if start != 'best':
-        return _solve_from(problem, start, problem.graph.poses.copy())
-    present = problem.graph.poses.copy()
+        return _solve_from(problem, start, present)
     # poses that were composed from edges are those of odometry
     names = [name for name in STARTS if name != 'best' and (name != 'file' or problem.has_start)]
-    found: list[tuple[Solution, FloatArray]] = []
     for name in names:
         solution = _solve_from(problem, name, present)
         found.append((solution, problem.graph.poses.copy()))
@@ -189,15 +188,8 @@ class Report:
     reason: str  # why there is none; else empty
     seconds: float
     chi2: float  # of the solution, with the error (3.48)
-    bounds_chi2: bool = False  # whether the lower bound is one of chi2 as well
+    bound: float | None = None  # lower one of chi2, if one was proved
     chi2_from_it: float | None = None  # reached from the minimum that it found, if tried
-
-    @property
-    def bound(self) -> float | None:
-        """Lower bound of chi2, if one was proved."""
-        if self.certificate is None or not self.bounds_chi2:
-            return None
-        return max(self.certificate.bound, 0.0)
 
     def values(self) -> dict[str, Any]:
         """Return the keys of `certificate` in the JSON output, as in docs/tools.md."""
@@ -269,8 +261,9 @@ def with_certificate(
                                 other.determined, solution.tried)
         else:
             solution = resumed(problem, solution, poses)
-    return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2,
-                            formulation.below_chi2, found)
+    bound = max(made.bound, 0.0) if formulation.below_chi2 else None
+    return solution, Report(
+        made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
 
 
 # --- the tool

@@ -173,12 +173,9 @@ def fitted(rows: Records) -> Noise:
         tau = found(TAU)
     else:
         size, tau = found(WHITE, 2.0**multiple), None
+    seconds = 1e-9 * float(rows['stamp_ns'][-1] - rows['stamp_ns'][0])
     return Noise(found(WAY), found(TURN), size, tau, float(np.sqrt(np.median(rows['slow']))),
-                 _shown(rows), _seconds(rows))
-
-
-def _seconds(rows: Records) -> float:
-    return 1e-9 * float(rows['stamp_ns'][-1] - rows['stamp_ns'][0])
+                 _shown(rows, seconds), seconds)
 
 
 def _at(
@@ -209,7 +206,7 @@ def _interval(
     return Found(unit * 2.0**best.point[axis], low, high, kept=False)
 
 
-def _shown(rows: Records) -> float:
+def _shown(rows: Records, seconds: float) -> float:
     """Return how large the variance of positions can be at most, in units of the claimed one."""
     headings = np.cumsum(rows['motion'][:, 2])
     before = np.concatenate(([0.0], headings[:-1]))
@@ -220,7 +217,7 @@ def _shown(rows: Records) -> float:
     turn = np.angle(np.sum(np.conj(here) * there))
     errors = np.abs(there - here * np.exp(1j * turn))**2
     # two coordinates, without the three numbers by which odometry was laid there
-    degrees = 2.0 * _seconds(rows) / CHANGE - 3.0
+    degrees = 2.0 * seconds / CHANGE - 3.0
     quantile = 2.0 * float(gammaincinv(0.5 * max(degrees, 0.0), TAIL))
     # the upper end of the interval of a variance from a mean of squared errors
     return math.inf if not quantile > 0.0 else degrees / quantile * float(

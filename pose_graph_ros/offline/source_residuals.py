@@ -130,8 +130,8 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
     scales = np.where(weights > 0.0, weights, 1.0)**-0.5
     found: dict[str, SourceResiduals] = {}
     for source, (stamps, ids) in factors.held().items():
-        residuals, table = _residuals(graph, (source, 'map'), ids, stamps, scales), (
-            graph.factors_at(ids))
+        residuals = _residuals(graph, (source, 'map'), ids, stamps, scales)
+        table = graph.factors_at(ids)
         # J P J^T of measurements of points of the robot, in map axes
         rows = graph.node_rows(table.i)
         arms = np.einsum('kij,kj->ki', se2.rotation(graph.poses[rows, 2]), table.constants[:, :2])

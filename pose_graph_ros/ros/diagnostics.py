@@ -32,8 +32,7 @@ from pose_graph_ros.core.odometry.motion import AS_CLAIMED
 from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.ros.input import EXPECTED
-from pose_graph_ros.ros.topics import moved
-from pose_graph_ros.ros.transforms import other_publishers
+from pose_graph_ros.ros.topics import moved, other_publishers
 from pose_graph_ros.ros.worker import Worker
 
 if TYPE_CHECKING:
@@ -222,10 +221,9 @@ def concerns(session: 'Session') -> Iterator[Concern]:
 def _missing_input(session: 'Session') -> Iterator[Concern]:
     """Yield what is to be said if odometry, or all messages of a source, do not get in."""
     estimate, received = session.worker.estimate, session.input
-    odometry, refused = {
-        name: session.node.resolve_topic_name(source.topic)
-        for name, source in received.reader.sources.items() if source.kind.is_odometry
-    }, received.refused
+    odometry = {name: session.node.resolve_topic_name(source.topic)
+                for name, source in received.reader.sources.items() if source.kind.is_odometry}
+    refused = received.refused
     if estimate is None or (session.is_loaded and not any(
             session.worker.status.counts[name, 'accepted'] > 0 for name in odometry)):
         why = '; '.join(refused[name] for name in odometry if name in refused) or (
@@ -351,7 +349,7 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
             elif found != expected:
                 yield (f'{name} has the {what} {found!r}, but the parameter {parameter} is '
                        f'{expected!r}: set it, else {consequence}')
-    elif parent == '' and source.kind.without_frame != '' and not (
-            source.mounting != 'tf' or any(source.lever_arm)):  # no parameter stands for it
+    elif parent == '' and source.kind.without_frame != '' and (
+            source.mounting == 'tf' and not any(source.lever_arm)):  # no parameter stands for it
         yield f'{name} has no frame_id: ' + source.kind.without_frame.format(
             base=out.base_frame, map=out.map_frame, name=name)

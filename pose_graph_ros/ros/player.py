@@ -34,7 +34,7 @@ from pose_graph_ros.adapters.bags import MessageError, open_bag
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.quantities import NANOSECONDS
-from pose_graph_ros.ros.transforms import message_class, TF_TYPE, TFMessage
+from pose_graph_ros.ros.topics import message_class, TF_TYPE, TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
 RECORDED, KEPT = ('pose', 'filtered_odometry', 'diagnostics'), ('path', 'verdicts')

@@ -44,8 +44,8 @@ from pose_graph_ros.core.judgement.texts import details, sentence, total_values,
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS, Seconds, StampNs
-from pose_graph_ros.ros import transforms
-from pose_graph_ros.ros.transforms import Slew, TFMessage, TransformPublisher
+from pose_graph_ros.ros import topics
+from pose_graph_ros.ros.topics import Slew, TFMessage, TransformPublisher
 from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
@@ -105,7 +105,7 @@ class Publishers:
 
     def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
         return self._node.create_publisher(
-            transforms.message_class(type_name), topic,
+            topics.message_class(type_name), topic,
             copy(qos),  # rclpy writes the overrides into it
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
@@ -116,7 +116,7 @@ class Publishers:
                 'tf2_msgs is not installed: the transform from map to odom is not published',
                 once=True)
         elif values['publish_tf'] and self.transforms is None:
-            publisher = self._publisher(transforms.TF_TYPE, transforms.TOPIC, transforms.TF_QOS)
+            publisher = self._publisher(topics.TF_TYPE, topics.TOPIC, topics.TF_QOS)
             self.transforms = TransformPublisher(
                 self._node, publisher, self.map_frame, self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:

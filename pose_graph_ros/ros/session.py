@@ -37,8 +37,14 @@ from pose_graph_ros.ros.log import ANSWER, NUMBER
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.requests import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.topics import CLOSURE_QOS, INPUTS, JUDGE_TOPIC, SENSOR_QOS
-from pose_graph_ros.ros.transforms import message_class, STATIC_TOPIC
+from pose_graph_ros.ros.topics import (
+    CLOSURE_QOS,
+    INPUTS,
+    JUDGE_TOPIC,
+    message_class,
+    SENSOR_QOS,
+    STATIC_TOPIC,
+)
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)

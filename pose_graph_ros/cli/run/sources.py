@@ -117,7 +117,13 @@ def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
                     f'its covariances cannot be checked: {fit.n_used} measurements are as few as '
                     f'{short(fit.independent)} independent ones')
     share = f'{short(fit.ratio)} times' if fit.ratio > 1.0 else f'{short(100.0 * fit.ratio)} % of'
-    text = f'{claim(analysis)}, {share} the sigma ({short(fit.low)} to {short(fit.high)})'
+    positions = [row for row in fit.rows if row.coordinate < 2]
+    rows, unit = (positions, 'm') if len(positions) > 0 else (list(fit.rows), 'deg')
+    sigma = math.sqrt(sum(row.sigma**2 for row in rows) / len(rows))
+    sigma = sigma if unit == 'm' else math.degrees(sigma)
+    per = '' if analysis.residuals.kind in ('map', 'loop_closure') else ' from node to node'
+    text = (f'claims {short(sigma)} {unit}{per}, found {short(sigma * fit.ratio)} {unit}, {share} '
+            f'the sigma ({short(fit.low)} to {short(fit.high)})')
     # whether they are surely much too small or too large
     if fit.low > WRONG or (fit.high < 1.0 / WRONG and not analysis.correlated
                            and len(analysis.suspects) == 0):
@@ -146,18 +152,6 @@ def _wrong(analysis: SourceAnalysis) -> tuple[str, str]:
                         'show from node to node')
     return 'notice', (f': its covariances are {short(ratio**-2)} times too large, so it counts '
                       f'for less than it could; {advice} would be right')
-
-
-def claim(analysis: SourceAnalysis) -> str:
-    """Return what sigma a source claims, and which one was found."""
-    positions = [row for row in analysis.fit.rows if row.coordinate < 2]
-    rows = positions or list(analysis.fit.rows)
-    sigma = math.sqrt(sum(row.sigma**2 for row in rows) / len(rows))
-    per = '' if analysis.residuals.kind in ('map', 'loop_closure') else ' from node to node'
-    if len(positions) > 0:
-        return f'claims {short(sigma)} m{per}, found {short(sigma * analysis.fit.ratio)} m'
-    sigma = math.degrees(sigma)
-    return f'claims {short(sigma)} deg{per}, found {short(sigma * analysis.fit.ratio)} deg'
 
 
 def springs(

@@ -149,21 +149,17 @@ def street_corners(
             way = (facing + turn) % 4
             end = cell + DIRECTIONS[way]
             if np.all(end >= 0) and end[0] < len(streets) and end[1] < len(avenues):
-                seen = (*_middle(cell, end), way % 2) in visited
+                # the sum names the street between two crossings, in either direction
+                seen = (*(cell + end).tolist(), way % 2) in visited
                 weights[way] = likely * (1.0 if seen else fresh)
         facing = int(rng.choice(4, p=weights / weights.sum()))
         end = cell + DIRECTIONS[facing]
-        visited.add((*_middle(cell, end), facing % 2))
+        visited.add((*(cell + end).tolist(), facing % 2))
         driven += abs(streets[end[0]] - streets[cell[0]]) + abs(avenues[end[1]] - avenues[cell[1]])
         cell = end
         corners.append(cell)
     nodes = np.array(corners)
     return np.column_stack((streets[nodes[:, 0]], avenues[nodes[:, 1]]))
-
-
-def _middle(a: IntArray, b: IntArray) -> tuple[int, int]:
-    """Return what names the street between two crossings, in either direction."""
-    return int(a[0] + b[0]), int(a[1] + b[1])
 
 
 def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, FloatArray]:
