@@ -184,15 +184,8 @@ class TruncatedProblem:
         self.graph.set_poses(poses)
         return chi2_of(self.graph) + float(np.sum(np.minimum(self.energies(), self.limits)))
 
-    def graduated(self, surrogate: Surrogate, *, patient: bool = False) -> Choosing:
-        """
-        Return the set that graduated non-convexity ends with.
-
-        None if no step could be solved, or, unless `patient`, if each would take long: with many
-        random edges the factorisation is nearly dense.
-        """
-        if not patient and self.factorisation(np.ones(len(self))) > 500_000:
-            return None
+    def graduated(self, surrogate: Surrogate) -> Choosing:
+        """Return the set that graduated non-convexity ends with; None if no step was solved."""
         if not (yield from self.solve(np.zeros(len(self)))):
             return None
         share = self.shares()
@@ -214,14 +207,14 @@ class TruncatedProblem:
                     mu *= GRADUATION
         return (yield from self.choice(share <= 1.0))
 
-    def improved(self, choice: Choice, retests: int = 20) -> Generator[None, None, Choice]:
+    def improved(self, choice: Choice) -> Generator[None, None, Choice]:
         """
         Return a set that no retest lowers the cost of.
 
         All that is within its limit at the poses of the set is believed, and nothing else, as long
         as that lowers the cost.
         """
-        for _ in range(retests):
+        for _ in range(20):
             believed = choice.energies <= self.limits
             if np.array_equal(believed, choice.believed):
                 break

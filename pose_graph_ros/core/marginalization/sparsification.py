@@ -103,16 +103,16 @@ def sparsify(
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
         return SparsePrior(Factors(), 0.0)
-    blocks = conservative.nearest_below(found.rows[chosen])
-    distance = conservative.divergence(found.rows[chosen], blocks)
     most = len(chosen) + n_extra
-    while len(chosen) < most and distance > enough:
+    while True:
+        blocks = conservative.nearest_below(found.rows[chosen])
+        distance = conservative.divergence(found.rows[chosen], blocks)
+        if len(chosen) >= most or not distance > enough:
+            break
         extra = _overestimated(found, chosen, blocks)[:min(k, most - len(chosen))]
         if len(extra) == 0:
             break
         chosen = np.append(chosen, extra)
-        blocks = conservative.nearest_below(found.rows[chosen])
-        distance = conservative.divergence(found.rows[chosen], blocks)
     roots = found.roots[chosen]
     in_map = np.matmul(np.matmul(roots, blocks), np.swapaxes(roots, 1, 2))
     i, j = found.i[chosen], found.j[chosen]
