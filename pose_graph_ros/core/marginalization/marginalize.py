@@ -13,7 +13,7 @@ the position was observed: that says nothing about any neighbour. A fixed leavin
 pose, so it has no column in H_mm. `docs/solver.md` tells what is exact and what is not.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,8 +56,17 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
     """
     factors, priors = [], []
     leaving = _checked(graph, nodes)
-    for members in _parts(graph, leaving):
-        prior = marginal(graph, members)
+    used = graph.factors.rows(graph.factors.weight > 0.0)
+    ends = np.stack((used.i, used.j, used.k))
+    pairs = [ends[[0, 1]], ends[[0, 2]], ends[[1, 2]]]
+    for known in graph.priors:
+        inside = known.nodes[np.isin(known.nodes, leaving)]
+        pairs.append(np.stack((inside[:-1], inside[1:])))
+    joined = np.hstack(pairs)
+    i, j = np.searchsorted(leaving, joined[:, np.all(np.isin(joined, leaving), axis=0)])
+    part = components(i, j, len(leaving))
+    for first in np.unique(part):   # of the connected parts of the leaving nodes
+        prior = marginal(graph, leaving[part == first])
         if prior is None:
             continue
         is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
@@ -187,21 +196,6 @@ def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
     if len(gone) > 0:
         raise GraphUpdateError(f'marginalize: hidden node {gone[0]} is not in the graph')
     return ids
-
-
-def _parts(graph: Graph, leaving: IntArray) -> Iterator[IntArray]:
-    """Yield the connected parts of the leaving nodes, each ascending."""
-    used = graph.factors.rows(graph.factors.weight > 0.0)
-    ends = np.stack((used.i, used.j, used.k))
-    pairs = [ends[[0, 1]], ends[[0, 2]], ends[[1, 2]]]
-    for prior in graph.priors:
-        inside = prior.nodes[np.isin(prior.nodes, leaving)]
-        pairs.append(np.stack((inside[:-1], inside[1:])))
-    joined = np.hstack(pairs)
-    i, j = np.searchsorted(leaving, joined[:, np.all(np.isin(joined, leaving), axis=0)])
-    part = components(i, j, len(leaving))
-    for first in np.unique(part):
-        yield leaving[part == first]
 
 
 def part_of(
