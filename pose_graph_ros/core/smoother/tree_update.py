@@ -100,8 +100,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
         n_loose += 1
     orphans, start, adjacency = structure(head, marked, loose[:n_loose], affected)
     cliques = in_postorder(
-        affected, minimum_degree(
-            len(affected), len(orphans), n_leaving, n_last, start, adjacency),
+        affected, minimum_degree(len(affected), len(orphans), n_leaving, n_last, start, adjacency),
         n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, False)
     if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
                     head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
