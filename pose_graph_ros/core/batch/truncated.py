@@ -147,10 +147,6 @@ class TruncatedProblem:
         """Return r^2 at the present poses, shape (M,)."""
         return energies(self.graph.errors(self.edges), self.edges.information)
 
-    def shares(self) -> FloatArray:
-        """Return r^2 / c^2 at the present poses, shape (M,)."""
-        return self.energies() / self.limits
-
     def errors(self, numbers: IntArray) -> FloatArray:
         """Return the errors of some of the edges at the present poses, shape (K, 3)."""
         return self.graph.errors(self.edges.rows(numbers))
@@ -188,7 +184,7 @@ class TruncatedProblem:
         """Return the set that graduated non-convexity ends with; None if no step was solved."""
         if not (yield from self.solve(np.zeros(len(self)))):
             return None
-        share = self.shares()
+        share = self.energies() / self.limits
         largest = float(np.max(share, initial=0.0))
         if largest > 1.0:
             mu = surrogate.first(largest)
@@ -196,7 +192,7 @@ class TruncatedProblem:
                 weights = surrogate.weights(share, mu)
                 if not (yield from self.solve(weights)):
                     break
-                share = self.shares()
+                share = self.energies() / self.limits
                 if surrogate is Surrogate.GEMAN_MCCLURE:
                     if mu == 1.0:
                         break
