@@ -161,9 +161,8 @@ def _filled(graph: Graph, edges: Factors) -> Graph:
 
 SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
     'selection': best,
-    'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED, patient=True),
-    'gnc-gm': partial(
-        TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE, patient=True)}
+    'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED),
+    'gnc-gm': partial(TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE)}
 """The lowest truncated cost of several sets, or graduated non-convexity alone."""
 
 

@@ -21,7 +21,7 @@ the cliques of a graph.
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
+from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -33,13 +33,10 @@ from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, 
 from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, order_of
 
 if TYPE_CHECKING:
-    from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
     from pose_graph_ros.core.graph.graph import Graph
-    from pose_graph_ros.core.graph.priors import Prior
 
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
 Ends = Sequence[Blocks]   # one for each end of a constraint
-Constrained: TypeAlias = 'Graph | PlainGraph'
 ChordalSolve = Callable[[ComplexArray, ComplexArray | None], ComplexArray]
 """
 Solves for all positions of a graph, given headings u with |u| = 1, or for u if none are given.
@@ -50,6 +47,21 @@ What is known of fixed nodes, and what is returned, are complex numbers, the las
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
 _LINEAR = [*_PLACING, *(kind for kind, factor in FACTORS.items() if 0 not in factor.rows)]
+
+
+class Constrained(Protocol):
+    """What is needed of a graph, a `Graph` or a `PlainGraph`."""
+
+    @property
+    def node_kind(self) -> npt.NDArray[Any]: ...
+    @property
+    def n_priors(self) -> int: ...
+    @property
+    def poses(self) -> Poses: ...
+    @property
+    def fixed(self) -> BoolArray: ...
+    @property
+    def factors_by_row(self) -> Factors: ...  # with rows for ends
 
 
 class Terms(NamedTuple):
@@ -73,11 +85,6 @@ class Terms(NamedTuple):
         return cls(i, j, np.exp(1j * (mean[:, 2] - offset[:, 2])), complex_of(mean),
                    complex_of(offset), 0.5 * (information[:, 0, 0] + information[:, 1, 1]),
                    information[:, 2, 2])
-
-    @classmethod
-    def joined(cls, *terms: 'Terms') -> 'Terms':
-        """Return the terms of several tables."""
-        return cls(*map(np.concatenate, zip(*terms, strict=True)))
 
     def informative(self) -> 'Terms':
         """Return the terms without those that say nothing."""
@@ -290,22 +297,19 @@ def _joint_terms(graph: 'Graph') -> Terms:
         np.full(len(biased), n), biased.i, biased.mean,
         biased.constants[:, :2] @ np.eye(2, 3), biased.weighted_information)
     linear = np.isin(factors.kind, _LINEAR) | ((factors.j < 0) & ~is_bias[factors.i])
-    return Terms.joined(
-        Terms.of_factors(factors.rows(linear), n),
-        of_biased._replace(
-            tau=of_biased.tau / (1.0 + of_biased.tau * biased.constants[:, 2]**2),
-            kappa=of_biased.kappa / (1.0 + of_biased.kappa * biased.constants[:, 3]**2)),
-        *(_of_prior(prior, graph.node_rows(prior.nodes), graph.is_pose) for prior in graph.priors))
-
-
-def _of_prior(prior: 'Prior', rows: IntArray, is_pose: BoolArray) -> Terms:
-    """Return terms at the reference poses of a prior, which suffice to start from."""
-    blocks = np.einsum('iaib->iab', prior.information.reshape(len(rows), 3, -1, 3))
-    poses = np.flatnonzero(is_pose[rows] & (np.trace(blocks, axis1=1, axis2=2) > 0.0))
-    information = blocks[poses]
-    nodes, reference = rows[poses], prior.reference[poses]
-    if prior.anchored:
-        return Terms.of(np.full(len(nodes), len(is_pose)), nodes, reference, 0.0, information)
-    first = nodes[:1].repeat(len(nodes) - 1)
-    return Terms.of(first, nodes[1:], se2.between(reference[:1], reference[1:]), 0.0,
-                    information[1:])
+    terms = [Terms.of_factors(factors.rows(linear), n), of_biased._replace(
+        tau=of_biased.tau / (1.0 + of_biased.tau * biased.constants[:, 2]**2),
+        kappa=of_biased.kappa / (1.0 + of_biased.kappa * biased.constants[:, 3]**2))]
+    for prior in graph.priors:  # at its reference poses, which suffice to start from
+        rows = graph.node_rows(prior.nodes)
+        blocks = np.einsum('iaib->iab', prior.information.reshape(len(rows), 3, -1, 3))
+        says = np.trace(blocks, axis1=1, axis2=2) > 0.0
+        poses = np.flatnonzero(graph.is_pose[rows] & says)
+        nodes, reference, information = rows[poses], prior.reference[poses], blocks[poses]
+        if prior.anchored:
+            terms.append(Terms.of(np.full(len(nodes), n), nodes, reference, 0.0, information))
+        else:
+            terms.append(Terms.of(
+                nodes[:1].repeat(len(nodes) - 1), nodes[1:],
+                se2.between(reference[:1], reference[1:]), 0.0, information[1:]))
+    return Terms(*map(np.concatenate, zip(*terms, strict=True)))

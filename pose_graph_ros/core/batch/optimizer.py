@@ -68,9 +68,31 @@ def in_parts(
 ) -> Optimization:
     """Return the result of `optimize`, after a pause at each iteration."""
     chi2 = chi2_of(graph)
-    answer = _prepare(graph, chi2)
-    if answer is not None:
-        return answer
+    if not np.isfinite(chi2):
+        return _failed('chi2 is not finite', chi2)
+    if np.all(graph.fixed):
+        return BatchResult(Status.CONVERGED, '', 0, chi2)
+    cliques = symbolic.analyse(graph.memory.head)
+    # the root of the tree of cliques, a part of the graph, that each node is in
+    n = len(cliques.n_frontal)
+    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
+    while np.any(root[root] != root):
+        root = root[root]
+    part = np.empty(graph.n_nodes, dtype=np.int64)
+    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
+    # parts with a fixed or an observed node or an anchored prior
+    held = np.zeros(n, dtype=bool)
+    held[part[graph.fixed]] = True
+    ends = graph.factor_records['ends']
+    held[part[ends[(ends[:, 1] < 0) & (graph.weights > 0.0), 0]]] = True
+    for prior in graph.priors if graph.n_priors > 0 else ():
+        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
+    loose = graph.node_ids[~held[part]]
+    if len(loose) > 0:
+        return _failed(
+            f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
+            f'and no observed node: their poses are not determined', chi2)
+    plant(graph, cliques)
     poses = graph.poses.copy()
     if starts == (Start.PRESENT,):
         result = yield from _minimize(graph, config, chi2)
@@ -151,40 +173,6 @@ def _start(graph: Graph, start: Start) -> FloatArray:
     if start is Start.JOINT and not _is_observed(graph):
         raise LinearSolveError('joint start: no node is observed')
     return linear_starts.joint(graph, unit=start is Start.UNIT)
-
-
-def _prepare(graph: Graph, chi2: float) -> BatchResult | None:
-    """
-    Store the cliques of the whole graph.
-
-    Return a result if there is nothing to optimise or poses are not determined.
-    """
-    if not np.isfinite(chi2):
-        return _failed('chi2 is not finite', chi2)
-    if np.all(graph.fixed):
-        return BatchResult(Status.CONVERGED, '', 0, chi2)
-    cliques = symbolic.analyse(graph.memory.head)
-    # the root of the tree of cliques, a part of the graph, that each node is in
-    n = len(cliques.n_frontal)
-    root = np.where(cliques.parent[:n] < 0, np.arange(n), cliques.parent[:n])
-    while np.any(root[root] != root):
-        root = root[root]
-    part = np.empty(graph.n_nodes, dtype=np.int64)
-    part[cliques.nodes] = np.repeat(root, np.diff(cliques.first))
-    # parts with a fixed or an observed node or an anchored prior
-    held = np.zeros(n, dtype=bool)
-    held[part[graph.fixed]] = True
-    ends = graph.factor_records['ends']
-    held[part[ends[(ends[:, 1] < 0) & (graph.weights > 0.0), 0]]] = True
-    for prior in graph.priors if graph.n_priors > 0 else ():
-        held[part[graph.node_rows(prior.nodes[:1])]] |= prior.anchored
-    loose = graph.node_ids[~held[part]]
-    if len(loose) > 0:
-        return _failed(
-            f'hidden node {loose[0]} and {len(loose) - 1} others are connected to no fixed '
-            f'and no observed node: their poses are not determined', chi2)
-    plant(graph, cliques)
-    return None
 
 
 def plant(graph: Graph, cliques: symbolic.Cliques) -> None:

@@ -147,10 +147,6 @@ class TruncatedProblem:
         """Return r^2 at the present poses, shape (M,)."""
         return energies(self.graph.errors(self.edges), self.edges.information)
 
-    def shares(self) -> FloatArray:
-        """Return r^2 / c^2 at the present poses, shape (M,)."""
-        return self.energies() / self.limits
-
     def errors(self, numbers: IntArray) -> FloatArray:
         """Return the errors of some of the edges at the present poses, shape (K, 3)."""
         return self.graph.errors(self.edges.rows(numbers))
@@ -184,18 +180,11 @@ class TruncatedProblem:
         self.graph.set_poses(poses)
         return chi2_of(self.graph) + float(np.sum(np.minimum(self.energies(), self.limits)))
 
-    def graduated(self, surrogate: Surrogate, *, patient: bool = False) -> Choosing:
-        """
-        Return the set that graduated non-convexity ends with.
-
-        None if no step could be solved, or, unless `patient`, if each would take long: with many
-        random edges the factorisation is nearly dense.
-        """
-        if not patient and self.factorisation(np.ones(len(self))) > 500_000:
-            return None
+    def graduated(self, surrogate: Surrogate) -> Choosing:
+        """Return the set that graduated non-convexity ends with; None if no step was solved."""
         if not (yield from self.solve(np.zeros(len(self)))):
             return None
-        share = self.shares()
+        share = self.energies() / self.limits
         largest = float(np.max(share, initial=0.0))
         if largest > 1.0:
             mu = surrogate.first(largest)
@@ -203,7 +192,7 @@ class TruncatedProblem:
                 weights = surrogate.weights(share, mu)
                 if not (yield from self.solve(weights)):
                     break
-                share = self.shares()
+                share = self.energies() / self.limits
                 if surrogate is Surrogate.GEMAN_MCCLURE:
                     if mu == 1.0:
                         break
@@ -214,14 +203,14 @@ class TruncatedProblem:
                     mu *= GRADUATION
         return (yield from self.choice(share <= 1.0))
 
-    def improved(self, choice: Choice, retests: int = 20) -> Generator[None, None, Choice]:
+    def improved(self, choice: Choice) -> Generator[None, None, Choice]:
         """
         Return a set that no retest lowers the cost of.
 
         All that is within its limit at the poses of the set is believed, and nothing else, as long
         as that lowers the cost.
         """
-        for _ in range(retests):
+        for _ in range(20):
             believed = choice.energies <= self.limits
             if np.array_equal(believed, choice.believed):
                 break

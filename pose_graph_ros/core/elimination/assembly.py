@@ -35,70 +35,55 @@ def eliminate_clique(head, c, terms):  # type: ignore[no-untyped-def]
     Its front is assembled and factorised, and the rows of R and the update matrix are stored. If
     a pivot is small, it is judged again by the weakest direction of the factors of its node.
     """
-    by_weakest = False
-    while True:     # one call, as the compiler then inlines it
-        bad = _eliminate(head, c, terms, by_weakest)
-        if bad < 0 or by_weakest:
-            return bad
-        by_weakest = True
-
-
-@kernel
-def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
-    """Eliminate a clique, with bounds of the pivots by the weakest direction if asked for."""
     nodes, pool_f, work_f = tb.nodes(head), tb.pool_f(head), tb.work_f(head)
-    scalars, pool_i, cliques = tb.scalars(head)[0], tb.pool_i(head), tb.cliques(head)
+    damping, pool_i, cliques = tb.scalars(head)[0].damping, tb.pool_i(head), tb.cliques(head)
     row = cliques[c]
-    n_frontal, n_separator = row.n_frontal, row.n_separator
-    n_all = n_frontal + n_separator
+    n_frontal, n_all = row.n_frontal, row.n_frontal + row.n_separator
     rows, n = 3 * n_frontal, 3 * n_all
     ld = padded(n)
     members = pool_i[row.members:row.members + n_all]
-    front = work_f[:n * ld]
-    least = work_f[n * ld:n * ld + rows]
-    front[:] = 0.0
+    front, least = work_f[:n * ld], work_f[n * ld:n * ld + rows]
     serial = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = serial
     for k in range(n_all):
         nodes[members[k]].index = 3 * k
         nodes[members[k]].front = serial
-    any_fixed, any_padded, anchored = False, False, 0
-    for k in range(n_frontal):
-        v = members[k]
-        anchored |= _add_factors(head, v, c, terms, rows, front, ld)
-        scale_t = nodes[v].scale_t * nodes[v].scale_t
-        scale_r = nodes[v].scale_r * nodes[v].scale_r
-        least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
-        least[3 * k + 2] = LEAST_PIVOT * scale_r
-        if terms > RELINEARIZED:
-            least[3 * k:3 * k + 3] = 0.0
-        if by_weakest:
-            _lower_bounds(head, v, least[3 * k:3 * k + 3])
-        damping = scalars.damping
-        if damping > 0.0:
-            for m in range(3):
+    bad, any_padded = -1, False
+    for by_weakest in (False, True):
+        front[:] = 0.0
+        anchored = 0
+        for k in range(n_frontal):
+            v, node = members[k], nodes[members[k]]
+            anchored |= _add_factors(head, v, c, terms, rows, front, ld)
+            scale_t, scale_r = node.scale_t * node.scale_t, node.scale_r * node.scale_r
+            least[3 * k] = least[3 * k + 1] = LEAST_PIVOT * scale_t
+            least[3 * k + 2] = LEAST_PIVOT * scale_r
+            if terms > RELINEARIZED:
+                least[3 * k:3 * k + 3] = 0.0
+            if by_weakest:
+                _lower_bounds(head, v, least[3 * k:3 * k + 3])
+            for m in range(3 if damping > 0.0 else 0):
                 more = damping * (scale_t if m < 2 else scale_r)
                 front[(3 * k + m) * ld + 3 * k + m] += more
-                front[(3 * k + m + 1) * ld - 1] += more * nodes[v].delta[m]
-        if nodes[v].fixed != 0:
-            any_fixed, anchored = True, 1
-        for m in range(nodes[v].dimension, 3):
-            front[(3 * k + m) * (ld + 1)] += 1.0
-            any_padded = True
-    child = row.child
-    while child >= 0:
-        _extend_add(head, child, front, ld)
-        anchored |= cliques[child].anchored
-        child = cliques[child].sibling
-    row.anchored = anchored
-    cliques[c].turn_seen = 0.0
-    cliques[c].turn_zero = clique_frames.mean_turn(head, c)
-    if any_fixed:
+                front[(3 * k + m + 1) * ld - 1] += more * node.delta[m]
+            for m in range(node.dimension, 3):
+                front[(3 * k + m) * (ld + 1)] += 1.0
+                any_padded = True
+        child = row.child
+        while child >= 0:
+            _extend_add(head, child, front, ld)
+            anchored |= cliques[child].anchored
+            child = cliques[child].sibling
         for k in range(n_frontal):
             if nodes[members[k]].fixed != 0:
                 substitute_fixed(head, members[k], 3 * k, front, n, ld)
                 least[3 * k:3 * k + 3] = 0.0
-    bad = factorize(front, rows, n, ld, least)
+                anchored = 1
+        row.anchored, row.turn_seen = anchored, 0.0
+        row.turn_zero = clique_frames.mean_turn(head, c)
+        bad = factorize(front, rows, n, ld, least)
+        if bad < 0:
+            break
     if bad >= 0:
         return members[bad // 3]
     if any_padded:
@@ -109,7 +94,7 @@ def _eliminate(head, c, terms, by_weakest):  # type: ignore[no-untyped-def]
     # the rows of R, directly followed by the update matrix
     write_rows(front, n, ld, pool_f, row.values)
     # the squared error of the parent's linear model of a slip beta is about SLIP_SCALE beta^4
-    scale, first = 0.0, nodes[members[n_frontal]] if n_separator > 0 else nodes[members[0]]
+    scale, first = 0.0, nodes[members[min(n_frontal, n_all - 1)]]
     for k in range(n_frontal + 1, n_all):
         f, i = nodes[members[k]], 3 * k * ld + 3 * k
         arm2 = (f.pose[0] - first.pose[0]) ** 2 + (f.pose[1] - first.pose[1]) ** 2

@@ -13,7 +13,7 @@ the position was observed: that says nothing about any neighbour. A fixed leavin
 pose, so it has no column in H_mm. `docs/solver.md` tells what is exact and what is not.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,8 +56,17 @@ def marginalize(graph: Graph, nodes: Collection[int]) -> GraphUpdate:
     """
     factors, priors = [], []
     leaving = _checked(graph, nodes)
-    for members in _parts(graph, leaving):
-        prior = marginal(graph, members)
+    used = graph.factors.rows(graph.factors.weight > 0.0)
+    ends = np.stack((used.i, used.j, used.k))
+    pairs = [ends[[0, 1]], ends[[0, 2]], ends[[1, 2]]]
+    for known in graph.priors:
+        inside = known.nodes[np.isin(known.nodes, leaving)]
+        pairs.append(np.stack((inside[:-1], inside[1:])))
+    joined = np.hstack(pairs)
+    i, j = np.searchsorted(leaving, joined[:, np.all(np.isin(joined, leaving), axis=0)])
+    part = components(i, j, len(leaving))
+    for first in np.unique(part):   # of the connected parts of the leaving nodes
+        prior = marginal(graph, leaving[part == first])
         if prior is None:
             continue
         is_pose = bool(np.all(graph.is_pose[graph.node_rows(prior.nodes)]))
@@ -84,8 +93,15 @@ def marginal(
     It is a prior at their present poses; None if they say nothing. The nodes of the further ones
     remain unless they leave. Raises as `marginalize` does.
     """
-    leaving = _checked(graph, nodes)
-    part = _part(graph, leaving, list(factors), [cut.edge for cut in cuts])
+    leaving, table = _checked(graph, nodes), graph.factors
+    # the part of the graph with the factors of leaving nodes and further ones
+    asked = np.union1d(graph.factors_on(leaving), np.array(list(factors), dtype=np.int64))
+    chosen = np.isin(graph.factor_ids, np.setdiff1d(asked, [cut.edge for cut in cuts]))
+    chosen &= table.weight > 0.0
+    priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
+    ends = np.concatenate((table.i[chosen], table.j[chosen], table.k[chosen]))
+    part = part_of(graph, np.unique(np.concatenate((
+        leaving, ends[ends >= 0], *(each.nodes for each in priors)))), chosen, priors)
     inside, fixed, poses = np.isin(part.node_ids, leaving), part.fixed, part.poses
     H, b = equations(part)
     energy = part.energies().chi2
@@ -107,13 +123,13 @@ def marginal(
     kept = kept[np.any(np.any(U != 0.0, axis=1).reshape(-1, 3), axis=1)]
     if len(kept) == 0:
         return None
-    says, factors_of = np.flatnonzero(np.isin(columns // 3, kept)), part.factors
+    says, table = np.flatnonzero(np.isin(columns // 3, kept)), part.factors
     only_poses = bool(np.all(part.is_pose[kept]))
     relative = [*_RELATIVE, *(_TO_LANDMARKS if only_poses else ())]
     # whether a constraint knows where its nodes are in the map, of which some remain
     anchored = (
         bool(np.any(inside & fixed)) or any(prior.anchored for prior in part.priors)
-        or not np.all(np.isin(factors_of.kind, relative) & (only_poses | (factors_of.k < 0))))
+        or not np.all(np.isin(table.kind, relative) & (only_poses | (table.k < 0))))
     return Prior(part.node_ids[kept].astype(np.int64), poses[kept].copy(),
                  _symmetric(U[np.ix_(says, says)]), u[says], energy, anchored)
 
@@ -180,37 +196,6 @@ def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:
     if len(gone) > 0:
         raise GraphUpdateError(f'marginalize: hidden node {gone[0]} is not in the graph')
     return ids
-
-
-def _parts(graph: Graph, leaving: IntArray) -> Iterator[IntArray]:
-    """Yield the connected parts of the leaving nodes, each ascending."""
-    factors = graph.factors
-    ends = _ends(factors.rows(factors.weight > 0.0))
-    pairs = [ends[[0, 1]], ends[[0, 2]], ends[[1, 2]]]
-    for prior in graph.priors:
-        inside = prior.nodes[np.isin(prior.nodes, leaving)]
-        pairs.append(np.stack((inside[:-1], inside[1:])))
-    joined = np.hstack(pairs)
-    i, j = np.searchsorted(leaving, joined[:, np.all(np.isin(joined, leaving), axis=0)])
-    part = components(i, j, len(leaving))
-    for first in np.unique(part):
-        yield leaving[part == first]
-
-
-def _ends(factors: Factors) -> IntArray:
-    """Return the ends of factors, -1 for none, shape (3, M)."""
-    return np.stack((factors.i, factors.j, factors.k))
-
-
-def _part(graph: Graph, leaving: IntArray, more: Sequence[int], without: Sequence[int]) -> Graph:
-    """Return the part of a graph with the factors of leaving nodes and further ones."""
-    factors = graph.factors
-    ids = np.union1d(graph.factors_on(leaving), np.array(more, dtype=np.int64))
-    chosen = np.isin(graph.factor_ids, np.setdiff1d(ids, without)) & (factors.weight > 0.0)
-    priors = [prior for prior in graph.priors if np.any(np.isin(prior.nodes, leaving))]
-    ends = _ends(factors)[:, chosen].ravel()
-    ids = np.unique(np.concatenate((leaving, ends[ends >= 0], *(each.nodes for each in priors))))
-    return part_of(graph, ids, chosen, priors)
 
 
 def part_of(

@@ -103,23 +103,27 @@ def sparsify(
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
         return SparsePrior(Factors(), 0.0)
-    blocks = conservative.nearest_below(found.rows[chosen])
-    distance = conservative.divergence(found.rows[chosen], blocks)
     most = len(chosen) + n_extra
-    while len(chosen) < most and distance > enough:
+    while True:
+        blocks = conservative.nearest_below(found.rows[chosen])
+        distance = conservative.divergence(found.rows[chosen], blocks)
+        if len(chosen) >= most or not distance > enough:
+            break
         extra = _overestimated(found, chosen, blocks)[:min(k, most - len(chosen))]
         if len(extra) == 0:
             break
         chosen = np.append(chosen, extra)
-        blocks = conservative.nearest_below(found.rows[chosen])
-        distance = conservative.divergence(found.rows[chosen], blocks)
     roots = found.roots[chosen]
     in_map = np.matmul(np.matmul(roots, blocks), np.swapaxes(roots, 1, 2))
     i, j = found.i[chosen], found.j[chosen]
     is_edge, is_seen = (i < k) & (j < k), i == k
     displaced = poses, delta.reshape(-1, 3)
     edges = edges_between(nodes, displaced, i[is_edge], j[is_edge], in_map[is_edge])
-    seen = _observed(nodes, displaced, j[is_seen], in_map[is_seen])
+    rows = j[is_seen]
+    mean = se2.wrapped(poses[rows] + displaced[1][rows])
+    seen = Factors.on(
+        nodes[rows], mean=mean, information=turned(in_map[is_seen], mean[:, 2]),
+        kind=np.full(len(rows), FactorKind.NODE_PRIOR, dtype=np.uint8))
     priors = tuple(
         _on_bias(nodes, displaced, (of.pose, int(row) - 1), of.gain, in_map[at])
         for at, row in enumerate(j) if row > k for of in (of_biases[row - k - 1],))
@@ -316,17 +320,6 @@ def edges_between(
     mean[:, 2] = se2.wrap(mean[:, 2] + moved[:, 2])
     return Factors(nodes[start], nodes[end], mean, turned(in_map, turn + mean[:, 2]),
                  np.full(len(start), FactorKind.PRIOR, dtype=np.uint8))
-
-
-def _observed(
-    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], rows: IntArray, in_map: FloatArray,
-) -> Factors:
-    """Return observed nodes with information in map axes."""
-    poses, delta = displaced
-    mean = se2.wrapped(poses[rows] + delta[rows])
-    return Factors.on(
-        nodes[rows], mean=mean, information=turned(in_map, mean[:, 2]),
-        kind=np.full(len(rows), FactorKind.NODE_PRIOR, dtype=np.uint8))
 
 
 def turned(information: FloatArray, theta: FloatArray) -> FloatArray:

@@ -352,8 +352,7 @@ class Gyros:
         self.new.append(Turn(
             source, i, j, middle_ns, rotation.angle - at_rest.angle + creep,
             rotation.variance - at_rest.variance + creep_variance,
-            rotation.seconds - at_rest.seconds,
-            (at_rest.angle - creep) / at_rest.seconds,
+            rotation.seconds - at_rest.seconds, (at_rest.angle - creep) / at_rest.seconds,
             (at_rest.variance + creep_variance) / at_rest.seconds**2))
 
     def _at_rest(

@@ -50,7 +50,6 @@ class HiddenNodes(NodeTable):
 
     def __init__(self, config: BackendConfig, make_node: Callable[[NewNode], int]) -> None:
         super().__init__()
-        self._config = config
         self._make_node = make_node
         self.streams: dict[str, OdometryStream] = {}  # by the name of the source
         # stamp after which a source is the primary one [ns], and its name, by stamp
@@ -69,6 +68,7 @@ class HiddenNodes(NodeTable):
         self._samples_since_ns = -1
         self.errors = AS_CLAIMED  # of the primary odometry, which the edges to new nodes know of
         self.relocated: set[int] = set()  # numbers of the nodes at which the robot was put by hand
+        self.configure(config)
 
     @property
     def relocated_ids(self) -> IntArray:
@@ -95,13 +95,9 @@ class HiddenNodes(NodeTable):
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for nodes and edges from now on; the next one has the new noise."""
-        self._config = config
+        self._config, self._patience_ns = config, round(config.odometry_patience * 1e9)
         for name, stream in self.streams.items():
             stream.configure(config.odometry_source(name))
-
-    @property
-    def _patience_ns(self) -> int:
-        return round(self._config.odometry_patience * 1e9)
 
     @property
     def _names(self) -> list[str]:

@@ -67,8 +67,7 @@ class SpeedWindow(NamedTuple):
         else:
             decay, (_, recent, greatest) = math.exp(-time / MEMORY_TIME), self.speeds
             speeds = Speeds(
-                velocity,
-                (max(speed[0], decay * recent[0]), max(speed[1], decay * recent[1])),
+                velocity, (max(speed[0], decay * recent[0]), max(speed[1], decay * recent[1])),
                 (max(speed[0], greatest[0]), max(speed[1], greatest[1])))
         return SpeedWindow(speeds, stamp_ns, pose)
 

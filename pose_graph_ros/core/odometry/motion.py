@@ -140,8 +140,7 @@ class OdometryErrors(NamedTuple):
         result = claimed / self.way
         position = claimed[:, :2, :2]
         turn = claimed[:, 2, 2] - np.einsum(
-            'mi,mi->m', claimed[:, 2, :2], np.linalg.solve(
-                position, claimed[:, :2, 2:])[..., 0])
+            'mi,mi->m', claimed[:, 2, :2], np.linalg.solve(position, claimed[:, :2, 2:])[..., 0])
         result[:, 2, 2] += turn * (1.0 / self.turn - 1.0 / self.way)
         return np.asarray(result)
 

@@ -50,9 +50,9 @@ class ThinnedNodes:
     own anchor. A node takes 40 bytes.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, first: int = 0) -> None:
         # by number, from the first node that is not frozen on; -1 for nodes that are in the graph
-        self._first, self._size = 0, 0
+        self._first, self._size = first, 0
         self._rows = GrowingArray((), THINNED)
 
     def __len__(self) -> int:
@@ -107,11 +107,6 @@ class ThinnedNodes:
         self._size -= int(np.count_nonzero(self._rows.values['anchor'][:n] >= 0))
         self._rows.drop_first(n)
         self._first = number
-
-    def restore(self, saved: ThinnedPlaces, first: int) -> None:
-        """Fill this empty object; `first` is the number of the first node that is not frozen."""
-        self._first = first
-        self.add(saved.numbers, saved.anchors, saved.relative, _full(saved.noise))
 
 
 def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
@@ -276,4 +271,6 @@ class NodeTable:
         self._odometry.append(saved.odometry)
         self._frozen.append(saved.frozen)
         self._travelled = saved.travelled
-        self.thinned.restore(saved.thinned, self.n_frozen)
+        self.thinned, thinned = ThinnedNodes(self.n_frozen), saved.thinned
+        self.thinned.add(
+            thinned.numbers, thinned.anchors, thinned.relative, _full(thinned.noise))

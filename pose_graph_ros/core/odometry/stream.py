@@ -245,8 +245,7 @@ class OdometryStream(ReorderBuffer[Received]):
         if saved.last is not None:
             self._last, self.settled_ns = saved.last, saved.last.row.stamp_ns
             self.timeline.restore(
-                saved.stamps_ns, saved.samples, saved.dense, saved.last.row,
-                resting=saved.resting)
+                saved.stamps_ns, saved.samples, saved.dense, saved.last.row, resting=saved.resting)
         self._waiting += saved.waiting
         self.restarted_ns = saved.restarted_ns
         self.tied, self.next_to_tie = saved.tied, saved.next_to_tie

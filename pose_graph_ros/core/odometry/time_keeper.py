@@ -99,7 +99,12 @@ class TimeKeeper:
             return PRESENT  # the engine refuses stamps of zero, and waits for odometry
         watch, now_ns = self._watches.setdefault(source, _Watch()), self.now_ns
         if source not in self._odometry:
-            return self._follow(source, watch, stamp_ns)
+            # it tells no time, and is judged by odometry and by what it sent before
+            known = [each for each in (now_ns, watch.newest_ns) if each > 0]
+            if known and all(abs(stamp_ns - each) > APART_NS for each in known):
+                return Judgement(self._refusal(source, stamp_ns))
+            watch.newest_ns = stamp_ns
+            return PRESENT
         if self._is_ahead(source, watch, stamp_ns):
             return Judgement(self._refusal(source, stamp_ns))
         own_ns = watch.newest_ns
@@ -147,14 +152,6 @@ class TimeKeeper:
         if clock_ns != watch.clock_ns:
             watch.clock_ns, watch.since_ns = clock_ns, stamp_ns
         return stamp_ns - clock_ns > LATEST_NS >= stamp_ns - watch.since_ns
-
-    def _follow(self, source: str, watch: _Watch, stamp_ns: int) -> Judgement:
-        """Judge a source that tells no time: by odometry, and by what it sent before."""
-        known = [each for each in (self.now_ns, watch.newest_ns) if each > 0]
-        if known and all(abs(stamp_ns - each) > APART_NS for each in known):
-            return Judgement(self._refusal(source, stamp_ns))
-        watch.newest_ns = stamp_ns
-        return PRESENT
 
     def _newest_but(self, source: str) -> int:
         return max((self._watches[name].newest_ns for name in self._odometry

@@ -70,13 +70,6 @@ def _set_least_pivots(head, v, least):  # type: ignore[no-untyped-def]
     least[2] = LEAST_PIVOT * node.scale_r * node.scale_r
 
 
-@kernel
-def _clear_frame(clique):  # type: ignore[no-untyped-def]
-    """Let the frame of a clique be the map; with one separator node, no turn of it is an error."""
-    clique.turn_seen = clique.turn_zero = clique.turn = 0.0
-    clique.slip_error2 = clique.slip_scale = clique.drift = 0.0
-
-
 @kernel(signature=(tb.HEAD, NUMBERS, ROWS, NUMBER))
 def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     """
@@ -91,11 +84,9 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     lacks = lacks_memory(head, head[tb.POOL_F_END] + _PAIR + _ROOT, head[tb.POOL_I_END] + 3, 256)
     if lacks or v + head[tb.N_PRIORS] >= head[tb.NODE_ROOM] or e >= head[tb.FACTOR_ROOM]:
         return NO_ROOM
-    if len(mean) != 3 or information.shape != (3, 3):
-        return NOT_A_CHAIN
     last = head[tb.NEWEST]
-    if (last < 0 or head[tb.N_TOUCHED] > 0 or head[tb.UPDATE] > tb.LAST_STAMP
-            or nodes[last].clique < 0):
+    if (len(mean) != 3 or information.shape != (3, 3) or last < 0 or head[tb.N_TOUCHED] > 0
+            or head[tb.UPDATE] > tb.LAST_STAMP or nodes[last].clique < 0):
         return NOT_A_CHAIN
     c = nodes[last].clique
     old = cliques[c]
@@ -144,8 +135,9 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
     pool_i[new.members] = v
     write_rows(root, 3, ld_root, pool_f, new.values)
     new.child, new.anchored = c, old.anchored
-    _clear_frame(new)
-    _clear_frame(old)
+    for clique in (new, old):   # frames are the map; with one separator node no turn is an error
+        clique.turn_seen = clique.turn_zero = clique.turn = 0.0
+        clique.slip_error2 = clique.slip_scale = clique.drift = 0.0
     old.parent, old.sibling, old.n_separator = r, -1, 1
     old.members, old.values = take(head, NODES, 2), take(head, VALUES, _PAIR)
     pool_i[old.members], pool_i[old.members + 1] = last, v

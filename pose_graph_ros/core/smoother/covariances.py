@@ -94,7 +94,7 @@ def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-de
     nodes, cliques, m = tb.nodes(head), tb.cliques(head), len(out)
     out[:] = 0.0
     if j < 0:
-        _begin(head, i, of_i, -1, np.empty((m, 48)), np.empty((m, 48)), out)
+        _begin(head, i, of_i, -1, np.empty((m, 48)), out)
         return
     # Each path to a root goes on along the other one: they meet in the lowest clique above both
     # nodes, or both end at -1.
@@ -104,8 +104,8 @@ def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-de
         common = cliques[common].parent if common >= 0 else begin_j
         other = cliques[other].parent if other >= 0 else begin_i
     spare = np.empty((m, 96))
-    first, spare, at_i = _begin(head, i, of_i, common, np.empty((m, 96)), spare, out)
-    second, spare, at_j = _begin(head, j, of_j, common, np.empty((m, 96)), spare, out)
+    first, spare, at_i = _begin(head, i, of_i, common, spare, out)
+    second, spare, at_j = _begin(head, j, of_j, common, spare, out)
     if common >= 0:
         n = 3 * (cliques[common].n_frontal + cliques[common].n_separator)
         for r in range(m):
@@ -115,7 +115,7 @@ def write_covariance(head, i, of_i, j, of_j, out):  # type: ignore[no-untyped-de
 
 
 @kernel(allocates=True)
-def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped-def]
+def _begin(head, v, jacobian, top, spare, out):  # type: ignore[no-untyped-def]
     """
     Climb from a node to a clique, which is not solved for; -1 to climb beyond the root.
 
@@ -125,7 +125,7 @@ def _begin(head, v, jacobian, top, here, spare, out):  # type: ignore[no-untyped
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
     c = nodes[v].clique
     row = cliques[c]
-    here = _cleared(here, 3 * (row.n_frontal + row.n_separator))
+    here = np.zeros((len(jacobian), max(3 * (row.n_frontal + row.n_separator), 48)))
     first = 0
     while pool_i[row.members + first] != v:
         first += 1
@@ -158,7 +158,9 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
         # the right-hand sides of the separator are those of the parent, in its frame
         above = cliques[row.parent]
         n_above = above.n_frontal + above.n_separator
-        spare = _cleared(spare, 3 * n_above)
+        if spare.shape[1] < 3 * n_above:
+            spare = np.empty((len(here), 6 * n_above))
+        spare[:, :3 * n_above] = 0.0
         for m in range(n_above):
             nodes[pool_i[above.members + m]].index = 3 * m
         turn = (clique_frames.present_turn(head, c) - clique_frames.present_turn(head, row.parent))
@@ -172,15 +174,6 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
         first, c = 0, row.parent
         here, spare = spare, here
     return here, spare
-
-
-@kernel(allocates=True)
-def _cleared(vectors, n):  # type: ignore[no-untyped-def]
-    """Return vectors whose first n entries are zero; `vectors` themselves if long enough."""
-    if vectors.shape[1] < n:
-        return np.zeros((len(vectors), 2 * n))
-    vectors[:, :n] = 0.0
-    return vectors
 
 
 @kernel(allocates=True, fastmath=_FAST)

@@ -196,12 +196,9 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
         work_f[row_start(i, size) + size] = right[i]
     row.members = pools.take(head, pools.NODES, n)
     row.values = pools.take(head, pools.VALUES, pools.n_values(0, n))
-    for k in range(n):
-        pool_i[row.members + k] = members[k]
-    at = row.values
-    for k in range(n_numbers):
-        pool_f[at + k] = work_f[k]
-    at += n_numbers
+    transaction_log.copied(members, pool_i[row.members:row.members + n])
+    at = row.values + n_numbers
+    transaction_log.copied(work_f, pool_f[row.values:at])
     for k in range(n):
         for m in range(3):
             pool_f[at + 3 * k + m] = nodes[members[k]].pose[m]

@@ -93,10 +93,14 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             affected[n_leaving], affected[k] = affected[k], affected[n_leaving]
             n_leaving += 1
     n_last = newest_last(affected[n_leaving:], head[tb.NEWEST])
-    orphans, start, adjacency = structure(head, marked, _loose_priors(head), affected)
+    loose = np.empty(head[tb.N_PRIORS], np.int32)
+    c, n_loose = head[tb.LOOSE], 0
+    while c >= 0:
+        loose[n_loose], c = c, tree[c].sibling
+        n_loose += 1
+    orphans, start, adjacency = structure(head, marked, loose[:n_loose], affected)
     cliques = in_postorder(
-        affected, minimum_degree(
-            len(affected), len(orphans), n_leaving, n_last, start, adjacency),
+        affected, minimum_degree(len(affected), len(orphans), n_leaving, n_last, start, adjacency),
         n_leaving, RELAXED_ZEROS, RELAXED_FRONTAL, False)
     if lacks_memory(head, head[tb.POOL_F_END] + cliques.need_f,
                     head[tb.POOL_I_END] + cliques.need_i, cliques.largest):
@@ -125,20 +129,6 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
             tb.work_i(head)[head[tb.N_ROOTS]] = c
             head[tb.N_ROOTS] += 1
     return DONE
-
-
-@kernel(allocates=True)
-def _loose_priors(head):  # type: ignore[no-untyped-def]
-    """Return the priors without a parent."""
-    cliques = tb.cliques(head)
-    c, n = head[tb.LOOSE], 0
-    while c >= 0:
-        c, n = cliques[c].sibling, n + 1
-    loose = np.empty(n, np.int32)
-    c = head[tb.LOOSE]
-    for k in range(n):
-        loose[k], c = c, cliques[c].sibling
-    return loose
 
 
 @kernel(inline='always')

@@ -30,7 +30,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import IntArray, Poses
 from pose_graph_ros.core.graph import transaction_log
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.priors import packed, Prior
+from pose_graph_ros.core.graph.priors import packed
 
 _OF_STEP = SolverConfig(max_iterations=50, step_tolerance=1e-6)
 # Unit headings take longer than an update may.
@@ -129,20 +129,16 @@ class Trial:
         changed = (before.factors.weight[old] != now.factors.weight[new]) & ~np.isin(
             ids, list(self._update.weigh))
         was_fixed = copy.fixed[copy.node_rows(now.node_ids)]
-        known = {_key(prior) for prior in before.priors}
+        known = {prior.nodes.tobytes() + packed(prior).tobytes() for prior in before.priors}
         copy.apply(GraphUpdate(
             remove_nodes=copy.node_ids[self._graph.node_rows(copy.node_ids) < 0].tolist(),
             drop=copy.factor_ids[self._graph.factor_rows(copy.factor_ids) < 0].tolist(),
-            priors=[prior for prior in now.priors if _key(prior) not in known],
+            priors=[prior for prior in now.priors
+                    if prior.nodes.tobytes() + packed(prior).tobytes() not in known],
             weigh=dict(zip(ids[changed].tolist(),
                            now.factors.weight[new[changed]].tolist(), strict=True)),
             fix=self._graph.node_ids[now.fixed & ~was_fixed].tolist(),
             free=self._graph.node_ids[was_fixed & ~now.fixed].tolist()))
-
-
-def _key(prior: Prior) -> bytes:
-    """Return all of a prior as bytes."""
-    return prior.nodes.tobytes() + packed(prior).tobytes()
 
 
 def continued(graph: Graph, poses: Poses, ids: IntArray | None = None) -> Poses:
