@@ -94,7 +94,7 @@ class ErrorTuner:
             return float(np.max(moved, initial=0.0))
         if self._begin_next() or self._judge.fixes.step():
             return 0.0
-        if self._search is None and self._is_due:
+        if self._search is None and self._judge.fixes.n_seen >= self._next:
             fixes = self._judge.fixes
             fixes.prepare()
             self._search = learning.search(
@@ -113,15 +113,11 @@ class ErrorTuner:
         return 0.0
 
     @property
-    def _is_due(self) -> bool:
-        return self._judge.fixes.n_seen >= self._next
-
-    @property
     def is_idle(self) -> bool:
         """Whether `step` has nothing to do."""
         return (self._change is None and self._search is None and len(self._waiting) == 0
                 and not self._odometry_is_due() and not self._judge.fixes.decides_anew
-                and not self._is_due)
+                and self._judge.fixes.n_seen < self._next)
 
     def _use(self, learnt: learning.Learnt, newest: int | None = None) -> None:
         """
