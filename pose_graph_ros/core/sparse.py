@@ -12,8 +12,8 @@ need sums.
 from collections.abc import Iterable
 import functools
 import importlib
-from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader, FileFinder
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 import sys
 from typing import Any
@@ -45,15 +45,14 @@ def _extension() -> Any:
     scipy = find_spec('scipy')
     if NAME not in sys.modules and scipy is not None:
         for folder in scipy.submodule_search_locations or ():
-            path = Path(folder, *NAME.split('.')[1:])
-            for suffix in EXTENSION_SUFFIXES:
-                spec = spec_from_file_location(NAME, f'{path}{suffix}')
-                if spec is not None and spec.loader is not None and Path(
-                        f'{path}{suffix}').is_file():
-                    module = module_from_spec(spec)
-                    spec.loader.exec_module(module)
-                    sys.modules[NAME] = module
-                    return module
+            finder = FileFinder(str(Path(folder, *NAME.split('.')[1:-1])),
+                                (ExtensionFileLoader, EXTENSION_SUFFIXES))
+            spec = finder.find_spec(NAME)
+            if spec is not None and spec.loader is not None:
+                module = module_from_spec(spec)
+                spec.loader.exec_module(module)
+                sys.modules[NAME] = module
+                return module
     return importlib.import_module(NAME)
 
 
