@@ -150,7 +150,7 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
     Return what waits for odometry to be settled only, in the order of stamps, and if it is gated.
     """
     found = []
-    for source, given in parts.pipeline.waiting.until(parts.nodes.newest_ns):
+    for _, _, source, given in parts.pipeline.waiting.until(parts.nodes.newest_ns):
         attachment = parts.nodes.attach_ahead(given.stamp_ns)
         # the first one of a source may set the origin of the map, but not before it is attached
         if attachment is None or not parts.factors.has(source):

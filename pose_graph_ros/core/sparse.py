@@ -12,8 +12,8 @@ need sums.
 from collections.abc import Iterable
 import functools
 import importlib
-from importlib.machinery import EXTENSION_SUFFIXES
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from importlib.machinery import EXTENSION_SUFFIXES, ExtensionFileLoader, FileFinder
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 import sys
 from typing import Any
@@ -45,64 +45,36 @@ def _extension() -> Any:
     scipy = find_spec('scipy')
     if NAME not in sys.modules and scipy is not None:
         for folder in scipy.submodule_search_locations or ():
-            path = Path(folder, *NAME.split('.')[1:])
-            for suffix in EXTENSION_SUFFIXES:
-                spec = spec_from_file_location(NAME, f'{path}{suffix}')
-                if spec is not None and spec.loader is not None and Path(
-                        f'{path}{suffix}').is_file():
-                    module = module_from_spec(spec)
-                    spec.loader.exec_module(module)
-                    sys.modules[NAME] = module
-                    return module
+            finder = FileFinder(str(Path(folder, *NAME.split('.')[1:-1])),
+                                (ExtensionFileLoader, EXTENSION_SUFFIXES))
+            spec = finder.find_spec(NAME)
+            if spec is not None and spec.loader is not None:
+                module = module_from_spec(spec)
+                spec.loader.exec_module(module)
+                sys.modules[NAME] = module
+                return module
     return importlib.import_module(NAME)
 
 
-class Factors:
+def _factors(
+    values: npt.NDArray[Any], rows: npt.NDArray[np.int32], starts: npt.NDArray[np.int32], *,
+    ordered: bool,
+) -> Any:
     """
-    Factors of a sparse symmetric or Hermitian matrix in compressed columns.
+    Return SuperLU's factors of a sparse symmetric or Hermitian matrix in compressed columns.
 
     Raises LinearSolveError if it is singular. Both triangles are given, the rows ascending in each
     column; an order with little fill is found unless they are ordered already.
     """
-
-    def __init__(
-        self, values: npt.NDArray[Any], rows: npt.NDArray[np.int32],
-        starts: npt.NDArray[np.int32], *, ordered: bool,
-    ) -> None:
-        specification = 'NATURAL' if ordered else 'MMD_AT_PLUS_A'
-        try:
-            # what `scipy.sparse.linalg.splu` calls (SciPy 1.11 to 1.17), not a public interface
-            self._factors = _extension().gstrf(
-                len(starts) - 1, len(values), values, rows, starts,
-                csc_construct_func=lambda parts, shape: parts, ilu=False,
-                options={**OPTIONS, 'ColPerm': specification})
-        except (RuntimeError, MemoryError) as error:
-            raise LinearSolveError(f'sparse factorisation: {error}') from error
-
-    @property
-    def places(self) -> IntArray:
-        """Place of each row in the order of elimination, shape (n,)."""
-        return np.asarray(self._factors.perm_c, dtype=np.int64)
-
-    def solve(self, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return the solutions for right-hand sides of the matrix's type, (n,) or (n, k)."""
-        return np.asarray(self._factors.solve(right))
-
-    @property
-    def is_positive(self) -> bool:
-        """
-        Whether the factors show that the matrix is positive definite.
-
-        Without a permutation that differs between rows and columns, `U = D L^H`. By Sylvester's
-        law of inertia D has as many positive numbers as there are positive eigenvalues.
-        """
-        if not np.array_equal(self._factors.perm_r, self._factors.perm_c):
-            return False
-        values, rows, starts = self._factors.U
-        columns = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-        # the arrays may have space behind the last column
-        pivots = values[:starts[-1]][rows[:starts[-1]] == columns]
-        return len(pivots) == len(starts) - 1 and bool(np.all(pivots.real > 0.0))
+    specification = 'NATURAL' if ordered else 'MMD_AT_PLUS_A'
+    try:
+        # what `scipy.sparse.linalg.splu` calls (SciPy 1.11 to 1.17), not a public interface
+        return _extension().gstrf(
+            len(starts) - 1, len(values), values, rows, starts,
+            csc_construct_func=lambda parts, shape: parts, ilu=False,
+            options={**OPTIONS, 'ColPerm': specification})
+    except (RuntimeError, MemoryError) as error:
+        raise LinearSolveError(f'sparse factorisation: {error}') from error
 
 
 class BlockPattern:
@@ -148,26 +120,37 @@ class BlockPattern:
         at, rows, starts = self._layout(size)
         values = np.empty(len(rows), dtype=summed.dtype)
         values[at] = summed
-        return BlockFactors(Factors(values, rows, starts, ordered=True), self._places, size)
+        return BlockFactors(_factors(values, rows, starts, ordered=True), self._places, size)
 
 
 class BlockFactors:
     """Factors of a matrix of blocks, solved for right-hand sides in the order of the nodes."""
 
-    def __init__(self, factors: Factors, places: IntArray, size: int) -> None:
-        self._factors, self._size = factors, size
+    def __init__(self, factors: Any, places: IntArray, size: int) -> None:
+        self._factors = factors
         self._numbers = (size * places[:, None] + np.arange(size)).ravel()
 
     @property
     def is_positive(self) -> bool:
-        """Whether the matrix was shown to be positive definite."""
-        return self._factors.is_positive
+        """
+        Whether the factors show that the matrix is positive definite.
+
+        Without a permutation that differs between rows and columns, `U = D L^H`. By Sylvester's
+        law of inertia D has as many positive numbers as there are positive eigenvalues.
+        """
+        if not np.array_equal(self._factors.perm_r, self._factors.perm_c):
+            return False
+        values, rows, starts = self._factors.U
+        columns = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        # the arrays may have space behind the last column
+        pivots = values[:starts[-1]][rows[:starts[-1]] == columns]
+        return len(pivots) == len(starts) - 1 and bool(np.all(pivots.real > 0.0))
 
     def solve(self, right: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return the solution for right-hand sides of the matrix's type, (n b,) or (n b, k)."""
         ordered = np.empty_like(right)
         ordered[self._numbers] = right
-        return self._factors.solve(ordered)[self._numbers]
+        return np.asarray(self._factors.solve(ordered)[self._numbers])
 
 
 def order_of(i: IntArray, j: IntArray, n: int) -> IntArray:
@@ -184,7 +167,8 @@ def order_of(i: IntArray, j: IntArray, n: int) -> IntArray:
     starts = np.searchsorted(columns, np.arange(n + 1)).astype(np.int32)
     # diagonally dominant
     values = np.where(rows == columns, np.diff(starts)[columns].astype(np.float64), -0.5)
-    return Factors(values, rows.astype(np.int32), starts, ordered=False).places
+    factors = _factors(values, rows.astype(np.int32), starts, ordered=False)
+    return np.asarray(factors.perm_c, dtype=np.int64)
 
 
 def components(i: IntArray, j: IntArray, n: int) -> IntArray:

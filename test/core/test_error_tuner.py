@@ -163,7 +163,7 @@ def test_a_change_that_fails_is_undone_as_a_whole(
     backend.optimize()
     white = path(backend)
     tuner, smoother = backend._tuner, backend._smoother
-    tuner._waiting['fix'] = CorrelatedErrors(TAU, 1.0, 0.05)
+    tuner._begin('fix', CorrelatedErrors(TAU, 1.0, 0.05))
     update, calls = smoother.update, 0
 
     def failing(change: object) -> UpdateResult:

@@ -38,8 +38,9 @@ import sys
 import numpy as np
 from pose_graph_ros.core import sparse
 sparse.EXTENSION_SUFFIXES = ('.elsewhere',)
-diagonal = np.arange(3, dtype=np.int32)
-factors = sparse.Factors(np.full(3, 2.0), diagonal, np.arange(4, dtype=np.int32), ordered=False)
+i = np.arange(3)
+pattern = sparse.BlockPattern(i, i, sparse.order_of(i[:-1], i[1:], 3))
+factors = pattern.factors([2.0 * np.ones((3, 1, 1))])
 assert factors.is_positive and factors.solve(np.ones(3)).tolist() == [0.5] * 3
 assert sys.modules['scipy.sparse.linalg'].splu
 """

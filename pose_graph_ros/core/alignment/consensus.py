@@ -178,7 +178,7 @@ def consensus(positions: Positions, given: Given) -> Consensus | None:
     far, along, walk = (np.abs(column - column[middle]) for column in (
         positions.odometry, positions.path, positions.walk))
     slip = noise.sigma_distance**2 + noise.sigma_lateral**2
-    variance = positions.variance + walk * far**2 / 6.0 + 0.5 * slip * along
+    variance = positions.variance + (walk * far**2 / 6.0 + 0.5 * slip * along)
     inlier, cost = _inliers(positions.odometry, positions.observed, variance)
     n = int(np.count_nonzero(inlier))
     if n < 2:

@@ -43,8 +43,8 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import chi2_of, in_parts, Status, to_the_end
 from pose_graph_ros.core.config import Loss, SolverConfig
 from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.geometry.covariance import scaled
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.checks import scaled
 from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import costs_and_weights

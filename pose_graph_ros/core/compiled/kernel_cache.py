@@ -176,16 +176,8 @@ class KernelCache:
         self._name = f'{source.stem}.{dispatcher.py_func.__qualname__}'.replace('<locals>.', '')
         # its own folder first
         self._folders = others if self._own is None else (self._own, *others)
-
-    @property
-    def cache_path(self) -> str:
-        """Folder of its code; empty without one."""
-        return str(next(iter(self._folders), ''))
-
-    @property
-    def is_writable(self) -> bool:
-        """Whether its code can be kept."""
-        return self._own is not None
+        self.cache_path = str(next(iter(self._folders), ''))    # empty without one
+        self.is_writable = self._own is not None    # whether its code can be kept
 
     def holds_code(self, signature: Any) -> bool:
         """Tell whether there is valid code for a signature; it is not loaded."""

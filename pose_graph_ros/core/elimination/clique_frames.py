@@ -237,9 +237,14 @@ def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
     prior_rows.evaluate(head, c, present_turn(head, c), work)
     g, r, w = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
     change = work[4 * n:5 * n]
-    prior_rows.change_of_frame(head, c, r, change)
-    if row.anchored != 0:
-        prior_rows.add_reference_arms(head, c, r)
+    # the reference poses, the energy, and r at the linearization: what of it has changed is S D
+    reference = pool_f[row.values + triangle_size(n, n):]
+    for i in range(n):
+        change[i] = r[i] - reference[n + 1 + i]
+    if row.anchored != 0:   # make r the derivative of the coordinates in its frame by -phi
+        for i in range(0, n, 3):
+            r[i] -= reference[i + 1] - reference[1]
+            r[i + 1] += reference[i] - reference[0]
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
     of_nodes = of_frame = compliance = moved = arms = 0.0
     for i in range(0, n, 3):

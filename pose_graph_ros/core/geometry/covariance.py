@@ -32,16 +32,22 @@ def defect(covariance: FloatArray) -> str | None:
         return 'not_positive'
     if np.any(diagonal > LARGEST_VARIANCE):
         return 'too_large'
-    deviation = np.sqrt(diagonal)
-    with np.errstate(over='ignore'):
-        correlation = covariance / deviation / deviation[:, None]
-    # values beyond 1 are invalid anyway; clipping avoids an overflow
-    correlation = np.clip(correlation, -2.0, 2.0)
+    correlation = scaled(covariance)
     if np.any(np.abs(correlation - correlation.T) > 1e-6):
         return 'not_symmetric'
     if np.min(np.linalg.eigvalsh(correlation)) < 1e-9:
         return 'not_positive_definite'
     return None
+
+
+def scaled(matrix: FloatArray) -> FloatArray:
+    """Return matrices, shape (..., d, d), with 1 in place of each positive diagonal number."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    with np.errstate(over='ignore'):
+        divided = matrix / root[..., :, None] / root[..., None, :]
+    # correlations beyond 1 are invalid however large they are, and might overflow
+    return np.clip(divided, -2.0, 2.0)
 
 
 def floored(covariance: FloatArray, floors: FloatArray) -> FloatArray:

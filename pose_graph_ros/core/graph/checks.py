@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
+from pose_graph_ros.core.geometry.covariance import scaled
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind, RECORD
 
@@ -146,16 +147,6 @@ def are_definite(information: FloatArray) -> BoolArray:
     # the leading minors
     return np.asarray(np.all(np.abs(diagonal - 1.0) < 1e-12, axis=1)
                       & (1.0 - a * a > 1e-9) & (determinant > 1e-9))
-
-
-def scaled(matrix: FloatArray) -> FloatArray:
-    """Return matrices with 1 in place of each positive number on the diagonal."""
-    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
-    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    with np.errstate(over='ignore'):
-        divided = matrix / root[:, :, None] / root[:, None, :]
-    # correlations beyond 1 are invalid however large they are, and might overflow
-    return np.clip(divided, -2.0, 2.0)
 
 
 def _refuse_rows(bad: BoolArray, reason: str, values: npt.NDArray[np.generic]) -> None:

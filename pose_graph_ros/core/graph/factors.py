@@ -222,11 +222,10 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     ft, fth = factors_of_end(f, kind)
     c, s = rotation(f, kind, start[2])
     ex, ey, c, s, ax, ay = error(f, kind, ft * end[0] - start[0], ft * end[1] - start[1], c, s)
-    eth = fth * end[2] - start[2] + third[2]
-    if kind < OBSERVED:
-        eth += f.mean[2] if kind == BIAS else -f.mean[2]
-    else:
-        eth += f.mean[2] - f.constants[2]
+    offset = f.mean[2] if kind == BIAS else -f.mean[2]
+    if kind >= OBSERVED:
+        offset = f.mean[2] - f.constants[2]
+    eth = fth * end[2] - start[2] + offset + third[2]
     return ex + third[0], ey + third[1], wrap(eth), c, s, ax, ay
 
 

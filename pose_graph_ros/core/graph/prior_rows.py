@@ -129,27 +129,6 @@ def keep_linearization(head, c, r):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def change_of_frame(head, c, r, out):  # type: ignore[no-untyped-def]
-    """Write by how much r has changed since the linearization: S times relative positions."""
-    row = tb.cliques(head)[c]
-    n = 3 * row.n_separator
-    before = tb.pool_f(head)[row.values + triangle_size(n, n) + n + 1:]
-    for k in range(n):
-        out[k] = r[k] - before[k]
-
-
-@kernel
-def add_reference_arms(head, c, r):  # type: ignore[no-untyped-def]
-    """Make r of an anchored prior the derivative of the coordinates in its frame by -phi."""
-    row = tb.cliques(head)[c]
-    n = 3 * row.n_separator
-    reference = tb.pool_f(head)[row.values + triangle_size(n, n):]
-    for i in range(0, n, 3):
-        r[i] -= reference[i + 1] - reference[1]
-        r[i + 1] += reference[i] - reference[0]
-
-
-@kernel
 def gradient(head, c, work):  # type: ignore[no-untyped-def]
     """
     Return the energy of a prior.

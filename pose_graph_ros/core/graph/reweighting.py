@@ -130,10 +130,8 @@ class Reweighting:
 
     def restore(self, saved: SavedLosses) -> None:
         """Restore what `saved` returned; nothing may have been added before."""
-        rows = np.empty(len(saved.rows), _ROW)
-        rows['id'], rows['loss'] = saved.rows, saved.losses
-        rows['threshold'], rows['base'] = saved.thresholds, saved.shares
-        self._table.append(rows)
+        self._table.append(np.array([*zip(
+            saved.rows, saved.losses, saved.thresholds, saved.shares, strict=True)], _ROW))
         self._cursor = saved.cursor
 
     def forget(self, ids: IntArray) -> None:

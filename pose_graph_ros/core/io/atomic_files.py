@@ -39,7 +39,10 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 _write(fresh / path.name, content)
             for path in contents:
                 if path.exists():
-                    _back_up(path, old / path.name)
+                    try:
+                        os.link(path, old / path.name)
+                    except OSError:     # a file system without hard links
+                        _write(old / path.name, path.read_bytes())
             try:
                 for path in contents:
                     os.replace(fresh / path.name, path)
@@ -58,14 +61,6 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _back_up(path: Path, name: Path) -> None:
-    """Give a file a second name, or copy it where the file system has no hard links."""
-    try:
-        os.link(path, name)
-    except OSError:
-        _write(name, path.read_bytes())
 
 
 def _put_back(renamed: list[Path], old: Path) -> None:

@@ -55,8 +55,9 @@ import numpy as np
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import FileFormatError
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.covariance import scaled
 from pose_graph_ros.core.geometry.se2 import BoolArray, compose_one, FloatArray, IntArray, Pose
-from pose_graph_ros.core.graph.checks import check, RowError, scaled
+from pose_graph_ros.core.graph.checks import check, RowError
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import GraphRows, NextIds
 from pose_graph_ros.core.io import g2o_text as gt

@@ -142,13 +142,6 @@ class Additions:
             biases=np.array(self.biases).reshape(-1, 3), dimensions=self.dimensions,
             factors=Factors.joined(self.factors), remove=self.remove)
 
-    def add_biases(self, n: int, value: FloatArray, dimension: int) -> IntArray:
-        """Add states with the same initial value, shape (3,); return their ids."""
-        begin = self.first.node + len(self.biases)
-        self.biases += n * [value]
-        self.dimensions += n * [dimension]
-        return np.arange(begin, begin + n)
-
     def add(self, factors: Factors) -> IntArray:
         """Add factors; return their ids."""
         begin = self.first.factor + self.n_factors
@@ -194,8 +187,10 @@ class BiasChain:
         if len(new_ns) == 0:
             return self
         begins_ns = np.insert(self.begins_ns, at, new_ns)
-        nodes = np.insert(self.nodes, at, additions.add_biases(
-            len(new_ns), value, len(process.variances)))
+        first = additions.first.node + len(additions.biases)
+        nodes = np.insert(self.nodes, at, np.arange(first, first + len(new_ns)))
+        additions.biases += len(new_ns) * [value]
+        additions.dimensions += len(new_ns) * [len(process.variances)]
         ties = np.insert(self.ties, at, -1)
         old = np.insert(np.ones(len(self), dtype=bool), at, values=False)
         seconds = np.diff(begins_ns) * 1e-9

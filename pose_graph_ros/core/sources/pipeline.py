@@ -53,19 +53,16 @@ class WaitingMeasurements:
     def measurements(self) -> list[tuple[str, ms.PoseMeasurement]]:
         return [(waiting.source, waiting.measurement) for waiting in self._waiting]
 
-    def until(self, stamp_ns: int) -> list[tuple[str, ms.PoseMeasurement]]:
-        """Return the measurements due up to a stamp [ns], with their sources, earliest first."""
-        return [(each.source, each.measurement) for each in self._waiting[:self._n_due(stamp_ns)]]
+    def until(self, stamp_ns: int) -> list[WaitingMeasurement]:
+        """Return the measurements due up to a stamp [ns], the earliest first."""
+        return self._waiting[:bisect.bisect_right(
+            self._waiting, stamp_ns, key=lambda each: each.due_ns)]
 
     def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
         """Remove and return the measurements due up to a stamp [ns], the earliest first."""
-        n = self._n_due(covered_ns)
-        due = self._waiting[:n]
-        del self._waiting[:n]
+        due = self.until(covered_ns)
+        del self._waiting[:len(due)]
         return due
-
-    def _n_due(self, stamp_ns: int) -> int:
-        return bisect.bisect_right(self._waiting, stamp_ns, key=lambda each: each.due_ns)
 
 
 @dataclass(frozen=True, slots=True)

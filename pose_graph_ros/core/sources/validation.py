@@ -44,7 +44,7 @@ def check_pose(measurement: ms.GlobalPose, policy: CovariancePolicy) -> Validate
     cov, repairs = _given(measurement.covariance, policy)
     if len(repairs) > 0 and policy.heading is not Heading.ALWAYS:
         cov[2, 2] = np.inf  # a sender that does not know its covariance knows no heading
-    is_known = _is_known_heading(cov[2, 2])
+    is_known = 0.0 < cov[2, 2] < covariance.UNKNOWN_HEADING_VARIANCE    # of a flat guess
     if never or (policy.heading is Heading.AUTO and not is_known):
         return _finished(ms.Position(measurement.stamp_ns, measurement.pose[:2], cov[:2, :2],
                                   np.zeros(2)), cov[:2, :2], repairs, policy)
@@ -159,15 +159,10 @@ def _no_information(measurement: ms.GlobalPose | ms.LoopClosure) -> ms.Answer:
 def _heading_variance(cov: FloatArray, policy: CovariancePolicy) -> float | None:
     """Return the variance of a heading within the bounds [rad^2]; None if it is not known."""
     variance = float(cov[2, 2]) if len(policy.override) < 2 else policy.override[1]**2
-    if not _is_known_heading(variance):
+    if not 0.0 < variance < covariance.UNKNOWN_HEADING_VARIANCE:
         return None
     return min(max(policy.scale * variance, policy.heading_floor**2),
                covariance.UNKNOWN_HEADING_VARIANCE)
-
-
-def _is_known_heading(variance: float) -> bool:
-    """Tell whether the variance of a heading is positive and below that of a flat guess."""
-    return bool(0.0 < variance < covariance.UNKNOWN_HEADING_VARIANCE)
 
 
 def _is_uninformative(cov: FloatArray) -> BoolArray:
