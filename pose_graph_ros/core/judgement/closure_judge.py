@@ -26,6 +26,7 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.closure_search import decide, Redecision
 from pose_graph_ros.core.judgement.closures import (
+    ANYTHING,
     as_edges,
     chances,
     claims,
@@ -33,7 +34,6 @@ from pose_graph_ros.core.judgement.closures import (
     GATE,
     NEVER,
     squares,
-    UNKNOWN,
 )
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
@@ -227,7 +227,7 @@ class ClosureJudge:
         self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self._round += 1
         if not all(state.in_graph for state in changes.values()):
-            self.states.spread[:] = UNKNOWN * np.eye(3)     # without them it is less certain
+            self.states.spread[:] = ANYTHING * np.eye(3)     # without them it is less certain
 
     def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, vd.State]:
         """Return the states of closures with a set of believed ones, both by the ids of edges."""

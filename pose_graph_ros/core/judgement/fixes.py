@@ -119,7 +119,7 @@ class FixJudge:
         """Return the number of the errors of a source, which is told to the bank if it is new."""
         if source not in self._sources:
             self._sources.append(source)
-            number = self._sources.index(source)
+            number = len(self._sources) - 1
             if number < BANK.sources:
                 given = self._errors_in_use(source) or CorrelatedErrors(1.0, 0.0, 1.0)
                 for bank in self._banks():
