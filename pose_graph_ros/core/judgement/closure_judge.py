@@ -199,9 +199,9 @@ class ClosureJudge:
 
     def _set_base_weights(self, numbers: IntArray) -> None:
         """Tell robust losses the weights of closures, which the graph has already."""
-        for number in numbers.tolist():
-            self._reweighting.set_base_weight(
-                int(self.states.held[number]), float(self.states.in_graph[number]))
+        for held, used in zip(self.states.held[numbers].tolist(),
+                              self.states.in_graph[numbers].tolist(), strict=True):
+            self._reweighting.set_base_weight(held, float(used))
 
     def _change(self, changes: Mapping[int, vd.State], *, at_once: bool = False) -> bool:
         """Change states and weights; tell whether there were any, and it has not diverged."""

@@ -167,8 +167,8 @@ class ClosureTable(Judgements):
         return (self.decision == vd.AUTO) & ~self.forgotten
 
     def rows(self, numbers: IntArray) -> Closures:
-        return Closures(*(np.take(self.records[name], numbers, axis=0)
-                          for name in Closures._fields))
+        rows = self.records[numbers]    # which copies no others
+        return Closures(*(rows[name].copy() for name in Closures._fields))
 
     def measure(self, begin: int, some: Closures) -> None:
         """Note what those from a number on measure, between nodes of the chain."""
