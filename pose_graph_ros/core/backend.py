@@ -72,8 +72,7 @@ class PoseGraphBackend:
         self._newest_node_covariance = np.zeros((3, 3))  # in map axes
         self._reweighting = Reweighting()
         self._factors = FactorBuilder(self._config, self._reweighting)
-        self._judge = Judge(
-            self._smoother, self._reweighting, self._config, self._nodes, self._factors)
+        self._judge = Judge(self._smoother, self._reweighting, self._nodes, self._factors)
         self.verdicts, self.verdict_totals = self._judge.verdicts, self._judge.totals
         self.verdict_changes = self._judge.changes
         self.gyro_biases = self._factors.gyro_rates
@@ -102,7 +101,6 @@ class PoseGraphBackend:
         self._nodes.configure(config)
         self._pipeline.configure(config)
         self._factors.config = config
-        self._judge.configure(config)
         self._alignment.configure(config)
 
     @property

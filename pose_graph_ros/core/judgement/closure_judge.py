@@ -26,6 +26,7 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.closure_search import decide, Redecision
 from pose_graph_ros.core.judgement.closures import (
+    ANYTHING,
     as_edges,
     chances,
     claims,
@@ -33,7 +34,6 @@ from pose_graph_ros.core.judgement.closures import (
     GATE,
     NEVER,
     squares,
-    UNKNOWN,
 )
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
@@ -44,10 +44,11 @@ from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 
 class ClosureJudge:
-    def __init__(self, smoother: IncrementalSmoother, reweighting: Reweighting) -> None:
-        self._smoother, self._reweighting = smoother, reweighting
-        self.chain = OdometryChain()
-        self.states = ClosureTable(self.chain)
+    def __init__(
+        self, smoother: IncrementalSmoother, reweighting: Reweighting, chain: OdometryChain,
+    ) -> None:
+        self._smoother, self._reweighting, self._chain = smoother, reweighting, chain
+        self.states = ClosureTable(chain)
         self.redecision = Redecision(smoother)
         # increases when more or less is believed, so that those that wait are tested again
         self._round = 0
@@ -61,7 +62,7 @@ class ClosureJudge:
         """Return the weights with which closures are to be added, shape (M,)."""
         begin, n = len(self.states), len(new)
         self._now_ns, self._n_staged = now_ns, n
-        self.chain.extend(self._smoother.graph)
+        self._chain.extend(self._smoother.graph)
         for one in new:
             self.states.append(one, now_ns, vd.WAITING)
         self.states.measure(begin, claims(edges))
@@ -198,9 +199,9 @@ class ClosureJudge:
 
     def _set_base_weights(self, numbers: IntArray) -> None:
         """Tell robust losses the weights of closures, which the graph has already."""
-        for number in numbers.tolist():
-            self._reweighting.set_base_weight(
-                int(self.states.held[number]), float(self.states.in_graph[number]))
+        for held, used in zip(self.states.held[numbers].tolist(),
+                              self.states.in_graph[numbers].tolist(), strict=True):
+            self._reweighting.set_base_weight(held, float(used))
 
     def _change(self, changes: Mapping[int, vd.State], *, at_once: bool = False) -> bool:
         """Change states and weights; tell whether there were any, and it has not diverged."""
@@ -226,7 +227,7 @@ class ClosureJudge:
         self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self._round += 1
         if not all(state.in_graph for state in changes.values()):
-            self.states.spread[:] = UNKNOWN * np.eye(3)     # without them it is less certain
+            self.states.spread[:] = ANYTHING * np.eye(3)     # without them it is less certain
 
     def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, vd.State]:
         """Return the states of closures with a set of believed ones, both by the ids of edges."""
@@ -303,7 +304,7 @@ class ClosureJudge:
         Decide on closures that are about to leave the graph; return the verdicts on those unused.
         """
         states, graph = self.states, self._smoother.graph
-        self.chain.extend(graph)
+        self._chain.extend(graph)
         leaving = states.numbers(edges)
         if len(leaving) == 0:
             return []
@@ -314,18 +315,17 @@ class ClosureJudge:
             self._change(self._tested(waiting[:self._most]))
         return states.verdicts(graph, leaving[~states.in_graph[leaving]][-MOST_OTHERS:])
 
-    def forget(self, nodes: IntArray, edges: IntArray) -> None:
+    def forget(self, edges: IntArray) -> None:
         gone = self.states.numbers(edges)
         if len(gone) > 0:
             # all others get other numbers
             self.states.select(np.setdiff1d(np.arange(len(self.states)), gone))
-        self.chain.forget(nodes)
 
     # --- from outside ----------------------------------------------------------------------------
 
     def restore(self, saved: SavedVerdicts, now_ns: int) -> None:
         self._now_ns = now_ns
-        self.chain.extend(self._smoother.graph)
+        self._chain.extend(self._smoother.graph)
         self.states.restore(saved)
         self.states.measure(0, claims(self._smoother.graph.factors_at(saved.held)))
 

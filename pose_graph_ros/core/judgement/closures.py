@@ -29,7 +29,7 @@ GATE = float(LIMITS[3])
 FLOORS = np.array(BELIEF.closure_floors)
 NEVER = -1  # round of the last test of one that was not tested
 # Variance of a prediction that was not tested: anything may be right.
-UNKNOWN = 1e12
+ANYTHING = 1e12
 
 
 class Closures(NamedTuple):
@@ -167,21 +167,21 @@ class ClosureTable(Judgements):
         return (self.decision == vd.AUTO) & ~self.forgotten
 
     def rows(self, numbers: IntArray) -> Closures:
-        return Closures(*(np.take(self.records[name], numbers, axis=0)
-                          for name in Closures._fields))
+        rows = self.records[numbers]    # which copies no others
+        return Closures(*(rows[name].copy() for name in Closures._fields))
 
     def measure(self, begin: int, some: Closures) -> None:
         """Note what those from a number on measure, between nodes of the chain."""
         for name, column in zip(Closures._fields, some, strict=True):
             self.records[name][begin:] = column
-        self.spread[begin:] = UNKNOWN * np.eye(3)
+        self.spread[begin:] = ANYTHING * np.eye(3)
         for k, nodes in enumerate((some.i, some.j)):
             self.travel[begin:, k] = self.chain.travel(nodes)
         self._by_end = None
 
     def test_all_again(self) -> None:
         self.round[:], self.resting[:] = NEVER, 0
-        self.spread[:] = UNKNOWN * np.eye(3)
+        self.spread[:] = ANYTHING * np.eye(3)
 
     def numbers(self, edges: IntArray) -> IntArray:
         """Return the numbers of those of some edges, given by their ids, that are closures."""

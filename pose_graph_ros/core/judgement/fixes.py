@@ -19,7 +19,7 @@ from pose_graph_ros.core.belief.hypotheses import ALONE, BEGINS, GOES_ON, GOOD, 
 from pose_graph_ros.core.belief.learning import axes_of, claimed, Known, TURN, WAY
 from pose_graph_ros.core.belief.rows import measured, Records
 from pose_graph_ros.core.belief.settings import BANK
-from pose_graph_ros.core.config import BackendConfig, Robust
+from pose_graph_ros.core.config import Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -52,12 +52,12 @@ class _Decided(NamedTuple):
 
 class FixJudge:
     def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
-        nodes: HiddenNodes, factors: FactorBuilder,
+        self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
+        factors: FactorBuilder, chain: OdometryChain,
     ) -> None:
-        self._smoother, self._reweighting, self.config = smoother, reweighting, config
-        self._nodes, self._factors = nodes, factors
-        self.states, self.chain = FixStates(), OdometryChain()
+        self._smoother, self._reweighting = smoother, reweighting
+        self._nodes, self._factors, self._chain = nodes, factors, chain
+        self.states = FixStates()
         self.bank = Bank()  # with the noise in use, which only this object may change
         self.next_bank: Bank | None = None  # with noise learnt anew, on its way to the newest row
         self._is_new = False  # whether all that the bank says is to be applied
@@ -110,7 +110,7 @@ class FixJudge:
 
     def _is_judged(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool | None:
         """Tell whether a source is judged; None if the bank does not even learn from it."""
-        settings = self.config.measurement_source(source, kind)
+        settings = self._factors.config.measurement_source(source, kind)
         if settings.robust is Robust.JUDGED:
             return True
         return False if settings.finds_correlation else None
@@ -119,7 +119,7 @@ class FixJudge:
         """Return the number of the errors of a source, which is told to the bank if it is new."""
         if source not in self._sources:
             self._sources.append(source)
-            number = self._sources.index(source)
+            number = len(self._sources) - 1
             if number < BANK.sources:
                 given = self._errors_in_use(source) or CorrelatedErrors(1.0, 0.0, 1.0)
                 for bank in self._banks():
@@ -143,7 +143,7 @@ class FixJudge:
             bank.insert(rows, self._odometry())
 
     def _odometry(self) -> Odometry:
-        chain = self.chain
+        chain = self._chain
         return Odometry(
             chain.nodes, chain.poses, chain.sums,
             self._nodes.stamps_ns[np.searchsorted(self._nodes.ids, chain.nodes)],
@@ -156,7 +156,7 @@ class FixJudge:
 
     def path(self, source: str, without: Collection[int]) -> Records:
         """Return rows for the measurements in the graph of one source, but for some stamps."""
-        self.chain.extend(self._smoother.graph)
+        self._chain.extend(self._smoother.graph)
         rows, bank = self._records(source, 0.0), Bank()
         rows = rows[~np.isin(rows['stamp_ns'], np.array([*without], dtype=np.int64))]
         if len(rows) > 0:
@@ -165,7 +165,7 @@ class FixJudge:
 
     def prepare(self) -> None:
         """Let the bank know of all measurements, also after a graph was loaded."""
-        self.chain.extend(self._smoother.graph)
+        self._chain.extend(self._smoother.graph)
         if not self._is_restored:
             return
         self._is_restored = False
@@ -178,7 +178,7 @@ class FixJudge:
     def known(self) -> Known:
         """Return which noise is given, and which is to be found."""
         n, finding = min(len(self._sources), BANK.sources), self._factors.finding()
-        point, scale = [*claimed(n)], self.config.odometry_scale
+        point, scale = [*claimed(n)], self._factors.config.odometry_scale
         if scale > 0.0:
             point[WAY] = point[TURN] = 2.0 * math.log2(scale)
         free = list[int]()
@@ -319,13 +319,12 @@ class FixJudge:
         else:
             self.commit()
 
-    def forget(self, nodes: IntArray, factors: IntArray) -> None:
+    def forget(self, factors: IntArray) -> None:
         leaving = self.states.leaving(factors)
         if np.any(leaving):
             self.states.select(np.flatnonzero(~leaving))
         for bank in self._banks():
             bank.forget(self._smoother.graph.factor_ids, BANK.most_learnt)
-        self.chain.forget(nodes)
         gone = {*factors.tolist()}
         if not gone.isdisjoint(self.loosened):
             self.loosened = {edge: weight for edge, weight in self.loosened.items()

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, Loss, Robust
+from pose_graph_ros.core.config import Loss, Robust
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import GraphUpdate
@@ -28,6 +28,7 @@ from pose_graph_ros.core.judgement.closure_judge import ClosureJudge
 from pose_graph_ros.core.judgement.fix_states import OdometryStates
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.judgement.judgements import LEFT, MOST_OTHERS, SavedVerdicts
+from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.texts import sentence, unknown
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, LoopClosure, rejected
@@ -54,14 +55,14 @@ class Judge:
     """Judges the constraints of a graph; it knows no clock, and nothing of how they arrived."""
 
     def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, config: BackendConfig,
-        nodes: HiddenNodes, factors: FactorBuilder,
+        self, smoother: IncrementalSmoother, reweighting: Reweighting, nodes: HiddenNodes,
+        factors: FactorBuilder,
     ) -> None:
-        self._smoother, self._reweighting, self._config = smoother, reweighting, config
-        self._nodes = nodes
-        self.fixes = FixJudge(smoother, reweighting, config, nodes, factors)
+        self._smoother, self._reweighting = smoother, reweighting
+        self._nodes, self._factors, self._chain = nodes, factors, OdometryChain()
+        self.fixes = FixJudge(smoother, reweighting, nodes, factors, self._chain)
         self._odometry = OdometryStates(nodes)
-        self._closures = closures = ClosureJudge(smoother, reweighting)
+        self._closures = closures = ClosureJudge(smoother, reweighting, self._chain)
         self.after, self.test, self.work = closures.after, closures.test, closures.work
         # solves the graph with some weights between the updates, as these diverge
         self.solve_later = closures.redecision.solve_later
@@ -73,10 +74,6 @@ class Judge:
         # on the newest constraints that have left the graph unused
         self._left: deque[vd.Verdict] = deque(maxlen=MOST_OTHERS)
 
-    def configure(self, config: BackendConfig) -> None:
-        self._config = config
-        self.fixes.config = config
-
     def before(
         self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
     ) -> GraphUpdate:
@@ -87,7 +84,7 @@ class Judge:
         # one without a position, such as of the walls of a building, recognises no place
         may_be = (factors.kind == FactorKind.LOOP_CLOSURE) & (factors.information[:, 0, 0] > 0.0)
         closures = [one for one in new if may_be[one.number - first]
-                    and self._config.measurement_source(
+                    and self._factors.config.measurement_source(
                         one.source, LoopClosure).robust is Robust.JUDGED]
         if len(closures) == 0:
             return change
@@ -133,7 +130,7 @@ class Judge:
         begin, weights = self._smoother.graph.next_ids.factor, change.factors.weight.copy()
         later, wanted = dict[int, float](), dict(change.weigh)
         for one in self._new:
-            if one.kind is LoopClosure or self._config.measurement_source(
+            if one.kind is LoopClosure or self._factors.config.measurement_source(
                     one.source, one.kind).applied_loss is Loss.NONE:
                 continue
             row = one.held - begin
@@ -219,8 +216,9 @@ class Judge:
         return [replace(each, left=True, since_ns=self._nodes.newest_ns) for each in unused]
 
     def forget(self, nodes: IntArray, factors: IntArray, leaving: Sequence[vd.Verdict]) -> None:
-        self._closures.forget(nodes, factors)
-        self.fixes.forget(nodes, factors)
+        self._chain.forget(nodes)
+        self._closures.forget(factors)
+        self.fixes.forget(factors)
         self._odometry.forget(factors)
         self._follow_odometry(self._nodes.newest_ns, announce=False)
         self._left.extend(leaving)
@@ -241,11 +239,10 @@ class Judge:
 
     def correct_odometry(self, before: OdometryErrors, after: OdometryErrors) -> None:
         """Follow the edges of odometry, which know of other errors of it now."""
-        for chain in (self.fixes.chain, self._closures.chain):
-            chain.correct(
-                before, after, self._nodes.stamps_ns[
-                    np.searchsorted(self._nodes.ids, chain.nodes)],
-                ~np.isin(chain.nodes[1:], self._nodes.relocated_ids))
+        nodes, known = self._chain.nodes, self._nodes
+        self._chain.correct(
+            before, after, known.stamps_ns[np.searchsorted(known.ids, nodes)],
+            ~np.isin(nodes[1:], known.relocated_ids))
 
     def finish(self, undo: ExitStack[bool]) -> None:
         """

@@ -86,7 +86,7 @@ class Judgements:
         """Make an empty table; more columns are not saved, and `new` or 0 in new constraints."""
         self.sources: list[str] = []
         self._kind, self._new = kind, {'decision': vd.AUTO, 'distance': np.nan, **new}
-        self._records = GrowingArray((), np.dtype([*COLUMNS, *more]))
+        self._records = GrowingArray((), np.dtype([*COLUMNS, *more], align=True))
         # of each source, how many have left the graph, by their states then, and the next number
         self._left: list[IntArray] = []
         self._next: list[int] = []

@@ -210,6 +210,7 @@ def _extend(  # type: ignore[no-untyped-def]
     """
     factors, nodes = tb.factors(head), tb.nodes(head)
     n, m = 0, 0
+    c, s = math.cos(poses[0, 2]), math.sin(poses[0, 2])     # of the newest heading
     for v in range(last + 1, head[tb.N_NODES]):
         if nodes[v].kind != NodeKind.POSE:
             continue
@@ -238,9 +239,9 @@ def _extend(  # type: ignore[no-untyped-def]
                 scale * xx, scale * xy, scale * xt, scale * yy, scale * yt, scale * tt)
         elif over_gaps:
             one, other = nodes[last].pose, nodes[v].pose
-            c, s = math.cos(one[2]), math.sin(one[2])
+            a, b = math.cos(one[2]), math.sin(one[2])
             far_x, far_y, turn = other[0] - one[0], other[1] - one[1], wrap(other[2] - one[2])
-            dx, dy = c * far_x + s * far_y, c * far_y - s * far_x
+            dx, dy = a * far_x + b * far_y, a * far_y - b * far_x
             far = math.sqrt(dx * dx + dy * dy)
             xy = xt = yt = 0.0
             xx, yy = GAP_ALONG * far + GAP_FLOOR, GAP_ACROSS * far + GAP_FLOOR
@@ -248,7 +249,6 @@ def _extend(  # type: ignore[no-untyped-def]
         else:
             continue
         last, before, into = v, sums[n], sums[n + 1]
-        c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
         x, y = poses[n, 0] + c * dx - s * dy, poses[n, 1] + s * dx + c * dy
         th = wrap(poses[n, 2] + turn)
         rows[n], n = v, n + 1
