@@ -223,7 +223,12 @@ class Forgetting:
         row = int(rows[rows >= 0][0])
         # fixed ones of before may have been freed meanwhile
         leaving = graph.node_ids[:row][graph.is_pose[:row] & ~graph.fixed[:row]]
-        self._follow_alignment()
+        if self._joint is not None and parts.alignment.is_aligned:
+            # join the path from before the alignment to the graph again, once: the angle at which
+            # it was moved into the map was a first guess, which is better known by now
+            last = se2.compose(nodes.recent_poses(graph)[0], se2.inverse(self._joint))
+            self._joint = None
+            nodes.move_frozen(se2.compose(last, se2.inverse(nodes.frozen[-1])))
         stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
         asked = self._ask(leaving, sr.NONE, int(graph.node_ids[np.argmax(stays)]))
         parts.smoother.linearize(asked.nodes)
@@ -243,7 +248,14 @@ class Forgetting:
             self._joint = se2.between(poses[n - 1], poses[n])
         parts.alignment.forget(int(nodes.ids[first]))
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
-        self._refuse(asked.nodes)
+        # constraints that were to be added to nodes that have left
+        left = {*asked.nodes.tolist()}
+        for queue in (parts.pipeline.queue, parts.quarantine):
+            lost = [each for each in queue if not left.isdisjoint(each.nodes)]
+            queue[:] = [each for each in queue if left.isdisjoint(each.nodes)]
+            for each in lost:
+                parts.pipeline.count(each.source, rejected(
+                    'before_window', 'its hidden node left the graph before it was added'))
 
     def _other_anchors(self, first: int) -> th.Places:
         """Return the places in others of anchors of thinned nodes that leave, before a number."""
@@ -254,28 +266,3 @@ class Forgetting:
         ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
         nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
         return th.Places.now(self._parts.smoother, table.ids[leave], table.ids[kept[nearest]])
-
-    def _follow_alignment(self) -> None:
-        """
-        Join the path from before the alignment to the graph again, once.
-
-        The angle at which it was moved into the map was a first guess, which is better known by
-        now.
-        """
-        nodes, joint = self._parts.nodes, self._joint
-        if joint is None or not self._parts.alignment.is_aligned:
-            return
-        self._joint = None
-        oldest = nodes.recent_poses(self._parts.graph)[0]
-        last = se2.compose(oldest, se2.inverse(joint))
-        nodes.move_frozen(se2.compose(last, se2.inverse(nodes.frozen[-1])))
-
-    def _refuse(self, nodes: IntArray) -> None:
-        """Count constraints that were to be added to nodes that have left."""
-        pipeline, gone = self._parts.pipeline, {*nodes.tolist()}
-        for queue in (pipeline.queue, self._parts.quarantine):
-            lost = [each for each in queue if not gone.isdisjoint(each.nodes)]
-            queue[:] = [each for each in queue if gone.isdisjoint(each.nodes)]
-            for each in lost:
-                pipeline.count(each.source, rejected(
-                    'before_window', 'its hidden node left the graph before it was added'))

@@ -145,15 +145,12 @@ def positions_along(poses: Poses, given: Given) -> Positions:
     covariance = axes @ np.linalg.inv(information)[:, :2, :2] @ np.swapaxes(axes, 1, 2)
     rows = table.i - first
     return Positions(
-        odometry=_points(predicted), observed=_points(table.mean),
+        odometry=predicted[:, 0] + 1j * predicted[:, 1],
+        observed=table.mean[:, 0] + 1j * table.mean[:, 1],
         root=np.asarray(np.linalg.cholesky(covariance), dtype=np.float64),
         direction=np.exp(1j * predicted[:, 2]), node=table.i,
         path=np.append(0.0, np.cumsum(length))[rows], walk=np.append(0.0, np.cumsum(walk))[rows],
         stamp=stamp[order], correlation_time=tau[order])
-
-
-def _points(poses: FloatArray) -> ComplexArray:
-    return np.asarray(poses[:, 0] + 1j * poses[:, 1])
 
 
 @dataclass(frozen=True, slots=True)

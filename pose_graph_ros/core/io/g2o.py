@@ -171,7 +171,14 @@ def _spread(rows: GraphRows) -> float:
 
 def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
     """Return the graph in the lines of a file."""
-    rows, loops = _without_loops(text.rows)
+    # edges from a node to itself tell nothing
+    rows, n_loops, loops = dict(text.rows), 0, tuple[str, ...]()
+    for tag, table in text.rows.items():
+        if gt.TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
+            rows[tag] = table.rows(np.flatnonzero(table.ids[:, 0] != table.ids[:, 1]))
+            n_loops += len(table) - len(rows[tag])
+    if n_loops > 0:
+        loops = (f'{n_loops} edges from a node to itself are skipped',)
     rows['LANDMARK'], notes = _numbered(text, rows)
     points = rows['VERTEX_XY']
     vertices = gt.Lines.joined((rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'], gt.Lines(
@@ -214,16 +221,6 @@ def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
         NextIds(n, len(factors)))
     return GraphFile(
         graph, ids, bool(len(given) == n), text.skipped, (*loops, *notes), edge2_order)
-
-
-def _without_loops(rows: dict[str, gt.Lines]) -> tuple[dict[str, gt.Lines], tuple[str, ...]]:
-    """Return lines without edges from a node to itself, which tell nothing, and a note of them."""
-    kept, n = dict(rows), 0
-    for tag, table in rows.items():
-        if gt.TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
-            kept[tag] = table.rows(np.flatnonzero(table.ids[:, 0] != table.ids[:, 1]))
-            n += len(table) - len(kept[tag])
-    return kept, () if n == 0 else (f'{n} edges from a node to itself are skipped',)
 
 
 def _numbered(text: gt.GraphText, rows: dict[str, gt.Lines]) -> tuple[gt.Lines, tuple[str, ...]]:

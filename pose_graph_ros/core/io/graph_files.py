@@ -40,6 +40,7 @@ VERSION = 7
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
 _DIGITS = 64
+MEMBERS = [item.name for item in fields(SavedGraph) if item.name != 'rows']
 IN_G2O = [kind for kind, factor in ct.FACTORS.items() if factor.tag == 'EDGE_SE2']
 
 
@@ -109,7 +110,7 @@ def write_graph(saved: SavedGraph, path: Path) -> tuple[Path, Path, Path]:
         'format': FORMAT, 'version': VERSION, 'created_by': f'pose_graph_ros {__version__}',
         'g2o_sha256': hashlib.sha256(g2o).hexdigest(),
         'graph': sc.encoded(_saved_rows(saved.rows)),
-        **{name: sc.encoded(getattr(saved, name)) for name in _members()}}
+        **{name: sc.encoded(getattr(saved, name)) for name in MEMBERS}}
     body = (',\n'.join(_lines(members)) + '\n}\n').encode('ascii')
     side = _OPENING + hashlib.sha256(body).hexdigest().encode('ascii') + _MIDDLE + body
     g2o_path, side_path, tum_path = paths
@@ -127,7 +128,7 @@ def read_graph(path: Path) -> SavedGraph:
     g2o_path, path, members, g2o = _verified(path)
     try:
         hints = sc.annotations(SavedGraph)
-        rest = {name: sc.decoded(hints[name], members[name]) for name in _members()
+        rest = {name: sc.decoded(hints[name], members[name]) for name in MEMBERS
                 if name in members}
         rows: SavedRows = sc.decoded(SavedRows, members['graph'])
         text = g2o.decode('ascii').partition(STANDING_FOR)[0].replace(NOT_USED, '')
@@ -164,10 +165,6 @@ def _verified(path: Path) -> tuple[Path, Path, dict[str, Any], bytes]:
         raise FileFormatError(
             f'{g2o_path}: is damaged, or not the file that {path} was written with')
     return g2o_path, path, members, g2o
-
-
-def _members() -> list[str]:
-    return [item.name for item in fields(SavedGraph) if item.name != 'rows']
 
 
 def _lines(members: dict[str, Any], indent: str = '') -> Iterator[str]:
