@@ -22,14 +22,13 @@ import numpy as np
 
 from pose_graph_ros.core.config import ThinningConfig, WindowConfig, WindowPrior
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import composed, FloatArray, IntArray
 from pose_graph_ros.core.measurements import (
     LoopClosure,
     Measurement,
     OdometrySample,
     Position,
 )
-from pose_graph_ros.offline.simulation.recording import composed
 from pose_graph_ros.offline.simulation.sensors import model_variances
 from pose_graph_ros.offline.simulation.worlds import path_length
 

@@ -25,14 +25,13 @@ from pose_graph_ros.core.config import (
     Robust,
 )
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, composed, FloatArray, IntArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.closures import forward
 from pose_graph_ros.core.judgement.verdicts import Verdict
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
-from pose_graph_ros.offline.simulation.recording import composed
 from pose_graph_ros.offline.simulation.worlds import path_length
 
 SECOND = 1_000_000_000

@@ -47,12 +47,11 @@ from pose_graph_ros.cli.picture import BLUE, GREEN, GREY, INK, PURPLE, VERMILION
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.config import Robust, SolverConfig
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray
+from pose_graph_ros.core.geometry.se2 import BoolArray, composed, FloatArray
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.io.g2o import read_g2o
 from pose_graph_ros.core.judgement.closures import floored, FLOORS
-from pose_graph_ros.offline.simulation.recording import composed
 from pose_graph_ros.offline.simulation.settings import FalseClosures
 
 TITLE = 'Wrong measurements'

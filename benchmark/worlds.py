@@ -34,10 +34,9 @@ from scipy.signal import lfilter
 from scipy.spatial import cKDTree
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.geometry.se2 import composed, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.offline.simulation.recording import composed
 from pose_graph_ros.offline.simulation.worlds import street_corners
 
 SEED = 20260

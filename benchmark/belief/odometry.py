@@ -12,8 +12,9 @@ from benchmark.belief.engine import at_end, config
 from benchmark.drives import Drive, plaza, SECOND, stamped, with_fixes
 from pose_graph_ros.core.config import MeasurementSource, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry.se2 import composed
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.offline.simulation.recording import composed, course
+from pose_graph_ros.offline.simulation.recording import course
 from pose_graph_ros.offline.simulation.sensors import model_variances
 from pose_graph_ros.offline.simulation.worlds import WORLDS
 

@@ -76,6 +76,14 @@ def compose(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.concatenate((position, theta[..., None]), axis=-1)
 
 
+def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
+    """Return the poses that steps (N, 3) lead to from a first one, shape (N + 1, 3)."""
+    heading = first[2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
+    moves = np.einsum('nij,nj->ni', rotation(heading[:-1]), steps[:, :2])
+    positions = first[:2] + np.concatenate((np.zeros((1, 2)), np.cumsum(moves, axis=0)))
+    return wrapped(np.column_stack((positions, heading)))
+
+
 def inverse(a: FloatArray) -> FloatArray:
     """Return `T_b_a` from `T_a_b`, shape (..., 3)."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])

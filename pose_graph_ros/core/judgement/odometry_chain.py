@@ -32,15 +32,6 @@ GAP_ALONG, GAP_ACROSS, GAP_BY_WAY, GAP_BY_TURN, GAP_FLOOR = (
     _NOISE.sigma_heading_turn**2, _NOISE.sigma_floor_position**2)
 
 
-def integrated(motions: FloatArray) -> FloatArray:
-    """Return poses from the motions between them, shape (N + 1, 3), the first at the origin."""
-    heading = np.concatenate(([0.0], np.cumsum(motions[:, 2])))
-    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
-    x, y = motions[:, 0], motions[:, 1]
-    steps = np.column_stack((c * x - s * y, s * x + c * y))
-    return np.column_stack((np.vstack((np.zeros(2), np.cumsum(steps, axis=0))), se2.wrap(heading)))
-
-
 def moved(covariances: FloatArray, motions: FloatArray) -> FloatArray:
     """Return covariances of poses, given in frames that motions lead to, where these begin."""
     adjoint = se2.adjoint(motions)
@@ -137,7 +128,7 @@ class OdometryChain:
             before.as_odometry_says(motions, seconds), seconds), motions)
         noises = np.where(by_odometry[:, None, None], after.covariances(
             before.inverse_noise.covariances(noises)), noises)
-        poses = se2.compose(poses[:1], integrated(motions))
+        poses = se2.composed(poses[0], motions)
         steps = moved(noises, poses[1:])
         self._poses.values[:] = poses
         self._sums.values[1:] = upper(sums[:1] + np.cumsum(steps, axis=0))

@@ -255,7 +255,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
     return SimulatedGraph(
-        truth, composed(poses[0], odometry.mean), Factors.joined((odometry, loops)), group,
+        truth, se2.composed(poses[0], odometry.mean), Factors.joined((odometry, loops)), group,
         Factors.joined((fixes, absolute)),
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
@@ -278,14 +278,6 @@ def odometry_edges(
     information[:, range(3), range(3)] = 1.0 / variances
     return Factors(np.arange(n), np.arange(1, n + 1), mean, information,
                  np.full(n, FactorKind.ODOMETRY))
-
-
-def composed(first: FloatArray, steps: FloatArray) -> FloatArray:
-    """Return the poses that steps (N, 3) lead to, shape (N + 1, 3)."""
-    heading = first[2] + np.concatenate(([0.0], np.cumsum(steps[:, 2])))
-    moves = np.einsum('nij,nj->ni', se2.rotation(heading[:-1]), steps[:, :2])
-    positions = first[:2] + np.concatenate((np.zeros((1, 2)), np.cumsum(moves, axis=0)))
-    return se2.wrapped(np.column_stack((positions, heading)))
 
 
 def _loop_edges(way: Course, path: Motion, node_distance: float) -> tuple[Factors, IntArray, int]:
