@@ -90,6 +90,7 @@ def _candidates(source: Path) -> Iterator[Path]:
 
 # --- the fingerprint ----------------------------------------------------------------------------
 
+@functools.cache
 def fingerprint(dispatcher: ni.Dispatcher) -> bytes:
     """Return a digest of all inputs of a kernel's machine code except its signature."""
     parts: list[object] = [
@@ -207,7 +208,7 @@ class KernelCache:
         try:
             code = ni.serialize.dumps(result._reduce())  # noqa: SLF001
             with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                file.write(self._fingerprint + hashlib.sha256(code).digest() + code)
+                file.write(fingerprint(self._dispatcher) + hashlib.sha256(code).digest() + code)
             os.replace(file.name, path)
         except Exception as error:
             _warn('written', path.parent, error)
@@ -220,10 +221,6 @@ class KernelCache:
         name = f'{self._name}-{hashlib.sha256(key).hexdigest()[:16]}.nbc'
         return (folder / name for folder in self._folders)
 
-    @functools.cached_property
-    def _fingerprint(self) -> bytes:
-        return fingerprint(self._dispatcher)
-
     def _code(self, path: Path) -> bytes | None:
         """Return the code in a file; None if it is not valid."""
         try:
@@ -234,7 +231,7 @@ class KernelCache:
             _warn('read', path.parent, error)
             return None
         made_from, check_sum, code = kept[:32], kept[32:64], kept[64:]
-        if made_from != self._fingerprint:
+        if made_from != fingerprint(self._dispatcher):
             return None
         if check_sum != hashlib.sha256(code).digest():
             _warn('read', path.parent, ValueError('the check sum is wrong'))

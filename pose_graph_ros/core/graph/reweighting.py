@@ -217,7 +217,8 @@ class Reweighting:
         if len(index) == 0:
             return {}
         ids = self['id'][index]
-        energy, weight = _energies(graph, ids)
+        some = graph.factors_at(ids)
+        energy, weight = energies(graph.errors(some), some.information), some.weight
         wanted = np.empty(len(index))
         for loss, threshold, chosen in self._groups(index):
             _, wanted[chosen] = costs_and_weights(loss, energy[chosen], widened * threshold)
@@ -234,15 +235,9 @@ class Reweighting:
 
     def cost(self, graph: Graph) -> float:
         """Return the sum of the robust costs minus the sum of the weighted energies."""
-        total = 0.0
-        energy, weight = _energies(graph, self['id'])
+        total, some = 0.0, graph.factors_at(self['id'])
+        energy, weight = energies(graph.errors(some), some.information), some.weight
         for loss, threshold, chosen in self._groups(np.arange(len(self))):
             costs, _ = costs_and_weights(loss, energy[chosen], threshold)
             total += float(np.sum(self['base'][chosen] * costs - weight[chosen] * energy[chosen]))
         return total
-
-
-def _energies(graph: Graph, ids: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return unweighted energies and weights of factors."""
-    some = graph.factors_at(ids)
-    return energies(graph.errors(some), some.information), some.weight

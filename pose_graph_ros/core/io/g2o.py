@@ -341,7 +341,12 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
     """
     ids = rows.node_ids if ids is None else ids
     factors = rows.factors.renumbered(rows.rows_of)
-    used, lines = _is_used(factors), list[str]()
+    used, lines = factors.weight > 0.0, list[str]()
+    # a measurement with a correlated error has weight 0; an edge from its node to a bias holds it
+    to_bias = factors.rows((factors.kind == FactorKind.BIAS) & used)
+    held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
+    for k in np.flatnonzero(~used & (factors.j < 0)).tolist() if len(held) > 0 else ():
+        used[k] = (int(factors.i[k]), *factors.mean[k, :2].tolist()) in held
     is_edge, n_biases = factors.j >= 0, int(np.sum(rows.is_bias))
     written = np.where(
         is_edge, np.isin(factors.kind, [kind for kind in FACTORS if FACTORS[kind].tag])
@@ -370,20 +375,6 @@ def g2o_text(rows: GraphRows, ids: IntArray | None = None) -> str:
                   f'{len(rows.priors)}: {len(instead)} lines',
                   *_factor_lines(instead, ids, np.ones(len(instead), dtype=bool))]
     return '\n'.join(lines) + '\n'
-
-
-def _is_used(factors: Factors) -> BoolArray:
-    """
-    Return which measurements are used, shape (M,).
-
-    One with a correlated error has weight 0; an edge from its node to a bias holds it instead.
-    """
-    used = factors.weight > 0.0
-    to_bias = factors.rows((factors.kind == FactorKind.BIAS) & used)
-    held = set(zip(to_bias.i.tolist(), *to_bias.mean[:, :2].T.tolist(), strict=True))
-    for k in np.flatnonzero(~used & (factors.j < 0)).tolist() if len(held) > 0 else ():
-        used[k] = (int(factors.i[k]), *factors.mean[k, :2].tolist()) in held
-    return np.asarray(used)
 
 
 def _factor_lines(factors: Factors, ids: IntArray, used: BoolArray) -> list[str]:

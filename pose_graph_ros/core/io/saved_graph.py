@@ -74,7 +74,11 @@ def site_refusal(
     if datum is not None and (refusal := datum_refusal(saved.datum, datum)) is not None:
         return refusal
     if fix is not None:
-        metres = _distance_to(saved, fix)
+        # of the datum or the nearest node, whichever is nearer
+        metres = float(distances(fix, saved.datum.latitude, saved.datum.longitude)[0])
+        if saved.alignment.state == AlignmentState.ALIGNED.value:   # the nodes are in the map
+            points = TangentPlane(*saved.datum).to_geodetic(saved.path[:, :2])
+            metres = min(metres, float(np.min(distances(fix, points[:, 0], points[:, 1]))))
         if not metres <= SAME_SITE:
             return (f'the saved graph is of another site: its datum is {saved.datum}, the present '
                     f'one {fix}, which is {metres / 1000.0:.1f} km from the nearest node')
@@ -89,13 +93,3 @@ def datum_refusal(saved: MapOrigin, datum: MapOrigin) -> str | None:
         return None
     return (f'the saved graph is of another site: its datum is {saved}, the present one {datum}; '
             f'they are {metres:.2f} m and {turned:.6f} rad apart')
-
-
-def _distance_to(saved: SavedGraph, fix: MapOrigin) -> float:
-    """Return the distance of a fix to the datum or the nearest node, whichever is less [m]."""
-    assert saved.datum is not None
-    least = float(distances(fix, saved.datum.latitude, saved.datum.longitude)[0])
-    if saved.alignment.state != AlignmentState.ALIGNED.value:
-        return least  # the nodes are not in the map
-    points = TangentPlane(*saved.datum).to_geodetic(saved.path[:, :2])
-    return min(least, float(np.min(distances(fix, points[:, 0], points[:, 1]))))

@@ -59,13 +59,6 @@ class SourceState:
         """Number of measurements, with those that have left the graph."""
         return len(self) + self.n_gone
 
-    def append(self, queued: Queued, number: int, held_by: int) -> None:
-        """Append a constraint: the id of what it was added as, and of the edge that holds it."""
-        if queued.measured is LoopClosure:
-            self.edges.append_one((queued.stamp_ns, number))
-        else:
-            self.measured.append_one((queued.stamp_ns, number, held_by, queued.noise.tolist()))
-
     def forget(self, nodes: IntArray, factors: IntArray) -> IntArray:
         """Return the numbers of the measurements that are left, after forgetting the others."""
         kept = np.flatnonzero(~np.isin(self.measured['id'], factors))
@@ -197,8 +190,12 @@ class FactorBuilder:
 
     def commit(self) -> None:
         for queued, new in zip(self._queued, self.new, strict=True):
-            self.sources.setdefault(new.source, SourceState()).append(
-                queued, new.number, new.held_by)
+            state = self.sources.setdefault(new.source, SourceState())
+            if new.kind is LoopClosure:
+                state.edges.append_one((new.stamp_ns, new.number))
+            else:
+                state.measured.append_one(
+                    (new.stamp_ns, new.number, new.held_by, queued.noise.tolist()))
             if queued.needs_bias:
                 continue    # a rotation has no loss
             odometry = self.config.odometry.get(new.source) if new.stamp_ns < 0 else None
