@@ -38,7 +38,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.judgement.texts import short, states_by_stamps
+from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
@@ -140,9 +140,8 @@ class Tuning:
         after = self._run(checked({**self._values, **changed(tuned)}),
                           'all, with the settings after')
         doubted = frozenset(
-            (source, stamp) for (source, stamp, reference), state
-            in states_by_stamps(after.verdicts()).items()
-            if state is State.DOUBTED and reference is None)
+            (one.source, one.stamp_ns) for one in after.verdicts()
+            if one.state is State.DOUBTED and one.reference_ns is None)
         if len(doubted) > 0:
             tuned, tau = self._estimate(runs, doubted)
         period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9

@@ -355,11 +355,6 @@ class WindowConfig:
     def __post_init__(self) -> None:
         check(self)
 
-    @property
-    def is_limited(self) -> bool:
-        """Whether there is any limit."""
-        return self.nodes > 0 or self.seconds > 0.0 or self.metres > 0.0
-
 
 @dataclass(frozen=True, slots=True)
 class ThinningConfig:

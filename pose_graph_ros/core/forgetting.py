@@ -96,7 +96,7 @@ class Forgetting:
         if len(self._parts.nodes) == 0 or self._parts.graph.has_touched:
             return
         nodes, window = self._parts.nodes, config.window
-        n = n_leaving(window, nodes) if window.is_limited else 0
+        n = n_leaving(window, nodes) if max(window.nodes, window.seconds, window.metres) > 0 else 0
         if n > 0:
             n = n_leaving(window, nodes, self._parts.pipeline.needed_ns)
         if n > 0 and len(nodes) >= self._rest:

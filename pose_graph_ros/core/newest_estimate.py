@@ -70,7 +70,8 @@ def estimate(
         n_hidden=len(nodes), n_frozen=nodes.n_frozen, n_thinned=len(nodes.thinned),
         n_priors=graph.n_priors,
         n_edges=graph.n_edges,
-        n_observed=factors.n_measurements, n_biases=int(np.count_nonzero(graph.is_bias)),
+        n_observed=sum(len(each) + each.n_otherwise for each in factors.sources.values()),
+        n_biases=int(np.count_nonzero(graph.is_bias)),
         primary=nodes.primary, odometry=source,
         odometry_errors=nodes.errors if errors == AS_CLAIMED else nodes.errors._replace(
             rate=errors.rate, scale=errors.scale),

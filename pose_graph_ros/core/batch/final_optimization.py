@@ -81,7 +81,8 @@ def _optimize_robustly(
     """
     best, poses, weights = None, graph.poses, graph.weights
     for weight, widened in ((1.0, TUNING.widened), (TUNING.small_weight, ())):
-        graph.apply(GraphUpdate(weigh=reweighting.all_alike(weight)))
+        graph.apply(GraphUpdate(weigh=dict(zip(
+            reweighting['id'].tolist(), (weight * reweighting['base']).tolist(), strict=True))))
         result = optimizer.optimize_from_two_starts(graph, config, solve)
         for factor in widened:
             if result.status is not Status.FAILED:

@@ -206,10 +206,6 @@ class Reweighting:
         """Return the new weights of all factors whose weight changes."""
         return self._changes(graph, np.arange(len(self)), widened=widened)
 
-    def all_alike(self, weight: float) -> Mapping[int, float]:
-        """Return the base weights of all times a weight; 1 makes it plain least squares."""
-        return dict(zip(self['id'].tolist(), (weight * self['base']).tolist(), strict=True))
-
     def _changes(
         self, graph: Graph, index: IntArray, *, least: float = 0.0, widened: float = 1.0,
     ) -> Mapping[int, float]:

@@ -49,7 +49,13 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                     renamed.append(path)
                 _sync_folder(folder)
             except BaseException:
-                _put_back(renamed, old)
+                # new files are replaced by the previous ones; those without one are removed
+                for path in renamed:
+                    with contextlib.suppress(OSError):
+                        if (old / path.name).exists():
+                            os.replace(old / path.name, path)
+                        else:
+                            path.unlink()
                 raise
     except (OSError, ValueError) as error:
         names = ', '.join(str(path) for path in contents)
@@ -61,16 +67,6 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _put_back(renamed: list[Path], old: Path) -> None:
-    """Replace new files by the previous ones; remove those without a previous one."""
-    for path in renamed:
-        with contextlib.suppress(OSError):
-            if (old / path.name).exists():
-                os.replace(old / path.name, path)
-            else:
-                path.unlink()
 
 
 def _sync_folder(folder: Path) -> None:

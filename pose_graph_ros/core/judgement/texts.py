@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is believed, doubted or waits, in words that need no knowledge of the solver."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import math
 import re
 
@@ -15,6 +15,7 @@ NOUNS = {vd.Judged.LOOP_CLOSURE: ('closure', 'closures'), vd.Judged.FIX: ('fix',
          vd.Judged.ODOMETRY: ('odometry edge', 'odometry edges')}
 # states in the order in which people want to read of them
 ORDER = (vd.State.DOUBTED, vd.State.WAITING, vd.State.WEAKLY_BELIEVED, vd.State.BELIEVED)
+Key = tuple[str, int, int | None]  # source, stamp and stamp of the other end of a measurement [ns]
 
 
 def seconds(stamp_ns: int, digits: int = 3) -> str:
@@ -171,10 +172,3 @@ def total_values(totals: Mapping[str, vd.SourceVerdicts]) -> dict[str, str]:
             values |= {f'{source}.left': str(each.n_left),
                        f'{source}.left_unused': str(each.n_left_unused)}
     return values
-
-
-Key = tuple[str, int, int | None]  # source, stamp and stamp of the other end of a measurement [ns]
-
-
-def states_by_stamps(verdicts: Iterable[vd.Verdict]) -> dict[Key, vd.State]:
-    return {(each.source, each.stamp_ns, each.reference_ns): each.state for each in verdicts}

@@ -123,11 +123,6 @@ class FactorBuilder:
         # none of them was used
         self._reports: dict[str, tuple[SourceReport, int]] = {}
 
-    @property
-    def n_measurements(self) -> int:
-        """Number of measurements in the graph, without loop closures."""
-        return sum(len(each) + each.n_otherwise for each in self.sources.values())
-
     def build(self, queue: Sequence[Queued], graph: Graph) -> GraphUpdate:
         """Return the update that adds a queue to the graph, to be followed by `commit`."""
         additions = bs.Additions(graph.next_ids)

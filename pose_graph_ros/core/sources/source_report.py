@@ -8,7 +8,7 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -125,8 +125,13 @@ def report(
     newest = newest[np.diff(newest[:, 0], prepend=-1) > 0]
     stamps, observed = newest[:, 0], graph.factors_at(newest[:, 1])
     if np.any(observed.kind == FactorKind.BIAS):    # all are, with a given time constant
-        errors, information = _biased_residuals(graph, observed)
-        residuals = errors
+        # whole errors of positions in map axes
+        factor = observed.constants[:, 2]
+        errors = graph.errors(observed)[:, :2]
+        errors = errors - factor[:, None] * graph.poses_of(observed.j)[:, :2]
+        variance = factor**2 + 1.0 / (0.5 * np.trace(
+            observed.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)
+        information, residuals = np.eye(2) / variance[:, None, None], errors
     else:
         errors, information = graph.errors(observed), observed.information
         # of positions, in map axes
@@ -137,13 +142,3 @@ def report(
     n_measured = int(np.count_nonzero(np.diagonal(information, axis1=1, axis2=2) > 0.0))
     return SourceReport(len(ids), energy / max(n_measured, 1),
                         estimate(stamps, residuals), in_use, found)
-
-
-def _biased_residuals(graph: Graph, edges: Factors) -> tuple[FloatArray, FloatArray]:
-    """Return whole errors of positions in map axes, of edges to a bias, and their information."""
-    errors = graph.errors(edges)[:, :2]
-    factor = edges.constants[:, 2]
-    total = errors - factor[:, None] * graph.poses_of(edges.j)[:, :2]
-    variance = factor**2 + 1.0 / (0.5 * np.trace(
-        edges.information[:, :2, :2], axis1=1, axis2=2) + 1e-12)
-    return total, np.eye(2) / variance[:, None, None]

@@ -14,7 +14,6 @@ from pose_graph_ros.core.judgement.texts import (
     as_json,
     sentence,
     short,
-    states_by_stamps,
 )
 from pose_graph_ros.core.judgement.verdicts import (
     Decision,
@@ -71,13 +70,6 @@ def test_every_state_has_a_sentence_of_its_own(
     (math.nan, 2, 'nan')])
 def test_numbers_for_people_have_no_exponents(value: float, digits: int, text: str) -> None:
     assert short(value, digits) == text
-
-
-def test_states_are_found_by_source_and_stamps() -> None:
-    fix = replace(CLOSURE, source='fix', reference_ns=None, state=State.BELIEVED)
-    assert states_by_stamps([CLOSURE, fix]) == {
-        ('loop_closure', 1_695_250_000_000, 1_600_000_000_000): State.DOUBTED,
-        ('fix', 1_695_250_000_000, None): State.BELIEVED}
 
 
 def test_as_json_has_numbers_and_no_nan() -> None:
