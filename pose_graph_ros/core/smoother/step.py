@@ -91,6 +91,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         before, scalars.error2_before = scalars.error2_before, error2
         scalars.lowest = min(scalars.lowest, scalars.chi2)
         large = error2 > 1.0 and error2 > 1e-3 * scalars.lowest
+        if entered == AFTER_BATCH:  # it may swing about what the batch has found, but not leave it
+            large = large and scalars.chi2 > 2.0 * scalars.lowest + 1.0
         if large and (out_of_iterations or 0.0 < before < 2.0 * error2 or not error2 < 1e6):
             return tree_update.DIVERGED
         if out_of_iterations:
