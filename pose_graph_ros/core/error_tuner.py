@@ -48,8 +48,6 @@ from pose_graph_ros.core.transaction import succeeds
 PART, WHOLE = 100, 5000
 # Slow errors that differ by less than this factor are not changed online in the graph.
 ALIKE = 1.5
-# Noise that explains the measurements better by less than this changes nothing online [nats].
-SIMILAR = 1.0
 
 
 @dataclass(slots=True)
@@ -118,7 +116,7 @@ class ErrorTuner:
             except StopIteration as end:
                 self._search = None
                 found: learning.Found = end.value
-                self._use(found.instead_of(self._in_use, SIMILAR), newest=BANK.most_learnt)
+                self._use(found, found.instead_of(self._in_use), BANK.most_learnt)
         return 0.0
 
     @property
@@ -129,13 +127,16 @@ class ErrorTuner:
                 and self._wanted() is None and fixes.next_bank is None
                 and fixes.n_seen < self._next)
 
-    def _use(self, learnt: learning.Learnt, newest: int | None = None) -> None:
+    def _use(
+        self, found: learning.Found, learnt: learning.Learnt, newest: int | None = None,
+    ) -> None:
         """
         Use noise that was learnt, also for judging the newest measurements, or all.
 
         If not all, the graph follows only where it differs much.
         """
         fixes = self._judge.fixes
+        fixes.bank.by_noise = found.spread(learnt.pose)
         if newest is None or learnt.point != self._in_use:
             self._in_use = learnt.point
             fixes.adopt(learning.noise_at(learnt.point), newest)
@@ -169,7 +170,7 @@ class ErrorTuner:
             return
         # what was in use depends on the order of arrival
         found = to_the_end(learning.search(fixes.bank, fixes.known()))
-        self._use(found.best)
+        self._use(found, found.best)
         self.finish_change()
 
     def leaving(self, factors: IntArray) -> list[int]:

@@ -35,10 +35,11 @@ class Odometry(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How far hypotheses by which other sources are in a fault are from the best one."""
+    """How far what may have happened, but is not believed, is from the best hypothesis."""
 
     pose: FloatArray  # by the best one, at the newest row, shape (3,) [m, m, rad]
-    covariance: FloatArray  # of the poses of those others about it, shape (3, 3)
+    # about it, of the poses by which other sources are in a fault, and of those by other noise
+    covariance: FloatArray
 
 
 NO_SPREAD = Spread(np.zeros(3), np.zeros((3, 3)))
@@ -63,6 +64,7 @@ class Bank:
         self._first_node = -1  # node that the motion to the first row begins at, if it is known
         self.n_sources = 0
         self.spread = NO_SPREAD  # when it was last decided
+        self.by_noise = NO_SPREAD.covariance  # the part of it by other noise, when it was learnt
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -199,7 +201,8 @@ class Bank:
         best = int(np.argmax(likely))
         off = se2.wrapped(some['state'][:, :3] - some['state'][best, :3])
         likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
-        self.spread = Spread(some['state'][best, :3].copy(), (off.T * likely) @ off)
+        self.spread = Spread(
+            some['state'][best, :3].copy(), (off.T * likely) @ off + self.by_noise)
 
     def again(self, noise: Records, newest: int | None = None, least: float | None = None) -> Self:
         """

@@ -24,6 +24,7 @@ from pose_graph_ros.core.belief.filter import log_density
 from pose_graph_ros.core.belief.hypotheses import SLIPPED
 from pose_graph_ros.core.belief.rows import Records
 from pose_graph_ros.core.belief.settings import BANK
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
@@ -67,6 +68,7 @@ class Learnt(NamedTuple):
     point: Point
     evidence: float  # of all measurements, with the prior of the noise [nats]
     constants: FloatArray  # rate and scale of odometry, and their variances, shape (4,)
+    pose: FloatArray  # of the robot in the map at the newest measurement, shape (3,)
 
     def odometry(self) -> OdometryErrors:
         rate, scale, *variances = self.constants.tolist()
@@ -94,11 +96,18 @@ class Found(NamedTuple):
     best: Learnt
     every: dict[Point, Learnt]
 
-    def instead_of(self, point: Point | None, needed: float) -> Learnt:
-        """Return the best, or what is as good up to so much evidence with noise that is in use."""
+    def instead_of(self, point: Point | None) -> Learnt:
+        """Return the best, or noise that is in use if the evidence against it is not enough."""
         used = None if point is None else self.every.get((*point, *self.best.point[len(point):]))
         return used if used is not None and (
-            self.best.evidence - used.evidence <= needed) else self.best
+            self.best.evidence - used.evidence <= BANK.noise_evidence) else self.best
+
+    def spread(self, about: FloatArray) -> FloatArray:
+        """Return the covariance of the poses by all noise about one, by evidence, (3, 3)."""
+        every = self.every.values()
+        likely = np.exp([each.evidence - self.best.evidence for each in every])
+        off = se2.wrapped(np.array([each.pose for each in every]) - about)
+        return np.asarray((off.T * likely / np.sum(likely)) @ off)
 
 
 def claimed(n_sources: int) -> Point:
@@ -315,7 +324,7 @@ def search(
         # the bank has the evidence of what decides; of the others, that of what it believes
         more = yield from _others(rows, slips, point, posterior(slips))
         found[point] = Learnt(point, trial.evidence + more + log_prior(point, known), (
-            yield from posterior(slips).shown(point)).constants)
+            yield from posterior(slips).shown(point)).constants, trial.spread.pose)
         if n_rounds < MOST_ROUNDS:
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)

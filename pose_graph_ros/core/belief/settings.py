@@ -41,7 +41,7 @@ class BankSettings:
 
     # --- how noisy all is
     # evidence that is needed for slow errors of a source, for odometry that is not as noisy as it
-    # claims, and for each of its constant errors [nats]
+    # claims or for other noise than that in use, and for each constant error of odometry [nats]
     slow_evidence: float = 10.0
     noise_evidence: float = 3.0
     constant_evidence: float = 1.0

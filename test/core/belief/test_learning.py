@@ -12,6 +12,7 @@ from pose_graph_ros.core.belief.filter import log_density
 from pose_graph_ros.core.belief.learning import (
     axes_of,
     claimed,
+    Found,
     Known,
     Learnt,
     log_prior,
@@ -194,3 +195,23 @@ def test_the_newest_measurements_are_learnt_from_alone() -> None:
     best = to_the_end(search(bank, ALL, newest=100)).best
     assert best.errors(0) is None
     assert np.array_equal(bank.rows, later)     # the bank stays as it is
+
+
+def test_where_other_noise_leads_to_spreads_the_newest_pose_by_its_evidence() -> None:
+    def learnt(turn: float, evidence: float, *pose: float) -> Learnt:
+        return Learnt((0.0, turn), evidence, np.zeros(4), np.array(pose))
+    best, other = learnt(0.0, -10.0, 1.0, 2.0, 3.1), learnt(4.0, -11.0, 21.0, 2.0, -3.1)
+    found = Found(best, {each.point: each for each in (best, other)})
+    off, weight = np.array((20.0, 0.0, 2.0 * np.pi - 6.2)), 1.0 / (1.0 + np.e)
+    np.testing.assert_allclose(found.spread(best.pose), weight * np.outer(off, off), atol=1e-12)
+    assert found.instead_of(other.point) is other, 'too little speaks against it'
+    hopeless = other._replace(evidence=-50.0)
+    found = Found(best, {each.point: each for each in (best, hopeless)})
+    np.testing.assert_allclose(found.spread(best.pose), 0.0, atol=1e-9)
+    assert found.instead_of(hopeless.point) is best
+
+
+def test_a_bank_of_other_noise_keeps_what_all_noise_has_spread() -> None:
+    bank, noise = Bank(), noise_at(claimed(1))
+    bank.by_noise = np.diag((4.0, 4.0, 0.01))
+    assert bank.again(noise).by_noise is bank.by_noise
