@@ -141,7 +141,10 @@ def main() -> None:
     cases = itertools.starmap(Case, itertools.product(
         options.scenarios, drives, itertools.chain(*options.seeds), [options.data]))
     found: list[Found] = []
-    command = f'python -m benchmark.belief {" ".join(sys.argv[1:])}'
+    paths = '--data', '-o'      # of this machine
+    command = ' '.join(['python -m benchmark.belief', *(
+        word for before, word in itertools.pairwise(sys.argv)
+        if word not in paths and before not in paths)])
     with ProcessPoolExecutor(options.jobs, initializer=warm_up) as pool:
         for one in pool.map(measure, cases):
             found.append(one)
