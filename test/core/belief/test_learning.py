@@ -211,7 +211,11 @@ def test_where_other_noise_leads_to_spreads_the_newest_pose_by_its_evidence() ->
     assert found.instead_of(hopeless.point) is best
 
 
-def test_a_bank_of_other_noise_keeps_what_all_noise_has_spread() -> None:
-    bank, noise = Bank(), noise_at(claimed(1))
-    bank.by_noise = np.diag((4.0, 4.0, 0.01))
-    assert bank.again(noise).by_noise is bank.by_noise
+def test_the_spread_by_noise_is_added_to_that_by_hypotheses_and_outlives_the_noise() -> None:
+    bank, noise = a_drive(0, n=40), noise_at(claimed(1))
+    bank.decide()
+    before, bank.by_noise = bank.spread, np.diag((4.0, 4.0, 0.01))
+    again = bank.again(noise)
+    again.decide()
+    np.testing.assert_allclose(again.spread.pose, before.pose)
+    np.testing.assert_allclose(again.spread.covariance - before.covariance, bank.by_noise)
