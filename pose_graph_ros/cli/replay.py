@@ -32,7 +32,7 @@ from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import Recorder, Run, Update
 from pose_graph_ros.cli.run.document import write_results
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction, UpdateReport

@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
 from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement

@@ -26,7 +26,7 @@ from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, stamp_ns
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, source_list
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2

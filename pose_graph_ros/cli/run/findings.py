@@ -18,7 +18,7 @@ import numpy as np
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run import Run
 from pose_graph_ros.cli.run.sources import SourceAnalysis, verdict
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import number_of, sentence, short

@@ -140,9 +140,10 @@ class FixJudge:
 
     def _insert(self, rows: Records) -> None:
         for bank in self._banks():
-            bank.insert(rows, self._odometry())
+            bank.insert(rows, self.odometry())
 
-    def _odometry(self) -> Odometry:
+    def odometry(self) -> Odometry:
+        """Return the chain of odometry, with the errors that it knows of."""
         chain = self._chain
         return Odometry(
             chain.nodes, chain.poses, chain.sums,
@@ -160,7 +161,7 @@ class FixJudge:
         rows, bank = self._records(source, 0.0), Bank()
         rows = rows[~np.isin(rows['stamp_ns'], np.array([*without], dtype=np.int64))]
         if len(rows) > 0:
-            bank.insert(rows, self._odometry())
+            bank.insert(rows, self.odometry())
         return bank.rows
 
     def prepare(self) -> None:
@@ -175,14 +176,15 @@ class FixJudge:
                 rows['source'], rows['judged'] = self._number(source), judged
                 self._insert(rows)
 
-    def known(self) -> Known:
-        """Return which noise is given, and which is to be found."""
-        n, finding = min(len(self._sources), BANK.sources), self._factors.finding()
+    def known(self, sources: Sequence[str] | None = None) -> Known:
+        """Return which noise is given, and which is to be found, also of some other sources."""
+        sources = self._sources if sources is None else sources
+        n, finding = min(len(sources), BANK.sources), self._factors.finding()
         point, scale = [*claimed(n)], self._factors.config.odometry_scale
         if scale > 0.0:
             point[WAY] = point[TURN] = 2.0 * math.log2(scale)
         free = list[int]()
-        for number, source in enumerate(self._sources[:n]):
+        for number, source in enumerate(sources[:n]):
             given = None if source in finding else self._errors_in_use(source)
             if given is not None:
                 for axis, value in zip(axes_of(number), given[::-1], strict=True):
