@@ -12,12 +12,14 @@ bank tells whether the graph was aligned by what turns out to be wrong.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import product
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core.belief.bank import Bank, is_believed, Odometry
-from pose_graph_ros.core.belief.learning import noise_at
+from pose_graph_ros.core.belief.learning import Known, log_prior, noise_at, TURN, WAY
 from pose_graph_ros.core.belief.rows import measured, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.geometry import se2
@@ -32,10 +34,13 @@ from pose_graph_ros.core.sources.queued import Queued
 
 # Sigma of the heading by which the graph is aligned, and of a measured one that does it alone: the
 # user may set a pose, or a compass be all that there is [rad].
-KNOWN, MEASURED_ALONE = 0.15, 0.5
+KNOWN, MEASURED_ALONE = 0.2, 0.5
 # The graph is aligned anew if its heading is off by more than both [sigma, rad]; the solver
 # corrects smaller differences.
 OFF_SIGMAS, OFF = 4.0, 0.3
+# Exponents of 2 of the variances of odometry that are tried, in units of those that are claimed or
+# given: with noise that is far too large the heading is forgotten before it is known.
+ODOMETRY = 0.0, -6.0
 # Number of measurements at which that is checked first.
 FIRST_CHECK = 8
 
@@ -63,6 +68,14 @@ class _Found(NamedTuple):
     T_map_graph: FloatArray | None = None  # shape (3,); None while the angle is not known
 
 
+class _Assumed(NamedTuple):
+    """What a bank on all that waits takes to be so."""
+
+    mirrored: bool  # the y axis of odometry points to the wrong side
+    more: float  # how much noisier odometry is than it says, as in `ODOMETRY`
+    prior: float  # logarithm of the probability of the noise
+
+
 class Alignment:
     """
     Aligns the graph with the map as soon as measurements tell its heading.
@@ -80,9 +93,8 @@ class Alignment:
 
     def forget(self) -> None:
         """Look at all that waits anew, as nodes have left the graph."""
-        # with odometry as it is, and in a mirror; sources by number, and what the banks have
-        self._banks, self._sources = (Bank(), Bank()), list[str]()
-        self._seen = set[tuple[str, int]]()
+        self._banks, self._sources = dict[_Assumed, Bank](), list[str]()
+        self._seen = set[tuple[str, int]]()  # what the banks have, by source and stamp
 
     def find(self, graph: Graph, waiting: Sequence[Queued]) -> FloatArray | None:
         """
@@ -108,28 +120,38 @@ class Alignment:
         sources = sorted({each.source for each in waiting})
         if sources != self._sources:
             self.forget()
-            self._sources = sources
-            noise = noise_at(self._fixes.known(sources).point)
-            self._banks = Bank(noise), Bank(noise)
+            self._sources, given = sources, self._fixes.known(sources).point
+            for mirrored, more in product((False, True), ODOMETRY):
+                prior = log_prior((more, more), Known((), odometry=True, sources=()))
+                self._banks[_Assumed(mirrored, more, prior)] = Bank(noise_at(
+                    (given[WAY] + more, given[TURN] + more, *given[2:])))
         new = [each for each in waiting if (each.source, each.stamp_ns) not in self._seen]
         self._seen.update((each.source, each.stamp_ns) for each in new)
-        self._fixes.prepare()
-        odometry, bank = self._fixes.odometry(), self._banks[0]
         rows = measured(Factors.joined([each.factor for each in new]),
                         [each.stamp_ns for each in new], np.arange(len(new)).tolist())
-        if len(rows) > 0:
-            rows['source'] = [min(sources.index(new[k].source), BANK.sources - 1)
-                              for k in rows['id'].tolist()]
-            rows['judged'] = 1
-            for each, (of, given) in zip(
-                    self._banks, ((odometry, rows), _mirrored(odometry, rows)), strict=True):
-                each.insert(given, of)
-        for each in self._banks:
-            each.decide()
+        own = [new[k] for k in rows['id'].tolist()]
+        rows['source'] = [min(sources.index(one.source), BANK.sources - 1) for one in own]
+        rows['judged'] = [self._fixes.judges(one.source, one.measured) is True for one in own]
+        self._fixes.prepare()
+        odometry = self._fixes.odometry()
+        likely = dict[_Assumed, float]()
+        for assumed, bank in self._banks.items():
+            if len(rows) > 0:
+                bank.insert(*(_mirrored(rows, odometry) if assumed.mirrored else (rows, odometry)))
+            bank.decide()
+            likely[assumed] = bank.evidence + assumed.prior
+        straight, turned_over = ([each for each in self._banks if each.mirrored is of]
+                                 for of in (False, True))
+        best = max(straight, key=lambda each: likely[each])
         # as with a left-handed frame
-        is_mirrored = self._banks[1].evidence > bank.evidence + BANK.noise_evidence
-        sigma = bank.heading_sigma
-        if is_mirrored or sigma > KNOWN or not np.any(is_believed(bank.told(0).choice)):
+        is_mirrored = (max(likely[each] for each in turned_over)
+                       > likely[best] + BANK.noise_evidence)
+        weights = [math.exp(likely[each] - likely[best]) for each in straight]
+        bank, some = self._banks[best], [self._banks[each] for each in straight]
+        off = se2.wrap(np.array([each.spread.pose[2] for each in some]) - bank.spread.pose[2])
+        sigma = math.sqrt(np.average(
+            np.array([each.heading_sigma for each in some])**2 + off**2, weights=weights))
+        if sigma > KNOWN or is_mirrored or not np.any(is_believed(bank.told(0).choice)):
             return _Found(sigma)
         node = int(bank.rows['node'][-1])
         return _Found(sigma, se2.compose(bank.spread.pose, se2.inverse(graph.poses_of(node))))
@@ -184,14 +206,14 @@ class Alignment:
         self._next_check = saved.next_verdict
 
 
-def _mirrored(odometry: Odometry, rows: Records) -> tuple[Odometry, Records]:
-    """Return odometry and rows of measurements as if the y axis of the robot were turned over."""
+def _mirrored(rows: Records, odometry: Odometry) -> tuple[Records, Odometry]:
+    """Return rows of measurements and odometry as if the y axis of the robot were turned over."""
     given = rows.copy()
     given['offset'] *= (1.0, -1.0, -1.0)
-    return odometry._replace(
+    return given, odometry._replace(
         poses=odometry.poses * (1.0, -1.0, -1.0),
         sums=odometry.sums * (1.0, -1.0, -1.0, 1.0, 1.0, 1.0),
-        errors=odometry.errors._replace(rate=-odometry.errors.rate)), given
+        errors=odometry.errors._replace(rate=-odometry.errors.rate))
 
 
 def _by_heading(graph: Graph, waiting: Sequence[Queued]) -> _Found:

