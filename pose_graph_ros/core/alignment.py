@@ -218,6 +218,8 @@ def _mirrored(rows: Records, odometry: Odometry) -> tuple[Records, Odometry]:
 
 def _by_heading(graph: Graph, waiting: Sequence[Queued]) -> _Found:
     """Return the motion by the most certain heading, at its position or at those of others."""
+    if all(each.factor.kind[0] == FactorKind.POSITION for each in waiting):
+        return _Found(np.inf)
     observed = Factors.joined([each.factor for each in waiting])
     sigma, full = np.full(len(observed), np.inf), observed.kind == FactorKind.GLOBAL_POSE
     placed = observed.kind != FactorKind.HEADING
