@@ -88,7 +88,7 @@ class Alignment:
         self._nodes, self._fixes = nodes, fixes
         self.state = AlignmentState.LOCAL
         self.sigma = np.inf  # standard deviation of the angle when it was found [rad]
-        self._next_check: float = FIRST_CHECK
+        self._next_check = FIRST_CHECK
         self.forget()
 
     def forget(self) -> None:
@@ -140,6 +140,8 @@ class Alignment:
                 bank.insert(*(_mirrored(rows, odometry) if assumed.mirrored else (rows, odometry)))
             bank.decide()
             likely[assumed] = bank.evidence + assumed.prior
+        if len(bank) == 0:
+            return _Found(np.inf)
         straight, turned_over = ([each for each in self._banks if each.mirrored is of]
                                  for of in (False, True))
         best = max(straight, key=lambda each: likely[each])
@@ -156,10 +158,6 @@ class Alignment:
         node = int(bank.rows['node'][-1])
         return _Found(sigma, se2.compose(bank.spread.pose, se2.inverse(graph.poses_of(node))))
 
-    def stop_checking(self) -> None:
-        """Check the angle no more, because the path is not that of odometry any more."""
-        self._next_check = np.inf
-
     def check(self, graph: Graph) -> FloatArray | None:
         """
         Return new poses of all rows of the graph if its heading is wrong.
@@ -168,11 +166,13 @@ class Alignment:
         if the heading is not checked or not wrong.
         """
         bank, nodes, n_seen = self._fixes.bank, self._nodes, self._fixes.n_seen
-        if not self.is_aligned or n_seen < self._next_check or len(bank) == 0:
+        # where the robot was put elsewhere by hand, the path is not that of odometry
+        if (not self.is_aligned or n_seen < self._next_check or len(nodes.relocated) > 0
+                or len(bank) == 0 or bank.done < len(bank)):
             return None
-        rows = graph.node_rows(nodes.ids[nodes.n_frozen:])
-        at = int(np.searchsorted(nodes.ids[nodes.n_frozen:], bank.rows['node'][-1]))
-        if rows[at] < 0:
+        ids = nodes.ids[nodes.n_frozen:]
+        rows, at = graph.node_rows(ids), int(np.searchsorted(ids, bank.rows['node'][-1]))
+        if ids[at] != bank.rows['node'][-1] or rows[at] < 0:
             return None
         pose = bank.spread.pose
         off = abs(float(se2.wrap(pose[2] - graph.poses[rows[at], 2])))
@@ -197,7 +197,7 @@ class Alignment:
         """Return the state."""
         return SavedAlignment(
             self.state.value, float(self.sigma) if np.isfinite(self.sigma) else None,
-            int(min(self._next_check, np.iinfo(np.int64).max)))
+            self._next_check)
 
     def load(self, saved: SavedAlignment) -> None:
         """Set the state to a saved one."""

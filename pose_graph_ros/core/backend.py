@@ -231,7 +231,6 @@ class PoseGraphBackend:
         if isinstance(moved, ms.Answer):
             return self._pipeline.count(source, moved)
         self._collect()
-        self._alignment.stop_checking()
         self._pipeline.attach_to_node(moved, source, int(self._nodes.ids[-1]))
         return self._pipeline.count(source, ms.ACCEPTED)
 
