@@ -31,6 +31,7 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.judgement.fixes import FixJudge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.sources.queued import Queued
+from pose_graph_ros.core.sources.settings import SOURCES
 
 # Sigma of the heading by which the graph is aligned, and of a measured one that does it alone: the
 # user may set a pose, or a compass be all that there is [rad].
@@ -94,7 +95,8 @@ class Alignment:
     def forget(self) -> None:
         """Look at all that waits anew, as nodes have left the graph."""
         self._banks, self._sources = dict[_Assumed, Bank](), list[str]()
-        self._seen = set[tuple[str, int]]()  # what the banks have, by source and stamp
+        # what the banks have of what waits, by source and stamp, and how much they ever had
+        self._seen, self._n_seen = set[tuple[str, int]](), 0
 
     def find(self, graph: Graph, waiting: Sequence[Queued]) -> FloatArray | None:
         """
@@ -126,10 +128,12 @@ class Alignment:
                 self._banks[_Assumed(mirrored, more, prior)] = Bank(noise_at(
                     (given[WAY] + more, given[TURN] + more, *given[2:])))
         new = [each for each in waiting if (each.source, each.stamp_ns) not in self._seen]
-        self._seen.update((each.source, each.stamp_ns) for each in new)
+        self._seen = {(each.source, each.stamp_ns) for each in waiting}
         rows = measured(Factors.joined([each.factor for each in new]),
                         [each.stamp_ns for each in new], np.arange(len(new)).tolist())
         own = [new[k] for k in rows['id'].tolist()]
+        rows['id'] += self._n_seen
+        self._n_seen += len(new)
         rows['source'] = [min(sources.index(one.source), BANK.sources - 1) for one in own]
         rows['judged'] = [self._fixes.judges(one.source, one.measured) is True for one in own]
         self._fixes.prepare()
@@ -139,6 +143,8 @@ class Alignment:
             if len(rows) > 0:
                 bank.insert(*(_mirrored(rows, odometry) if assumed.mirrored else (rows, odometry)))
             bank.decide()
+            if len(bank) > SOURCES.most_unaligned:
+                bank.forget(np.arange(self._n_seen - len(waiting), self._n_seen), len(waiting))
             likely[assumed] = bank.evidence + assumed.prior
         if len(bank) == 0:
             return _Found(np.inf)

@@ -23,6 +23,7 @@ from pose_graph_ros.core.measurements import (
 )
 from pose_graph_ros.core.sources.kinds import attach, observed
 from pose_graph_ros.core.sources.queued import Queued
+from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000
 NOISE = OdometryNoise()
@@ -380,3 +381,21 @@ def test_a_saved_graph_that_is_not_aligned_is_aligned_by_what_has_waited() -> No
         each.update()
         assert each.estimate().alignment is AlignmentState.ALIGNED
     np.testing.assert_allclose(again.graph.poses, backend.graph.poses, atol=1e-6)
+
+
+def test_what_waits_for_days_takes_no_more_memory_than_what_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr('pose_graph_ros.core.alignment.SOURCES', replace(
+        SOURCES, most_unaligned=100))
+    some = drive(0, 400, 1.0)
+    xy = np.where(np.arange(400)[:, None] < 250, some.xy[0], some.xy)   # frozen at first
+    driven = Driven(some)
+    queue = driven.queued(*replace(some, xy=xy).positions)
+    ends = range(1, 401, 9)
+    motions = [driven.find(queue[max(end - 100, 0):end]) for end in ends]
+    assert all(len(bank) < 200 for bank in driven.alignment._banks.values())
+    assert len(driven.alignment._seen) <= 100
+    # until the receiver follows the robot
+    known = [end for end, motion in zip(ends, motions, strict=True) if motion is not None]
+    assert 250 < known[0] < 350
