@@ -40,8 +40,9 @@ KNOWN, MEASURED_ALONE = 0.2, 0.5
 # corrects smaller differences.
 OFF_SIGMAS, OFF = 4.0, 0.3
 # Exponents of 2 of the variances of odometry that are tried, in units of those that are claimed or
-# given: with noise that is far too large the heading is forgotten before it is known.
-ODOMETRY = 0.0, -6.0
+# given: with noise that is far too large the heading is forgotten before it is known, and with
+# noise that is too small, or a scale that is off by a fifth, odometry contradicts all fixes.
+ODOMETRY = 0.0, -6.0, 6.0
 # Number of measurements at which that is checked first.
 FIRST_CHECK = 8
 
@@ -135,7 +136,7 @@ class Alignment:
         rows['id'] += self._n_seen
         self._n_seen += len(new)
         rows['source'] = [min(sources.index(one.source), BANK.sources - 1) for one in own]
-        rows['judged'] = [self._fixes.judges(one.source, one.measured) is True for one in own]
+        rows['judged'] = [not self._fixes.trusts(one.source, one.measured) for one in own]
         self._fixes.prepare()
         odometry = self._fixes.odometry()
         likely = dict[_Assumed, float]()

@@ -78,7 +78,7 @@ class FixJudge:
     ) -> GraphUpdate:
         """Return an update in which all rows have the weights that the new ones make right."""
         by_id = {one.number: one for one in new if one.kind in (GlobalPose, Position)
-                 and self.judges(one.source, one.kind) is not None}
+                 and self._is_judged(one.source, one.kind) is not None}
         if len(by_id) == 0:
             return change
         self._now_ns, before, graph = now_ns, self._begin(), self._smoother.graph
@@ -92,7 +92,7 @@ class FixJudge:
         for row in rows:
             one = by_id[int(row['id'])]
             row['source'] = self._number(one.source)
-            row['judged'] = self.judges(one.source, one.kind)
+            row['judged'] = self._is_judged(one.source, one.kind)
             if row['judged']:
                 self.states.append(one, now_ns, BELIEVED)
         if len(self.bank) == 0 and not np.any(graph.fixed) and not graph.has_touched:
@@ -108,12 +108,16 @@ class FixJudge:
             decided.d2[noted])
         return self._with_weights(change, before)
 
-    def judges(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool | None:
+    def _is_judged(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool | None:
         """Tell whether a source is judged; None if the bank does not even learn from it."""
         settings = self._factors.config.measurement_source(source, kind)
         if settings.robust is Robust.JUDGED:
             return True
         return False if settings.finds_correlation else None
+
+    def trusts(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool:
+        """Tell whether a source is believed whatever speaks against it."""
+        return self._factors.config.measurement_source(source, kind).robust is Robust.NONE
 
     def _number(self, source: str) -> int:
         """Return the number of the errors of a source, which is told to the bank if it is new."""
@@ -172,7 +176,7 @@ class FixJudge:
         self._is_restored = False
         for source in self._factors.sources:
             rows = self._records(source)
-            if len(rows) > 0 and (judged := self.judges(source)) is not None:
+            if len(rows) > 0 and (judged := self._is_judged(source)) is not None:
                 rows['source'], rows['judged'] = self._number(source), judged
                 self._insert(rows)
 
