@@ -21,7 +21,6 @@ from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 STATIC_TRANSFORMS = '/tf_static'
-HEADER = 'std_msgs/msg/Header'
 # the "infinite" duration of rmw, 2^63 - 1 ns
 FOREVER = interfaces.QosTime(9223372036, 854775807)
 Convert = Callable[[bytes], bytes | memoryview]
@@ -159,7 +158,8 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
     name, types = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype), jazzy
     if name not in jazzy.fielddefs:
         types = get_typestore(Stores.EMPTY)
-        types.register({**own.fielddefs, HEADER: jazzy.fielddefs[HEADER]})
+        header = 'std_msgs/msg/Header'
+        types.register({**own.fielddefs, header: jazzy.fielddefs[header]})
     if converter.is_same_wireformat(own, types, source.msgtype, name):
         return name, types, partial(types.ros1_to_cdr, typename=name)
     return name, types, partial(

@@ -237,16 +237,15 @@ def _add_marker(  # noqa: PLR0917  fields of a marker
 ) -> None:
     """Add a visualization_msgs/Marker field by field."""
     def add_header() -> None:
-        stream.add('<i4', header[0])
-        stream.add('<u4', header[1])
+        stream.add('<u4', *header[:2])
         stream.add_text(header[2])
 
     add_header()
     stream.add_text(namespace)
     stream.add('<i4', *what)
-    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)    # pose
-    stream.add('<f8', size, size, 0.0)                      # scale: lines use the first
-    stream.add('<f4', *LOOK.node)                         # of points without their own
+    # pose and scale, of which lines use the first
+    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, size, size, 0.0)
+    stream.add('<f4', *LOOK.node)                           # of points without their own
     stream.add('<i4', 0, 0)                                 # lifetime: forever
     stream.add('u1', 0)                                     # frame_locked
     stream.add('<u4', len(points))

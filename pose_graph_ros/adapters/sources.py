@@ -13,14 +13,9 @@ import math
 from typing import Any
 
 from pose_graph_ros.adapters import conversions, parameter_table as table
+from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.parameter_table import Change, Parameter
-from pose_graph_ros.adapters.surroundings import (
-    datum_of,
-    frame,
-    Message,
-    StaticFrames,
-    Surroundings,
-)
+from pose_graph_ros.adapters.surroundings import datum_of, frame, StaticFrames, Surroundings
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError

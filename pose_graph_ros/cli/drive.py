@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -236,16 +236,6 @@ class Samples:
         return Trajectory(stamps, np.array(self._poses).reshape(-1, 3)[::stride][first])
 
 
-class _Fix(NamedTuple):
-    """A measured position."""
-
-    source: str
-    stamp_ns: StampNs
-    measured: Fix | FloatArray  # a fix is not in the map yet
-    arm: FloatArray  # of the antenna, (2,) [m]
-    held_out: bool
-
-
 Measured = tuple[str, OdometrySample | Measurement, bool]
 """A measurement after its source, and whether it is kept out of the graph."""
 
@@ -305,39 +295,39 @@ def collect_drive(
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
     corrected = estimate.path
-    odometry, fixes, loops = Samples(), list[_Fix](), list[Key]()
+    odometry, fixes, loops = Samples(), list[Fix | kinds.GlobalPose | kinds.Position](), list[Key]()
+    sources, held = list[str](), list[bool]()  # of the fixes
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
         if not held_out:
             arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
-            case Fix(stamp, _, _, lever_arm):
-                fixes.append(_Fix(source, stamp, measurement, lever_arm, held_out))
-            case kinds.GlobalPose(stamp, pose, _):
-                fixes.append(_Fix(source, stamp, pose[:2], np.zeros(2), held_out))
-            case kinds.Position(stamp, position, _, lever_arm):
-                fixes.append(_Fix(source, stamp, position, lever_arm, held_out))
+            case Fix() | kinds.GlobalPose() | kinds.Position():
+                fixes.append(measurement)
+                sources.append(source)
+                held.append(held_out)
             case kinds.LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
             case OdometrySample(stamp, pose) if source == odometry_source:
                 odometry.add(stamp, pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
-    arms = np.array([each.arm for each in fixes]).reshape(-1, 2)
+    arms = np.array([np.zeros(2) if isinstance(each, kinds.GlobalPose) else each.lever_arm
+                     for each in fixes]).reshape(-1, 2)
     inside, positions = corrected.covers(stamps), np.zeros((len(fixes), 2))
     # a fix that can have been used makes the datum, if there is none
-    for k in sorted(range(len(fixes)), key=lambda k: fixes[k].held_out or not inside[k]):
-        measured = fixes[k].measured
-        positions[k] = measured.place() if isinstance(measured, Fix) else measured
+    for k in sorted(range(len(fixes)), key=lambda k: held[k] or not inside[k]):
+        each = fixes[k]
+        positions[k] = each.place() if isinstance(each, Fix) else (
+            each.pose[:2] if isinstance(each, kinds.GlobalPose) else each.position)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
     known = {(each.source, each.stamp_ns, each.reference_ns): STATES.index(each.state.value)
              for each in verdicts}
     judged = {each.source for each in verdicts}
-    states = np.array([known.get((each.source, each.stamp_ns, None), BELIEVED) for each in fixes],
-                      dtype=np.int64)
-    kept_out = np.array([each.held_out for each in fixes], dtype=bool)
-    sources = [each.source for each in fixes]
+    states = np.array([known.get((source, stamp, None), BELIEVED) for source, stamp in zip(
+        sources, stamps.tolist(), strict=True)], dtype=np.int64)
+    kept_out = np.array(held, dtype=bool)
     # those that the graph has not from its begin on are refused
     lost = stamps >= int(backend.node_stamps_ns[estimate.n_frozen])
     for source, added in backend.measured().items():

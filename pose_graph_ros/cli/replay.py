@@ -37,7 +37,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, Pose
+from pose_graph_ros.core.geometry.se2 import between_one, compose_one, Pose
 from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection, Trajectory
 from pose_graph_ros.core.io import path_files
 from pose_graph_ros.core.io.g2o import write_g2o
@@ -117,9 +117,7 @@ class LivePoses:
         self._period_ns = round(1e9 / frequency)
         self._estimate: Estimate | None = None
         self._next_ns = self._newest_ns = 0
-        self._stamps: list[int] = []
-        self._poses: list[FloatArray] = []
-        self._covariances: list[FloatArray] = []
+        self._found: list[tuple[int, Prediction]] = []
 
     def is_due(self, sample: OdometrySample | Measurement, n_nodes: int) -> bool:
         """Return whether the graph is to be updated with a measurement."""
@@ -139,17 +137,14 @@ class LivePoses:
                 estimate.primary != source or sample.stamp_ns <= self._newest_ns):
             return
         self._newest_ns = sample.stamp_ns
-        found = predict(estimate, sample)
-        self._stamps.append(sample.stamp_ns)
-        self._poses.append(found.T_map_base)
-        self._covariances.append(found.covariance)
+        self._found.append((sample.stamp_ns, predict(estimate, sample)))
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of a table, as that of the path."""
-        return path_files.csv_lines(
-            Trajectory(np.array(self._stamps, dtype=np.int64),
-                       np.array(self._poses).reshape(-1, 3)),
-            np.array(self._covariances).reshape(-1, 3, 3))
+        stamps = np.array([stamp for stamp, _ in self._found], dtype=np.int64)
+        poses = np.array([each.T_map_base for _, each in self._found]).reshape(-1, 3)
+        return path_files.csv_lines(Trajectory(stamps, poses), np.array(
+            [each.covariance for _, each in self._found]).reshape(-1, 3, 3))
 
 
 class _Corrector:
@@ -281,16 +276,9 @@ def run(
     reader, recorder = reader_of(bag, values), Recorder()
     refused: Counter[tuple[str, str]] = Counter()
     backend, report = run_measurements(
-        measurements_of(bag, inputs, reader, refused), values, recorder, live)
+        (each[:2] for each in measured_in(bag, inputs, reader, refused, held_out=False)),
+        values, recorder, live)
     return Replayed(backend, report, backend.counts + refused, recorder, reader.datum)
-
-
-def measurements_of(
-    bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
-) -> Iterator[tuple[str, OdometrySample | Measurement]]:
-    """Yield the valid measurements of a bag that are not held out, and their sources."""
-    for source, measurement, _ in measured_in(bag, inputs, reader, refused, held_out=False):
-        yield source, measurement
 
 
 def run_measurements(

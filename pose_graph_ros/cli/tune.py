@@ -30,8 +30,8 @@ from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, IMU
 from pose_graph_ros.cli import shared, tuned_parameters
-from pose_graph_ros.cli.drive import distances, read_truth
-from pose_graph_ros.cli.replay import measurements_of, run_measurements
+from pose_graph_ros.cli.drive import distances, measured_in, read_truth
+from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
 from pose_graph_ros.core import measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -46,7 +46,7 @@ from pose_graph_ros.core.sources.kinds import validate
 from pose_graph_ros.core.sources.validation import Validated
 from pose_graph_ros.offline import noise
 from pose_graph_ros.offline.noise import Errors, Found, Noise, Summary
-from pose_graph_ros.offline.source_residuals import RowFit, ScaleFit
+from pose_graph_ros.offline.source_residuals import ScaleFit
 from pose_graph_ros.offline.variance_components import analyse
 
 Key = tuple[str, StampNs]  # source and stamp of a measurement
@@ -86,28 +86,30 @@ class Tuning:
         self._inputs, self._values = inputs, values
         self._step, self._steps = 0, 0
         self._path = bag.path
-        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
-        self._measurements = list(islice(stream, IN_MEMORY))
+        stream = measured_in(bag, inputs, reader_of(bag, values), Counter(), held_out=False)
+        self._measurements = [each[:2] for each in islice(stream, IN_MEMORY)]
         self.is_cut = next(stream, None) is not None  # whether the bag has more
-        start = min((each.stamp_ns for _, each in self._measurements
-                     if isinstance(each, OdometrySample)), default=0)
+        moves = [(name, each.stamp_ns) for name, each in self._measurements
+                 if isinstance(each, OdometrySample)]
+        start = min((stamp_ns for _, stamp_ns in moves), default=0)
         # the first fix that odometry covers is placed first
         for k in sorted(range(len(self._measurements)),
                         key=lambda k: self._measurements[k][1].stamp_ns < start):
             name, fix = self._measurements[k]
             if isinstance(fix, measurements.Fix):
                 self._measurements[k] = name, fix.placed()
-        counts = Counter(name for name, each in self._measurements
-                         if isinstance(each, OdometrySample))
+        counts = Counter(name for name, _ in moves)
         self._odometries = [name for name in inputs.odometry if counts[name] > 1]
         if len(self._odometries) == 0:
             topics = ' or '.join(inputs.topics[name] for name in inputs.odometry)
             raise BagError(f'{self._path}: no usable odometry on {topics}')
-        stamps = [each.stamp_ns for name, each in self._measurements
-                  if name == self._odometries[0]]
+        stamps = [stamp_ns for name, stamp_ns in moves if name == self._odometries[0]]
         self._start_ns, self._duration = min(stamps), (max(stamps) - min(stamps)) * 1e-9
-        self._sources = {name: some for name, some in self._valid(values).items()
-                         if len(some) >= LEAST}
+        valid = self._valid(values)
+        self._repaired = {name for name, _, is_repaired in valid if is_repaired}
+        every = {name: [each for of, each, _ in valid if of == name]
+                 for name in inputs.of(lambda kind: kind.in_map or kind is IMU)}
+        self._sources = {name: some for name, some in every.items() if len(some) >= LEAST}
         self._closures: list[tuple[str, LoopClosure]] = []
         if all(isinstance(each, HeadingOnly) for some in self._sources.values() for each in some):
             self._sources, self._closures = {}, [
@@ -163,17 +165,14 @@ class Tuning:
                        errors, folds, stretch,
                        f'{self._duration:.0f} s of odometry, {", ".join(measured)}', len(doubted))
 
-    def _valid(self, values: Mapping[str, Any]) -> dict[str, list[Absolute]]:
-        """Return the valid measurements in the map of each source by stamp, by some parameters."""
-        config, found = backend_config(values), {}
-        for name in self._inputs.of(lambda kind: kind.in_map or kind is IMU):
-            valid = []
-            for of, each in self._measurements:
-                if of == name and isinstance(each, Absolute):
-                    one = validate(each, config.measurement_source(name, type(each)).covariance)
-                    if isinstance(one, Validated) and isinstance(one.measurement, Absolute):
-                        valid.append(one.measurement)
-            found[name] = sorted(valid, key=lambda each: each.stamp_ns)
+    def _valid(self, values: Mapping[str, Any]) -> list[tuple[str, Absolute, bool]]:
+        """Return source, valid measurement in the map, and whether it was repaired, by stamp."""
+        config, found = backend_config(values), []
+        for name, each in sorted(self._measurements, key=lambda each: each[1].stamp_ns):
+            if isinstance(each, Absolute):
+                one = validate(each, config.measurement_source(name, type(each)).covariance)
+                if isinstance(one, Validated) and isinstance(one.measurement, Absolute):
+                    found.append((name, one.measurement, len(one.repairs) > 0))
         return found
 
     def _run(
@@ -220,7 +219,7 @@ class Tuning:
                 way, turn = noise.proven_odometry(found.values())
             else:
                 way, turn = (NOT_SHOWN if one is None else one.proven(one.high) for one in (
-                    _of_residuals(by_residuals.get(name), axis) for axis in (0, 2)))
+                    _shown(by_residuals.get(name), axis) for axis in (0, 2)))
             tuned += tuned_parameters.odometry_parameters(name, way, turn, self._values)
             if run is not runs[0]:
                 continue
@@ -229,10 +228,9 @@ class Tuning:
             for source, some in self._sources.items():
                 tuned += tuned_parameters.source_parameters(
                     source, self._claims(source, some), self._values, size=proven.get(source),
-                    heading=_of_residuals(by_residuals.get(source), 2))
+                    heading=_shown(by_residuals.get(source), 2))
             for source in dict.fromkeys(of for of, _ in self._closures):
-                size = None if source not in by_residuals else _found(by_residuals[source])
-                if size is not None:
+                if (size := _shown(by_residuals.get(source))) is not None:
                     # their constraints share noise of odometry up to the hidden nodes
                     tuned += tuned_parameters.source_parameters(
                         source, OF_CLOSURES, self._values,
@@ -241,9 +239,6 @@ class Tuning:
 
     def _claims(self, name: str, some: Sequence[Absolute]) -> Claims:
         policy = backend_config(self._values).measurement_source(name, type(some[0])).covariance
-        repaired = any(isinstance(one := validate(each, policy), Validated)
-                       and len(one.repairs) > 0 for of, each in self._measurements
-                       if of == name and isinstance(each, Absolute))
         positions = np.array([0.5 * np.trace(each.covariance[:2, :2]) for each in some
                               if not isinstance(each, HeadingOnly)])
         headings = _heading_variances(some)
@@ -253,7 +248,7 @@ class Tuning:
         return Claims(
             all(np.ptp(each) < 0.05 * np.min(each) for each in (positions, headings)
                 if len(each) > 0),
-            inside and not repaired and len(policy.override) == 0,
+            inside and name not in self._repaired and len(policy.override) == 0,
             *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0
               for each in (positions, headings)))
 
@@ -304,7 +299,7 @@ class Tuning:
             in_use = reports[name].in_use if name in reports else None
             found.append(noise.errors_at(
                 path, covariances,
-                [each for each in valid[name] if (name, each.stamp_ns) in held
+                [each for of, each, _ in valid if of == name and (name, each.stamp_ns) in held
                  and not isinstance(each, HeadingOnly)],
                 1.0 if in_use is None else in_use.correlated + in_use.white))
         closures = [each for name, each in self._closures
@@ -324,16 +319,12 @@ def _heading_variances(some: Sequence[Absolute]) -> FloatArray:
                      for each in some if isinstance(each, HeadingOnly | measurements.GlobalPose)])
 
 
-def _of_residuals(found: ScaleFit | None, axis: int) -> Found | None:
-    """Return the noise of a coordinate that residuals show; None if they show nothing."""
-    rows = [] if found is None else [row for row in found.rows if row.coordinate == axis]
-    return _found(rows[0]) if len(rows) > 0 else None
-
-
-def _found(of: RowFit | ScaleFit) -> Found | None:
-    if math.isnan(of.ratio):
-        return None
-    return Found(of.ratio**2, of.low**2, of.high**2, kept=of.low <= 1.0 <= of.high)
+def _shown(fit: ScaleFit | None, axis: int | None = None) -> Found | None:
+    """Return the noise, or that of a coordinate, by residuals; None if they show nothing."""
+    of = fit if fit is None or axis is None else next(
+        (row for row in fit.rows if row.coordinate == axis), None)
+    return None if of is None or math.isnan(of.ratio) else Found(
+        of.ratio**2, of.low**2, of.high**2, kept=of.low <= 1.0 <= of.high)
 
 
 # --- the tool

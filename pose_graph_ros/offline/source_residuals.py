@@ -65,6 +65,8 @@ LEAST_INDEPENDENT = 10.0
 # Probability of the interval of the factor.
 INTERVAL = 0.95
 _COORDINATES = 3
+# A ratio with its interval, where residuals do not show it.
+UNKNOWN: dict[str, Any] = {'ratio': math.nan, 'low': math.nan, 'high': math.nan}
 
 
 class SourceResiduals(NamedTuple):
@@ -230,10 +232,8 @@ class ScaleFit(NamedTuple):
     @property
     def unknown(self) -> 'ScaleFit':
         """The same, without saying how large sigmas are."""
-        rows = tuple(row._replace(ratio=math.nan, low=math.nan, high=math.nan)
-                     for row in self.rows)
-        return self._replace(
-            rows=rows, ratio=math.nan, low=math.nan, high=math.nan, independent=0.0)
+        return self._replace(rows=tuple(row._replace(**UNKNOWN) for row in self.rows),
+                             independent=0.0, **UNKNOWN)
 
 
 def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> ScaleFit:
@@ -243,7 +243,7 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
     known = used.rows(np.all(np.isfinite(used.taken), axis=(1, 2)))
     n = len(used.ids)
     if len(known.ids) == 0:
-        return ScaleFit(n, (), 0.0, 0.0, 1.0, 0.0, 0.0, math.nan, math.nan, math.nan)
+        return ScaleFit(n, (), 0.0, 0.0, 1.0, 0.0, 0.0, **UNKNOWN)
     rows = tuple(_row(used, known, row, errors)
                  for row in np.flatnonzero(np.any(known.measured, axis=0)).tolist())
     freedom, energies = np.sum(used.measured, axis=1), used.energies

@@ -31,20 +31,12 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS
-from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros import diagnostics, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
 from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.requests import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.topics import (
-    CLOSURE_QOS,
-    INPUTS,
-    JUDGE_TOPIC,
-    message_class,
-    SENSOR_QOS,
-    STATIC_TOPIC,
-)
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -122,18 +114,18 @@ class Session:
         sources = self.input.reader.sources.values()
         callbacks: dict[str, Callable[[Any], None]] = {
             'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
-            JUDGE_TOPIC: lambda message: decide(message, self.worker),
-            STATIC_TOPIC: self.input.reader.frames.receive}
+            topics.JUDGE_TOPIC: lambda message: decide(message, self.worker),
+            topics.STATIC_TOPIC: self.input.reader.frames.receive}
         in_frames = any(source.kind.in_frames for source in sources)
         wanted: list[tuple[str, str, QoSProfile, Callable[[Any], None]]] = [
-            (topic, *given, callbacks[topic]) for topic, given in INPUTS.items()
-            if topic != STATIC_TOPIC or in_frames]
+            (topic, *given, callbacks[topic]) for topic, given in topics.INPUTS.items()
+            if topic != topics.STATIC_TOPIC or in_frames]
         wanted += [(source.topic, source.kind.message_type,
-                    CLOSURE_QOS if source.kind.is_rare else SENSOR_QOS,
+                    topics.CLOSURE_QOS if source.kind.is_rare else topics.SENSOR_QOS,
                     partial(self._on_message, source)) for source in sources]
         for topic, kind, qos, callback in wanted:
             self._subscriptions.append(self.node.create_subscription(
-                message_class(kind), topic, guarded(callback, lambda: self.active),
+                topics.message_class(kind), topic, guarded(callback, lambda: self.active),
                 copy(qos),  # rclpy writes the overrides into it
                 qos_overriding_options=QoSOverridingOptions.with_default_policies()))
         self._watch_time()
