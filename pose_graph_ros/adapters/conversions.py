@@ -59,9 +59,7 @@ def planar_pose(pose: Message) -> FloatArray | Answer:
     return np.array((p.x, p.y, wrap_one(yaw)))
 
 
-def odometry_sample(
-    message: Message, source: 'Source', _by: Surroundings,
-) -> OdometrySample | Answer:
+def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometrySample | Answer:
     """
     Return the sample in a nav_msgs/Odometry, or the reason for rejecting it.
 
@@ -233,9 +231,7 @@ def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate
                    float(variance) if variance > 0.0 else 0.0)
 
 
-def twist_odometry(
-    message: Message, source: 'Source', by: Surroundings,
-) -> OdometrySample | Answer:
+def twist(message: Message, source: 'Source', by: Surroundings) -> OdometrySample | Answer:
     """Return the odometry by a TwistWithCovarianceStamped, or the reason for rejecting it."""
     twist = planar_twist(message.twist.twist)
     if isinstance(twist, Answer):

@@ -7,7 +7,7 @@ Check the values of parameters and their changes, say what is wrong with names, 
 """
 
 from array import array
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from itertools import pairwise
@@ -21,7 +21,7 @@ import yaml
 from pose_graph_ros.adapters import parameter_table as table, sources
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
-from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE
+from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE, Values
 from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -57,7 +57,7 @@ def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
         for each in (*OF_ALL, *KINDS[kind].parameters))
 
 
-def listed_sources(given: Mapping[str, Any]) -> list[str]:
+def listed_sources(given: Values) -> list[str]:
     """Return the names of all sources; raises `ConfigError` for equal or bad names."""
     names: list[str] = checked_value(
         PARAMETERS[0], given.get('sources', list(table.DEFAULT_SOURCES)))
@@ -70,7 +70,7 @@ def listed_sources(given: Mapping[str, Any]) -> list[str]:
     return sources.source_names(names)
 
 
-def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
+def all_parameters(given: Values) -> tuple[Parameter, ...]:
     """Return the parameters of the node and of the sources in the given parameters."""
     parameters = list(PARAMETERS)
     for source in listed_sources(given):
@@ -79,7 +79,7 @@ def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
     return tuple(parameters)
 
 
-def checked(given: Mapping[str, Any]) -> dict[str, Any]:
+def checked(given: Values) -> dict[str, Any]:
     """Return all parameters: the given values, after a check of type and range, or defaults."""
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}
@@ -170,9 +170,7 @@ def is_same(one: Any, other: Any) -> bool:
     return bool(one == other) and isinstance(one, bool) == isinstance(other, bool)
 
 
-def changed(
-    values: Mapping[str, Any], wanted: Mapping[str, Any], *, configured: bool,
-) -> dict[str, Any]:
+def changed(values: Values, wanted: Values, *, configured: bool) -> dict[str, Any]:
     """
     Return all parameters with some of them changed, after all checks.
 
@@ -201,7 +199,7 @@ def changed(
     return new
 
 
-def require_together(values: Mapping[str, Any]) -> None:
+def require_together(values: Values) -> None:
     """Raise a `ConfigError` if a condition on more than one parameter is broken."""
     frames = [frame(values[name]) for name in FRAMES]
     if '' in frames:

@@ -30,6 +30,8 @@ _IMU = 'sensor_msgs/msg/Imu'
 
 Settings = OdometrySource | MeasurementSource | GyroSource
 Measured = OdometrySample | Measurement
+Values = Mapping[str, Any]
+"""Checked parameters by name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +63,7 @@ class Kind:
 
 
 ODOMETRY = Kind(
-    'odometry', 'nav_msgs/msg/Odometry', conversions.odometry_sample, OdometrySource(),
+    'odometry', 'nav_msgs/msg/Odometry', conversions.odometry, OdometrySource(),
     (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
 GLOBAL_POSE = Kind(
     'global_pose', _POSE, conversions.global_pose, config.POSITIONS,
@@ -79,7 +81,7 @@ LOOP_CLOSURE = Kind(
     'loop_closure', _POSE, conversions.loop_closure, config.LOOP_CLOSURES,
     table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
 TWIST = Kind(
-    'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', conversions.twist_odometry,
+    'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', conversions.twist,
     OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
     without_frame='it is taken for {base}, the base_link_frame')
 GYRO = Kind(
@@ -119,7 +121,7 @@ class Source:
     beacons: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
+def source_list(values: Values) -> tuple[Source, ...]:
     """Return the sources by the checked parameters, odometry in the order of preference."""
     found = []
     for name in source_names(values['sources']):
@@ -143,7 +145,7 @@ def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
     return tuple(found)
 
 
-def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+def _own(values: Values, source: str) -> dict[str, Any]:
     """Return the parameters of a source by their names without its own."""
     return {name.removeprefix(f'{source}.'): value for name, value in values.items()
             if name.startswith(f'{source}.')}
@@ -158,7 +160,7 @@ def source_names(listed: list[str]) -> list[str]:
 _SETTINGS = {'CovariancePolicy.heading_floor': 'sigma_floor'}
 
 
-def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
+def backend_config(values: Values) -> config.BackendConfig:
     """
     Return the settings of the engine by the checked parameters.
 
@@ -220,8 +222,7 @@ class MessageReader:
     """Converts the messages of all sources to measurements, by the checked parameters."""
 
     def __init__(
-        self, values: Mapping[str, Any], frames: StaticFrames | None = None,
-        keeper: TimeKeeper | None = None,
+        self, values: Values, frames: StaticFrames | None = None, keeper: TimeKeeper | None = None,
     ) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
         self.keeper = keeper or TimeKeeper(
@@ -232,7 +233,7 @@ class MessageReader:
         self.surroundings = Surroundings(
             frame(values['map_frame']), frame(values['base_link_frame']), self.datum, self.frames)
 
-    def configure(self, values: Mapping[str, Any]) -> None:
+    def configure(self, values: Values) -> None:
         """
         Use other time offsets, lever arms, yaw offsets and mountings for messages from now on.
 
@@ -243,14 +244,14 @@ class MessageReader:
             self.keeper.shift(source.name, source.time_offset_ns - before.time_offset_ns)
             self.sources[source.name] = source
 
-    def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+    def read(self, name: str, message: Message) -> Measured | Answer:
         """Return the measurement in a message of a source, or the reason for rejecting it."""
         measurement = self.convert(name, message)
         if isinstance(measurement, Answer):
             return measurement
         return self.keeper.judge(name, measurement).refusal or measurement
 
-    def convert(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+    def convert(self, name: str, message: Message) -> Measured | Answer:
         """Return the same without a judgement of its stamp."""
         source = self.sources[name]
         measurement = source.kind.convert(message, source, self.surroundings)

@@ -24,12 +24,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
-from pose_graph_ros.adapters.sources import backend_config, source_list
+from pose_graph_ros.adapters.sources import backend_config, source_list, Values
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import drive_in
 from pose_graph_ros.cli.run import Recorder, Run, Update
@@ -127,9 +126,7 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
     return values
 
 
-def _run(
-    bag: Path, inputs: Inputs, values: Mapping[str, Any], options: argparse.Namespace,
-) -> bool:
+def _run(bag: Path, inputs: Inputs, values: Values, options: argparse.Namespace) -> bool:
     """Tell whether the optimisation converged after playing the bag to the node."""
     node_command = [sys.executable, '-m', 'pose_graph_ros.ros.main',
                     *shared.ros_arguments(options),

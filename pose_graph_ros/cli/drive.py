@@ -295,8 +295,8 @@ def collect_drive(
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
     corrected = estimate.path
-    odometry, fixes, loops = Samples(), list[Fix | kinds.GlobalPose | kinds.Position](), list[Key]()
-    sources, held = list[str](), list[bool]()  # of the fixes
+    odometry, loops, sources, held = Samples(), list[Key](), list[str](), list[bool]()
+    fixes = list[Fix | kinds.GlobalPose | kinds.Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
         if not held_out:

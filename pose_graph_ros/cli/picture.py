@@ -6,7 +6,6 @@ Draw a drive: a map of all paths, and below it (or beside a tall one) their erro
 A simulated one has the truth in place of a corrected path.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -55,9 +54,7 @@ SIMULATED = {'doubted fixes, not used': 'fixes moved by a jump',
 """Names in the legend of what was simulated, by those of a drive."""
 
 
-def draw_drive(
-    drive: Drive, file: Path, title: str, names: Mapping[str, str] | None = None,
-) -> None:
+def draw_drive(drive: Drive, file: Path, title: str, names: dict[str, str] | None = None) -> None:
     """
     Draw a drive as a picture with a width of 1600 pixels, and write it to a file.
 

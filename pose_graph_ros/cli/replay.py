@@ -24,7 +24,7 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, open_bag, Span
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, MessageReader
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, MessageReader, Values
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, ON_EARTH
@@ -42,7 +42,7 @@ from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection
 from pose_graph_ros.core.io import path_files
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.judgement.texts import Key
-from pose_graph_ros.core.measurements import Measurement, OdometrySample
+from pose_graph_ros.core.measurements import OdometrySample
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
 LINES = {'geojson': path_files.geojson_lines, 'kml': path_files.kml_lines,
@@ -119,7 +119,7 @@ class LivePoses:
         self._next_ns = self._newest_ns = 0
         self._found: list[tuple[int, Prediction]] = []
 
-    def is_due(self, sample: OdometrySample | Measurement, n_nodes: int) -> bool:
+    def is_due(self, sample: Measured, n_nodes: int) -> bool:
         """Return whether the graph is to be updated with a measurement."""
         return (isinstance(sample, OdometrySample) and n_nodes > 0
                 and sample.stamp_ns >= self._next_ns)
@@ -130,7 +130,7 @@ class LivePoses:
         if self._estimate is not None:
             self._next_ns = self._estimate.stamp_ns + self._period_ns
 
-    def add(self, sample: OdometrySample | Measurement, source: str) -> None:
+    def add(self, sample: Measured, source: str) -> None:
         """Add the pose at a sample of the primary odometry, unless it is late."""
         estimate = self._estimate
         if not isinstance(sample, OdometrySample) or estimate is None or (
@@ -269,9 +269,7 @@ class Replayed(NamedTuple):
         return {*self.recorder.refused, *self.backend.refused_closures}
 
 
-def run(
-    bag: Bag, inputs: Inputs, values: Mapping[str, Any], live: LivePoses | None = None,
-) -> Replayed:
+def run(bag: Bag, inputs: Inputs, values: Values, live: LivePoses | None = None) -> Replayed:
     """Return a new engine after adding all messages of a bag and a full optimisation."""
     reader, recorder = reader_of(bag, values), Recorder()
     refused: Counter[tuple[str, str]] = Counter()
@@ -282,7 +280,7 @@ def run(
 
 
 def run_measurements(
-    measurements: Iterable[tuple[str, OdometrySample | Measurement]], values: Mapping[str, Any],
+    measurements: Iterable[tuple[str, Measured]], values: Values,
     recorder: Recorder | None = None, live: LivePoses | None = None,
 ) -> tuple[PoseGraphBackend, UpdateReport]:
     """Return a new engine after adding measurements, and the report of the full optimisation."""
@@ -371,7 +369,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
 
 
 def _run_of(
-    options: argparse.Namespace, result: Replayed, drive: Drive, *, values: Mapping[str, Any],
+    options: argparse.Namespace, result: Replayed, drive: Drive, *, values: Values,
     kinds: Mapping[str, Kind], seconds: float,
 ) -> Run:
     return Run(

@@ -28,7 +28,7 @@ import numpy as np
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import backend_config, IMU
+from pose_graph_ros.adapters.sources import backend_config, IMU, Values
 from pose_graph_ros.cli import shared, tuned_parameters
 from pose_graph_ros.cli.drive import distances, measured_in, read_truth
 from pose_graph_ros.cli.replay import run_measurements
@@ -82,7 +82,7 @@ class Outcome:
 class Tuning:
     """Tunes with the measurements of a bag, the first million, all fixes in the same map."""
 
-    def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
+    def __init__(self, bag: Bag, inputs: Inputs, values: Values) -> None:
         self._inputs, self._values = inputs, values
         self._step, self._steps = 0, 0
         self._path = bag.path
@@ -122,9 +122,7 @@ class Tuning:
                     f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
                     f'poses or loop closures are needed; used are {topics}')
 
-    def tune(
-        self, folds: int, truth: Trajectory | None, stretch: Seconds | None = None,
-    ) -> Outcome:
+    def tune(self, folds: int, truth: Trajectory | None, stretch: Seconds | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
         if stretch is not None and stretch > self._duration / folds:
             raise BagError(
@@ -165,7 +163,7 @@ class Tuning:
                        errors, folds, stretch,
                        f'{self._duration:.0f} s of odometry, {", ".join(measured)}', len(doubted))
 
-    def _valid(self, values: Mapping[str, Any]) -> list[tuple[str, Absolute, bool]]:
+    def _valid(self, values: Values) -> list[tuple[str, Absolute, bool]]:
         """Return source, valid measurement in the map, and whether it was repaired, by stamp."""
         config, found = backend_config(values), []
         for name, each in sorted(self._measurements, key=lambda each: each[1].stamp_ns):
@@ -176,7 +174,7 @@ class Tuning:
         return found
 
     def _run(
-        self, values: Mapping[str, Any], text: str, without: Collection[Key] = (),
+        self, values: Values, text: str, without: Collection[Key] = (),
         odometry: str = '',
     ) -> PoseGraphBackend:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
@@ -289,7 +287,7 @@ class Tuning:
         return estimate.path, backend.path_covariances(estimate)
 
     def _errors(
-        self, values: Mapping[str, Any], backend: PoseGraphBackend, held: Collection[Key],
+        self, values: Values, backend: PoseGraphBackend, held: Collection[Key],
     ) -> list[Errors]:
         """Return the errors of a path at what was held out of each source, and at closures."""
         reports, valid, (path, covariances) = (

@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """From estimated noise to parameters of the node, and their file with a reason for each."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
+from pose_graph_ros.adapters.sources import Values
 from pose_graph_ros.core.quantities import Metres, Radians
 from pose_graph_ros.offline.noise import Found
 
@@ -33,9 +34,7 @@ class Tuned:
         return bool(self.after != self.before)
 
 
-def odometry_parameters(
-    source: str, way: Found, turn: Found, values: Mapping[str, Any],
-) -> Iterator[Tuned]:
+def odometry_parameters(source: str, way: Found, turn: Found, values: Values) -> Iterator[Tuned]:
     """Yield the parameters of a source of odometry by the noise of the way and of turns."""
     if values[f'{source}.noise'] == 'twist':
         yield _one(f'{source}.covariance_scale', max(way, turn), values, 1.0)
@@ -57,7 +56,7 @@ class Claims(NamedTuple):
 
 
 def source_parameters(
-    source: str, claims: Claims, values: Mapping[str, Any], *, size: Found | None,
+    source: str, claims: Claims, values: Values, *, size: Found | None,
     heading: Found | None = None,
 ) -> Iterator[Tuned]:
     """Yield the parameters of a source by the size of its errors, of positions and headings."""
@@ -94,7 +93,7 @@ def source_parameters(
 
 
 def _one(
-    name: str, found: Found, values: Mapping[str, Any], power: float, largest: float = math.inf,
+    name: str, found: Found, values: Values, power: float, largest: float = math.inf,
 ) -> Tuned:
     """Return a parameter by the factor on the variances, of which it is a power."""
     before = values[name]

@@ -210,7 +210,7 @@ def _statistics(
 class Analysis(NamedTuple):
     """The residuals of each source, and how large its true sigmas are."""
 
-    residuals: Mapping[str, SourceResiduals]  # at the estimate
+    residuals: dict[str, SourceResiduals]  # at the estimate
     fits: Mapping[str, ScaleFit]  # how large they are, with the factors of all in one estimate
     # Sources with correlated errors that the graph takes for independent: the residuals do not
     # show how large these are, and what those of other sources show may be because of them.

@@ -19,10 +19,10 @@ import time
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import MessageReader
+from pose_graph_ros.adapters.sources import Measured, MessageReader
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.se2 import between_one
-from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
+from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
 from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS, TimeKeeper
 from pose_graph_ros.core.quantities import Seconds, StampNs
@@ -49,6 +49,9 @@ class Expectations:
 
 
 EXPECTED = Expectations()
+Counts = Counter[tuple[str, str]]
+Details = Mapping[tuple[str, str], str]
+"""Of messages by source and 'accepted' or a reason, and details of the newest refusals."""
 INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
 
 
@@ -129,10 +132,7 @@ class Arrivals:
                 f'{odometry}{waits}: mend the clock of its driver (GPS time is 18 s ahead of '
                 f'UTC), or set {self.source}.time_offset')
 
-    def refusal(
-        self, counts: Counter[tuple[str, str]], details: Mapping[tuple[str, str], str],
-        now: Seconds,
-    ) -> str:
+    def refusal(self, counts: Counts, details: Details, now: Seconds) -> str:
         """Return what to say if its newest messages were all refused, else an empty text."""
         refused = Counter({reason: counts[name, reason] for name, reason in details
                            if name == self.source and reason not in INTENDED})
@@ -179,7 +179,7 @@ class ReceivedMessage(NamedTuple):
 
     source: str
     message: Message
-    measurement: OdometrySample | Measurement
+    measurement: Measured
     refusal: Answer | None = None  # why it is not used, by its stamp
 
 
@@ -276,7 +276,7 @@ class Input:
         self.arrivals = {
             name: Arrivals(name, is_rare=source.kind.is_rare)
             for name, source in self.reader.sources.items()}
-        self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
+        self.rejected: Counts = Counter()  # number by source and reason
         self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
         self.posted = 0  # number of measurements that were handed to the engine
         self.silent: list[str] = []  # sources that are silent while others are not
@@ -312,7 +312,7 @@ class Input:
         overdue = time.monotonic() - self._odometry_at > LONGEST_DOUBT
         return self.time_jumps.release() if overdue else []
 
-    def read(self, source: str, message: Message) -> OdometrySample | Measurement | None:
+    def read(self, source: str, message: Message) -> Measured | None:
         """Return the measurement of a message; None if it cannot be used, whatever its stamp."""
         try:
             measurement = self.reader.convert(source, message)
@@ -325,10 +325,7 @@ class Input:
             message.header.frame_id, getattr(message, 'child_frame_id', ''))
         return measurement
 
-    def post(
-        self, received: ReceivedMessage,
-        post: Callable[[str, OdometrySample | Measurement], bool],
-    ) -> None:
+    def post(self, received: ReceivedMessage, post: Callable[[str, Measured], bool]) -> None:
         """Hand a measurement to the engine, unless its stamp is refused or the input is paused."""
         source, _, measurement, refusal = received
         if refusal is not None:
@@ -341,10 +338,7 @@ class Input:
             self.posted += 1
             self.posted_at, self.is_streaming = time.monotonic(), True
 
-    def watch(
-        self, counts: Counter[tuple[str, str]], details: Mapping[tuple[str, str], str], *,
-        active: bool,
-    ) -> None:
+    def watch(self, counts: Counts, details: Details, *, active: bool) -> None:
         """
         Find the sources that are silent or refused, and log each reason once.
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sources of a run in run.json: residuals, expected against found, with a verdict in words."""
 
-from collections.abc import Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -154,9 +153,7 @@ def _wrong(analysis: SourceAnalysis) -> tuple[str, str]:
                       f'for less than it could; {advice} would be right')
 
 
-def springs(
-    run: Run, residuals: Mapping[str, SourceResiduals], frame: Frame,
-) -> list[dict[str, Any]]:
+def springs(run: Run, residuals: dict[str, SourceResiduals], frame: Frame) -> list[dict[str, Any]]:
     """Return the constraints with the largest weighted energies, in descending order."""
     names = {each.number: each.id for each in run.verdicts}
     stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []
@@ -197,9 +194,7 @@ def springs(
     return found
 
 
-def _text(
-    each: ConstraintEnergy, ends: Sequence[Mapping[str, Any]], residual: FloatArray | None,
-) -> str:
+def _text(each: ConstraintEnergy, ends: list[dict[str, Any]], residual: FloatArray | None) -> str:
     """Return what a constraint is and how far it is off; the residual is None if unknown."""
     times = ' to '.join(f'{end["t"]:.1f}' for end in sorted(ends, key=lambda end: end['t']))
     at = f' at {times} s' if len(ends) > 0 else ''

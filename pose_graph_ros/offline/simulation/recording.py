@@ -18,6 +18,7 @@ import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.random import Generator
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
@@ -72,7 +73,7 @@ class Course:
 
     motion: Motion
     setup: Setup
-    streams: Mapping[str, np.random.Generator]
+    streams: Mapping[str, Generator]
 
 
 def course(
@@ -89,9 +90,7 @@ def course(
     return Course(motion, change(usual), streams)
 
 
-def _states(
-    generator: np.random.Generator, motion: Motion, usual: Setup,
-) -> dict[str, np.random.Generator]:
+def _states(generator: Generator, motion: Motion, usual: Setup) -> dict[str, Generator]:
     """
     Return the states of a generator from which the usual sensors draw one after the other.
 
@@ -101,9 +100,9 @@ def _states(
     assert usual.fixes is not None
     assert usual.closures is not None
     truth, closures = motion.truth, usual.closures
-    states: dict[str, np.random.Generator] = {}
+    states: dict[str, Generator] = {}
 
-    def state(name: str) -> np.random.Generator:
+    def state(name: str) -> Generator:
         states[name] = copy.deepcopy(generator)
         return generator
 
@@ -183,7 +182,7 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
 
 
 def _true_closures(
-    generator: np.random.Generator, path: Motion, closures: settings.Closures,
+    generator: Generator, path: Motion, closures: settings.Closures,
 ) -> tuple[IntArray, FloatArray]:
     """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
     stamps = path.truth.stamps_ns
@@ -261,7 +260,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
 
 
 def odometry_edges(
-    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
+    generator: Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
 ) -> Factors:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1

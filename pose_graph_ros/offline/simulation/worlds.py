@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter1d
 
 from pose_graph_ros.core.geometry import se2
@@ -95,9 +96,7 @@ def path_length(path: FloatArray) -> FloatArray:
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
 
 
-def wandering(
-    generator: np.random.Generator, points: Points, step: Metres, sigma: Metres,
-) -> FloatArray:
+def wandering(generator: Generator, points: Points, step: Metres, sigma: Metres) -> FloatArray:
     """Return poses along a line, which wander slowly to its sides, shape (P, 3), not wrapped."""
     direction = np.gradient(points, axis=0) / step
     normal = np.column_stack((-direction[:, 1], direction[:, 0]))
@@ -113,9 +112,7 @@ def ramp(u: FloatArray) -> FloatArray:
     return u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
 
 
-def gauss_markov(
-    generator: np.random.Generator, count: int, sigma: float, step: float,
-) -> FloatArray:
+def gauss_markov(generator: Generator, count: int, sigma: float, step: float) -> FloatArray:
     """
     Return samples of a stationary first-order Gauss-Markov process, shape (count,).
 
@@ -128,7 +125,7 @@ def gauss_markov(
 
 
 def street_corners(
-    rng: np.random.Generator, length: float, spacing: FloatArray, *, fresh: float,
+    rng: Generator, length: float, spacing: FloatArray, *, fresh: float,
 ) -> FloatArray:
     """
     Return the crossings of a random drive through a grid of streets, shape (K, 2) [m].
@@ -232,7 +229,7 @@ REFLECTED = settings.Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
 class World:
     """A place, and what moves there."""
 
-    drive: Callable[[np.random.Generator, float], Motion]
+    drive: Callable[[Generator, float], Motion]
     """Return the motion of some length [s]."""
     setup: Callable[[Motion], Setup]
     """Return the usual sensors and disturbances."""
@@ -240,7 +237,7 @@ class World:
     """Whether its usual sensors draw from one stream of random numbers, one after the other."""
 
 
-def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
+def drive_circuit(generator: Generator, duration_s: float) -> Motion:
     """Return a drive along the circuit, at random within the lane, with random waits at lights."""
     heading, stops, lap_length = _circuit(duration_s)
     # on straight streets, and then along bent ones
@@ -298,7 +295,7 @@ def _drive_setup(motion: Motion) -> Setup:
         jumps=(REFLECTED,))
 
 
-def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
+def _hall(generator: Generator, duration_s: float) -> Motion:
     """
     Return a drive through the aisles of a hall in random order.
 
@@ -323,7 +320,7 @@ def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
     return follow(path, stops, waits, FORKLIFT, duration_s)[0]
 
 
-def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
+def _grid(generator: Generator, duration_s: float) -> Motion:
     length = (duration_s + MARGIN_S) * CART.speed
     corners = street_corners(
         generator, length + 2.0 * BLOCK * BLOCKS, np.full(BLOCKS, BLOCK), fresh=1.0)
