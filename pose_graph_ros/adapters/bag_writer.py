@@ -63,8 +63,7 @@ class BagWriter:
                 prefix=f'.{self.folder.name}-', dir=self.folder.parent))
         except OSError as error:
             raise BagError(f'{folder}: cannot be written: {bags.one_line(error)}') from error
-        self._writer = Writer(
-            self._scratch / self.folder.name, version=BAG_VERSION,
+        self._writer = Writer(self._scratch / self.folder.name, version=BAG_VERSION,
             storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
 
@@ -95,9 +94,8 @@ class BagWriter:
             try:
                 message = self._types.serialize_cdr(message, type_name)
             except Exception as error:  # generated code on a foreign object
-                raise BagError(
-                    f'{self.folder}: {topic}: no valid {type_name}: {bags.one_line(error)}',
-                ) from error
+                raise BagError(f'{self.folder}: {topic}: no valid {type_name}: '
+                    f'{bags.one_line(error)}') from error
         self._writer.write(self._connections[key], recorded_ns, message)
 
     def copy(self, message: BagMessage) -> None:
@@ -114,9 +112,8 @@ class BagWriter:
             try:
                 data = bytes(convert(data))
             except Exception as error:  # generated code can raise anything on invalid bytes
-                raise MessageError(
-                    f'{message.topic}: message recorded at {message.recorded_ns} ns is no '
-                    f'{message.type}: {bags.one_line(error)}') from error
+                raise MessageError(f'{message.topic}: message recorded at {message.recorded_ns} '
+                    f'ns is no {message.type}: {bags.one_line(error)}') from error
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
@@ -140,9 +137,8 @@ class BagWriter:
 def _qos(*, latched: bool) -> Qos:
     depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
                          else (10, QosDurability.VOLATILE))
-    return Qos(
-        interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE, durability,
-        FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
+    return Qos(interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE,
+        durability, FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
         avoid_ros_namespace_conventions=False)
 
 

@@ -70,9 +70,8 @@ class BagMessage:
         try:
             return self._decode(self.raw)
         except Exception as error:  # generated code can raise anything on invalid bytes
-            raise MessageError(
-                f'{self.topic}: message recorded at {self.recorded_ns} ns is no {self.type}: '
-                f'{one_line(error)}') from error
+            raise MessageError(f'{self.topic}: message recorded at {self.recorded_ns} ns is no '
+                f'{self.type}: {one_line(error)}') from error
 
 
 class Span(NamedTuple):
@@ -167,9 +166,8 @@ class Bag:
                     is_ros1 = isinstance(reader, Rosbag1Reader)
                     types = own_types(connection) or get_typestore(
                         Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-                    self._decoders[path, kind] = partial(
-                        types.deserialize_ros1 if is_ros1 else types.deserialize_cdr,
-                        typename=kind)
+                    self._decoders[path, kind] = partial(types.deserialize_ros1 if is_ros1
+                        else types.deserialize_cdr, typename=kind)
                 yield BagMessage(topic, kind, recorded_ns, bytes(raw), connection,
                                  self._decoders[path, kind])
         except Exception as error:  # the parsers can raise anything on a damaged file
@@ -206,8 +204,7 @@ def _reader(path: Path, stack: ExitStack) -> Reader:
     if not path.exists():
         raise BagError(f'{path}: does not exist')
     if path.is_file() and path.suffix not in BAG_FILE_SUFFIXES:
-        raise BagError(
-            f'{path}: no bag, expected a rosbag2 folder or a file ending in '
+        raise BagError(f'{path}: no bag, expected a rosbag2 folder or a file ending in '
             f'{", ".join(BAG_FILE_SUFFIXES)}')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         rest = _repaired(path, 'the recording was not ended, it has no metadata.yaml', stack)

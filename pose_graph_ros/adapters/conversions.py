@@ -77,9 +77,8 @@ def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometryS
     twist = planar_twist(message.twist.twist) if by_twist else None
     if isinstance(twist, Answer):
         return twist
-    return OdometrySample(
-        stamp_ns(message, source.time_offset_ns), pose, speed if math.isfinite(speed) else 0.0,
-        twist_variance(message.twist.covariance), twist)
+    return OdometrySample(stamp_ns(message, source.time_offset_ns), pose,
+        speed if math.isfinite(speed) else 0.0, twist_variance(message.twist.covariance), twist)
 
 
 def planar_twist(twist: Message) -> Pose | Answer:

@@ -164,16 +164,14 @@ OF_WHEELS = (
               'Random walk of both, per square root of an hour.', 1e-9, 10.0, sizes=(2,),
               change=Change.UNCONFIGURED))
 
-INTEGRATE = Parameter(
-    'integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` in the '
-    'messages, or their `twist`, integrated between messages.', choices=_values(Integrate),
-    change=Change.UNCONFIGURED)
+INTEGRATE = Parameter('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the '
+    '`pose` in the messages, or their `twist`, integrated between messages.',
+    choices=_values(Integrate), change=Change.UNCONFIGURED)
 
 OF_GYROS = (
     Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
-              'With `tf` the rotation from its frame to the robot base frame is taken from '
-              '/tf_static; messages are refused until it is there.',
-              choices=('tf', 'up', 'down')),
+        'With `tf` the rotation from its frame to the robot base frame is taken from /tf_static; '
+        'messages are refused until it is there.', choices=('tf', 'up', 'down')),
     Parameter('noise', _RATES.noise_from.value, '', 'Origin of the noise of the rate: `message` '
               'uses the variance in the messages, if it is positive, `model` uses `sigma_rate`.',
               choices=_values(RateNoise)),
@@ -192,13 +190,11 @@ OF_GYROS = (
               'which the rate is integrated. A longer one leaves the rotation between two hidden '
               'nodes out.', 1e-3, 10.0))
 
-HEADING = Parameter(
-    'heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
-    'With `auto` it is used if its variance is positive and less than that of a uniform '
+HEADING = Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of '
+    'the pose. With `auto` it is used if its variance is positive and less than that of a uniform '
     'distribution on the circle.', choices=_values(config.Heading))
-LEVER_ARM = Parameter(
-    'lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
-    'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,))
+LEVER_ARM = Parameter('lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base '
+    'frame, x and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,))
 BEACONS = Parameter(
     'beacons', [], '', 'Beacons at known places: name, x and y in the map [m] of each, such as '
     '"anchor_1 12.5 -3.0". Others are located by their ranges.', change=Change.UNCONFIGURED)

@@ -191,8 +191,7 @@ def changed(values: Values, wanted: Values, *, configured: bool) -> dict[str, An
                               f'file or by -p {name}:=..., and start the node again')
         if parameter.change is Change.UNCONFIGURED and configured:
             raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
-                              'lifecycle set` it to deactivate and cleanup, change it, and '
-                              'configure it again')
+                'lifecycle set` it to deactivate and cleanup, change it, and configure it again')
         new[name] = good
     new = checked(new)
     require_together(new)

@@ -159,8 +159,7 @@ def _filled(graph: Graph, edges: Factors) -> Graph:
     return copy
 
 
-SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
-    'selection': best,
+SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {'selection': best,
     'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED),
     'gnc-gm': partial(TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE)}
 """The lowest truncated cost of several sets, or graduated non-convexity alone."""

@@ -119,9 +119,8 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
             if before[0] < count and 0 < newest_ns < last_ns and 'chi2' in values:
                 mean = (total - before[1]) / (count - before[0])
                 recorder.add_update(Update(
-                    newest_ns, int(values['hidden_nodes']),
-                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2'])),
-                    count - before[0])
+                    newest_ns, int(values['hidden_nodes']), longest if longest > before[2]
+                    else max(mean, 0.0), float(values['chi2'])), count - before[0])
                 before = count, total, longest
     return values
 
@@ -147,8 +146,7 @@ def _run(bag: Path, inputs: Inputs, values: Values, options: argparse.Namespace)
                 raise DemoError(f'ROS 2 is not there: {error}') from error
             node = subprocess.Popen(node_command)
             try:
-                converged = player.play(
-                    bag, options.out / RECORDED, inputs,
+                converged = player.play(bag, options.out / RECORDED, inputs,
                     {name: values[f'{name}.topic'] for name in inputs.topics}, rate=options.rate,
                     is_running=lambda: node.poll() is None)
             finally:

@@ -207,11 +207,9 @@ def format_table(rows: Sequence[ErrorRow]) -> str:
 def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a drive as plain Python values, ready for JSON."""
     duration, distance = extent(drive.corrected)
-    return {
-        'duration_s': duration, 'distance_m': distance,
-        'odometry': len(drive.odometry), 'poses': len(drive.corrected),
-        **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
-           for kind, chosen in drive.fix_kinds.items()},
+    return {'duration_s': duration, 'distance_m': distance, 'odometry': len(drive.odometry),
+        'poses': len(drive.corrected), **{f'fixes_{kind.replace(" ", "_")}': int(
+            np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()},
         'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
         'errors': [asdict(row) for row in drive.rows], **extra}
 
@@ -274,8 +272,7 @@ def drive_in(
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    drive = collect_drive(
-        measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
+    drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
         inputs.odometry[0], refused)
     return place_truth(replace(
         drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),

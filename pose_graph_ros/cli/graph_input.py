@@ -113,8 +113,7 @@ def read_measurements(
     if len(starts) < n - 1:
         lone = int(np.setdiff1d(np.arange(n - 1), starts)[0])
         raise FileFormatError(f'{path}: expected an edge from each vertex to the next, as '
-                              f'odometry; there is none from {file.ids[lone]} to '
-                              f'{file.ids[lone + 1]}')
+            f'odometry; there is none from {file.ids[lone]} to {file.ids[lone + 1]}')
     odometry = steps[first]
     closures = np.setdiff1d(np.arange(len(edges)), odometry)
     last = np.maximum(edges.i, edges.j)[closures].tolist()
@@ -138,8 +137,7 @@ def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
     pose = np.zeros(3)
     for k, stamp_ns in enumerate(stamps_ns.tolist()):
         step = min(k, len(motions) - 1)
-        yield OdometrySample(
-            stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
+        yield OdometrySample(stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
             variances[step] / elapsed[step])
         pose = se2.compose(pose, motions[step])
 

@@ -37,9 +37,8 @@ USED_FIXES: dict[str, Any] = {
     'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
     'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
-HELD_OUT_FIXES: dict[str, Any] = {
-    'color': 'none', 'marker': 'D', 'linestyle': 'none', 'markersize': 4.5,
-    'markeredgecolor': VERMILION, 'markeredgewidth': 0.9}
+HELD_OUT_FIXES: dict[str, Any] = {'color': 'none', 'marker': 'D', 'linestyle': 'none',
+    'markersize': 4.5, 'markeredgecolor': VERMILION, 'markeredgewidth': 0.9}
 STYLE: Any = {
     'font.size': 12, 'text.color': INK, 'axes.labelcolor': INK, 'axes.edgecolor': GREY,
     'xtick.color': GREY, 'ytick.color': GREY, 'grid.color': GRID, 'axes.grid': True,
@@ -146,9 +145,8 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
                   linestyle=(0, (6, 4)), zorder=4, label='truth')
     axes.plot(*thinned(drive.placed_odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3,
               zorder=1, label=label('odometry alone'))
-    for chosen, style, name in zip(
-            drive.fix_kinds.values(), ({**USED_FIXES, 'markersize': 4.5}, DOUBTED_FIXES,
-                                       HELD_OUT_FIXES),
+    for chosen, style, name in zip(drive.fix_kinds.values(),
+            ({**USED_FIXES, 'markersize': 4.5}, DOUBTED_FIXES, HELD_OUT_FIXES),
             (label('fixes'), label('doubted fixes').replace(
                 'doubted fixes', 'doubted fixes, not used'), 'fixes held out'), strict=False):
         if np.any(chosen):
@@ -166,8 +164,7 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
                                         'os', (1, -1), strict=False):
         axes.plot(*pose[:2], marker, color='white', markeredgecolor=INK, markersize=10,
                   markeredgewidth=2.0, zorder=6)
-        axes.annotate(
-            name, pose[:2], (0, 12 * side), textcoords='offset points', ha='center',
+        axes.annotate(name, pose[:2], (0, 12 * side), textcoords='offset points', ha='center',
             va='bottom' if side > 0 else 'top', fontsize=13, fontweight='bold', zorder=7,
             path_effects=[withStroke(linewidth=3.5, foreground='white')])
     axes.set(xlabel=f'{drive.map_axes[0]} [m]', ylabel=f'{drive.map_axes[1]} [m]')
@@ -249,6 +246,5 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
     nothing = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
     fix_states, loop_states = (np.where(false, drives.DOUBTED, drives.BELIEVED)
                                for false in (wrong, group >= 0))
-    draw_drive(Drive(
-        odometry, nothing, truth, stamps, measured, fix_states, [''] * len(stamps), ends,
-        loop_states, [''] * len(ends)), file, title, SIMULATED)
+    draw_drive(Drive(odometry, nothing, truth, stamps, measured, fix_states, [''] * len(
+        stamps), ends, loop_states, [''] * len(ends)), file, title, SIMULATED)

@@ -191,9 +191,8 @@ class _Corrector:
         if (self._has_poses and stamp_ns > self._newest_ns
                 and frame(source.header.frame_id) == self.odom_frame):
             self._newest_ns = stamp_ns
-            yield TF, output_cdr.transform_cdr(
-                stamp_ns, np.array(compose_one(pose, between_one(odometry, (0.0, 0.0, 0.0)))),
-                self.map_frame, self.odom_frame)
+            yield TF, output_cdr.transform_cdr(stamp_ns, np.array(compose_one(
+                pose, between_one(odometry, (0.0, 0.0, 0.0)))), self.map_frame, self.odom_frame)
 
 
 def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> dict[str, int]:
@@ -209,10 +208,9 @@ def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> di
     """
     corrector, path = _Corrector(bag, inputs, run), run.estimate.path
     begin_ns, step = inputs.span.begin_ns, -(-len(path) // MOST_POSES)
-    writer.write(
-        PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
-        output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]),
-                            int(path.stamps_ns[-1]), corrector.map_frame))
+    writer.write(PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
+        output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]), int(
+            path.stamps_ns[-1]), corrector.map_frame))
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
@@ -234,9 +232,8 @@ def _copy(writer: BagWriter, message: BagMessage, ours: _Corrector) -> bool:
         if message.topic == TF and all(
                 name.encode() in message.raw for name in (ours.map_frame, ours.odom_frame)):
             transforms = message.decode().transforms
-            kept = [each for each in transforms if (
-                frame(each.header.frame_id), frame(each.child_frame_id)) != (
-                    ours.map_frame, ours.odom_frame)]
+            kept = [each for each in transforms if (frame(each.header.frame_id), frame(
+                each.child_frame_id)) != (ours.map_frame, ours.odom_frame)]
             if len(kept) < len(transforms):
                 if len(kept) > 0:
                     writer.write(TF, TYPES[TF], message.recorded_ns, MESSAGES[TYPES[TF]](kept))
@@ -273,9 +270,8 @@ def run(bag: Bag, inputs: Inputs, values: Values, live: LivePoses | None = None)
     """Return a new engine after adding all messages of a bag and a full optimisation."""
     reader, recorder = reader_of(bag, values), Recorder()
     refused: Counter[tuple[str, str]] = Counter()
-    backend, report = run_measurements(
-        (each[:2] for each in measured_in(bag, inputs, reader, refused, held_out=False)),
-        values, recorder, live)
+    backend, report = run_measurements((each[:2] for each in measured_in(
+        bag, inputs, reader, refused, held_out=False)), values, recorder, live)
     return Replayed(backend, report, backend.counts + refused, recorder, reader.datum)
 
 
@@ -296,9 +292,8 @@ def run_measurements(
                 measurement, backend.graph.n_nodes):
             begin = time.thread_time()  # of this process, however busy the machine is
             report = backend.update()
-            recorder.add_update(Update(
-                int(backend.node_stamps_ns[-1]), len(backend.node_stamps_ns),
-                1e3 * (time.thread_time() - begin), report.chi2))
+            recorder.add_update(Update(int(backend.node_stamps_ns[-1]), len(
+                backend.node_stamps_ns), 1e3 * (time.thread_time() - begin), report.chi2))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
             if live is not None:
                 live.updated(backend)
@@ -354,8 +349,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     require_datum(options.export, known=False)
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
-    measurements = [
-        (odometry if isinstance(each, OdometrySample) else CLOSURES, each)
+    measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
         for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
     start, recorder = time.monotonic(), Recorder()
     backend, report = run_measurements(measurements, values, recorder)

@@ -56,16 +56,13 @@ def execute(options: argparse.Namespace) -> int:
                           f'expected a name that ends in {GRAPH_SUFFIX}')
     name = options.out.stem if is_graph else options.out.name
     beside = {kind: options.out.with_name(f'{name}_truth.{kind}')
-              for kind in ('json', *(['tum'] if options.tum else []),
-                           *(['g2o'] if is_graph else []))}
+        for kind in ('json', *(['tum'] if options.tum else []), *(['g2o'] if is_graph else []))}
     written = [options.out, *beside.values()]
     for path in written:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
-    way = recording.course(
-        WORLDS[options.world], options.seed,
-        options.duration or settings.DURATIONS_S[options.world],
-        lambda usual: changed(usual, options))
+    way = recording.course(WORLDS[options.world], options.seed, options.duration
+        or settings.DURATIONS_S[options.world], lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.truth.stamps_ns[-1] - settings.START_NS) / 1e9}
     files = dict[Path, bytes]()
@@ -208,9 +205,8 @@ def _delivered(
 def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:
     false = np.flatnonzero(group >= 0)
     return {'true_closures': int(np.sum(group < 0)),
-            'false_closures': [{what: pair, 'group': number} for pair, number in zip(
-                ends[false].tolist(), group[false].tolist(), strict=True)],
-            'missing_groups': missing}
+        'false_closures': [{what: pair, 'group': number} for pair, number in zip(
+            ends[false].tolist(), group[false].tolist(), strict=True)], 'missing_groups': missing}
 
 
 def _disturbances(setup: settings.Setup) -> dict[str, Any]:
@@ -223,8 +219,7 @@ def _disturbances(setup: settings.Setup) -> dict[str, Any]:
         'outages': [{'topic': each.topic, 'begin_ns': stamp(each.begin_s),
                      'end_ns': stamp(each.end_s)} for each in setup.outages],
         'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s),
-                   'end_ns': stamp(each.at_s + each.seconds), 'step': each.step}
-                  for each in setup.jumps],
+            'end_ns': stamp(each.at_s + each.seconds), 'step': each.step} for each in setup.jumps],
         **{name: [asdict(each) for each in found] for name, found in (
             ('delays', setup.delays), ('clock_offsets', setup.offsets),
             ('duplicates', setup.duplicates), ('claimed_sigmas', setup.claims))}}
@@ -252,9 +247,8 @@ def odometry_messages(
     for stamp, pose, (vx, _, yaw_rate) in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), rates.tolist(), strict=True):
         twist = _of('Twist', _of('Vector3', vx, 0.0, 0.0), _of('Vector3', 0.0, 0.0, yaw_rate))
-        yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
-            _header(stamp, frame), 'base_link',
-            _of('PoseWithCovariance', _pose(pose), covariance),
+        yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](_header(stamp, frame),
+            'base_link', _of('PoseWithCovariance', _pose(pose), covariance),
             _of('TwistWithCovariance', twist, covariance))
 
 

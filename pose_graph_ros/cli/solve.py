@@ -170,8 +170,7 @@ def _held_weakly(
     weak = 1e-7 * np.median(typical[typical > 0.0]) * (
         np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
     copy.apply(GraphUpdate(factors=Factors.on(
-        np.arange(n), None, graph.poses.copy(), weak,
-        [FactorKind.GLOBAL_POSE] * n)))
+        np.arange(n), None, graph.poses.copy(), weak, [FactorKind.GLOBAL_POSE] * n)))
     other = optimize(copy, CONFIG)
     if other.status is Status.FAILED:
         return result, False
@@ -215,8 +214,7 @@ class Report:
                      f'its minimum, is nowhere lower by more than {made.gap:.2g}']
         else:
             lines = [f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
-                     f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum '
-                     f'found']
+                f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum found']
         if made.is_lower:
             lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
         if self.chi2_from_it is not None:
@@ -262,8 +260,7 @@ def with_certificate(
         else:
             solution = resumed(problem, solution, poses)
     bound = max(made.bound, 0.0) if formulation.below_chi2 else None
-    return solution, Report(
-        made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
+    return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
 
 
 # --- the tool
@@ -359,9 +356,8 @@ def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArr
     return [
         *(f'  from the {name}: chi2 {each.chi2:.9g}, {each.status.value} after '
           f'{each.iterations} iterations' for name, each in solution.tried),
-        f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
-        f'from the {solution.start}, {seconds:.3f} s'
-        f'{": " if result.reason else ""}{result.reason}',
+        f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations from '
+            f'the {solution.start}, {seconds:.3f} s{": " if result.reason else ""}{result.reason}',
         *(f'  edge {ids[factors.i[k]]} -> {ids[factors.j[k]]}: energy {energies[k]:.4g}'
           for k in order[is_edge & ~np.isin(order, doubted)][:N_LARGEST]),
         *(f'  observed node on {ids[factors.i[k]]}: energy {energies[k]:.4g}'

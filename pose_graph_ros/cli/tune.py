@@ -112,15 +112,13 @@ class Tuning:
         self._sources = {name: some for name, some in every.items() if len(some) >= LEAST}
         self._closures: list[tuple[str, LoopClosure]] = []
         if all(isinstance(each, HeadingOnly) for some in self._sources.values() for each in some):
-            self._sources, self._closures = {}, [
-                (name, each) for name, each in self._measurements
+            self._sources, self._closures = {}, [(name, each) for name, each in self._measurements
                 if isinstance(each, LoopClosure)]
             if len(self._closures) < LEAST:
                 topics = ', '.join(f'{topic} ({source})'
                                    for source, topic in inputs.topics.items())
-                raise BagError(
-                    f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
-                    f'poses or loop closures are needed; used are {topics}')
+                raise BagError(f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, '
+                    f'global poses or loop closures are needed; used are {topics}')
 
     def tune(self, folds: int, truth: Trajectory | None, stretch: Seconds | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
@@ -139,8 +137,7 @@ class Tuning:
         tuned, tau = self._estimate(runs, frozenset())
         after = self._run(checked({**self._values, **changed(tuned)}),
                           'all, with the settings after')
-        doubted = frozenset(
-            (one.source, one.stamp_ns) for one in after.verdicts()
+        doubted = frozenset((one.source, one.stamp_ns) for one in after.verdicts()
             if one.state is State.DOUBTED and one.reference_ns is None)
         if len(doubted) > 0:
             tuned, tau = self._estimate(runs, doubted)
@@ -180,8 +177,7 @@ class Tuning:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
         self._step += 1
         _show(f'step {self._step} of {self._steps}: {text}')
-        backend, _ = run_measurements((
-            (name, each) for name, each in self._measurements
+        backend, _ = run_measurements(((name, each) for name, each in self._measurements
             if odometry in ('', name) or not isinstance(each, OdometrySample)
             if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
         return backend
@@ -191,9 +187,8 @@ class Tuning:
     ) -> tuple[PoseGraphBackend, list[PoseGraphBackend]]:
         """Return a run with the settings before, and those that show the noise of odometries."""
         before = self._run(self._values, f'{text}, with the settings before', left_out)
-        return before, [before] if self._is_shown_before else [
-            self._run(self._looking, f'{text}, by {name}', left_out, name)
-            for name in self._odometries]
+        return before, [before] if self._is_shown_before else [self._run(
+            self._looking, f'{text}, by {name}', left_out, name) for name in self._odometries]
 
     def _estimate(
         self, runs: Sequence[PoseGraphBackend], without: Collection[Key],
@@ -230,8 +225,7 @@ class Tuning:
             for source in dict.fromkeys(of for of, _ in self._closures):
                 if (size := _shown(by_residuals.get(source))) is not None:
                     # their constraints share noise of odometry up to the hidden nodes
-                    tuned += tuned_parameters.source_parameters(
-                        source, OF_CLOSURES, self._values,
+                    tuned += tuned_parameters.source_parameters(source, OF_CLOSURES, self._values,
                         size=size.written(max(size.value, 1.0)))
         return tuned, longest
 
@@ -240,8 +234,7 @@ class Tuning:
         positions = np.array([0.5 * np.trace(each.covariance[:2, :2]) for each in some
                               if not isinstance(each, HeadingOnly)])
         headings = _heading_variances(some)
-        inside = len(positions) == 0 or bool(
-            np.min(positions) > 1.01 * policy.position_floor**2
+        inside = len(positions) == 0 or bool(np.min(positions) > 1.01 * policy.position_floor**2
             and np.max(positions) < 0.99 * policy.position_ceiling**2)
         return Claims(
             all(np.ptp(each) < 0.05 * np.min(each) for each in (positions, headings)
@@ -275,9 +268,8 @@ class Tuning:
             common = np.intersect1d(*(each.stamps_ns for each in errors))
             one, other = (each.rows(np.isin(each.stamps_ns, common)) for each in errors)
             pairs.append((one, other))
-        return pairs, [] if truth is None else [
-            float(np.sqrt(np.mean(np.square(distances(
-                self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
+        return pairs, [] if truth is None else [float(np.sqrt(np.mean(np.square(
+            distances(self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
             for _, backend in tried]
 
     def _path_of(self, backend: PoseGraphBackend) -> tuple[Trajectory, Covariances]:

@@ -129,9 +129,8 @@ def formulate(graph: Constrained) -> Formulation:
         arm_i, arm_j, kappa, tau, number[:-1], poses.copy(), is_below, origin)
     part = components(form.i[tau > 0.0], form.j[tau > 0.0], form.n_unknowns)
     if np.any(part != 0):
-        raise NotCoveredError(
-            f'constraints on positions join {int(np.sum(part != 0))} nodes to nothing fixed '
-            f'and nothing observed')
+        raise NotCoveredError(f'constraints on positions join {int(np.sum(part != 0))} nodes to '
+            'nothing fixed and nothing observed')
     return form
 
 

@@ -370,9 +370,8 @@ def error_summary(of: Errors) -> Summary:
         nees = float(np.mean(_sigmas(errors, covariances))) / 2.0
         nlpd = float(np.mean(_surprises(of)[usable]))
     distinct = np.diff(of.stamps_ns, prepend=-1) > 0
-    return Summary(
-        len(squared), float(np.sqrt(np.mean(squared))), float(np.median(of.distances)), nees,
-        nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
+    return Summary(len(squared), float(np.sqrt(np.mean(squared))), float(np.median(of.distances)),
+        nees, nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
 
 
 def _sigmas(errors: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -142,8 +142,7 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
         errors = factors.errors_in_use(source)
         # the variance of correlated errors, in units of the claimed one
         total = 1.0 if errors is None else errors.correlated + errors.white
-        found[source] = residuals._replace(
-            taken=J @ covariances[rows] @ np.swapaxes(J, 1, 2),
+        found[source] = residuals._replace(taken=J @ covariances[rows] @ np.swapaxes(J, 1, 2),
             scale=np.where(table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
     for name, ids in edges_by_source(graph, nodes, factors).items():
         if name[0] not in found:
@@ -178,8 +177,7 @@ def _residuals(
     of_state = table.constants[biased][:, [2, 2, 3]] * measured[biased]
     errors[biased] -= of_state * graph.poses_of(table.j[biased])
     claimed[biased] += (of_state / (1.0, 1.0, STRETCH))[:, :, None]**2 * np.eye(3)
-    return SourceResiduals(
-        *name, stamps_ns, errors, measured, claimed * scale[:, None, None]**2,
+    return SourceResiduals(*name, stamps_ns, errors, measured, claimed * scale[:, None, None]**2,
         np.full((len(ids), 3, 3), np.nan), table.weight > 0.0, scale, ids)
 
 
@@ -251,8 +249,7 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
     redundancy, scale = expected / float(np.mean(freedom)), float(np.median(used.scale))
     independent = sum(row.independent for row in rows)
     ratio, low, high = _ratio(energies, freedom, redundancy, independent)
-    return ScaleFit(
-        n, rows, expected, float(np.mean(energies)),
+    return ScaleFit(n, rows, expected, float(np.mean(energies)),
         float(np.mean(energies <= _quantiles(freedom, INTERVAL))), redundancy, independent,
         scale * ratio, scale * low, scale * high)
 
@@ -270,9 +267,8 @@ def _row(
     # up to the redundancy
     left = float(np.mean(np.clip(1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0)))
     independent = _independent(values, left, used.stamps_ns[measured], errors)
-    return RowFit(
-        row, len(values), float(np.sqrt(np.mean(sigma**2))), math.sqrt(left),
-        float(np.sqrt(np.mean(values**2))), independent,
+    return RowFit(row, len(values), float(np.sqrt(np.mean(sigma**2))),
+        math.sqrt(left), float(np.sqrt(np.mean(values**2))), independent,
         *_ratio(values**2, np.ones(len(values)), left, independent))
 
 

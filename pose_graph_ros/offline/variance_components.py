@@ -120,9 +120,8 @@ def constraints(graph: Graph) -> Constraints:
         priors = priors + csr_array((prior.information.ravel(), (row.ravel(), column.ravel())),
                                     shape=(size, size))
     free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
-    return Constraints(
-        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
-        factors.weight, jacobian[:, free], priors[free][:, free], used)
+    return Constraints(error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0,
+        factors.information, factors.weight, jacobian[:, free], priors[free][:, free], used)
 
 
 def restricted_likelihood(
@@ -233,8 +232,7 @@ def analyse(parts: Parts) -> Analysis:
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
-    correlated = frozenset(
-        source for source, each in white.items() if each.kind == 'map'
+    correlated = frozenset(source for source, each in white.items() if each.kind == 'map'
         and (found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
     if len(correlated) == 0:
         fits |= _together(parts, fits, white)

@@ -59,15 +59,13 @@ def values(session: 'Session') -> dict[str, object]:
               for (source, answer), count in sorted((status.counts + rejected).items())}
     found |= {f'{source}.bias': f'{bias:.6f}' for source, bias in status.biases.items()}
     found |= {f'{source}.calibrated_{name}': f'{value:.6f}'
-              for source, each in status.calibrations.items()
-              for name, value in each._asdict().items()}
+        for source, each in status.calibrations.items() for name, value in each._asdict().items()}
     found |= {f'{source}.odometry_difference': ': '.join(filter(None, (
         f'{short(each.sigmas)} sigmas', each.reason)))
         for source, each in status.differences.items()}
     found |= {f'quarantined.{rank}': name for rank, name in enumerate(status.set_aside, 1)}
     if estimate is not None:
-        found.update({
-            'odometry': estimate.primary, 'alignment': estimate.alignment.value,
+        found.update({'odometry': estimate.primary, 'alignment': estimate.alignment.value,
             'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
             'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
             'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
@@ -232,10 +230,9 @@ def _missing_input(session: 'Session') -> Iterator[Concern]:
             f'a graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
         yield Concern(WARN, f'{state}: {why}')
     if received.quiet > 0.0:
-        yield Concern(WARN, f'nothing has been received for {received.quiet:.0f} s: the drivers '
-                      'have stopped, or a bag has ended'
-                      + ('; the graph has been optimised' if session.worker.is_optimal else ''),
-                      logged=True)
+        yield Concern(WARN, 'nothing has been received for '
+            f'{received.quiet:.0f} s: the drivers have stopped, or a bag has ended'
+            + ('; the graph has been optimised' if session.worker.is_optimal else ''), logged=True)
     if len(refused) > 0:
         yield Concern(WARN, '; '.join(refused.values()))
 

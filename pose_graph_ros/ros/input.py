@@ -127,9 +127,8 @@ class Arrivals:
         if self.n_apart >= EVIDENCE and clock_ns - self.apart_since_ns >= EVIDENCE_NS:
             way = 'ahead of' if late_ns < 0 else 'behind'
             waits = ', for which its measurements wait' if may_be_late else ''
-            self.wrong = (
-                f'the stamps of {self.source} are {abs(self.delay):.1f} s {way} those of '
-                f'{odometry}{waits}: mend the clock of its driver (GPS time is 18 s ahead of '
+            self.wrong = (f'the stamps of {self.source} are {abs(self.delay):.1f} s {way} those '
+                f'of {odometry}{waits}: mend the clock of its driver (GPS time is 18 s ahead of '
                 f'UTC), or set {self.source}.time_offset')
 
     def refusal(self, counts: Counts, details: Details, now: Seconds) -> str:
@@ -146,9 +145,8 @@ class Arrivals:
             return ''
         begin = f'{count} of {self.count}' if accepted == 0 else f'the newest {count}'
         # all reasons with the newest detail of each, the most frequent first
-        reasons = '; '.join(
-            (f'{n} times ' if len(newest) > 1 else '') + f'{reason} '
-            f'({details[self.source, reason]})' for reason, n in newest.most_common())
+        reasons = '; '.join((f'{n} times ' if len(newest) > 1 else '')
+            + f'{reason} ({details[self.source, reason]})' for reason, n in newest.most_common())
         return f'{begin} messages of {self.source} were refused: {reasons}'
 
 
@@ -273,8 +271,7 @@ class Input:
         self._clear()
 
     def _clear(self) -> None:
-        self.arrivals = {
-            name: Arrivals(name, is_rare=source.kind.is_rare)
+        self.arrivals = {name: Arrivals(name, is_rare=source.kind.is_rare)
             for name, source in self.reader.sources.items()}
         self.rejected: Counts = Counter()  # number by source and reason
         self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
@@ -355,8 +352,7 @@ class Input:
             if source in self.reader.sources and (source, reason) not in self._told:
                 self._told.add((source, reason))
                 logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
-                           '%s: %s: %s (logged once, counted in diagnostics)',
-                           source, reason, detail)
+                    '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used."""

@@ -93,8 +93,7 @@ class Player(Node):
             self.create_subscription(
                 message_class(type_name), topic, partial(self._record, name, topic, type_name),
                 LATCHED if name in KEPT else RELIABLE, raw=True)
-        self._optimize, self._save = (
-            self.create_client(Trigger, f'{NODE_NAME}/{name}')
+        self._optimize, self._save = (self.create_client(Trigger, f'{NODE_NAME}/{name}')
             for name in ('optimize', 'save_graph'))
 
     def _record(self, output: str, topic: str, type_name: str, raw: bytes) -> None:
@@ -136,8 +135,7 @@ class Player(Node):
         self._spin_until(
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
             and len(self.diagnostics) > 0 and self._optimize.service_is_ready()
-            and self._save.service_is_ready(), PATIENCE.appear,
-            'the node does not subscribe')
+            and self._save.service_is_ready(), PATIENCE.appear, 'the node does not subscribe')
         self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PATIENCE.prepare,
                         'the node is still compiling')
         sent = self.processed

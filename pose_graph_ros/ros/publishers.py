@@ -73,9 +73,8 @@ class View:
 
     def is_due(self, state: object, period: Seconds) -> bool:
         """Tell whether to publish what is new, if a state is given, wanted, and not too soon."""
-        return ((state is None or state != self.shown)
-                and time.monotonic() - self.at >= period
-                and bool(self.publisher.get_subscription_count() > 0))
+        return ((state is None or state != self.shown) and time.monotonic() - self.at >= period
+            and bool(self.publisher.get_subscription_count() > 0))
 
 
 class Publishers:
@@ -85,9 +84,8 @@ class Publishers:
         self._node = node
         self.frames = tuple(frame(values[name]) for name in FRAMES)
         self.map_frame, self.odom_frame, self.base_frame = self.frames
-        self._publishers = {
-            name: self._publisher(type_name, values[f'outputs.{name}'],
-                                  LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
+        self._publishers = {name: self._publisher(
+            type_name, values[f'outputs.{name}'], LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
             for name, (_, type_name, _) in OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
             self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))
@@ -112,9 +110,8 @@ class Publishers:
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
         if values['publish_tf'] and TFMessage is None:
-            self._node.get_logger().warning(
-                'tf2_msgs is not installed: the transform from map to odom is not published',
-                once=True)
+            self._node.get_logger().warning('tf2_msgs is not installed: the transform from map to '
+                'odom is not published', once=True)
         elif values['publish_tf'] and self.transforms is None:
             publisher = self._publisher(topics.TF_TYPE, topics.TOPIC, topics.TF_QOS)
             self.transforms = TransformPublisher(
@@ -227,8 +224,7 @@ class Publishers:
             self.transforms.forget()
         with self._lock:
             self.graph += 1
-            for view, empty in (
-                    (self.path, lambda header: Path(header=header)),
+            for view, empty in ((self.path, lambda header: Path(header=header)),
                     (self.markers, lambda header: MarkerArray(
                         markers=[Marker(header=header, action=Marker.DELETEALL)])),
                     (self.verdicts, lambda header: verdicts_message([], {}, header))):
@@ -238,9 +234,8 @@ class Publishers:
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
-        status = DiagnosticStatus(
-            level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph', message=text,
-            hardware_id='pose_graph', values=_key_values(values))
+        status = DiagnosticStatus(level=level, name=f'{self._node.get_fully_qualified_name()}: '
+            'pose graph', message=text, hardware_id='pose_graph', values=_key_values(values))
         self._publishers['diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
@@ -261,10 +256,9 @@ def verdicts_message(
     n_all = sum(sum(each.counts.values()) for each in totals.values())
     of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
     doubting = any(each.doubting for each in totals.values())
-    summary = DiagnosticStatus(
-        level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK, name='summary',
-        message=f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}',
-        values=_key_values(total_values(totals)))
+    summary = DiagnosticStatus(level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK,
+        name='summary', message=f'{len(verdicts)} of {n_all} are listed; '
+        f'{of_sources or "nothing is judged yet"}', values=_key_values(total_values(totals)))
     return DiagnosticArray(header=header, status=[summary, *(DiagnosticStatus(
         level=LEVELS[each.state], name=each.id, message=sentence(each), hardware_id=each.source,
         values=_key_values(details(each))) for each in verdicts)])

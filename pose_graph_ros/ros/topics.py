@@ -70,8 +70,7 @@ def other_publishers(node: Node, topic: str) -> list[str]:
 SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100)     # a loop closure is rare and must not get lost
 JUDGE_TOPIC = '~/judge'
-INPUTS = {
-    'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+INPUTS = {'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
     'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
     JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
 """Messages and quality of service by topic, but for the sources."""
@@ -109,9 +108,8 @@ def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, 
                               f'has with {other}')
         if published != '' and output == '':
             hint = f': move that {moved(node, published)}, instead of a remap, which moves both'
-            raise ConfigError(
-                f'{user}: expected a topic that the node does not publish, got {topic}, which is '
-                f'{first}{hint if published in OUTPUTS else ""}')
+            raise ConfigError(f'{user}: expected a topic that the node does not publish, got '
+                f'{topic}, which is {first}{hint if published in OUTPUTS else ""}')
     for name, value in sorted(overrides.items()):
         topic, _, rest = name.removeprefix(OVERRIDES).partition('.')
         entity, _, policy = rest.partition('.')
@@ -211,12 +209,11 @@ class TransformPublisher:
             names = ' or '.join(other_publishers(self._node, TOPIC))
             names = names and f', by {names}'
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
-            self.other = (
-                f'another node publishes {parent} -> {self._odom_frame} on '
+            self.other = (f'another node publishes {parent} -> {self._odom_frame} on '
                 f'{self._node.resolve_topic_name(TOPIC)}{names}{wrong}: set publish_tf of one of '
-                'the two to false; if it is that of another robot, give each a namespace and its '
-                'own tf, with remap_tf:=true of the launch file or -r /tf:=tf '
-                '-r /tf_static:=tf_static')
+                'the two to false; if it is that of another robot, give each a namespace and '
+                'its own tf, with remap_tf:=true of the launch file or -r /tf:=tf -r '
+                '/tf_static:=tf_static')
             return
 
 

@@ -53,9 +53,8 @@ def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
         if source != run.estimate.primary:
             factor = fit.ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
             advice = f'{source}.covariance_scale to {short(factor)}'
-        found[source] = SourceAnalysis(
-            each, run.kinds.get(source, guesses[each.kind]), fit,
-            source_residuals.whiteness(each), None if report is None else report.in_use,
+        found[source] = SourceAnalysis(each, run.kinds.get(source, guesses[each.kind]),
+            fit, source_residuals.whiteness(each), None if report is None else report.in_use,
             source in analysis.correlated, tuple(sorted(analysis.correlated - {source})), advice)
     return found
 
@@ -110,11 +109,10 @@ def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
     if fit.n_used == 0:
         return '', 'nothing of it is used'
     if fit.says_nothing:
-        return '', ('its covariances cannot be checked: the path follows it, so that its '
-                    f'residuals are {short(100.0 * fit.redundancy)} % of what its errors are'
-                    if fit.redundancy < 0.1 else
-                    f'its covariances cannot be checked: {fit.n_used} measurements are as few as '
-                    f'{short(fit.independent)} independent ones')
+        return '', ('its covariances cannot be checked: the path follows it, '
+            f'so that its residuals are {short(100.0 * fit.redundancy)} % of what its errors are'
+            if fit.redundancy < 0.1 else f'its covariances cannot be checked: {fit.n_used} '
+            f'measurements are as few as {short(fit.independent)} independent ones')
     share = f'{short(fit.ratio)} times' if fit.ratio > 1.0 else f'{short(100.0 * fit.ratio)} % of'
     positions = [row for row in fit.rows if row.coordinate < 2]
     rows, unit = (positions, 'm') if len(positions) > 0 else (list(fit.rows), 'deg')
@@ -184,11 +182,9 @@ def springs(run: Run, residuals: dict[str, SourceResiduals], frame: Frame) -> li
             what, _, rest = name.partition(' at ')
             seconds = (each.stamp_ns - frame.start_ns) * 1e-9
             name = f'{what} at {seconds:.1f} s{rest.partition(" s")[2]}'
-        found.append({
-            'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
-            'name': names.get(each.number, name),
-            'energy': number(each.energy), 'expected': number(
-                expected if math.isfinite(expected) else float(each.freedom)),
+        found.append({'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
+            'name': names.get(each.number, name), 'energy': number(each.energy),
+            'expected': number(expected if math.isfinite(expected) else float(each.freedom)),
             'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,
             'text': _text(each, here if len(each.nodes) < 2 else ends, residual)})
     return found
@@ -200,8 +196,7 @@ def _text(each: ConstraintEnergy, ends: list[dict[str, Any]], residual: FloatArr
     at = f' at {times} s' if len(ends) > 0 else ''
     if each.kind == 'bias':
         return f'error of {each.source}{at}: it changes faster than its correlation time says'
-    off = '' if residual is None else (
-        f': {short(np.hypot(*residual[:2]))} m' + ('' if residual[2] == 0.0 else
-                                                f' and {short(abs(residual[2]))} rad') + ' off')
+    off = '' if residual is None else (f': {short(np.hypot(*residual[:2]))} m'
+        + ('' if residual[2] == 0.0 else f' and {short(abs(residual[2]))} rad') + ' off')
     name = each.name.partition(' at ')[0] if len(ends) > 0 else each.name
     return f'{name}{at}{off}'

@@ -145,8 +145,7 @@ def record(way: Course) -> Recording:
         found = streams['rate'].random(len(ends)) < setup.closures.rate
         closures, missing = sensors.with_false(
             streams['false'], way.motion, setup.closures, ends[found], measured[found])
-    every = {
-        ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
+    every = {ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
         settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
         FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)), CLOSURES: closures}
     kept = {topic: each.rows(sensors.heard(each.later_ns, topic, setup.outages))
@@ -253,9 +252,8 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     loops, group, missing = _loop_edges(way, Motion(truth, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
-    return SimulatedGraph(
-        truth, se2.composed(poses[0], odometry.mean), Factors.joined((odometry, loops)), group,
-        Factors.joined((fixes, absolute)),
+    return SimulatedGraph(truth, se2.composed(poses[0], odometry.mean),
+        Factors.joined((odometry, loops)), group, Factors.joined((fixes, absolute)),
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
 

@@ -128,8 +128,7 @@ def model_variances(steps: FloatArray, model: OdometryNoise = MODEL) -> FloatArr
     In: motions of the robot, shape (N, 3). Out: variances in its frame, shape (N, 3).
     """
     distance, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
-    return np.column_stack((
-        model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,
+    return np.column_stack((model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,
         model.sigma_heading_distance**2 * distance + model.sigma_heading_turn**2 * turn))
 
 
@@ -170,8 +169,7 @@ def revisits(
     poses, stamps = path.truth.poses[places], path.truth.stamps_ns[places]
     pairs = KDTree(poses[:, :2]).query_pairs(closures.radius, output_type='ndarray')
     old, new = np.sort(pairs, axis=1).T
-    good = (
-        (stamps[new] - stamps[old] > closures.min_time_s * 1e9)
+    good = ((stamps[new] - stamps[old] > closures.min_time_s * 1e9)
         & (path.distance[places[new]] - path.distance[places[old]] > closures.min_distance)
         & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < closures.angle))
     old, new = old[good], new[good]

@@ -173,9 +173,8 @@ class FalseClosures:
             return [self.size] * self.groups + [1] * self.singles
         total = round(self.share / (1.0 - self.share) * true)
         if grouped > total:
-            raise ConfigError(
-                f'{self.groups} groups of {self.size} false closures are {grouped}, but a share '
-                f'of {self.share:g} beside {true} true ones is {total}')
+            raise ConfigError(f'{self.groups} groups of {self.size} false closures are {grouped}, '
+                f'but a share of {self.share:g} beside {true} true ones is {total}')
         return [self.size] * self.groups + [1] * (total - grouped)
 
 
@@ -253,10 +252,9 @@ class Jump:
         if self.step is not None and self.topic == FIXES and self.step[2] != 0.0:
             raise ConfigError(f'jump of {FIXES}: expected DX,DY, got a heading of {self.step[2]}')
         if not self.seconds > 0.0 or (self.topic == ODOMETRY and self.seconds != math.inf):
-            raise ConfigError(f'jump of {self.topic}: expected '
-                              + ('no length of time, as odometry never comes back, '
-                                 if self.topic == ODOMETRY else 'a positive length of time, ')
-                              + f'got {self.seconds:g} s')
+            raise ConfigError(f'jump of {self.topic}: expected ' + (
+                'no length of time, as odometry never comes back, ' if self.topic == ODOMETRY
+                else 'a positive length of time, ') + f'got {self.seconds:g} s')
 
 
 @dataclass(frozen=True, slots=True)

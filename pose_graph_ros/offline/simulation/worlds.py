@@ -244,8 +244,7 @@ def drive_circuit(generator: Generator, duration_s: float) -> Motion:
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
     grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
-    bent = grid + np.column_stack((
-        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
+    bent = grid + np.column_stack((7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
         9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
     path = wandering(generator, bent @ se2.rotation(STREET_BEARING).T, CIRCUIT_STEP, LANE_SIGMA)
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))
@@ -262,8 +261,7 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     outgoing = np.roll(incoming, -1, axis=0)
     right = np.array([[0.0, -1.0], [1.0, 0.0]])
     lane = corners + LANE_OFFSET * (incoming + outgoing) @ right
-    turns = np.arctan2(
-        incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
+    turns = np.arctan2(incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
         np.sum(incoming * outgoing, axis=1))
 
     # distance from the corner to the ends of a turn: the integral of the cosine of its heading
@@ -288,8 +286,7 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
 
 def _drive_setup(motion: Motion) -> Setup:
     outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
-    return Setup(
-        wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
+    return Setup(wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
         closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
         outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
         jumps=(REFLECTED,))
