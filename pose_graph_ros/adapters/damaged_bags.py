@@ -153,11 +153,11 @@ class _Sqlite:
 
     def messages(self) -> Iterator[_Message]:
         """Yield all messages; where rows cannot be read, the next ones are looked for."""
-        definitions, topics = dict[str, str](), dict[int, Connection]()
+        select, definitions, topics = self._database.execute, dict[str, str](), {}
         with suppress(sqlite3.Error):   # older ones have none
-            definitions = dict(self._database.execute(
+            definitions = dict(select(
                 'SELECT topic_type, encoded_message_definition FROM message_definitions'))
-        for number, name, of_type, form, profiles in self._database.execute(
+        for number, name, of_type, form, profiles in select(
                 'SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics'):
             qualities: list[Qos] = []
             with suppress(Exception):   # the parser can raise anything
@@ -167,9 +167,8 @@ class _Sqlite:
         last, step = 0, 1
         while step < 2**40:
             try:
-                with closing(self._database.execute(
-                        'SELECT id, timestamp, topic_id, data FROM messages WHERE id >= ? '
-                        'ORDER BY id LIMIT 1000', (last + 1,))) as rows:
+                with closing(select('SELECT id, timestamp, topic_id, data FROM messages '
+                                    'WHERE id >= ? ORDER BY id LIMIT 1000', (last + 1,))) as rows:
                     n = 0
                     for number, recorded_ns, topic, data in rows:
                         if number > last + 10**6:   # it is wrong
@@ -177,8 +176,7 @@ class _Sqlite:
                         if number <= last:
                             raise sqlite3.DatabaseError('rows are not in their order')
                         n, step, last = n + 1, 1, number
-                        if topic in topics and isinstance(recorded_ns, int) and (
-                                isinstance(data, bytes)):
+                        if topic in topics and type(recorded_ns) is int and type(data) is bytes:
                             yield topics[topic], recorded_ns, data
                     if n == 0:
                         break
@@ -201,10 +199,8 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
     if about.get('compression_format'):
         return False    # what rosbag2 itself has compressed is not unpacked here
     listed = [Path(str(name)).name for name in about.get('relative_file_paths') or ()]
-    files = [path]
-    if path.is_dir():
-        files = [path / name for name in listed if (path / name).is_file()] or sorted(
-            path.iterdir())
+    files = [path] if path.is_file() else [
+        path / name for name in listed if (path / name).is_file()] or sorted(path.iterdir())
     files = [each for each in files if each.suffix in {'.mcap', '.db3'}]
     found: list[_Mcap | _Sqlite] = []
     connections: dict[tuple[str, str], Connection] = {}

@@ -7,10 +7,10 @@ Filling in message objects would take ten times as long. In CDR every number is 
 size, counted from the end of the four bytes at the start of the stream.
 """
 
-from dataclasses import dataclass
 import functools
 import math
 import struct
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -147,8 +147,7 @@ class CdrStream:
         self.data += bytes(-len(self.data) % 4) + _LENGTH.pack(len(name)) + name
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(NamedTuple):
     """Colours (red, green, blue, alpha) and sizes [m] of the markers of the graph."""
 
     # of constraints by their errors [sigma], interpolated between

@@ -18,11 +18,10 @@ Its C is taken to be the mean of those of its closures, a little too large.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 import math
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -56,8 +55,7 @@ LEFT = float(gammainc(2.5, GATE / 2.0) + GATE / 3.0 * gammaincc(1.5, GATE / 2.0)
 TRIES = 5  # sets of closures that are tried to join parts that no odometry joins
 
 
-@dataclass(frozen=True, slots=True)
-class BelievedEdges:
+class BelievedEdges(NamedTuple):
     """Which edges of a graph are believed."""
 
     closures: IntArray  # rows of all edges that may be doubted, (M,)
@@ -141,14 +139,14 @@ def _not_worse(
     information[closures] *= result.scale**-2.0
     scaled = edges.replaced(information=information)
     problem = TruncatedProblem(_filled(graph, scaled), closures, result.poses)
-    result = replace(result, cost=problem.cost_at(result.poses), cost_of_all=(
+    result = result._replace(cost=problem.cost_at(result.poses), cost_of_all=(
         None if plain is None else problem.cost_at(plain)))
     for start in starts:
         if problem.cost_at(start) < result.cost * (1.0 - SAME_MINIMUM):
             problem = TruncatedProblem(_filled(graph, scaled), closures, start)
             choice = to_the_end(problem.near_start())
             if choice is not None and choice.cost < result.cost:
-                result = replace(result, believed=choice.believed, poses=choice.poses,
+                result = result._replace(believed=choice.believed, poses=choice.poses,
                                  cost=choice.cost)
     return result
 

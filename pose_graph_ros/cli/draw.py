@@ -9,12 +9,11 @@ Lines and texts show on light and on dark backgrounds.
 import argparse
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 import json
 from pathlib import Path
 import sys
 import textwrap
-from typing import Any
+from typing import Any, NamedTuple
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -51,8 +50,7 @@ SETTINGS: dict[Any, Any] = {'svg.fonttype': 'none', 'svg.hashsalt': 'pose_graph_
     'font.family': ['DejaVu Sans', 'sans-serif'], 'font.size': 8.0}
 
 
-@dataclass(frozen=True, slots=True)
-class Panel:
+class Panel(NamedTuple):
     """A view of a graph with the places of its vertices, and the pattern of H if it is drawn."""
 
     title: str

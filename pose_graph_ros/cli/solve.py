@@ -10,14 +10,14 @@ better one. What takes long to load, such as compiled kernels, is imported where
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import json
 import math
 from pathlib import Path
 import re
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -45,8 +45,7 @@ CONFIG = SolverConfig(max_iterations=200)
 MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
+class Solution(NamedTuple):
     """A graph at the lowest minimum that was found."""
 
     result: BatchResult
@@ -107,7 +106,7 @@ def solve(problem: Problem, start: str) -> Solution:
         each[0].result.status is Status.FAILED, each[0].result.chi2))
     if best is not found[-1][0]:
         best = resumed(problem, best, poses)
-    return replace(best, tried=tuple((each.start, each.result) for each, _ in found))
+    return best._replace(tried=tuple((each.start, each.result) for each, _ in found))
 
 
 def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
@@ -116,8 +115,8 @@ def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
     """
     again = _solve_from(problem, 'present', poses)
     if again.result.status is not Status.CONVERGED:
-        return replace(again, start=solution.start)
-    return replace(solution, result=replace(solution.result, chi2=again.result.chi2))
+        return again._replace(start=solution.start)
+    return solution._replace(result=replace(solution.result, chi2=again.result.chi2))
 
 
 def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
@@ -179,8 +178,7 @@ def _held_weakly(
                    reason=f'{result.reason}; it is held near its start'), False
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(NamedTuple):
     """What the certificate says of a solution."""
 
     certificate: Certificate | None

@@ -13,7 +13,6 @@ part in these.
 import argparse
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from enum import Enum
 from itertools import islice
 import json
@@ -21,7 +20,7 @@ import math
 import os
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,8 +63,7 @@ class Verdict(Enum):
     WORSE = 'held-out errors are not lower after tuning'
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Result of a tuning."""
 
     tuned: Sequence[Tuned]
@@ -349,7 +347,7 @@ def execute(options: argparse.Namespace) -> int:
             'bags': [str(each) for each in options.bags],
             'file': str(options.out) if is_better else None,
             'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
-            'parameters': [_plain(asdict(each)) | {'changed': each.changes}
+            'parameters': [_plain(each._asdict()) | {'changed': each.changes}
                            for each in outcome.tuned],
             'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
             'to_truth': _plain(dict(zip(

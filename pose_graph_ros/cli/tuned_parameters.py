@@ -3,7 +3,6 @@
 """From estimated noise to parameters of the node, and their file with a reason for each."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
 import math
 from typing import Any, NamedTuple
 
@@ -17,8 +16,7 @@ ODOMETRY = {'sigma_distance': False, 'sigma_lateral': False, 'sigma_heading_dist
 LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters
 
 
-@dataclass(frozen=True, slots=True)
-class Tuned:
+class Tuned(NamedTuple):
     """One parameter of the node, before and after."""
 
     name: str
@@ -70,10 +68,10 @@ def source_parameters(
     if claims.is_scalable and not apart:
         one = _one(scale, leading, values, 1.0)
         if claims.is_constant and claims.sigma > 0.0 and one.changes:
-            one = replace(one, note=f'{one.note}; sigma {_number(claims.sigma)} m claimed, '
+            one = one._replace(note=f'{one.note}; sigma {_number(claims.sigma)} m claimed, '
                           f'{_number(claims.sigma * math.sqrt(leading.value))} m found')
         if one.changes and size is not None and heading is not None:
-            one = replace(one, note=f'{one.note}; of headings by themselves it would be '
+            one = one._replace(note=f'{one.note}; of headings by themselves it would be '
                           f'{_number(values[scale] * heading.value)}')
         yield one
     else:

@@ -36,7 +36,6 @@ is the projection of Q - L. All rows may be turned by one unitary matrix, so row
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -52,8 +51,7 @@ Preconditioner = Callable[[ComplexArray, ComplexArray], ComplexArray]
 """From headings, and derivatives by them, to a change that is nearly a step of Newton."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tuning:
+class Tuning(NamedTuple):
     """Numbers of the certificate; fractions of f are those of at least 1."""
 
     max_rank: int = 6  # numbers for each heading at most
@@ -74,8 +72,7 @@ class Verdict(Enum):
     NOT_ATTEMPTED = 'not attempted'
 
 
-@dataclass(frozen=True, slots=True)
-class Certificate:
+class Certificate(NamedTuple):
     """What was found of the minimum near given poses, and of the best one."""
 
     verdict: Verdict  # of the best minimum that was found
@@ -104,8 +101,7 @@ class Certificate:
         return self.chi2 < self.near - TUNING.lower * max(self.near, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Spectrum:
+class Spectrum(NamedTuple):
     """What is known of the certificate matrix of some headings."""
 
     positive: bool  # whether S plus the shift was shown to be positive definite

@@ -31,7 +31,8 @@ for each node. Headings may also be rows of r complex numbers each (`certify`): 
 columns as well.
 """
 
-from dataclasses import dataclass
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,8 +47,7 @@ class NotCoveredError(PoseGraphError):
     """The objective does not cover a graph; the message is the reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class Formulation:
+class Formulation(NamedTuple):
     """Terms of the objective, M of them; unknown 0 is the map."""
 
     i: IntArray

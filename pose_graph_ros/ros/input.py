@@ -30,8 +30,7 @@ from pose_graph_ros.core.quantities import Seconds, StampNs
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Expectations:
+class Expectations(NamedTuple):
     """When sources are missed [s], and from when on it is said that they are refused."""
 
     # A source is silent after the longest of this time, this many of its median gaps between two

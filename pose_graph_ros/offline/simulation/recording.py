@@ -15,7 +15,8 @@ freedom as there are measured numbers.
 
 from collections.abc import Callable, Iterable, Mapping
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -39,8 +40,7 @@ STREAMS = ('world', 'gyro', 'odometry', 'fixes', 'poses', 'closures', 'rate', 'j
 """Who draws random numbers of its own; the place in this list is a part of its seed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
+class Recording(NamedTuple):
     """Measurements and true poses of a simulated drive; all stamps as the messages have them."""
 
     setup: Setup
@@ -67,8 +67,7 @@ class Recording:
         return Trajectory(stamps_ns, values[:, :3])
 
 
-@dataclass(frozen=True, slots=True)
-class Course:
+class Course(NamedTuple):
     """A motion through a world, what is simulated there, and random numbers for it."""
 
     motion: Motion
@@ -201,8 +200,7 @@ def _true_closures(
 
 # --- a graph
 
-@dataclass(frozen=True, slots=True)
-class SimulatedGraph:
+class SimulatedGraph(NamedTuple):
     """A graph of N nodes, whose numbers are 0 to N - 1, and the truth."""
 
     truth: Trajectory

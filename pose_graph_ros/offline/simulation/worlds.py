@@ -17,8 +17,8 @@ which headings turn, has a derivative that does.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -38,8 +38,7 @@ DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 TURN_POINTS = 1000  # at which a turn is tabulated
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """True poses of a vehicle in the frame of the world, and how far it has driven."""
 
     truth: Trajectory  # headings need not be wrapped
@@ -47,8 +46,7 @@ class Motion:
     lap_time: float = np.inf  # when the second lap begins [s]; never if there are no laps
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(NamedTuple):
     """What the vehicle can do."""
 
     speed: float  # [m/s]
@@ -225,8 +223,7 @@ OUTAGE_S = (-40.0, 30.0)
 REFLECTED = settings.Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
 
 
-@dataclass(frozen=True, slots=True)
-class World:
+class World(NamedTuple):
     """A place, and what moves there."""
 
     drive: Callable[[Generator, float], Motion]
@@ -250,7 +247,7 @@ def drive_circuit(generator: Generator, duration_s: float) -> Motion:
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))
     motion, arrival = follow(path, stops, waits, CAR, duration_s)
     lap = round(lap_length / CIRCUIT_STEP)
-    return replace(motion, lap_time=float(arrival[lap]) if lap < len(arrival) else np.inf)
+    return motion._replace(lap_time=float(arrival[lap]) if lap < len(arrival) else np.inf)
 
 
 def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
