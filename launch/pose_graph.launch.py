@@ -36,10 +36,10 @@ def _nodes(context: LaunchContext, names: list[str]) -> list[LaunchDescriptionEn
     given = {name: context.launch_configurations[name] for name in names}
     # what comes later takes precedence
     parameters = [launch_arguments.parameter_file(given), launch_arguments.parameters(given)]
-    node = Node(package=PACKAGE,
-        executable='pose_graph_node', name=given['name'], namespace=given['namespace'],
-        output='screen', parameters=parameters, remappings=launch_arguments.remappings(given),
-        ros_arguments=['--log-level', given['log_level']])
+    node = Node(package=PACKAGE, executable='pose_graph_node', name=given['name'],
+                namespace=given['namespace'], output='screen', parameters=parameters,
+                remappings=launch_arguments.remappings(given),
+                ros_arguments=['--log-level', given['log_level']])
     if not launch_arguments.switch(given, 'rviz'):
         return [node]
     try:

@@ -137,8 +137,7 @@ def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[tuple[str, BagMessage, 
     sources: dict[str, list[str]] = {}
     for source, topic in inputs.topics.items():
         sources.setdefault(topic, []).append(source)
-    held = inputs.fixes or inputs.of(lambda kind: kind.in_map)
-    count = 0
+    held, count = inputs.fixes or inputs.of(lambda kind: kind.in_map), 0
     for message in reader.messages(list(sources), inputs.span):
         for source in sources[message.topic]:
             count += source in held

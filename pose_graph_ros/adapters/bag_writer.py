@@ -64,7 +64,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f'{folder}: cannot be written: {bags.one_line(error)}') from error
         self._writer = Writer(self._scratch / self.folder.name, version=BAG_VERSION,
-            storage_plugin=StoragePlugin.MCAP)
+                              storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
 
     def __enter__(self) -> Self:
@@ -95,7 +95,7 @@ class BagWriter:
                 message = self._types.serialize_cdr(message, type_name)
             except Exception as error:  # generated code on a foreign object
                 raise BagError(f'{self.folder}: {topic}: no valid {type_name}: '
-                    f'{bags.one_line(error)}') from error
+                               f'{bags.one_line(error)}') from error
         self._writer.write(self._connections[key], recorded_ns, message)
 
     def copy(self, message: BagMessage) -> None:
@@ -113,7 +113,7 @@ class BagWriter:
                 data = bytes(convert(data))
             except Exception as error:  # generated code can raise anything on invalid bytes
                 raise MessageError(f'{message.topic}: message recorded at {message.recorded_ns} '
-                    f'ns is no {message.type}: {bags.one_line(error)}') from error
+                                   f'ns is no {message.type}: {bags.one_line(error)}') from error
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
@@ -138,8 +138,8 @@ def _qos(*, latched: bool) -> Qos:
     depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
                          else (10, QosDurability.VOLATILE))
     return Qos(interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE,
-        durability, FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
-        avoid_ros_namespace_conventions=False)
+               durability, FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
+               avoid_ros_namespace_conventions=False)
 
 
 def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Convert]:
@@ -153,8 +153,7 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
     own = bags.own_types(source) or get_typestore(Stores.ROS1_NOETIC)
     name, types = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype), jazzy
     if name not in jazzy.fielddefs:
-        types = get_typestore(Stores.EMPTY)
-        header = 'std_msgs/msg/Header'
+        types, header = get_typestore(Stores.EMPTY), 'std_msgs/msg/Header'
         types.register({**own.fielddefs, header: jazzy.fielddefs[header]})
     if converter.is_same_wireformat(own, types, source.msgtype, name):
         return name, types, partial(types.ros1_to_cdr, typename=name)

@@ -71,7 +71,7 @@ class BagMessage:
             return self._decode(self.raw)
         except Exception as error:  # generated code can raise anything on invalid bytes
             raise MessageError(f'{self.topic}: message recorded at {self.recorded_ns} ns is no '
-                f'{self.type}: {one_line(error)}') from error
+                               f'{self.type}: {one_line(error)}') from error
 
 
 class Span(NamedTuple):
@@ -167,7 +167,7 @@ class Bag:
                     types = own_types(connection) or get_typestore(
                         Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
                     self._decoders[path, kind] = partial(types.deserialize_ros1 if is_ros1
-                        else types.deserialize_cdr, typename=kind)
+                                                         else types.deserialize_cdr, typename=kind)
                 yield BagMessage(topic, kind, recorded_ns, bytes(raw), connection,
                                  self._decoders[path, kind])
         except Exception as error:  # the parsers can raise anything on a damaged file
@@ -205,7 +205,7 @@ def _reader(path: Path, stack: ExitStack) -> Reader:
         raise BagError(f'{path}: does not exist')
     if path.is_file() and path.suffix not in BAG_FILE_SUFFIXES:
         raise BagError(f'{path}: no bag, expected a rosbag2 folder or a file ending in '
-            f'{", ".join(BAG_FILE_SUFFIXES)}')
+                       f'{", ".join(BAG_FILE_SUFFIXES)}')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         rest = _repaired(path, 'the recording was not ended, it has no metadata.yaml', stack)
         if rest is None:

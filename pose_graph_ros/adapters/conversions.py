@@ -77,8 +77,8 @@ def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometryS
     twist = planar_twist(message.twist.twist) if by_twist else None
     if isinstance(twist, Answer):
         return twist
-    return OdometrySample(stamp_ns(message, source.time_offset_ns), pose,
-        speed if math.isfinite(speed) else 0.0, twist_variance(message.twist.covariance), twist)
+    return OdometrySample(stamp_ns(message, source.time_offset_ns), pose, speed if math.isfinite(
+        speed) else 0.0, twist_variance(message.twist.covariance), twist)
 
 
 def planar_twist(twist: Message) -> Pose | Answer:
@@ -127,9 +127,9 @@ def heading(message: Message, source: 'Source', by: Surroundings) -> ms.HeadingO
     if yaw is None:
         q = message.orientation
         return rejected('not_finite', f'quaternion ({q.x}, {q.y}, {q.z}, {q.w})')
-    return ms.HeadingOnly(stamp_ns(message, source.time_offset_ns),
-                       float(se2.wrap(yaw + source.yaw_offset - by.datum.yaw)),
-                       float(message.orientation_covariance[8]))
+    turned = float(se2.wrap(yaw + source.yaw_offset - by.datum.yaw))
+    return ms.HeadingOnly(stamp_ns(message, source.time_offset_ns), turned,
+                          float(message.orientation_covariance[8]))
 
 
 def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> ms.LoopClosure | Answer:
@@ -182,7 +182,7 @@ def fix(message: Message, source: 'Source', by: Surroundings) -> ms.Fix | Answer
         with np.errstate(over='ignore', invalid='ignore'):
             cov = covariance.turned(cov, by.datum.yaw)
     return ms.Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
-               by.lever_arm(frame(message.header.frame_id), source))
+                  by.lever_arm(frame(message.header.frame_id), source))
 
 
 def beacon_range(message: Message, source: 'Source', by: Surroundings) -> ms.Range | Answer:
@@ -202,8 +202,8 @@ def beacon_range(message: Message, source: 'Source', by: Surroundings) -> ms.Ran
     place = source.beacons.get(beacon)
     # older messages have no variance
     return ms.Range(stamp_ns(message, source.time_offset_ns), beacon, distance,
-                 float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
-                 None if place is None else np.array(place))
+                    float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
+                    None if place is None else np.array(place))
 
 
 def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate | Answer:
@@ -227,7 +227,7 @@ def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate
         return rejected('not_finite', (
             f'angular velocity ({velocity.x}, {velocity.y}, {velocity.z})'))
     return ms.YawRate(stamp_ns(message, source.time_offset_ns), float(rate),
-                   float(variance) if variance > 0.0 else 0.0)
+                      float(variance) if variance > 0.0 else 0.0)
 
 
 def twist(message: Message, source: 'Source', by: Surroundings) -> OdometrySample | Answer:

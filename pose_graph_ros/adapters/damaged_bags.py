@@ -113,8 +113,9 @@ class _Mcap:
             elif kind == _CHANNEL and number not in self._topics:
                 of_type, text = self._types[int.from_bytes(stream.read(2), 'little')]
                 name, form = (storage_mcap.read_string(stream) for _ in range(2))
-                self._topics[number] = self._connect(name, of_type, form, text,
-                    storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
+                self._topics[
+                    number] = self._connect(name, of_type, form, text,
+                                            storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
 
     def _message(self, data: bytes) -> Iterator[_Message]:
         """Yield the message in a record, if it is of a known topic."""
@@ -209,8 +210,9 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
         topic: str, of_type: str, encoding: str, definition: str, qualities: list[Qos],
     ) -> Connection:
         if (topic, of_type) not in connections:
-            connections[topic, of_type] = writer.add_connection(topic, of_type, msgdef=definition,
-                rihs01=NO_HASH, serialization_format=encoding, offered_qos_profiles=qualities)
+            connections[topic, of_type] = writer.add_connection(
+                topic, of_type, msgdef=definition, rihs01=NO_HASH, serialization_format=encoding,
+                offered_qos_profiles=qualities)
         return connections[topic, of_type]
 
     with Writer(copy, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -233,7 +235,8 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
             missing = f'{missing_s:.1f} s at the end are missing'
     if len(found) == len(files) and all(each.complete for each in found):
         missing = 'its end is there'
-    logger.warning('%s: %s; what can be read of it is used: %d messages in %.1f s, %d '
-        'damaged parts are left out, %s', path, reason, n, 1e-9 * (end_ns - writer.min_timestamp),
-        sum(each.n_damaged for each in found), missing)
+    logger.warning('%s: %s; what can be read of it is used: '
+                   '%d messages in %.1f s, %d damaged parts are left out, %s', path, reason, n,
+                   1e-9 * (end_ns - writer.min_timestamp), sum(each.n_damaged for each in found),
+                   missing)
     return True

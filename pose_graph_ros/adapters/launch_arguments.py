@@ -97,4 +97,4 @@ def remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
 def display_remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
     """Return the remaps of topics by the arguments for RViz, which has no parameters of them."""
     return remappings(given) + [(topic, given[name]) for name, (topic, *_) in OUTPUTS.items()
-        if given[name] not in ('', AS_IN_FILE)]
+                                if given[name] not in ('', AS_IN_FILE)]

@@ -62,8 +62,8 @@ def odometry_cdr(
     # a finite sum is the quick way to tell
     finite = math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))
     return b''.join((_head(stamp_ns, map_frame, base_frame),
-        _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
-        _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
+                     _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
+                     _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
@@ -168,7 +168,7 @@ LOOK = Look()
 # Constants of visualization_msgs/Marker.
 LINE_LIST, POINTS, ADD, DELETEALL = 5, 8, 0, 3
 NAMESPACES = ('hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes',
-    'weak_closures', 'waiting_closures', 'doubted', 'unused_errors', 'unused_nodes')
+              'weak_closures', 'waiting_closures', 'doubted', 'unused_errors', 'unused_nodes')
 """Namespaces of the markers by id."""
 
 def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
@@ -205,7 +205,7 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
 def colours(sigmas: FloatArray) -> Colours:
     """Return the colours, shape (M, 4), of constraints with these errors, shape (M,) [sigma]."""
     return np.column_stack([np.interp(sigmas, LOOK.sigmas, channel)
-        for channel in zip(*LOOK.colours, strict=True)]).astype(np.float32)
+                            for channel in zip(*LOOK.colours, strict=True)]).astype(np.float32)
 
 
 def _lines(lines: Lines) -> tuple[FloatArray, Colours]:

@@ -51,10 +51,9 @@ def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
     of_type = type_parameter(source)
     checked_value(of_type, kind)
     _, topic = KNOWN_SOURCES.get(source, (None, source))
-    return of_type, *(
-        replace(each, name=f'{source}.{each.name}',
-                default=topic if each.name == 'topic' else each.default)
-        for each in (*OF_ALL, *KINDS[kind].parameters))
+    return of_type, *(replace(each, name=f'{source}.{each.name}', default=(
+        topic if each.name == 'topic' else each.default)) for each in (
+            *OF_ALL, *KINDS[kind].parameters))
 
 
 def listed_sources(given: Values) -> list[str]:
@@ -190,8 +189,9 @@ def changed(values: Values, wanted: Values, *, configured: bool) -> dict[str, An
             raise ConfigError(f'parameter {name} is read at the start: give it in a parameter '
                               f'file or by -p {name}:=..., and start the node again')
         if parameter.change is Change.UNCONFIGURED and configured:
-            raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
-                'lifecycle set` it to deactivate and cleanup, change it, and configure it again')
+            raise ConfigError(f'parameter {name} is taken when the node is configured: '
+                              '`ros2 lifecycle set` it to deactivate and cleanup, change it, and '
+                              'configure it again')
         new[name] = good
     new = checked(new)
     require_together(new)
@@ -286,11 +286,10 @@ def as_markdown() -> str:
     every = [TYPE, *OF_ALL]
     for kind in KINDS.values():
         every += [each for each in kind.parameters if each not in every]
-    lines = ['| parameter | default | unit | range | changes | description |',
-             '|---|---|---|---|---|---|',
+    head = 'default | unit | range | changes | description |'
+    lines = [f'| parameter | {head}', '|---|---|---|---|---|---|',
              *(f'| `{each.name}` | {_facts(each)}' for each in PARAMETERS), '',
-             '| parameter | types | default | unit | range | changes | description |',
-             '|---|---|---|---|---|---|---|']
+             f'| parameter | types | {head}', '|---|---|---|---|---|---|---|']
     for each in every:
         kinds = [kind.name for kind in KINDS.values() if each in kind.parameters]
         lines.append(f'| `<source>.{each.name}` | {", ".join(kinds) or "all"} | {_facts(each)}')
@@ -306,9 +305,7 @@ def _facts(parameter: Parameter) -> str:
 
 
 def _range(parameter: Parameter) -> str:
-    if len(parameter.choices) > 0:
-        return ', '.join(parameter.choices)
-    return '' if parameter.smallest is None else (
+    return ', '.join(parameter.choices) if parameter.smallest is None else (
         f'{parameter.smallest:g} to {parameter.largest:g}')
 
 

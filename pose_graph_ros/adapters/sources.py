@@ -63,24 +63,25 @@ class Kind:
 
 
 ODOMETRY = Kind('odometry', 'nav_msgs/msg/Odometry', conversions.odometry, OdometrySource(),
-    (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
-GLOBAL_POSE = Kind('global_pose', _POSE, conversions.global_pose,
-    config.POSITIONS, (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
-    without_frame='it is taken for {map}, the map_frame')
+                (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
+GLOBAL_POSE = Kind('global_pose', _POSE, conversions.global_pose, config.POSITIONS,
+                   (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
+                   without_frame='it is taken for {map}, the map_frame')
 FIX = Kind('fix', 'sensor_msgs/msg/NavSatFix', conversions.fix, config.POSITIONS,
-    (*table.in_the_map(config.POSITIONS), table.LEVER_ARM), in_map=True, on_earth=True,
-    in_frames=True, without_frame='its antenna is taken to be in {base}: set {name}.lever_arm')
+           (*table.in_the_map(config.POSITIONS), table.LEVER_ARM), in_map=True, on_earth=True,
+           in_frames=True, without_frame='its antenna is taken to be in {base}: set '
+           '{name}.lever_arm')
 IMU = Kind('imu', _IMU, conversions.heading, config.HEADINGS,
-    (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
+           (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
 LOOP_CLOSURE = Kind('loop_closure', _POSE, conversions.loop_closure, config.LOOP_CLOSURES,
-    table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
-TWIST = Kind('twist', 'geometry_msgs/msg/TwistWithCovarianceStamped',
-    conversions.twist, OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
-    without_frame='it is taken for {base}, the base_link_frame')
+                    table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
+TWIST = Kind('twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', conversions.twist,
+             OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
+             without_frame='it is taken for {base}, the base_link_frame')
 GYRO = Kind('gyro', _IMU, conversions.yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
-    without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
-RANGE = Kind('range', 'sensor_msgs/msg/Range', conversions.beacon_range, config.RANGES,
-    (*table.of_measurements(config.RANGES), table.LEVER_ARM, table.BEACONS), in_frames=True)
+            without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
+RANGE = Kind('range', 'sensor_msgs/msg/Range', conversions.beacon_range, config.RANGES, (
+    *table.of_measurements(config.RANGES), table.LEVER_ARM, table.BEACONS), in_frames=True)
 KINDS = {kind.name: kind
          for kind in (ODOMETRY, GLOBAL_POSE, FIX, IMU, LOOP_CLOSURE, TWIST, GYRO, RANGE)}
 """Kinds of sources by name."""
@@ -197,9 +198,8 @@ def backend_config(values: Values) -> config.BackendConfig:
         nodes=config.NodePolicy(**_same(values, config.NodePolicy)),
         odometry=odometry, measurements=measurements, gyros=gyros,
         window=config.WindowConfig(
-            seconds=values['window.seconds'], metres=values['window.metres'],
-            nodes=math.ceil(values['window.nodes']),
-            prior=config.WindowPrior(values['window.prior'])),
+            values['window.seconds'], values['window.metres'], math.ceil(values['window.nodes']),
+            config.WindowPrior(values['window.prior'])),
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
@@ -217,7 +217,7 @@ class MessageReader:
     ) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
         self.keeper = keeper or TimeKeeper([name for name, source in self.sources.items()
-            if source.kind.is_odometry], CLOCK_JUMP_NS)
+                                            if source.kind.is_odometry], CLOCK_JUMP_NS)
         self.frames = StaticFrames() if frames is None else frames
         self.datum = datum_of(values)
         self.surroundings = Surroundings(

@@ -147,7 +147,7 @@ def _not_worse(
             choice = to_the_end(problem.near_start())
             if choice is not None and choice.cost < result.cost:
                 result = result._replace(believed=choice.believed, poses=choice.poses,
-                                 cost=choice.cost)
+                                         cost=choice.cost)
     return result
 
 
@@ -157,8 +157,8 @@ def _filled(graph: Graph, edges: Factors) -> Graph:
     return copy
 
 
-SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {'selection': best,
-    'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED),
+SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
+    'selection': best, 'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED),
     'gnc-gm': partial(TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE)}
 """The lowest truncated cost of several sets, or graduated non-convexity alone."""
 
@@ -171,8 +171,7 @@ def _joining(edges: Factors, closures: IntArray, part: IntArray, number: int) ->
     ends = np.sort(np.column_stack((part[table.i], part[table.j]))[order], axis=1)
     # of several between the same parts the first
     pairs, first = np.unique(ends, axis=0, return_index=True)
-    apart = pairs[:, 0] != pairs[:, 1]
-    size = len(part)
+    apart, size = pairs[:, 0] != pairs[:, 1], len(part)
     tree = minimum_spanning_tree(coo_array(
         (first[apart] + 1.0, tuple(pairs[apart].T)), (size, size)).tocsr())
     return closures[order[np.sort(tree.data).astype(np.int64) - 1]]

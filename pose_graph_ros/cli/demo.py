@@ -147,8 +147,8 @@ def _run(bag: Path, inputs: Inputs, values: Values, options: argparse.Namespace)
             node = subprocess.Popen(node_command)
             try:
                 converged = player.play(bag, options.out / RECORDED, inputs,
-                    {name: values[f'{name}.topic'] for name in inputs.topics}, rate=options.rate,
-                    is_running=lambda: node.poll() is None)
+                                        {name: values[f'{name}.topic'] for name in inputs.topics},
+                                        rate=options.rate, is_running=lambda: node.poll() is None)
             finally:
                 node.send_signal(signal.SIGINT)  # nothing happens if it has ended
                 try:

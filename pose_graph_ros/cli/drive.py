@@ -208,10 +208,10 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a drive as plain Python values, ready for JSON."""
     duration, distance = extent(drive.corrected)
     return {'duration_s': duration, 'distance_m': distance, 'odometry': len(drive.odometry),
-        'poses': len(drive.corrected), **{f'fixes_{kind.replace(" ", "_")}': int(
-            np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()},
-        'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
-        'errors': [asdict(row) for row in drive.rows], **extra}
+            'poses': len(drive.corrected), **{f'fixes_{kind.replace(" ", "_")}': int(
+                np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()},
+            'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
+            'errors': [asdict(row) for row in drive.rows], **extra}
 
 
 class Samples:
@@ -273,7 +273,7 @@ def drive_in(
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
     drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-        inputs.odometry[0], refused)
+                          inputs.odometry[0], refused)
     return place_truth(replace(
         drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
@@ -332,13 +332,12 @@ def collect_drive(
             (np.array(sources, dtype=str) == source) & np.isin(stamps, added) & ~kept_out)
         # of several with one stamp the first one was added
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
+    refused = {key for key in loops if key[0] in judged} if refused is None else refused
     return Drive(
         odometry.path(), corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
-        np.array([known.get(key, REFUSED if (
-            key[0] in judged if refused is None else key in refused) else BELIEVED)
-            for key in loops], dtype=np.int64),
+        np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
         [source for source, _, _ in loops], arrived_ns=arrived)
 
 

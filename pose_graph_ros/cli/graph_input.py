@@ -112,8 +112,9 @@ def read_measurements(
     starts, first = np.unique(np.minimum(edges.i, edges.j)[steps], return_index=True)
     if len(starts) < n - 1:
         lone = int(np.setdiff1d(np.arange(n - 1), starts)[0])
-        raise FileFormatError(f'{path}: expected an edge from each vertex to the next, as '
-            f'odometry; there is none from {file.ids[lone]} to {file.ids[lone + 1]}')
+        raise FileFormatError(f'{path}: expected an edge from each vertex '
+                              f'to the next, as odometry; there is none from {file.ids[lone]} to '
+                              f'{file.ids[lone + 1]}')
     odometry = steps[first]
     closures = np.setdiff1d(np.arange(len(edges)), odometry)
     last = np.maximum(edges.i, edges.j)[closures].tolist()
@@ -133,12 +134,11 @@ def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
     forward = (edges.i < edges.j)[:, None]
     motions = np.where(forward, edges.mean, se2.inverse(edges.mean))
     variances = np.diagonal(_covariances(edges), axis1=1, axis2=2)
-    elapsed = np.diff(stamps_ns) * 1e-9
-    pose = np.zeros(3)
+    elapsed, pose = np.diff(stamps_ns) * 1e-9, np.zeros(3)
     for k, stamp_ns in enumerate(stamps_ns.tolist()):
         step = min(k, len(motions) - 1)
         yield OdometrySample(stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
-            variances[step] / elapsed[step])
+                             variances[step] / elapsed[step])
         pose = se2.compose(pose, motions[step])
 
 

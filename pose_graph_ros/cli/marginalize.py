@@ -35,8 +35,8 @@ def execute(options: argparse.Namespace) -> int:
     sizes = [len(prior.nodes) for prior in graph.priors]
     if len(sizes) > 0 and not options.sparse:
         raise ConfigError(f'{options.graph}: without these nodes there are {len(sizes)} dense '
-            f'priors, the largest one on {max(sizes)} nodes, which g2o does not have; --sparse '
-            'puts edges in their place')
+                          f'priors, the largest one on {max(sizes)} nodes, which g2o does not '
+                          'have; --sparse puts edges in their place')
     if len(sizes) > 0:
         rows, without = graph.rows(), Graph()
         without.fill(rows._replace(priors=()))

@@ -209,8 +209,8 @@ def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> di
     corrector, path = _Corrector(bag, inputs, run), run.estimate.path
     begin_ns, step = inputs.span.begin_ns, -(-len(path) // MOST_POSES)
     writer.write(PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
-        output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]), int(
-            path.stamps_ns[-1]), corrector.map_frame))
+                 output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]), int(
+                     path.stamps_ns[-1]), corrector.map_frame))
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
@@ -350,7 +350,7 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
-        for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
+                    for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
     start, recorder = time.monotonic(), Recorder()
     backend, report = run_measurements(measurements, values, recorder)
     result, seconds = Replayed(backend, report, backend.counts, recorder), time.monotonic() - start

@@ -12,7 +12,6 @@ import argparse
 from collections.abc import Callable
 from dataclasses import replace
 import json
-import math
 from pathlib import Path
 import re
 import sys
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
@@ -212,7 +212,8 @@ class Report(NamedTuple):
                      f'its minimum, is nowhere lower by more than {made.gap:.2g}']
         else:
             lines = [f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
-                f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum found']
+                     f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum '
+                     'found']
         if made.is_lower:
             lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
         if self.chi2_from_it is not None:
@@ -252,11 +253,9 @@ def with_certificate(
         graph.set_poses(made.poses)
         other = solve(problem, 'present')
         found = other.result.chi2
-        if other.result.is_better_than(solution.result):
-            solution = Solution(other.result, 'minimum of the chordal objective',
-                                other.determined, solution.tried)
-        else:
-            solution = resumed(problem, solution, poses)
+        solution = Solution(
+            other.result, 'minimum of the chordal objective', other.determined, solution.tried,
+        ) if other.result.is_better_than(solution.result) else resumed(problem, solution, poses)
     bound = max(made.bound, 0.0) if formulation.below_chi2 else None
     return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
 
@@ -325,7 +324,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     if options.json:
         graph, result = problem.graph, solution.result
         edges = graph.factors_at(doubted)
-        print(json.dumps(_finite({
+        print(json.dumps(finite({
             'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
             'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
             'iterations': result.iterations, 'status': result.status.value,
@@ -335,8 +334,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             'held': file.ids[held].tolist(),
             'doubted': np.stack((problem.ids[edges.i], problem.ids[edges.j]), axis=1).tolist(),
             'chi2_start': before, 'seconds': seconds, 'edge2': file.edge2_order,
-            'robust': decision,
-            'certificate': None if certificate is None else certificate.values(),
+            'robust': decision, 'certificate': certificate and certificate.values(),
             **({} if rows is None else {'marginals_relative_error': error}),
             **({} if rows is None or len(tables) > 0 else {'marginals': table})}),
             indent=2, allow_nan=False))
@@ -354,21 +352,13 @@ def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArr
     return [
         *(f'  from the {name}: chi2 {each.chi2:.9g}, {each.status.value} after '
           f'{each.iterations} iterations' for name, each in solution.tried),
-        f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations from '
-            f'the {solution.start}, {seconds:.3f} s{": " if result.reason else ""}{result.reason}',
+        f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
+        f'from the {solution.start}, {seconds:.3f} s{": " if result.reason else ""}'
+        f'{result.reason}',
         *(f'  edge {ids[factors.i[k]]} -> {ids[factors.j[k]]}: energy {energies[k]:.4g}'
           for k in order[is_edge & ~np.isin(order, doubted)][:N_LARGEST]),
         *(f'  observed node on {ids[factors.i[k]]}: energy {energies[k]:.4g}'
           for k in order[~is_edge][:N_LARGEST])]
-
-
-def _finite(value: Any) -> Any:
-    """Return values for JSON, which has no infinity: None in its place."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _marginals(

@@ -12,7 +12,7 @@ part in these.
 
 import argparse
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from enum import Enum
 from itertools import islice
 import json
@@ -28,7 +28,7 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, IMU, Values
-from pose_graph_ros.cli import shared, tuned_parameters
+from pose_graph_ros.cli import finite, shared, tuned_parameters
 from pose_graph_ros.cli.drive import distances, measured_in, read_truth
 from pose_graph_ros.cli.replay import run_measurements
 from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
@@ -111,12 +111,12 @@ class Tuning:
         self._closures: list[tuple[str, LoopClosure]] = []
         if all(isinstance(each, HeadingOnly) for some in self._sources.values() for each in some):
             self._sources, self._closures = {}, [(name, each) for name, each in self._measurements
-                if isinstance(each, LoopClosure)]
+                                                 if isinstance(each, LoopClosure)]
             if len(self._closures) < LEAST:
                 topics = ', '.join(f'{topic} ({source})'
                                    for source, topic in inputs.topics.items())
                 raise BagError(f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, '
-                    f'global poses or loop closures are needed; used are {topics}')
+                               f'global poses or loop closures are needed; used are {topics}')
 
     def tune(self, folds: int, truth: Trajectory | None, stretch: Seconds | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
@@ -136,7 +136,7 @@ class Tuning:
         after = self._run(checked({**self._values, **changed(tuned)}),
                           'all, with the settings after')
         doubted = frozenset((one.source, one.stamp_ns) for one in after.verdicts()
-            if one.state is State.DOUBTED and one.reference_ns is None)
+                            if one.state is State.DOUBTED and one.reference_ns is None)
         if len(doubted) > 0:
             tuned, tau = self._estimate(runs, doubted)
         period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
@@ -146,10 +146,8 @@ class Tuning:
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
         one, other = noise.comparable(*zip(*(
             pair for errors, _ in tried for pair in errors), strict=True))
-        verdict = Verdict.SAME
-        if len(changed(tuned)) > 0:
-            verdict = Verdict.BETTER if noise.is_better(
-                one, other, self._start_ns, stretch) else Verdict.WORSE
+        verdict = Verdict.SAME if len(changed(tuned)) == 0 else Verdict.BETTER if noise.is_better(
+            one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [] if truth is None else np.sqrt(np.mean(np.square(
             [to_truth for _, to_truth in tried]), axis=0)).tolist()
         measured = [f'{len(some)} of {name}' for name, some in self._sources.items()] or [
@@ -175,9 +173,10 @@ class Tuning:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
         self._step += 1
         _show(f'step {self._step} of {self._steps}: {text}')
-        backend, _ = run_measurements(((name, each) for name, each in self._measurements
-            if odometry in ('', name) or not isinstance(each, OdometrySample)
-            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
+        backend, _ = run_measurements((
+            (name, each) for name, each in self._measurements if odometry in ('', name)
+            or not isinstance(each, OdometrySample) if isinstance(each, OdometrySample)
+            or (name, each.stamp_ns) not in without), values)
         return backend
 
     def _runs(
@@ -223,8 +222,8 @@ class Tuning:
             for source in dict.fromkeys(of for of, _ in self._closures):
                 if (size := _shown(by_residuals.get(source))) is not None:
                     # their constraints share noise of odometry up to the hidden nodes
-                    tuned += tuned_parameters.source_parameters(source, OF_CLOSURES, self._values,
-                        size=size.written(max(size.value, 1.0)))
+                    tuned += tuned_parameters.source_parameters(
+                        source, OF_CLOSURES, self._values, size=size.written(max(size.value, 1.0)))
         return tuned, longest
 
     def _claims(self, name: str, some: Sequence[Absolute]) -> Claims:
@@ -233,13 +232,13 @@ class Tuning:
                               if not isinstance(each, HeadingOnly)])
         headings = _heading_variances(some)
         inside = len(positions) == 0 or bool(np.min(positions) > 1.01 * policy.position_floor**2
-            and np.max(positions) < 0.99 * policy.position_ceiling**2)
+                                             and np.max(positions) < 0.99
+                                             * policy.position_ceiling**2)
+        both = positions, headings
         return Claims(
-            all(np.ptp(each) < 0.05 * np.min(each) for each in (positions, headings)
-                if len(each) > 0),
+            all(np.ptp(each) < 0.05 * np.min(each) for each in both if len(each) > 0),
             inside and name not in self._repaired and len(policy.override) == 0,
-            *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0
-              for each in (positions, headings)))
+            *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0 for each in both))
 
     def _fold(
         self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
@@ -319,8 +318,7 @@ def _shown(fit: ScaleFit | None, axis: int | None = None) -> Found | None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    start = time.monotonic()
-    values = shared.parameter_values(options)
+    start, values = time.monotonic(), shared.parameter_values(options)
     if options.out.is_dir():
         raise BagError(f'{options.out}: is a folder; expected a file to write')
     if not options.out.resolve().parent.is_dir():
@@ -343,17 +341,15 @@ def execute(options: argparse.Namespace) -> int:
         options.out.write_text(
             tuned_parameters.yaml_text(outcome.tuned, headline), encoding='utf-8')
     if options.json:
-        print(json.dumps({
+        print(json.dumps(finite({
             'bags': [str(each) for each in options.bags],
             'file': str(options.out) if is_better else None,
             'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
-            'parameters': [_plain(each._asdict()) | {'changed': each.changes}
-                           for each in outcome.tuned],
-            'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
-            'to_truth': _plain(dict(zip(
-                ('before', 'after'), outcome.to_truth, strict=False))) or None,
+            'parameters': [each._asdict() | {'changed': each.changes} for each in outcome.tuned],
+            'before': outcome.before._asdict(), 'after': outcome.after._asdict(),
+            'to_truth': dict(zip(('before', 'after'), outcome.to_truth, strict=False)) or None,
             'folds': outcome.folds, 'stretch_s': outcome.stretch, 'doubted': outcome.n_doubted,
-            'is_cut': tuning.is_cut, 'seconds': time.monotonic() - start}, indent=2))
+            'is_cut': tuning.is_cut, 'seconds': time.monotonic() - start}), indent=2))
     else:
         print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         print('\n'.join(_lines(outcome, tuning)))
@@ -390,9 +386,8 @@ def _lines(outcome: Outcome, tuning: Tuning) -> list[str]:
     lines += ['', f'{"held out":<22}{"rms":>9}{"median":>9}{"NEES":>9}{"NLPD":>9}'
                   f'{"correlation":>13}{"count":>8}']
     for name, of in (('before', outcome.before), ('after', outcome.after)):
-        lines.append(
-            f'{name:<22}{of.rms:>7.3f} m{of.median:>7.3f} m{of.nees:>9.3g}{of.nlpd:>9.3f}'
-            f'{of.correlation_time:>11.3g} s{of.n:>8}')
+        lines.append(f'{name:<22}{of.rms:>7.3f} m{of.median:>7.3f} m{of.nees:>9.3g}'
+                     f'{of.nlpd:>9.3f}{of.correlation_time:>11.3g} s{of.n:>8}')
     for name, error in zip(('before, to truth', 'after, to truth'), outcome.to_truth,
                            strict=False):
         lines.append(f'{name:<22}{error:>7.3f} m')
@@ -406,7 +401,3 @@ def _value(value: Any) -> str:
     return f'{value:.4g}' if isinstance(value, int | float) else str(value)
 
 
-def _plain(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return facts with null for what is not a finite number, which JSON does not know."""
-    return {name: None if isinstance(value, float) and not abs(value) < float('inf') else value
-            for name, value in facts.items()}

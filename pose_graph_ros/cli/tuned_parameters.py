@@ -69,10 +69,10 @@ def source_parameters(
         one = _one(scale, leading, values, 1.0)
         if claims.is_constant and claims.sigma > 0.0 and one.changes:
             one = one._replace(note=f'{one.note}; sigma {_number(claims.sigma)} m claimed, '
-                          f'{_number(claims.sigma * math.sqrt(leading.value))} m found')
+                               f'{_number(claims.sigma * math.sqrt(leading.value))} m found')
         if one.changes and size is not None and heading is not None:
             one = one._replace(note=f'{one.note}; of headings by themselves it would be '
-                          f'{_number(values[scale] * heading.value)}')
+                               f'{_number(values[scale] * heading.value)}')
         yield one
     else:
         sigmas = [claims.sigma * math.sqrt(size.value)] if size is not None else [1.0]
@@ -116,25 +116,22 @@ def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
     lines = [*(f'# {line}'.rstrip() for line in headline), '/**:', '  ros__parameters:']
     for source in dict.fromkeys(each.name.partition('.')[0] for each in tuned):
         own = [each for each in tuned if each.name.startswith(f'{source}.')]
-        if not any(each.changes for each in own):
-            lines += [f'    # {each.name}: {_text(each.before)}, {_why(each)}' for each in own]
-            continue
-        lines.append(f'    {source}:')
+        some_change = any(each.changes for each in own)
+        lines += [f'    {source}:'] if some_change else []
         for each in own:
             leaf = each.name.partition('.')[2]
             if each.changes:
                 lines += [f'      # {_text(each.before)} before; {_why(each)}',
                           f'      {leaf}: {_text(each.after)}']
             else:
-                lines.append(f'      # {leaf}: {_text(each.before)}, {_why(each)}')
+                name = f'      # {leaf}' if some_change else f'    # {each.name}'
+                lines.append(f'{name}: {_text(each.before)}, {_why(each)}')
     return '\n'.join(lines) + '\n'
 
 
 def interval(tuned: Tuned) -> str:
     """Return the interval of a parameter; empty if it has none."""
-    if math.isnan(tuned.low):
-        return ''
-    return f'{_number(tuned.low)} to {_number(tuned.high)}'
+    return '' if math.isnan(tuned.low) else f'{_number(tuned.low)} to {_number(tuned.high)}'
 
 
 def _why(tuned: Tuned) -> str:

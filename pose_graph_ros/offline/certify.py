@@ -164,8 +164,9 @@ def certify(
             bound = max(bound, spectrum.bound)
     gap = max(cost - bound, 0.0)
     certified = gap <= TUNING.gap * max(cost, 1.0)
-    return Certificate(Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED, cost, near, gap,
-        spectrum.smallest, y.shape[1], formulation.poses(form.positions(z)[:, 0], z[:, 0]))
+    return Certificate(Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED,
+                       cost, near, gap, spectrum.smallest, y.shape[1],
+                       formulation.poses(form.positions(z)[:, 0], z[:, 0]))
 
 
 def _escaped(form: QuadraticForm, y: ComplexArray, direction: ComplexArray) -> ComplexArray:
@@ -248,7 +249,8 @@ def _smallest(
     operator = scipy.sparse.linalg.LinearOperator((n, n), matvec=inverse, dtype=np.complex128)
     rng = np.random.default_rng(0)
     try:
-        values, vectors = scipy.sparse.linalg.eigsh(operator, k=1, which='LM', tol=TUNING.accuracy,
+        values, vectors = scipy.sparse.linalg.eigsh(
+            operator, k=1, which='LM', tol=TUNING.accuracy,
             v0=_without(basis, rng.normal(size=n) + 1j * rng.normal(size=n)))
     except scipy.sparse.linalg.ArpackError:
         return None, None

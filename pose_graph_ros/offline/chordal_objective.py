@@ -71,8 +71,7 @@ class Formulation(NamedTuple):
 
     def headings(self, poses: FloatArray) -> ComplexArray:
         """Return z, shape (n_unknowns,), of poses of all hidden nodes, shape (N, 3)."""
-        z = np.ones(self.n_unknowns, dtype=np.complex128)
-        free = self.number > 0
+        z, free = np.ones(self.n_unknowns, dtype=np.complex128), self.number > 0
         z[self.number[free]] = np.exp(1j * poses[free, 2])
         return z
 
@@ -130,7 +129,7 @@ def formulate(graph: Constrained) -> Formulation:
     part = components(form.i[tau > 0.0], form.j[tau > 0.0], form.n_unknowns)
     if np.any(part != 0):
         raise NotCoveredError(f'constraints on positions join {int(np.sum(part != 0))} nodes to '
-            'nothing fixed and nothing observed')
+                              'nothing fixed and nothing observed')
     return form
 
 

@@ -258,8 +258,8 @@ def map_places(view: Any, *, spring: bool = False) -> tuple[dict[int, FloatArray
     turns = 2.4 * np.arange(len(nodes))
     aside = np.column_stack((np.cos(turns), np.sin(turns)))
     if spring:
-        start = {node: place + 0.01 * way
-            for node, place, way in zip(in_map, _to_unit(at, in_map, lines), aside, strict=False)}
+        start = {node: place + 0.01 * way for node, place, way in zip(
+            in_map, _to_unit(at, in_map, lines), aside, strict=False)}
         found = nx.spring_layout(lines, pos=start, iterations=200, seed=0)
         at = np.array([found[node] for node in in_map]).reshape(-1, 2)
     at = _to_unit(at, in_map, lines)

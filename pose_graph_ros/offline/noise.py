@@ -371,7 +371,7 @@ def error_summary(of: Errors) -> Summary:
         nlpd = float(np.mean(_surprises(of)[usable]))
     distinct = np.diff(of.stamps_ns, prepend=-1) > 0
     return Summary(len(squared), float(np.sqrt(np.mean(squared))), float(np.median(of.distances)),
-        nees, nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
+                   nees, nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
 
 
 def _sigmas(errors: FloatArray, covariances: FloatArray) -> FloatArray:

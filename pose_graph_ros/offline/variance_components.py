@@ -92,8 +92,7 @@ def split(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
 
 def constraints(graph: Graph) -> Constraints:
     """Return the constraints of a graph with a weight above 0, linear at its estimate."""
-    poses = graph.poses
-    used = np.flatnonzero(graph.weights > 0.0)
+    poses, used = graph.poses, np.flatnonzero(graph.weights > 0.0)
     factors = graph.factors_by_row.rows(used)
     error = errors(poses, factors)
     # derivatives by the nodes of the ends, and their columns
@@ -121,7 +120,8 @@ def constraints(graph: Graph) -> Constraints:
                                     shape=(size, size))
     free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
     return Constraints(error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0,
-        factors.information, factors.weight, jacobian[:, free], priors[free][:, free], used)
+                       factors.information, factors.weight, jacobian[:, free],
+                       priors[free][:, free], used)
 
 
 def restricted_likelihood(
@@ -232,8 +232,8 @@ def analyse(parts: Parts) -> Analysis:
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
-    correlated = frozenset(source for source, each in white.items() if each.kind == 'map'
-        and (found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
+    correlated = frozenset(source for source, each in white.items() if each.kind == 'map' and (
+        found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
     if len(correlated) == 0:
         fits |= _together(parts, fits, white)
     return Analysis(residuals, fits, correlated)

@@ -127,8 +127,8 @@ class Arrivals:
             way = 'ahead of' if late_ns < 0 else 'behind'
             waits = ', for which its measurements wait' if may_be_late else ''
             self.wrong = (f'the stamps of {self.source} are {abs(self.delay):.1f} s {way} those '
-                f'of {odometry}{waits}: mend the clock of its driver (GPS time is 18 s ahead of '
-                f'UTC), or set {self.source}.time_offset')
+                          f'of {odometry}{waits}: mend the clock of its driver (GPS time is 18 s '
+                          f'ahead of UTC), or set {self.source}.time_offset')
 
     def refusal(self, counts: Counts, details: Details, now: Seconds) -> str:
         """Return what to say if its newest messages were all refused, else an empty text."""
@@ -145,7 +145,8 @@ class Arrivals:
         begin = f'{count} of {self.count}' if accepted == 0 else f'the newest {count}'
         # all reasons with the newest detail of each, the most frequent first
         reasons = '; '.join((f'{n} times ' if len(newest) > 1 else '')
-            + f'{reason} ({details[self.source, reason]})' for reason, n in newest.most_common())
+                            + f'{reason} ({details[self.source, reason]})'
+                            for reason, n in newest.most_common())
         return f'{begin} messages of {self.source} were refused: {reasons}'
 
 
@@ -271,7 +272,7 @@ class Input:
 
     def _clear(self) -> None:
         self.arrivals = {name: Arrivals(name, is_rare=source.kind.is_rare)
-            for name, source in self.reader.sources.items()}
+                         for name, source in self.reader.sources.items()}
         self.rejected: Counts = Counter()  # number by source and reason
         self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
         self.posted = 0  # number of measurements that were handed to the engine
@@ -350,8 +351,8 @@ class Input:
         for (source, reason), detail in details.items():
             if source in self.reader.sources and (source, reason) not in self._told:
                 self._told.add((source, reason))
-                logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
-                    '%s: %s: %s (logged once, counted in diagnostics)', source, reason, detail)
+                logger.log(logging.INFO if reason in INTENDED else logging.WARNING, '%s: %s: %s '
+                           '(logged once, counted in diagnostics)', source, reason, detail)
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used."""
@@ -374,8 +375,7 @@ class PoseContinuity:
 
     def __init__(self, maximum_speed: float, *, resumes: bool = False) -> None:
         self.maximum_speed = maximum_speed  # may be changed at any time
-        self._resumes = resumes
-        self._stamp_ns = 0
+        self._resumes, self._stamp_ns = resumes, 0
         self._pose = (0.0, 0.0, 0.0)
         self._window = SpeedWindow(UNKNOWN, 0, self._pose)
         self._jump_ns = 0
@@ -389,11 +389,9 @@ class PoseContinuity:
             motion = between_one(self._pose, (x, y, theta))
             step = math.hypot(motion[0], motion[1]), abs(motion[2])
             begins = self._stamp_ns == 0 or elapsed_ns < 0
-            if begins:
-                jumped = self._stamp_ns == 0 and self._resumes
-            else:
-                jumped = elapsed_ns > FAR_NS or is_jump(
-                    self._window.speeds, step, elapsed_ns * 1e-9, sample.speed, self.maximum_speed)
+            jumped = (self._stamp_ns == 0 and self._resumes) if begins else (
+                elapsed_ns > FAR_NS or is_jump(self._window.speeds, step, elapsed_ns * 1e-9,
+                                               sample.speed, self.maximum_speed))
             self._stamp_ns, self._pose = sample.stamp_ns, (x, y, theta)
             if begins or jumped:
                 self._window = SpeedWindow(self._window.speeds, sample.stamp_ns, self._pose)

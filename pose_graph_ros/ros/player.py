@@ -83,7 +83,6 @@ class Player(Node):
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        self.n_poses = 0  # of the newest path
         outputs = {name: OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
         if TFMessage is not None:
             outputs['tf'] = '/tf', TF_TYPE
@@ -93,7 +92,7 @@ class Player(Node):
                 message_class(type_name), topic, partial(self._record, name, topic, type_name),
                 LATCHED if name in KEPT else RELIABLE, raw=True)
         self._optimize, self._save = (self.create_client(Trigger, f'{NODE_NAME}/{name}')
-            for name in ('optimize', 'save_graph'))
+                                      for name in ('optimize', 'save_graph'))
 
     def _record(self, output: str, topic: str, type_name: str, raw: bytes) -> None:
         received = topic, type_name, time.time_ns(), raw
@@ -136,7 +135,7 @@ class Player(Node):
             and len(self.diagnostics) > 0 and self._optimize.service_is_ready()
             and self._save.service_is_ready(), PATIENCE.appear, 'the node does not subscribe')
         self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PATIENCE.prepare,
-                        'the node is still compiling')
+                         'the node is still compiling')
         sent = self.processed
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
@@ -202,17 +201,20 @@ class Player(Node):
         self._spin_until(asked.done, PATIENCE.answer, f'no answer to {what}')
         return asked.result()
 
-    def write(self, folder: Path) -> None:
-        """Have the node save its graph, and write a rosbag2 of all that it has published."""
+    def write(self, folder: Path) -> int:
+        """
+        Have the node save its graph, and write a rosbag2 of all that it has published.
+
+        Return the number of poses of the newest path.
+        """
         answer = self._call(self._save, 'saving the graph')
         if not answer.success:
             raise PlayError(f'~/save_graph: {answer.message}')
-        path = deserialize_message(self._newest['path'][-1], PathMessage)
-        self.n_poses = len(path.poses)
         newest = list(self._newest.values())
         with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
             for message in (*self._recorded, *newest):
                 writer.write(*message)
+        return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
 
 
 def play(
@@ -230,10 +232,10 @@ def play(
         player = Player(inputs, topics, context, is_running)
         published = player.play(bag, rate)
         success, answer = player.request_final_optimization()
-        player.write(out)
+        n_poses = player.write(out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '
-              f'path of {player.n_poses} poses')
+              f'path of {n_poses} poses')
     finally:
         rclpy.try_shutdown(context=context)
     return success

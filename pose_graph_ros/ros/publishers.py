@@ -74,7 +74,7 @@ class View:
     def is_due(self, state: object, period: Seconds) -> bool:
         """Tell whether to publish what is new, if a state is given, wanted, and not too soon."""
         return ((state is None or state != self.shown) and time.monotonic() - self.at >= period
-            and bool(self.publisher.get_subscription_count() > 0))
+                and bool(self.publisher.get_subscription_count() > 0))
 
 
 class Publishers:
@@ -111,7 +111,7 @@ class Publishers:
         """Set the parameters that can change while the node runs."""
         if values['publish_tf'] and TFMessage is None:
             self._node.get_logger().warning('tf2_msgs is not installed: the transform from map to '
-                'odom is not published', once=True)
+                                            'odom is not published', once=True)
         elif values['publish_tf'] and self.transforms is None:
             publisher = self._publisher(topics.TF_TYPE, topics.TOPIC, topics.TF_QOS)
             self.transforms = TransformPublisher(
@@ -225,9 +225,9 @@ class Publishers:
         with self._lock:
             self.graph += 1
             for view, empty in ((self.path, lambda header: Path(header=header)),
-                    (self.markers, lambda header: MarkerArray(
-                        markers=[Marker(header=header, action=Marker.DELETEALL)])),
-                    (self.verdicts, lambda header: verdicts_message([], {}, header))):
+                                (self.markers, lambda header: MarkerArray(
+                                    markers=[Marker(header=header, action=Marker.DELETEALL)])),
+                                (self.verdicts, lambda header: verdicts_message([], {}, header))):
                 if view.stamp_ns > 0:
                     view.publisher.publish(empty(_header(view.stamp_ns + 1, self.map_frame)))
                 view.forget()
@@ -235,7 +235,8 @@ class Publishers:
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
         status = DiagnosticStatus(level=level, name=f'{self._node.get_fully_qualified_name()}: '
-            'pose graph', message=text, hardware_id='pose_graph', values=_key_values(values))
+                                  'pose graph', message=text, hardware_id='pose_graph',
+                                  values=_key_values(values))
         self._publishers['diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
@@ -257,8 +258,9 @@ def verdicts_message(
     of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
     doubting = any(each.doubting for each in totals.values())
     summary = DiagnosticStatus(level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK,
-        name='summary', message=f'{len(verdicts)} of {n_all} are listed; '
-        f'{of_sources or "nothing is judged yet"}', values=_key_values(total_values(totals)))
+                               name='summary', message=f'{len(verdicts)} '
+                               f'of {n_all} are listed; {of_sources or "nothing is judged yet"}',
+                               values=_key_values(total_values(totals)))
     return DiagnosticArray(header=header, status=[summary, *(DiagnosticStatus(
         level=LEVELS[each.state], name=each.id, message=sentence(each), hardware_id=each.source,
         values=_key_values(details(each))) for each in verdicts)])

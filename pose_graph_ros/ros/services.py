@@ -32,8 +32,7 @@ logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
 CLOSED = 'the node was cleaned up meanwhile'
-SERVICE_THREAD = 'pose graph services'
-HIDDEN_NODE = '_services'
+SERVICE_THREAD, HIDDEN_NODE = 'pose graph services', '_services'
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
 
@@ -124,7 +123,7 @@ class Services:
             return True, 'paused already' if request.data else 'was not paused'
         received.paused = request.data
         return True, ('paused: measurements are counted but not used; poses still '
-            'follow the odometry' if request.data else 'resumed')
+                      'follow the odometry' if request.data else 'resumed')
 
     def _set_datum(self, _: Trigger.Request) -> Answer:
         """Let the next good fix be the datum, unless the graph refers to the present one."""

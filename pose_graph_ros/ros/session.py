@@ -80,7 +80,7 @@ class Session:
     ) -> None:
         """Start the thread that owns a graph, which may resume a drive."""
         self._continuity = {name: PoseContinuity(source.maximum_speed, resumes=resumes)
-            for name, source in self._config.odometry.items()}
+                            for name, source in self._config.odometry.items()}
         self.is_loaded = resumes  # whether the graph began as one that was loaded
         # of this graph, so that the answer of an earlier worker is nobody's
         self.searches = diagnostics.Searches()

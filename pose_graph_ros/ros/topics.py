@@ -71,8 +71,8 @@ SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT
 CLOSURE_QOS = QoSProfile(depth=100)     # a loop closure is rare and must not get lost
 JUDGE_TOPIC = '~/judge'
 INPUTS = {'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
-    'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
-    JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
+          'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+          JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
 """Messages and quality of service by topic, but for the sources."""
 if TFMessage is not None:   # late subscribers receive the newest message of every broadcaster
     INPUTS[STATIC_TOPIC] = TF_TYPE, QoSProfile(
@@ -109,7 +109,7 @@ def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, 
         if published != '' and output == '':
             hint = f': move that {moved(node, published)}, instead of a remap, which moves both'
             raise ConfigError(f'{user}: expected a topic that the node does not publish, got '
-                f'{topic}, which is {first}{hint if published in OUTPUTS else ""}')
+                              f'{topic}, which is {first}{hint if published in OUTPUTS else ""}')
     for name, value in sorted(overrides.items()):
         topic, _, rest = name.removeprefix(OVERRIDES).partition('.')
         entity, _, policy = rest.partition('.')
@@ -201,8 +201,7 @@ class TransformPublisher:
         if self._odom_frame.encode() not in data or self.other != '':
             return
         for transform in deserialize_message(data, TFMessage).transforms:
-            parent = frame(transform.header.frame_id)
-            t = transform.transform
+            parent, t = frame(transform.header.frame_id), transform.transform
             if frame(transform.child_frame_id) != self._odom_frame or (
                     stamp_ns(transform), t.translation.x, t.rotation.z) in self._own:
                 continue
@@ -210,10 +209,10 @@ class TransformPublisher:
             names = names and f', by {names}'
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
             self.other = (f'another node publishes {parent} -> {self._odom_frame} on '
-                f'{self._node.resolve_topic_name(TOPIC)}{names}{wrong}: set publish_tf of one of '
-                'the two to false; if it is that of another robot, give each a namespace and '
-                'its own tf, with remap_tf:=true of the launch file or -r /tf:=tf -r '
-                '/tf_static:=tf_static')
+                          f'{self._node.resolve_topic_name(TOPIC)}{names}{wrong}: set publish_tf '
+                          'of one of the two to false; if it is that of another robot, give each '
+                          'a namespace and its own tf, with remap_tf:=true of the launch file or '
+                          '-r /tf:=tf -r /tf_static:=tf_static')
             return
 
 

@@ -275,10 +275,9 @@ class Worker:
         count, total, longest = self._durations
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
-            refusals=dict(backend.refusals),
-            pending=backend.n_waiting, quarantined=backend.n_quarantined,
-            set_aside=backend.set_aside(3), updates=count, solve_mean=total / max(count, 1),
-            solve_max=longest,
+            refusals=dict(backend.refusals), pending=backend.n_waiting,
+            quarantined=backend.n_quarantined, set_aside=backend.set_aside(3), updates=count,
+            solve_mean=total / max(count, 1), solve_max=longest,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
             biases=backend.gyro_biases(backend.graph), calibrations=backend.calibrations(),

@@ -66,11 +66,11 @@ def _whole(run: Run) -> Iterator[Finding]:
                                  f'{reason}): the path is not at the minimum', 'updates')
     if estimate.alignment is AlignmentState.UNALIGNED:
         yield Finding('warning', 'the angle between odometry and map is unknown, as fixes are too '
-            'few or from too short a path: drive farther', 'map')
+                      'few or from too short a path: drive farther', 'map')
     elif estimate.alignment is AlignmentState.LOCAL:
         others = '' if len(run.backend.parts.pipeline.beacons.ids) == 0 else ' and beacons'
         yield Finding('notice', 'nothing was measured in the map, so the path begins at its '
-            f'origin, and nothing but loop closures{others} bounds its drift', 'map')
+                      f'origin, and nothing but loop closures{others} bounds its drift', 'map')
     for source, each in run.backend.calibrations().items():
         yield Finding(
             'good', f'{source}: its yaw rate is corrected by {short(each.rate, 3)} rad/s (sigma '
@@ -171,13 +171,13 @@ def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[F
         far = [float(np.hypot(*every[k].residual[:2])) for k in part]
         size = f', {short(np.nanmedian(far))} m from the path' if np.any(np.isfinite(far)) else ''
         yield Finding('warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} '
-            f's to {end:.1f} s contradict the path and are not used{size}: look for reflections, '
-            'or a jump of the receiver', 'map')
+                      f's to {end:.1f} s contradict the path and are not used{size}: look for '
+                      'reflections, or a jump of the receiver', 'map')
     rest = len(at) - sum(map(len, long[:MOST_TOLD]))
     if rest > 0:
         more = ' more' if len(long) > 0 else ''
         yield Finding('notice', f'{source}: {rest}{more} of {number_of(len(every), Judged.FIX)} '
-            'contradict the path, alone or in other stretches, and are not used', 'map')
+                      'contradict the path, alone or in other stretches, and are not used', 'map')
 
 
 def _closures(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
@@ -213,8 +213,9 @@ def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
                                  'more places', 'map')
     jumps = run.counts.get((source, 'jump'), 0)
     if jumps > 0:
-        yield Finding('warning', f'{source}: odometry jumped {jumps} times by more than '
-            f'{source}.maximum_speed allows; the motion there is taken as unknown', 'map')
+        yield Finding('warning', f'{source}: odometry jumped {jumps} times by more '
+                      f'than {source}.maximum_speed allows; the motion there is taken as unknown',
+                      'map')
 
 
 def silent(stamps_ns: Sequence[StampNs], least_s: Seconds) -> FloatArray:
@@ -260,7 +261,7 @@ def silences(
                 'the motion there is not known')
         longest = float(np.max(lengths))
         yield Finding('warning' if longest > 20.0 else 'notice', f'{source}: no messages from '
-            f'{where}{more} ({short(longest, 3)} s at most); {what}', f'source-{source}')
+                      f'{where}{more} ({short(longest, 3)} s at most); {what}', f'source-{source}')
 
 
 def _refusals(run: Run) -> Iterator[Finding]:
@@ -278,6 +279,6 @@ def _refusals(run: Run) -> Iterator[Finding]:
                 'accepted', 'pending', 'sorted', 'thinned', 'rotations', 'done_over', 'jump'):
             detail = run.backend.refusals.get((source, reason), '')
             yield Finding('warning' if count > 0.05 * totals[source] else 'notice',
-                f'{source}: {count} of {totals[source]} messages are not used: {reason}'
-                + (f', the last: {detail}' if detail else ''), f'source-{source}')
+                          f'{source}: {count} of {totals[source]} messages are not used: {reason}'
+                          + (f', the last: {detail}' if detail else ''), f'source-{source}')
     yield from invalid

@@ -53,9 +53,10 @@ def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
         if source != run.estimate.primary:
             factor = fit.ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
             advice = f'{source}.covariance_scale to {short(factor)}'
-        found[source] = SourceAnalysis(each, run.kinds.get(source, guesses[each.kind]),
-            fit, source_residuals.whiteness(each), None if report is None else report.in_use,
-            source in analysis.correlated, tuple(sorted(analysis.correlated - {source})), advice)
+        found[source] = SourceAnalysis(each, run.kinds.get(source, guesses[each.kind]), fit,
+                                       source_residuals.whiteness(each), None if report is None
+                                       else report.in_use, source in analysis.correlated,
+                                       tuple(sorted(analysis.correlated - {source})), advice)
     return found
 
 
@@ -73,23 +74,23 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     names = _NAMES['map' if residuals.kind == 'map' else 'edge']
     some = source_residuals.spread(len(used.ids), 2000)
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
-    values = normalised[np.isfinite(normalised)]
-    white = analysis.whiteness
+    values, white = normalised[np.isfinite(normalised)], analysis.whiteness
+    def numbers(of: Any, *fields: str) -> dict[str, float | None]:
+        return {field: number(getattr(of, field)) for field in fields}
+
     return {
         'name': residuals.source, 'kind': analysis.kind.name,
         'count': len(residuals.ids), 'used': len(used.ids),
-        'rows': [{'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
-                  'count': row.n, **{name: number(getattr(row, name)) for name in (
-                      'sigma', 'expected', 'found', 'ratio', 'low', 'high')}}
-                 for row in found.rows],
-        'energy': {'expected': number(found.energy_expected),
-                   'found': number(found.energy_found),
+        'rows': [{
+            'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
+            'count': row.n, **numbers(row, 'sigma', 'expected', 'found', 'ratio', 'low', 'high')}
+            for row in found.rows],
+        'energy': {'expected': number(found.energy_expected), 'found': number(found.energy_found),
                    'quantile95_share': number(found.within)},
-        **{name: number(getattr(found, name)) for name in (
-            'ratio', 'low', 'high', 'redundancy', 'independent')},
-        'verdict': verdict(analysis)[1],
-        'unused': {'count': len(unused.ids),
-                   'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
+        **numbers(found, 'ratio', 'low', 'high', 'redundancy', 'independent'),
+        'verdict': verdict(analysis)[1], 'unused': {
+            'count': len(unused.ids), 'median_distance': number(
+                float(np.median(far)) if len(far) > 0 else None)},
         'histogram': None if len(values) == 0 or found.says_nothing else {
             'edges': rounded(edges), 'count': np.histogram(
                 np.clip(values, edges[0] + 1e-9, edges[-1] - 1e-9), edges)[0].tolist()},
@@ -109,10 +110,11 @@ def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
     if fit.n_used == 0:
         return '', 'nothing of it is used'
     if fit.says_nothing:
-        return '', ('its covariances cannot be checked: the path follows it, '
-            f'so that its residuals are {short(100.0 * fit.redundancy)} % of what its errors are'
-            if fit.redundancy < 0.1 else f'its covariances cannot be checked: {fit.n_used} '
-            f'measurements are as few as {short(fit.independent)} independent ones')
+        return '', ('its covariances cannot be checked: the path follows '
+                    f'it, so that its residuals are {short(100.0 * fit.redundancy)} % of what '
+                    'its errors are' if fit.redundancy < 0.1 else 'its covariances cannot be '
+                    f'checked: {fit.n_used} measurements are as few as {short(fit.independent)} '
+                    'independent ones')
     share = f'{short(fit.ratio)} times' if fit.ratio > 1.0 else f'{short(100.0 * fit.ratio)} % of'
     positions = [row for row in fit.rows if row.coordinate < 2]
     rows, unit = (positions, 'm') if len(positions) > 0 else (list(fit.rows), 'deg')
@@ -182,7 +184,8 @@ def springs(run: Run, residuals: dict[str, SourceResiduals], frame: Frame) -> li
             what, _, rest = name.partition(' at ')
             seconds = (each.stamp_ns - frame.start_ns) * 1e-9
             name = f'{what} at {seconds:.1f} s{rest.partition(" s")[2]}'
-        found.append({'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
+        found.append({
+            'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
             'name': names.get(each.number, name), 'energy': number(each.energy),
             'expected': number(expected if math.isfinite(expected) else float(each.freedom)),
             'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,
@@ -196,7 +199,7 @@ def _text(each: ConstraintEnergy, ends: list[dict[str, Any]], residual: FloatArr
     at = f' at {times} s' if len(ends) > 0 else ''
     if each.kind == 'bias':
         return f'error of {each.source}{at}: it changes faster than its correlation time says'
-    off = '' if residual is None else (f': {short(np.hypot(*residual[:2]))} m'
-        + ('' if residual[2] == 0.0 else f' and {short(abs(residual[2]))} rad') + ' off')
+    off = '' if residual is None else (f': {short(np.hypot(*residual[:2]))} m' + (
+        '' if residual[2] == 0.0 else f' and {short(abs(residual[2]))} rad') + ' off')
     name = each.name.partition(' at ')[0] if len(ends) > 0 else each.name
     return f'{name}{at}{off}'

@@ -145,8 +145,9 @@ def record(way: Course) -> Recording:
         closures, missing = sensors.with_false(
             streams['false'], way.motion, setup.closures, ends[found], measured[found])
     every = {ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
-        settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
-        FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)), CLOSURES: closures}
+             settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
+             FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)),
+             CLOSURES: closures}
     kept = {topic: each.rows(sensors.heard(each.later_ns, topic, setup.outages))
             for topic, each in every.items()}
     arrivals = {topic: sensors.arrivals(streams[topic], topic, each.later_ns, setup)
@@ -154,14 +155,13 @@ def record(way: Course) -> Recording:
     stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
     arrivals[settings.TRUTH] = sensors.arrivals(
         np.random.default_rng(0), settings.TRUTH, stamps, setup)
-    ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
-                        if each.topic == topic) for topic in settings.TOPICS}
-    return Recording(
-        setup, float(way.motion.distance[-1]), Trajectory(stamps, to_map(truth.at(stamps))),
-        {topic: each._replace(stamps_ns=each.stamps_ns + ahead[topic])
-         for topic, each in kept.items()}, arrivals,
-        tuple(int(np.sum(~sensors.heard(every[each.topic].later_ns, each.topic, [each])))
-              for each in setup.outages), missing)
+    for offset in setup.offsets:
+        own = kept[offset.topic]
+        kept[offset.topic] = own._replace(stamps_ns=own.stamps_ns + round(offset.seconds * 1e9))
+    silenced = tuple(int(np.sum(~sensors.heard(every[each.topic].later_ns, each.topic, [each])))
+                     for each in setup.outages)
+    return Recording(setup, float(way.motion.distance[-1]), Trajectory(
+        stamps, to_map(truth.at(stamps))), kept, arrivals, silenced, missing)
 
 
 def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
@@ -250,8 +250,9 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
     loops, group, missing = _loop_edges(way, Motion(truth, way.motion.distance[at]), node_distance)
     fixes, wrong_fixes = _observed(way, truth, FIXES)
     absolute, wrong_poses = _observed(way, truth, POSES)
-    return SimulatedGraph(truth, se2.composed(poses[0], odometry.mean),
-        Factors.joined((odometry, loops)), group, Factors.joined((fixes, absolute)),
+    return SimulatedGraph(
+        truth, se2.composed(poses[0], odometry.mean), Factors.joined((odometry, loops)), group,
+        Factors.joined((fixes, absolute)),
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
 
@@ -272,7 +273,7 @@ def odometry_edges(
     information = np.zeros((n, 3, 3))
     information[:, range(3), range(3)] = 1.0 / variances
     return Factors(np.arange(n), np.arange(1, n + 1), mean, information,
-                 np.full(n, FactorKind.ODOMETRY))
+                   np.full(n, FactorKind.ODOMETRY))
 
 
 def _loop_edges(way: Course, path: Motion, node_distance: float) -> tuple[Factors, IntArray, int]:

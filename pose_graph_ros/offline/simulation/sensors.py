@@ -111,8 +111,7 @@ def _by_model(generator: Generator, steps: FloatArray, wheels: Wheels) -> FloatA
     """Return the motions with the noise that the node assumes, shape (N, 3)."""
     variances = model_variances(steps)
     cells = (PERIOD_S / CELL_S * np.arange(len(steps))).astype(np.int64)
-    n_cells = int(cells[-1]) + 1
-    noise = np.empty_like(steps)
+    n_cells, noise = int(cells[-1]) + 1, np.empty_like(steps)
     for axis in range(3):
         whole = np.bincount(cells, variances[:, axis], n_cells)
         drawn = generator.standard_normal(n_cells) * np.sqrt(whole)
@@ -129,7 +128,8 @@ def model_variances(steps: FloatArray, model: OdometryNoise = MODEL) -> FloatArr
     """
     distance, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
     return np.column_stack((model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,
-        model.sigma_heading_distance**2 * distance + model.sigma_heading_turn**2 * turn))
+                            model.sigma_heading_distance**2 * distance
+                            + model.sigma_heading_turn**2 * turn))
 
 
 def velocities(path: Trajectory) -> FloatArray:
@@ -170,8 +170,8 @@ def revisits(
     pairs = KDTree(poses[:, :2]).query_pairs(closures.radius, output_type='ndarray')
     old, new = np.sort(pairs, axis=1).T
     good = ((stamps[new] - stamps[old] > closures.min_time_s * 1e9)
-        & (path.distance[places[new]] - path.distance[places[old]] > closures.min_distance)
-        & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < closures.angle))
+            & (path.distance[places[new]] - path.distance[places[old]] > closures.min_distance)
+            & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < closures.angle))
     old, new = old[good], new[good]
     # one random pair of each stretch of the path
     order = generator.permutation(len(new))

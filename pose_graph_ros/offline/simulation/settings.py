@@ -174,7 +174,7 @@ class FalseClosures:
         total = round(self.share / (1.0 - self.share) * true)
         if grouped > total:
             raise ConfigError(f'{self.groups} groups of {self.size} false closures are {grouped}, '
-                f'but a share of {self.share:g} beside {true} true ones is {total}')
+                              f'but a share of {self.share:g} beside {true} true ones is {total}')
         return [self.size] * self.groups + [1] * (total - grouped)
 
 

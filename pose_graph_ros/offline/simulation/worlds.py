@@ -190,8 +190,7 @@ def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, 
     # from the middle of line k to that of line k + 1
     rest = s - begins[line]
     start, after = half[line] - reach, np.minimum(line + 1, len(ways) - 1)
-    bend = np.clip(rest - start, 0.0, turn)
-    straight = np.minimum(rest, start)
+    bend, straight = np.clip(rest - start, 0.0, turn), np.minimum(rest, start)
     beyond = np.maximum(rest - start - turn, 0.0)
     forward = (straight + np.interp(bend, along, ahead))[:, None]
     sideways = (np.interp(bend, along, left) + beyond)[:, None]
@@ -242,7 +241,7 @@ def drive_circuit(generator: Generator, duration_s: float) -> Motion:
     steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
     grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
     bent = grid + np.column_stack((7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
-        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
+                                   9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
     path = wandering(generator, bent @ se2.rotation(STREET_BEARING).T, CIRCUIT_STEP, LANE_SIGMA)
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))
     motion, arrival = follow(path, stops, waits, CAR, duration_s)
@@ -259,7 +258,7 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     right = np.array([[0.0, -1.0], [1.0, 0.0]])
     lane = corners + LANE_OFFSET * (incoming + outgoing) @ right
     turns = np.arctan2(incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
-        np.sum(incoming * outgoing, axis=1))
+                       np.sum(incoming * outgoing, axis=1))
 
     # distance from the corner to the ends of a turn: the integral of the cosine of its heading
     turn = (np.arange(1000) + 0.5) / 1000
@@ -284,9 +283,9 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
 def _drive_setup(motion: Motion) -> Setup:
     outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
     return Setup(wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
-        closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
-        outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
-        jumps=(REFLECTED,))
+                 closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
+                 outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time)
+                 else (), jumps=(REFLECTED,))
 
 
 def _hall(generator: Generator, duration_s: float) -> Motion:
@@ -322,8 +321,7 @@ def _grid(generator: Generator, duration_s: float) -> Motion:
     path = wandering(generator, points, PATH_STEP, ASIDE)
     path[:, :2] = path[:, :2] @ se2.rotation(STREET_BEARING).T
     path[:, 2] += STREET_BEARING
-    stops = np.empty(0, dtype=np.int64)
-    return follow(path, stops, np.array([REST_S]), CART, duration_s)[0]
+    return follow(path, np.empty(0, dtype=np.int64), np.array([REST_S]), CART, duration_s)[0]
 
 
 WORLDS = {
