@@ -34,7 +34,6 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 logger = logging.getLogger(__name__)
 
 BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
-IDL_SEPARATOR = '=' * 80 + '\n'
 JOURNALS = ('.db3-wal', '.db3-journal')
 
 
@@ -257,7 +256,7 @@ def own_types(connection: Connection) -> Typestore | None:
             types.register(get_types_from_msg(text, connection.msgtype))
         else:
             # several definitions, each after a separator and a line 'IDL: <name>'
-            for part in text.split(IDL_SEPARATOR):
+            for part in text.split('=' * 80 + '\n'):
                 idl = part.partition('\n')[2] if part.startswith('IDL: ') else part
                 if idl.strip():
                     types.register(get_types_from_idl(idl))

@@ -148,9 +148,8 @@ def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> ms.Lo
     if (node := _REFERENCE_NODE.fullmatch(named)) is not None:
         return ms.LoopClosure(stamp, pose, cov, reference_node=int(node[1]))
     if (time := _REFERENCE_TIME.fullmatch(named)) is not None:
-        nanoseconds = int((time[2] or '').ljust(9, '0'))
         return ms.LoopClosure(stamp, pose, cov, reference_ns=(
-            int(time[1]) * NANOSECONDS + nanoseconds + offset_ns))
+            int(time[1]) * NANOSECONDS + int((time[2] or '').ljust(9, '0')) + offset_ns))
     return rejected('wrong_frame', f'expected a hidden node such as x42 or a time such as '
                                    f'@1695.250000000, got {named!r}')
 

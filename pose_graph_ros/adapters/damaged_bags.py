@@ -231,8 +231,7 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
         with suppress(KeyError, TypeError, ValueError):
             wanted_ns = (int(about['starting_time']['nanoseconds_since_epoch'])
                          + int(about['duration']['nanoseconds']))
-            missing_s = max(1e-9 * (wanted_ns + 1 - end_ns), 0.0)
-            missing = f'{missing_s:.1f} s at the end are missing'
+            missing = f'{max(1e-9 * (wanted_ns + 1 - end_ns), 0.0):.1f} s at the end are missing'
     if len(found) == len(files) and all(each.complete for each in found):
         missing = 'its end is there'
     logger.warning('%s: %s; what can be read of it is used: '

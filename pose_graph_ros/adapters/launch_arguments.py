@@ -39,8 +39,7 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
         'sources': (AS_IN_FILE, 'names of the sources, such as [odom, fix, gyro]'),
         **inputs,
         **{name: (AS_IN_FILE, f'topic of the output, {type_name}; sets outputs.{name}, by default '
-                              f'{topic}') for name, (topic, type_name, _) in OUTPUTS.items()},
-    }
+                              f'{topic}') for name, (topic, type_name, _) in OUTPUTS.items()}}
 
 
 def switch(given: Mapping[str, str], name: str) -> bool:

@@ -193,13 +193,12 @@ def changed(values: Values, wanted: Values, *, configured: bool) -> dict[str, An
                               '`ros2 lifecycle set` it to deactivate and cleanup, change it, and '
                               'configure it again')
         new[name] = good
-    new = checked(new)
-    require_together(new)
-    return new
+    return checked_together(new)
 
 
-def require_together(values: Values) -> None:
-    """Raise a `ConfigError` if a condition on more than one parameter is broken."""
+def checked_together(given: Values) -> dict[str, Any]:
+    """Return all parameters as `checked`, after a check of conditions on more than one."""
+    values = checked(given)
     frames = [frame(values[name]) for name in FRAMES]
     if '' in frames:
         raise ConfigError(f'parameter {FRAMES[frames.index("")]}: expected the name of a frame, '
@@ -209,6 +208,7 @@ def require_together(values: Values) -> None:
                           f'{", ".join(map(repr, frames))}')
     datum_of(values)
     sources.backend_config(values)
+    return values
 
 
 def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
@@ -253,8 +253,7 @@ def as_yaml() -> str:
              '# Generated from the tables in pose_graph_ros/adapters/parameter_table.py by',
              '# `pose-graph parameters --yaml`. pose_graph.yaml has what most robots need.',
              '/**:', '  ros__parameters:']
-    commented: set[str] = set()
-    group = ''
+    commented, group = set[str](), ''
     for parameter in PARAMETERS:
         before, (group, _, leaf) = group, parameter.name.rpartition('.')
         if group not in ('', before):

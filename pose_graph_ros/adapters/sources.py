@@ -124,16 +124,13 @@ def source_list(values: Values) -> tuple[Source, ...]:
             try:
                 beacon, x, y = text.split()
                 places[beacon] = float(x), float(y)
-                good = all(abs(each) < 1e7 for each in places[beacon])
+                if not all(abs(each) < 1e7 for each in places[beacon]):
+                    raise ValueError
             except ValueError:
-                good = False
-            if not good:
                 raise ConfigError(f'parameter {name}.beacons: expected name, x and y, such as '
-                                  f'"anchor_1 12.5 -3.0", got {text!r}')
-        if 'beacons' in given:
-            given['beacons'] = places
+                                  f'"anchor_1 12.5 -3.0", got {text!r}') from None
         found.append(Source(name, KINDS[own['type']], time_offset_ns=round(
-            own['time_offset'] * NANOSECONDS), **given))
+            own['time_offset'] * NANOSECONDS), **given | {'beacons': places}))
     return tuple(found)
 
 

@@ -93,8 +93,7 @@ class Drive:
         for stamps, positions in anchors:
             inside = self.odometry.covers(stamps)
             if np.any(inside):
-                odometry = self.odometry.at(stamps[inside])[:, :2]
-                pose = fit_motion(odometry, positions[inside])
+                pose = fit_motion(self.odometry.at(stamps[inside])[:, :2], positions[inside])
                 return Trajectory(self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
         return self.odometry
 

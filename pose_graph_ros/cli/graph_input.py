@@ -131,8 +131,7 @@ def read_measurements(
 
 def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
     """Yield composed poses at all stamps, given the edge from each vertex to the next."""
-    forward = (edges.i < edges.j)[:, None]
-    motions = np.where(forward, edges.mean, se2.inverse(edges.mean))
+    motions = np.where((edges.i < edges.j)[:, None], edges.mean, se2.inverse(edges.mean))
     variances = np.diagonal(_covariances(edges), axis1=1, axis2=2)
     elapsed, pose = np.diff(stamps_ns) * 1e-9, np.zeros(3)
     for k, stamp_ns in enumerate(stamps_ns.tolist()):

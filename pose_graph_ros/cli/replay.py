@@ -258,7 +258,7 @@ class Replayed(NamedTuple):
     report: UpdateReport  # of the final optimisation
     counts: Counter[tuple[str, str]]  # messages by source and answer
     recorder: Recorder
-    datum: Datum | None = None  # of the map; None for a g2o file
+    seconds: float  # that it took
 
     @property
     def refused(self) -> set[Key]:
@@ -266,23 +266,12 @@ class Replayed(NamedTuple):
         return {*self.recorder.refused, *self.backend.refused_closures}
 
 
-def run(bag: Bag, inputs: Inputs, values: Values, live: LivePoses | None = None) -> Replayed:
-    """Return a new engine after adding all messages of a bag and a full optimisation."""
-    reader, recorder = reader_of(bag, values), Recorder()
-    refused: Counter[tuple[str, str]] = Counter()
-    backend, report = run_measurements((each[:2] for each in measured_in(
-        bag, inputs, reader, refused, held_out=False)), values, recorder, live)
-    return Replayed(backend, report, backend.counts + refused, recorder, reader.datum)
-
-
-def run_measurements(
-    measurements: Iterable[tuple[str, Measured]], values: Values,
-    recorder: Recorder | None = None, live: LivePoses | None = None,
-) -> tuple[PoseGraphBackend, UpdateReport]:
-    """Return a new engine after adding measurements, and the report of the full optimisation."""
-    backend = PoseGraphBackend(sources.backend_config(values))
-    recorder = Recorder() if recorder is None else recorder
-    next_update = UPDATE_EVERY
+def run(
+    measurements: Iterable[tuple[str, Measured]], values: Values, live: LivePoses | None = None,
+) -> Replayed:
+    """Return a new engine after adding measurements and a full optimisation."""
+    start, next_update = time.monotonic(), UPDATE_EVERY
+    backend, recorder = PoseGraphBackend(sources.backend_config(values)), Recorder()
     for source, measurement in measurements:
         if isinstance(measurement, OdometrySample):
             backend.add_odometry(measurement, source)
@@ -299,7 +288,8 @@ def run_measurements(
                 live.updated(backend)
         if live is not None:
             live.add(measurement, source)
-    return backend, backend.optimize()
+    report = backend.optimize()
+    return Replayed(backend, report, backend.counts, recorder, time.monotonic() - start)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -319,26 +309,29 @@ def _execute_bags(options: argparse.Namespace) -> int:
             BagWriter(options.new_bag, latched=LATCHED))
         if not options.json:
             print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
-        start = time.monotonic()
+        reader, refused = reader_of(bag, values), Counter[tuple[str, str]]()
         live = LivePoses(values['frequency']) if options.live else None
-        result = run(shared.watched_bag(bag, 'optimising'), inputs, values, live)
-        seconds = time.monotonic() - start
+        result = run((each[:2] for each in measured_in(
+            shared.watched_bag(bag, 'optimising'), inputs, reader, refused, held_out=False)),
+            values, live)
+        result = result._replace(counts=result.counts + refused)
         if len(result.backend.node_stamps_ns) == 0:
             names = inputs.odometry
             topics = ' or '.join(inputs.topics[name] for name in names)
             why = ', '.join(f'{answer} {count}' for (source, answer), count
                             in sorted(result.counts.items()) if source in names)
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
-        plane = None if result.datum is None else result.datum.plane
+        plane = reader.datum.plane
         done = _run_of(options, result, drive_in(
             shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, options.truth,
             origin=None if plane is None else plane.origin, refused=result.refused),
-            values=values, kinds=inputs.kinds, seconds=seconds)
-        facts: dict[str, Any] = {'bags': [str(path) for path in options.bags], 'seconds': seconds}
+            values, inputs.kinds)
+        facts: dict[str, Any] = {
+            'bags': [str(path) for path in options.bags], 'seconds': result.seconds}
         if writer is not None:
             facts['new_bag'] = write_corrected(
                 writer, shared.watched_bag(bag, 'writing the bag'), inputs, done)
-    return _report(options, done, facts, result.datum, live)
+    return _report(options, done, facts, reader.datum, live)
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
@@ -351,24 +344,21 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
     measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
                     for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
-    start, recorder = time.monotonic(), Recorder()
-    backend, report = run_measurements(measurements, values, recorder)
-    result, seconds = Replayed(backend, report, backend.counts, recorder), time.monotonic() - start
+    result = run(measurements, values)
     drive = collect_drive(
-        ((*each, False) for each in measurements), backend, odometry, result.refused)
-    return _report(options, _run_of(
-        options, result, drive, values=values,
-        kinds={odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}, seconds=seconds),
-        {'seconds': seconds})
+        ((*each, False) for each in measurements), result.backend, odometry, result.refused)
+    kinds = {odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}
+    return _report(options, _run_of(options, result, drive, values, kinds),
+                   {'seconds': result.seconds})
 
 
 def _run_of(
-    options: argparse.Namespace, result: Replayed, drive: Drive, *, values: Values,
-    kinds: Mapping[str, Kind], seconds: float,
+    options: argparse.Namespace, result: Replayed, drive: Drive, values: Values,
+    kinds: Mapping[str, Kind],
 ) -> Run:
-    return Run(
-        options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}', drive,
-        result.backend, result.recorder, values, kinds, result.counts, result.report, seconds)
+    return Run(options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}',
+               drive, result.backend, result.recorder, values, kinds, result.counts,
+               result.report, result.seconds)
 
 
 def _report(
@@ -382,8 +372,7 @@ def _report(
     if live is not None:
         exported.append(options.out / 'live.csv')
         write_lines(exported[-1], live.lines())
-    names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
-             *(path.name for path in exported)]
+    names = 'drive.png', 'summary.json', 'run.json', 'graph.g2o', *(each.name for each in exported)
     if options.json:
         print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
     else:

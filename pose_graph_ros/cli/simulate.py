@@ -113,8 +113,8 @@ def _lines(about: Mapping[str, Any]) -> Iterator[str]:
         yield (f'  {about["nodes"]} nodes, {about["edges"]} edges, {about["observed_nodes"]} '
                f'observed nodes; chi2 of the truth {about["chi2_of_the_truth"]:.6g}, of '
                f'{about["measured_numbers"]} numbers')
-    false = len(about['false_closures'])
-    yield f'  {about["true_closures"]} true and {false} false loop closures'
+    yield (f'  {about["true_closures"]} true and {len(about["false_closures"])} false loop '
+           'closures')
     if about['missing_groups'] > 0:
         yield (f'  warning: {about["missing_groups"]} false closures or groups of them found no '
                'places that are apart and driven in the same direction')

@@ -30,7 +30,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, IMU, Values
 from pose_graph_ros.cli import finite, shared, tuned_parameters
 from pose_graph_ros.cli.drive import distances, measured_in, read_truth
-from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.replay import run
 from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
 from pose_graph_ros.core import measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -173,11 +173,10 @@ class Tuning:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
         self._step += 1
         _show(f'step {self._step} of {self._steps}: {text}')
-        backend, _ = run_measurements((
-            (name, each) for name, each in self._measurements if odometry in ('', name)
-            or not isinstance(each, OdometrySample) if isinstance(each, OdometrySample)
-            or (name, each.stamp_ns) not in without), values)
-        return backend
+        return run((
+            (name, each) for name, each in self._measurements if (
+                odometry in ('', name) if isinstance(each, OdometrySample)
+                else (name, each.stamp_ns) not in without)), values).backend
 
     def _runs(
         self, text: str, left_out: Collection[Key] = (),
@@ -192,8 +191,8 @@ class Tuning:
     ) -> tuple[list[Tuned], Seconds]:
         """Return what runs show, but for some measurements, and the longest time constant."""
         tuned, longest = list[Tuned](), 0.0
-        for name, run in zip(self._odometries, runs, strict=True):
-            parts, by_residuals = run.parts, dict[str, ScaleFit]()
+        for name, engine in zip(self._odometries, runs, strict=True):
+            parts, by_residuals = engine.parts, dict[str, ScaleFit]()
             if len(self._closures) > 0 or any(
                     len(_heading_variances(some)) > 0 for some in self._sources.values()):
                 by_residuals |= analyse(parts).fits
@@ -211,7 +210,7 @@ class Tuning:
                 way, turn = (NOT_SHOWN if one is None else one.proven(one.high) for one in (
                     _shown(by_residuals.get(name), axis) for axis in (0, 2)))
             tuned += tuned_parameters.odometry_parameters(name, way, turn, self._values)
-            if run is not runs[0]:
+            if engine is not runs[0]:
                 continue
             longest = max((0.0 if each.tau is None else each.tau.value
                            for each in found.values()), default=0.0)

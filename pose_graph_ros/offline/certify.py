@@ -240,8 +240,7 @@ def _smallest(
     basis = np.zeros((n, 0), dtype=np.complex128) if known is None else np.linalg.qr(known)[0]
 
     def inverse(v: ComplexArray) -> ComplexArray:
-        right = _without(basis, v.ravel())[:, None]
-        return _without(basis, form.inverse(factors, right)[:, 0])
+        return _without(basis, form.inverse(factors, _without(basis, v.ravel())[:, None])[:, 0])
 
     # takes 0.1 s to load
     import scipy.sparse.linalg  # noqa: PLC0415

@@ -112,11 +112,6 @@ class Noise(NamedTuple):
             return self.size.written(1.0)
         return self.size.written(max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
 
-    @property
-    def excess(self) -> float:
-        """By what the variance that is proven is larger than that which was found."""
-        return max(self.proven.value / self.size.value, 1.0)
-
 
 def noise_of(parts: Parts, source: str, without: Collection[StampNs] = ()) -> Noise | None:
     """
@@ -214,8 +209,7 @@ def _shown(rows: Records, seconds: float) -> float:
     here += (rows['offset'][:, 0] + 1j * rows['offset'][:, 1]) * np.exp(1j * headings)
     there = rows['mean'][:, 0] + 1j * rows['mean'][:, 1]
     here, there = here - np.mean(here), there - np.mean(there)
-    turn = np.angle(np.sum(np.conj(here) * there))
-    errors = np.abs(there - here * np.exp(1j * turn))**2
+    errors = np.abs(there - here * np.exp(1j * np.angle(np.sum(np.conj(here) * there))))**2
     # two coordinates, without the three numbers by which odometry was laid there
     degrees = 2.0 * seconds / CHANGE - 3.0
     quantile = 2.0 * float(gammaincinv(0.5 * max(degrees, 0.0), TAIL))
@@ -226,7 +220,8 @@ def _shown(rows: Records, seconds: float) -> float:
 
 def proven_odometry(found: Collection[Noise]) -> tuple[Found, Found]:
     """Return the proven noise of odometry, of way and turn, as most of the drive shows it."""
-    excess = max(each.excess for each in found)
+    # by what the variances of sources that are proven are larger than those that were found
+    excess = max(1.0, *(each.proven.value / each.size.value for each in found))
     most = max(found, key=lambda each: each.seconds)
     return most.way.proven(excess * most.way.high), most.turn.proven(excess * most.turn.high)
 

@@ -167,11 +167,6 @@ class Concern(NamedTuple):
     text: str
     logged: bool = False  # whether the log has it, too, when it begins and when it is over
 
-    @property
-    def sentence(self) -> str:
-        """The text as a sentence."""
-        return f'{self.text[0].upper()}{self.text[1:]}.'
-
 
 ERROR, WARN, GOOD = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
 

@@ -50,7 +50,7 @@ class Session:
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
-        initial = initial_graph(values)
+        path, datum = initial_graph(values) or (None, None)
         self.input, self.out = Input(values), Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
@@ -63,7 +63,6 @@ class Session:
         self._jump_handle: JumpHandle | None = None
         # a clock that is set back, or a bag that starts again, must not stall a timer
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        path, datum = initial or (None, None)
 
         def prepare(stopped: Callable[[], bool]) -> PoseGraphBackend | None:
             self._warm_up(stopped)
@@ -319,7 +318,8 @@ class Session:
         self.searches.update(self.worker)
         # in this order: the sentence is then at least as new as the values beside it
         values, found = diagnostics.values(self), [*diagnostics.concerns(self)]
-        self.out.publish_diagnostics(found[0].level, found[0].sentence, values)
+        level, text, _ = found[0]
+        self.out.publish_diagnostics(level, f'{text[0].upper()}{text[1:]}.', values)
         if self.active:
             present = {NUMBER.sub('', each.text): each.text for each in found if each.logged}
             for key in present.keys() - self._told.keys():

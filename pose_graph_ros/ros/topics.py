@@ -240,8 +240,7 @@ class Slew:
         if self._last is not None and (linear > 0.0 or angular > 0.0):
             elapsed = (stamp_ns - self._stamp_ns) * 1e-9
             shown = se2.compose(self._last, T_odom_base)
-            wanted = se2.compose(T_map_odom, T_odom_base)
-            step = wanted - shown
+            step = se2.compose(T_map_odom, T_odom_base) - shown
             step[2] = se2.wrap(step[2])
             distance, turn = math.hypot(step[0], step[1]), abs(float(step[2]))
             if 0.0 < linear * elapsed < distance:

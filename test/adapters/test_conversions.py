@@ -11,7 +11,7 @@ from sensor_msgs.msg import Range as RangeMessage
 from tf2_msgs.msg import TFMessage
 
 from pose_graph_ros.adapters import conversions
-from pose_graph_ros.adapters.parameters import checked, require_together
+from pose_graph_ros.adapters.parameters import checked, checked_together
 from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY, Source
 from pose_graph_ros.adapters.surroundings import Datum, StaticFrames, Surroundings
 from pose_graph_ros.core.exceptions import ConfigError
@@ -127,8 +127,8 @@ def test_the_frame_of_a_range_names_the_beacon_and_perhaps_the_antenna() -> None
 @pytest.mark.parametrize('text', ['door', 'door 1', 'door 1 x', 'door 1 nan', 'door 1 2 3', ''])
 def test_a_beacon_without_name_and_place_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r'tags\.beacons: expected name, x and y'):
-        require_together(checked({
-            'sources': ['odom', 'tags'], 'tags.type': 'range', 'tags.beacons': [text]}))
+        checked_together({
+            'sources': ['odom', 'tags'], 'tags.type': 'range', 'tags.beacons': [text]})
 
 
 def reader(**values: object) -> MessageReader:

@@ -201,5 +201,4 @@ def _text(each: ConstraintEnergy, ends: list[dict[str, Any]], residual: FloatArr
         return f'error of {each.source}{at}: it changes faster than its correlation time says'
     off = '' if residual is None else (f': {short(np.hypot(*residual[:2]))} m' + (
         '' if residual[2] == 0.0 else f' and {short(abs(residual[2]))} rad') + ' off')
-    name = each.name.partition(' at ')[0] if len(ends) > 0 else each.name
-    return f'{name}{at}{off}'
+    return f'{each.name.partition(" at ")[0] if len(ends) > 0 else each.name}{at}{off}'

@@ -70,9 +70,8 @@ def jittered_stamps(generator: Generator, truth: Trajectory, period_s: float) ->
 
 def odometry(generator: Generator, truth: Trajectory, wheels: Wheels) -> Trajectory:
     """Return `T_odom_base` by odometry."""
-    steps = se2.between(truth.poses[:-1], truth.poses[1:])
     measured = (_by_wheels if wheels.errors is settings.OdometryErrors.WHEELS else _by_model)(
-        generator, steps, wheels)
+        generator, se2.between(truth.poses[:-1], truth.poses[1:]), wheels)
     x, y, turned = (0.0, 0.0, -truth.poses[0, 2]) if wheels.start is None else wheels.start
     heading = se2.wrap(truth.poses[0, 2] + turned) + np.concatenate((
         [0.0], np.cumsum(measured[:, 2])))

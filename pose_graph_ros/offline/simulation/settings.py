@@ -114,14 +114,9 @@ class Fixes:
             raise ConfigError('fixes: expected a white or a correlated error above 0, got 0 and 0')
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation of a coordinate, of both errors together [m]."""
-        return math.hypot(self.correlated, self.white)
-
-    @property
     def sigmas(self) -> tuple[float, float]:
-        """Those of both coordinates [m]."""
-        return self.sigma, self.sigma
+        """Standard deviations of the coordinates, of both errors together [m]."""
+        return (math.hypot(self.correlated, self.white),) * 2
 
 
 @dataclass(frozen=True, slots=True)

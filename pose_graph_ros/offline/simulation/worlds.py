@@ -261,8 +261,7 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
                        np.sum(incoming * outgoing, axis=1))
 
     # distance from the corner to the ends of a turn: the integral of the cosine of its heading
-    turn = (np.arange(1000) + 0.5) / 1000
-    reach = TURN_LENGTH * np.mean(np.cos(0.5 * np.pi * ramp(turn)))
+    reach = TURN_LENGTH * np.mean(np.cos(0.5 * np.pi * ramp((np.arange(1000) + 0.5) / 1000)))
     straights = np.linalg.norm(lane - np.roll(lane, 1, axis=0), axis=1) - 2.0 * reach
     begins = np.cumsum(straights + TURN_LENGTH) - TURN_LENGTH
     lap_length = float(begins[-1] + TURN_LENGTH)
