@@ -20,7 +20,6 @@ from pose_graph_ros.adapters.bags import BagError, BagMessage, MessageError
 from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
-STATIC_TRANSFORMS = '/tf_static'
 # the "infinite" duration of rmw, 2^63 - 1 ns
 FOREVER = interfaces.QosTime(9223372036, 854775807)
 Convert = Callable[[bytes], bytes | memoryview]
@@ -51,7 +50,7 @@ class BagWriter:
                         for each in self.folder.iterdir()):
                 raise BagError(
                     f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
-        self._latched = {STATIC_TRANSFORMS, *latched}
+        self._latched = {'/tf_static', *latched}
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[tuple[str, str], Connection] = {}
         # by type, of ROS 1: name and types in ROS 2, and how its messages are converted

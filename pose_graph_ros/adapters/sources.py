@@ -28,7 +28,6 @@ CLOCK_JUMP_NS = NANOSECONDS
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 _IMU = 'sensor_msgs/msg/Imu'
 
-Settings = OdometrySource | MeasurementSource | GyroSource
 Measured = OdometrySample | Measurement
 Values = Mapping[str, Any]
 """Checked parameters by name."""
@@ -41,7 +40,8 @@ class Kind:
     name: str  # value of the parameter `type`
     message_type: str
     convert: Callable[[Message, 'Source', Surroundings], Measured | Answer]
-    settings: Settings  # of a source, but for those that have parameters
+    # of a source, but for those that have parameters
+    settings: OdometrySource | MeasurementSource | GyroSource
     parameters: tuple[Parameter, ...]  # beside `OF_ALL`
     in_map: bool = False  # whether it tells where the robot is in the map
     on_earth: bool = False  # whether it tells where the map is on the Earth

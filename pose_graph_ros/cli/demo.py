@@ -50,10 +50,6 @@ NO_ANSWERS = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 
 """Ends of keys of the diagnostics that are not counts of messages by what was answered."""
 
 
-class DemoError(PoseGraphError):
-    """The node of the demo failed."""
-
-
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     values = shared.parameter_values(options)
@@ -143,7 +139,7 @@ def _run(bag: Path, inputs: Inputs, values: Values, options: argparse.Namespace)
             try:
                 player = importlib.import_module('pose_graph_ros.ros.player')
             except ImportError as error:  # all other tools work without ROS
-                raise DemoError(f'ROS 2 is not there: {error}') from error
+                raise PoseGraphError(f'ROS 2 is not there: {error}') from error
             node = subprocess.Popen(node_command)
             try:
                 converged = player.play(bag, options.out / RECORDED, inputs,
@@ -160,7 +156,7 @@ def _run(bag: Path, inputs: Inputs, values: Values, options: argparse.Namespace)
             os.environ.clear()
             os.environ.update(before)
         if code != 0:
-            raise DemoError(f'the node ended with code {code}')
+            raise PoseGraphError(f'the node ended with code {code}')
         print('the node stopped cleanly')
         return bool(converged)
 

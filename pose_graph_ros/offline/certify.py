@@ -46,7 +46,6 @@ from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray,
 from pose_graph_ros.core.sparse import BlockFactors
 from pose_graph_ros.offline.chordal_objective import Formulation, QuadraticForm
 
-Operator = Callable[[ComplexArray], ComplexArray]
 Preconditioner = Callable[[ComplexArray, ComplexArray], ComplexArray]
 """From headings, and derivatives by them, to a change that is nearly a step of Newton."""
 
@@ -325,7 +324,7 @@ def minimized(
     return y
 
 
-def _projection(y: ComplexArray) -> Operator:
+def _projection(y: ComplexArray) -> Callable[[ComplexArray], ComplexArray]:
     """Return the projection to the tangent space at Y, with row 0 at rest."""
     def tangent(v: ComplexArray) -> ComplexArray:
         v = v - multipliers(y, v)[:, None] * y

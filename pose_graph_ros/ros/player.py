@@ -59,10 +59,6 @@ class Patience(NamedTuple):
 PATIENCE = Patience()
 
 
-class PlayError(PoseGraphError):
-    """The node did not respond as expected; the message says how."""
-
-
 class Player(Node):
     """Publishes a bag and records the node's outputs."""
 
@@ -117,9 +113,9 @@ class Player(Node):
         end = time.monotonic() + timeout
         while not done():
             if not self._is_running():
-                raise PlayError('the node ended early')
+                raise PoseGraphError('the node ended early')
             if time.monotonic() > end:
-                raise PlayError(f'{failure} (waited {timeout:g} s)')
+                raise PoseGraphError(f'{failure} (waited {timeout:g} s)')
             self._executor.spin_once(timeout_sec=0.05)
 
     def play(self, bag: Path, rate: float) -> Counter[str]:
@@ -209,7 +205,7 @@ class Player(Node):
         """
         answer = self._call(self._save, 'saving the graph')
         if not answer.success:
-            raise PlayError(f'~/save_graph: {answer.message}')
+            raise PoseGraphError(f'~/save_graph: {answer.message}')
         newest = list(self._newest.values())
         with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
             for message in (*self._recorded, *newest):

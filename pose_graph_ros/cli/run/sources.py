@@ -19,7 +19,6 @@ from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, W
 from pose_graph_ros.offline.variance_components import Analysis
 
 WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong
-_NAMES = {'map': ('x', 'y', 'heading'), 'edge': ('along', 'across', 'heading')}
 
 
 class SourceAnalysis(NamedTuple):
@@ -71,7 +70,7 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     for row, size in expected.items():
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
-    names = _NAMES['map' if residuals.kind == 'map' else 'edge']
+    names = (*('xy' if residuals.kind == 'map' else ('along', 'across')), 'heading')
     some = source_residuals.spread(len(used.ids), 2000)
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
     values, white = normalised[np.isfinite(normalised)], analysis.whiteness

@@ -26,8 +26,6 @@ LATENCY_S = {ODOMETRY: 0.004, GYRO: 0.002, FIXES: 0.13, POSES: 0.05, CLOSURES: 0
 """Usual time from the stamp of a measurement to its recording, by topic."""
 TOPICS = (ODOMETRY, GYRO, FIXES, POSES, CLOSURES)
 """What can be disturbed."""
-CLAIMING = (GYRO, FIXES, POSES, CLOSURES)
-"""What comes with a covariance that can be wrong."""
 
 
 def _known(topic: str, known: tuple[str, ...] = TOPICS, what: str = '') -> None:
@@ -300,7 +298,8 @@ class ClaimedSigma:
     factor: float
 
     def __post_init__(self) -> None:
-        _known(self.topic, CLAIMING, 'claimed sigma: ')
+        # odometry comes without a covariance that can be wrong
+        _known(self.topic, TOPICS[1:], 'claimed sigma: ')
         require(self, 'factor', positive=True)
 
 
