@@ -38,9 +38,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.graph_files import read_graph
-from pose_graph_ros.offline.simulation.recording import course, record
-from pose_graph_ros.offline.simulation.settings import DURATIONS_S
-from pose_graph_ros.offline.simulation.worlds import WORLDS
+from pose_graph_ros.offline.simulation import recording, settings, worlds
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
@@ -59,8 +57,9 @@ def execute(options: argparse.Namespace) -> int:
     if bag_path is None:
         bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
         print(f'simulating a drive (seed {options.seed})')
-        write_drive(record(course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])), bag_path,
-                    overwrite=True)
+        way = recording.course(
+            worlds.WORLDS['drive'], options.seed, settings.DURATIONS_S['drive'])
+        write_drive(recording.record(way), bag_path, overwrite=True)
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}
     with open_bag(bag_path) as bag:

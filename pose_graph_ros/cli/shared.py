@@ -18,6 +18,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list, Values
 from pose_graph_ros.core.exceptions import ConfigError
 
+DELAY = 0.5  # after which a bar appears [s]
 Item = TypeVar('Item')
 
 
@@ -99,7 +100,7 @@ def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
         return items
     from tqdm import tqdm  # noqa: PLC0415  (not needed without a terminal)
 
-    return tqdm(items, leave=False, delay=0.5, **looks)
+    return tqdm(items, leave=False, delay=DELAY, **looks)
 
 
 def watched_bag(bag: Bag, title: str) -> Bag:

@@ -24,9 +24,7 @@ from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
 from pose_graph_ros.core.geometry.se2 import Covariance, FloatArray, IntArray, Poses
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import g2o_text
-from pose_graph_ros.core.io.path_files import tum_text
+from pose_graph_ros.core.io import atomic_files, g2o, path_files
 from pose_graph_ros.core.quantities import Metres, StampsNs
 from pose_graph_ros.offline.simulation import recording, settings
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
@@ -83,15 +81,15 @@ def execute(options: argparse.Namespace) -> int:
             **_disturbances(way.setup)}
         for path, poses in ((options.out, simulated.start),
                             (beside['g2o'], simulated.truth.poses)):
-            files[path] = g2o_text(simulated.graph(poses).rows()).encode()
+            files[path] = g2o.g2o_text(simulated.graph(poses).rows()).encode()
     else:
         simulated = recording.record(way)
         about |= write_drive(simulated, options.out)
     text = json.dumps(about, indent=2)
     files[beside['json']] = f'{text}\n'.encode()
     if options.tum:
-        files[beside['tum']] = tum_text(simulated.truth).encode()
-    write_files(files)
+        files[beside['tum']] = path_files.tum_text(simulated.truth).encode()
+    atomic_files.write_files(files)
     if options.plot is not None:
         # matplotlib takes half a second to load
         from pose_graph_ros.cli.picture import draw_simulated  # noqa: PLC0415

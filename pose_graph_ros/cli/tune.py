@@ -41,8 +41,7 @@ from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
-from pose_graph_ros.core.sources.kinds import validate
-from pose_graph_ros.core.sources.validation import Validated
+from pose_graph_ros.core.sources import kinds, validation
 from pose_graph_ros.offline import noise
 from pose_graph_ros.offline.noise import Errors, Found, Noise, Summary
 from pose_graph_ros.offline.source_residuals import ScaleFit
@@ -161,8 +160,8 @@ class Tuning:
         config, found = backend_config(values), []
         for name, each in sorted(self._measurements, key=lambda each: each[1].stamp_ns):
             if isinstance(each, Absolute):
-                one = validate(each, config.measurement_source(name, type(each)).covariance)
-                if isinstance(one, Validated) and isinstance(one.measurement, Absolute):
+                one = kinds.validate(each, config.measurement_source(name, type(each)).covariance)
+                if isinstance(one, validation.Validated) and isinstance(one.measurement, Absolute):
                     found.append((name, one.measurement, len(one.repairs) > 0))
         return found
 

@@ -28,10 +28,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from pose_graph_ros.adapters import bag_inputs
-from pose_graph_ros.adapters.bag_writer import BagWriter
+from pose_graph_ros.adapters import bag_inputs, bag_writer, parameter_table
 from pose_graph_ros.adapters.bags import MessageError, open_bag
-from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros.topics import message_class, TF_TYPE, TFMessage
@@ -79,7 +77,7 @@ class Player(Node):
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        outputs = {name: OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
+        outputs = {name: parameter_table.OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
         if TFMessage is not None:
             outputs['tf'] = '/tf', TF_TYPE
         for name, (relative, type_name) in outputs.items():
@@ -207,7 +205,8 @@ class Player(Node):
         if not answer.success:
             raise PoseGraphError(f'~/save_graph: {answer.message}')
         newest = list(self._newest.values())
-        with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
+        latched = [each[0] for each in newest]
+        with bag_writer.BagWriter(folder, overwrite=True, latched=latched) as writer:
             for message in (*self._recorded, *newest):
                 writer.write(*message)
         return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)

@@ -27,11 +27,8 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.adapters import output_cdr
+from pose_graph_ros.adapters import output_cdr, parameter_table, parameters
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.output_cdr import UNKNOWN_VARIANCE
-from pose_graph_ros.adapters.parameter_table import OUTPUTS
-from pose_graph_ros.adapters.parameters import FRAMES
 from pose_graph_ros.adapters.sources import JUDGE, source_list
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment.monitor import AlignmentState
@@ -54,7 +51,7 @@ LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 
 LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
-UNPLACED = np.diag((UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
+UNPLACED = np.diag((*2 * [output_cdr.UNKNOWN_VARIANCE], UNKNOWN_HEADING_VARIANCE))
 LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
           State.DOUBTED: DiagnosticStatus.WARN, State.WAITING: DiagnosticStatus.STALE}
 
@@ -82,11 +79,11 @@ class Publishers:
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node = node
-        self.frames = tuple(frame(values[name]) for name in FRAMES)
+        self.frames = tuple(frame(values[name]) for name in parameters.FRAMES)
         self.map_frame, self.odom_frame, self.base_frame = self.frames
         self._publishers = {name: self._publisher(
             type_name, values[f'outputs.{name}'], LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
-            for name, (_, type_name, _) in OUTPUTS.items()}
+            for name, (_, type_name, _) in parameter_table.OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
             self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))
         self.path, self.markers, self.verdicts = (View(self._publishers[name]) for name in LATCHED)
@@ -160,7 +157,7 @@ class Publishers:
             latitude, longitude, _ = plane.to_geodetic(
                 prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
             # in east and north
-            covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
+            covariance = np.diag((0.0, 0.0, output_cdr.UNKNOWN_VARIANCE))
             turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
             covariance[:2, :2] = 0.5 * (turned + turned.T)
             self._fix.publish(NavSatFix(

@@ -31,10 +31,9 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS
-from pose_graph_ros.ros import diagnostics, topics
+from pose_graph_ros.ros import diagnostics, publishers, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
-from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.requests import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.worker import Worker
@@ -51,7 +50,7 @@ class Session:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
         path, datum = initial_graph(values) or (None, None)
-        self.input, self.out = Input(values), Publishers(node, values)
+        self.input, self.out = Input(values), publishers.Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
         self.n_resets, self.reset_reason = 0, ''

@@ -117,9 +117,7 @@ class Run:
 def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
     """Return values as a list for JSON, None for those that are not finite."""
     array = np.round(np.asarray(values, dtype=np.float64), digits) + 0.0
-    as_objects = array.astype(object)
-    as_objects[~np.isfinite(array)] = None
-    return list(as_objects.tolist())
+    return [value if math.isfinite(value) else None for value in array.tolist()]
 
 
 def number(value: float | None, digits: int = 4) -> float | None:

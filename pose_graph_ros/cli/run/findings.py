@@ -8,7 +8,6 @@ is as it should be. Covariances count as wrong if the interval of the factor on 
 beyond 1.5; where the engine has found so by itself and allows for it, that is a notice.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 import math
 from typing import Any, NamedTuple
@@ -266,9 +265,6 @@ def silences(
 
 def _refusals(run: Run) -> Iterator[Finding]:
     """Yield how many messages were refused, by source and reason."""
-    totals: Counter[str] = Counter()
-    for (source, _), count in run.counts.items():
-        totals[source] += count
     invalid = []
     for (source, reason), count in sorted(run.counts.items()):
         if reason == 'default_covariance' or reason.startswith('repaired'):
@@ -278,7 +274,8 @@ def _refusals(run: Run) -> Iterator[Finding]:
         elif source not in ('solver', 'alignment') and reason not in (
                 'accepted', 'pending', 'sorted', 'thinned', 'rotations', 'done_over', 'jump'):
             detail = run.backend.refusals.get((source, reason), '')
-            yield Finding('warning' if count > 0.05 * totals[source] else 'notice',
-                          f'{source}: {count} of {totals[source]} messages are not used: {reason}'
+            total = sum(n for (of, _), n in run.counts.items() if of == source)
+            yield Finding('warning' if count > 0.05 * total else 'notice',
+                          f'{source}: {count} of {total} messages are not used: {reason}'
                           + (f', the last: {detail}' if detail else ''), f'source-{source}')
     yield from invalid
