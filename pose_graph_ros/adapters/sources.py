@@ -90,10 +90,9 @@ TYPE = Parameter('type', '', '', 'Type of the source.', choices=tuple(KINDS), ch
 
 SET_POSE, JUDGE = 'set_pose', 'judge'  # names under which what a person asks for is counted
 CLOSURES = 'loop_closure'  # name of the source of loop closures that always exists
-KNOWN_SOURCES = {
-    'odom': (ODOMETRY, 'odom'), 'global_pose': (GLOBAL_POSE, 'global_pose'),
-    'fix': (FIX, 'gps/fix'), 'imu': (IMU, 'imu/data'),
-    CLOSURES: (LOOP_CLOSURE, 'loop_closure'), 'gyro': (GYRO, 'imu/data')}
+KNOWN_SOURCES = {'odom': (ODOMETRY, 'odom'), 'global_pose': (GLOBAL_POSE, 'global_pose'),
+                 'fix': (FIX, 'gps/fix'), 'imu': (IMU, 'imu/data'),
+                 CLOSURES: (LOOP_CLOSURE, 'loop_closure'), 'gyro': (GYRO, 'imu/data')}
 """Default kind and topic of the predefined sources."""
 
 

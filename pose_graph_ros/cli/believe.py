@@ -110,8 +110,7 @@ def believe(
     if (problem.factorisation(np.ones(len(closures))) <= BELIEF.most_numbers * graph.n_nodes
             and optimizer.optimize_from_linear_start(copy, CONFIG).status is not Status.FAILED):
         plain = copy.poses.copy()
-    starts = [poses for poses in (plain, graph.poses.copy() if given else None)
-              if poses is not None]
+    starts = ([] if plain is None else [plain]) + ([graph.poses.copy()] if given else [])
     for start in starts:
         problem = TruncatedProblem(_filled(graph, softened), closures, start)
         choice = to_the_end(problem.near_start())

@@ -194,9 +194,8 @@ class Report(NamedTuple):
         return {
             'verdict': (Verdict.NOT_ATTEMPTED if made is None else made.verdict).value,
             'reason': self.reason, 'seconds': self.seconds,
-            **{key: None if made is None else getattr(made, name) for key, name in (
-                ('chi2', 'chi2'), ('gap', 'gap'), ('relative_gap', 'relative_gap'),
-                ('lambda_min', 'smallest'), ('rank', 'rank'))},
+            **{key: getattr(made, {'lambda_min': 'smallest'}.get(key, key), None) for key in (
+                'chi2', 'gap', 'relative_gap', 'lambda_min', 'rank')},
             'lower_minimum': made is not None and made.is_lower,
             'chi2_from_it': self.chi2_from_it, 'chi2_bound': bound,
             'chi2_gap': None if bound is None else max(self.chi2 - bound, 0.0)}

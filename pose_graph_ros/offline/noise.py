@@ -261,9 +261,6 @@ class Errors(NamedTuple):
         return Errors(*columns)
 
 
-NO_ERRORS = Errors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
-
-
 class Summary(NamedTuple):
     """Statistics of held-out errors; NaN without any."""
 
@@ -311,13 +308,11 @@ def errors_at(
     those of what was held out are multiplied by a factor.
     """
     stamps = np.array([each.stamp_ns for each in held_out], dtype=np.int64)
-    chosen = [held_out[k] for k in np.flatnonzero(path.covers(stamps)).tolist()]
-    if len(chosen) == 0:
-        return NO_ERRORS
-    stamps = np.array([each.stamp_ns for each in chosen], dtype=np.int64)
-    positions, levers = (np.array(column) for column in zip(*(
+    inside = np.flatnonzero(path.covers(stamps))
+    stamps, chosen = stamps[inside], [held_out[k] for k in inside.tolist()]
+    positions, levers = np.array([
         (each.position, each.lever_arm) if isinstance(each, Position)
-        else (each.pose[:2], np.zeros(2)) for each in chosen), strict=True))
+        else (each.pose[:2], np.zeros(2)) for each in chosen]).reshape(-1, 2, 2).swapaxes(0, 1)
     poses = path.at(stamps)
     arms = se2.transform(poses, levers) - poses[:, :2]
     after = np.clip(np.searchsorted(path.stamps_ns, stamps), 1, max(len(path) - 1, 1))
@@ -326,7 +321,7 @@ def errors_at(
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -arms[:, 1], arms[:, 0]
     spread = jacobian @ covariances[np.minimum(after, len(path) - 1)] @ np.swapaxes(jacobian, 1, 2)
-    own = factor * np.array([each.covariance[:2, :2] for each in chosen])
+    own = factor * np.array([each.covariance[:2, :2] for each in chosen]).reshape(-1, 2, 2)
     return Errors(stamps, positions - poses[:, :2] - arms, spread + own)
 
 
