@@ -33,8 +33,7 @@ from pose_graph_ros.offline.pattern import elimination_order, Pattern, pattern
 N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
 INK, GREY = '#111111', '#7a828c'
 COLOURS = {     # after Okabe and Ito, but for grey; without a sort, arcs of several terms
-    None: GREY,
-    Sort.ODOMETRY: GREY, Sort.LOOP_CLOSURE: '#2F8FD0', Sort.TURN: '#B9A51C',
+    None: GREY, Sort.ODOMETRY: GREY, Sort.LOOP_CLOSURE: '#2F8FD0', Sort.TURN: '#B9A51C',
     Sort.LANDMARK: '#009E73', Sort.OBSERVED: '#E69F00', Sort.BIAS: '#B583A4',
     Sort.PRIOR: '#D55E00'}
 FILLS = {Role.POSE: '#ffffff', Role.LANDMARK: '#D9F2E6', Role.BIAS: '#F0E2EC',
@@ -66,8 +65,7 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError('expected a graph or --example, and not both')
     graphs = ([(title, GraphFile(rows, rows.node_ids)) for title, rows in views.five_states()]
               if options.example else [('', read(options.graph, options.edge2))])
-    notes: list[str] = []
-    panels: list[Panel] = []
+    notes, panels = list[str](), list[Panel]()
     for title, file in graphs:
         whole = views.factor_graph(file.rows, file.ids)
         shown, n_cut = views.part(whole, _chosen(options, file.ids, whole))

@@ -9,7 +9,6 @@ but the transform and the diagnostics are made only while there is a subscriber.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 import math
 import threading
 import time
@@ -22,7 +21,6 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -81,8 +79,9 @@ class Publishers:
         self._node = node
         self.frames = tuple(frame(values[name]) for name in parameters.FRAMES)
         self.map_frame, self.odom_frame, self.base_frame = self.frames
-        self._publishers = {name: self._publisher(
-            type_name, values[f'outputs.{name}'], LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
+        self._publishers = {name: node.create_publisher(
+            topics.message_class(type_name), values[f'outputs.{name}'],
+            **topics.overridable(LATCHED_QOS if name in LATCHED else OUTPUT_QOS))
             for name, (_, type_name, _) in parameter_table.OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
             self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))
@@ -98,19 +97,14 @@ class Publishers:
         self._lock = threading.Lock()
         self.configure(values)
 
-    def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
-        return self._node.create_publisher(
-            topics.message_class(type_name), topic,
-            copy(qos),  # rclpy writes the overrides into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
         if values['publish_tf'] and TFMessage is None:
             self._node.get_logger().warning('tf2_msgs is not installed: the transform from map to '
                                             'odom is not published', once=True)
         elif values['publish_tf'] and self.transforms is None:
-            publisher = self._publisher(topics.TF_TYPE, topics.TOPIC, topics.TF_QOS)
+            publisher = self._node.create_publisher(
+                TFMessage, topics.TOPIC, **topics.overridable(topics.TF_QOS))
             self.transforms = TransformPublisher(
                 self._node, publisher, self.map_frame, self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:

@@ -9,7 +9,6 @@ the newest estimate, propagated by it, is published; path and markers are after 
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from copy import copy
 from functools import partial
 import logging
 import math
@@ -20,7 +19,6 @@ from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
@@ -123,8 +121,7 @@ class Session:
         for topic, kind, qos, callback in wanted:
             self._subscriptions.append(self.node.create_subscription(
                 topics.message_class(kind), topic, guarded(callback, lambda: self.active),
-                copy(qos),  # rclpy writes the overrides into it
-                qos_overriding_options=QoSOverridingOptions.with_default_policies()))
+                **topics.overridable(qos)))
         self._watch_time()
         self.active, self.activated_at = True, time.monotonic()
         for arrivals in self.input.arrivals.values():

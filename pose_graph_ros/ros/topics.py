@@ -10,6 +10,7 @@ and others that publish it.
 
 from collections import Counter, deque
 from collections.abc import Mapping
+from copy import copy
 from importlib import import_module
 import math
 import time
@@ -19,6 +20,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
@@ -52,6 +54,12 @@ TF_QOS = QoSProfile(depth=100)
 TOPIC, STATIC_TOPIC = '/tf', '/tf_static'
 # Reading all of /tf costs as much as odometry: how long it is read, and the period of that [s].
 LISTENING, PAUSE = 2.0, 30.0
+
+
+def overridable(profile: QoSProfile) -> dict[str, Any]:
+    """Return the arguments of a publisher or subscription whose parameters override a profile."""
+    return {'qos_profile': copy(profile),  # rclpy writes the overrides into it
+            'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
 
 
 def other_publishers(node: Node, topic: str) -> list[str]:
