@@ -49,7 +49,7 @@ PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0}
 def health(session: object) -> tuple[bytes, str]:
     """Return the level of the diagnostics and their message."""
     first = next(concerns(session))
-    return first.level, first.sentence
+    return first.level, f'{first.text[0].upper()}{first.text[1:]}.'
 
 
 class Robot(Driver):

@@ -334,7 +334,7 @@ class FixJudge:
         gone = {*factors.tolist()}
         if not gone.isdisjoint(self.loosened):
             self.loosened = {edge: weight for edge, weight in self.loosened.items()
-                              if edge not in gone}
+                             if edge not in gone}
 
     def decide(self, number: int, decision: Decision) -> bool:
         """Apply a person's decision on a measurement; return whether the solver succeeded."""
