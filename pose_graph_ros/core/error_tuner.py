@@ -27,11 +27,7 @@ from pose_graph_ros.core.graph.graph_update import Measured
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.motion import (
-    AS_CLAIMED,
-    changed,
-    OdometryErrors,
-)
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, changed, OdometryErrors
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.bias import (
     Additions,

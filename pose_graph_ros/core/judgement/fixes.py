@@ -268,7 +268,7 @@ class FixJudge:
 
     def _with_weights(self, change: GraphUpdate, before: _Decided) -> GraphUpdate:
         """Return an update with the weights of new records and of those that have changed."""
-        weights, loosened = self.states.weights(before.state, self._reweighting), before.loosened
+        weights, loosened = self.states.weights(before.state), before.loosened
         for edge in () if loosened is self.loosened else {*loosened, *self.loosened}:
             if loosened.get(edge) != self.loosened.get(edge):
                 weights[edge] = self.loosened.get(edge, 1.0)
@@ -284,8 +284,7 @@ class FixJudge:
         if self._before is None:
             return
         states = self.states
-        for held, weight in states.weights(
-                self._before.state, self._reweighting, base=True).items():
+        for held, weight in states.weights(self._before.state, base=True).items():
             self._reweighting.set_base_weight(held, weight)
         before = np.append(self._before.state, np.full(len(states) - len(self._before.state), NEW))
         for number in np.flatnonzero(states.state != before).tolist():
