@@ -177,16 +177,16 @@ class Alignment:
         if (not self.is_aligned or n_seen < self._next_check or len(nodes.relocated) > 0
                 or len(bank) == 0 or bank.done < len(bank)):
             return None
-        ids = nodes.ids[nodes.n_frozen:]
-        rows, at = graph.node_rows(ids), int(np.searchsorted(ids, bank.rows['node'][-1]))
-        if ids[at] != bank.rows['node'][-1] or rows[at] < 0:
+        node, pose = int(bank.rows['node'][-1]), bank.spread.pose
+        if graph.node_rows(node) < 0 or node < nodes.ids[nodes.n_frozen]:
             return None
-        pose = bank.spread.pose
-        off = abs(float(se2.wrap(pose[2] - graph.poses[rows[at], 2])))
+        off = abs(float(se2.wrap(pose[2] - graph.poses_of(node)[2])))
         if off <= max(OFF, OFF_SIGMAS * bank.heading_sigma):
             return None
         self._next_check = 2 * n_seen
-        moved = se2.compose(se2.compose(pose, se2.inverse(nodes.odometry[at])), nodes.odometry)
+        ids = nodes.ids[nodes.n_frozen:]
+        rows, there = graph.node_rows(ids), nodes.odometry[np.searchsorted(ids, node)]
+        moved = se2.compose(se2.compose(pose, se2.inverse(there)), nodes.odometry)
         # what is no hidden node of the path any more keeps its place beside the oldest one
         kept = rows >= 0
         moved, rows = moved[kept], rows[kept]
