@@ -137,7 +137,7 @@ def found(some: Drive, time: float = -1.0) -> Found:
     return Found(motion, driven.alignment.sigma, abs(error))
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(seeds, st.integers(2, 40), st.sampled_from([0.0, 0.3, 0.5]))
 def test_the_order_of_arrival_changes_nothing(seed: int, n: int, fraction: float) -> None:
     rng = np.random.default_rng(seed)
@@ -158,7 +158,7 @@ def test_the_order_of_arrival_changes_nothing(seed: int, n: int, fraction: float
         np.testing.assert_allclose(motion, expected, atol=1e-9)
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(seeds, st.integers(4, 40), st.floats(-3.1, 3.1), st.floats(-1e5, 1e5))
 def test_a_motion_of_the_map_moves_the_result(
     seed: int, n: int, theta: float, shift: float,
@@ -181,13 +181,13 @@ def test_a_motion_of_the_map_moves_the_result(
 ], ids=['robot_20', 'robot_60', 'car', 'fast_car', 'rtk', 'slow_errors'])
 def test_the_sigma_is_honest(n: int, gap: float, arguments: dict) -> None:
     squares = []
-    for seed in range(40):
+    for seed in range(25):
         result = found(drive(seed, n, gap, **arguments), arguments.get('time', 0.0))
         if result.motion is not None:
             squares.append((result.error / result.sigma)**2)
-    assert len(squares) > 35
-    # 40 draws of chi2: 0.22 one sigma; with sigmas of at least 0.3 m RTK is better than that
-    assert np.mean(squares) < 1.7
+    assert len(squares) > 21
+    # 25 draws of chi2: 0.28 one sigma; with sigmas of at least 0.3 m RTK is better than that
+    assert np.mean(squares) < 1.8
     assert np.mean(squares) > (0.0 if 'time' in arguments or 'sigma' in arguments else 0.3)
 
 
@@ -225,17 +225,17 @@ def test_two_fifths_may_be_wrong(
     kind: str, n: int, m: int, gap: float, arguments: dict,
 ) -> None:
     aligned = 0
-    for seed in range(8):
+    for seed in range(6):
         result = found(wrong(kind, drive(seed, n, gap, **arguments),
                              np.random.default_rng(seed), m))
         if result.motion is not None:
             aligned += 1
             assert result.error < max(0.2, 5.0 * result.sigma), seed
-    assert aligned >= 5
+    assert aligned >= 4
 
 
 def test_with_most_of_them_wrong_no_wrong_angle_is_found() -> None:
-    for seed in range(8):
+    for seed in range(5):
         some = wrong('scattered', drive(seed, 40, 2.0), np.random.default_rng(seed), 24)
         result = found(some)
         assert result.motion is None or result.error < 5.0 * result.sigma
@@ -249,7 +249,7 @@ def test_with_most_of_them_wrong_no_wrong_angle_is_found() -> None:
 def test_what_does_not_follow_the_robot_never_aligns(
     kind: str, n: int, gap: float, sigma: float,
 ) -> None:
-    for seed in range(6):
+    for seed in range(4):
         some = drive(seed, n, gap, sigma=sigma)
         if kind == 'mirrored' and np.ptp(np.unwrap(some.truth[:, 2])) < 2.0:
             continue    # so straight a drive does not show it
