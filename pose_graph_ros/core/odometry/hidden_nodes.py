@@ -16,7 +16,7 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.jumps import gap_motion
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
-from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, SavedSpan
+from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, Span
 from pose_graph_ros.core.odometry.stream import (
     choose_first,
     find_silence,
@@ -24,7 +24,7 @@ from pose_graph_ros.core.odometry.stream import (
     OdometryStream,
 )
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
-from pose_graph_ros.core.saved_columns import as_matrix, as_pose
+from pose_graph_ros.core.saved_columns import as_pose
 
 
 class NewNode(NamedTuple):
@@ -60,9 +60,9 @@ class HiddenNodes(NodeTable):
         self.covered_ns = -1
         # stamp and odometry pose from which the motion to the next node is measured
         self._base_ns, self._base = -1, (0.0, 0.0, 0.0)
-        # motion from the newest node to `_base_ns`, shape (3,), and covariance, shape (3, 3),
-        # where the primary source has no sample as old as that node; else None
-        self._span: tuple[FloatArray, FloatArray] | None = None
+        # motion from the newest node to `_base_ns`, where the primary source has no sample as old
+        # as that node; else None
+        self._span: Span | None = None
         self._secondary: list[tuple[str, Factors]] = []  # edges not yet taken, with their sources
         # stamp before which samples may have been dropped as nodes were thinned out [ns]
         self._samples_since_ns = -1
@@ -189,8 +189,8 @@ class HiddenNodes(NodeTable):
             self._base_ns = begin_ns
             if begin_ns > last_ns:
                 mean, noise = gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns)
-                self._span = (se2.compose(self._span[0], mean),
-                              passed_on(mean, self._span[1], noise))
+                self._span = Span(se2.compose(self._span.mean, mean),
+                                  passed_on(mean, self._span.covariance, noise))
         self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
         self._catch_up()
 
@@ -279,12 +279,13 @@ class HiddenNodes(NodeTable):
 
     def _since_node(
         self, stream: OdometryStream, motion: Motion, *, floor: bool = True,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> Span:
         """Return a motion from `_base_ns` on as one from the newest node, and its covariance."""
         mean, noise = motion.increment, stream.covariance(motion, floor=floor)
         if self._span is None:
-            return mean, noise
-        return se2.compose(self._span[0], mean), passed_on(mean, self._span[1], noise)
+            return Span(mean, noise)
+        return Span(se2.compose(self._span.mean, mean),
+                    passed_on(mean, self._span.covariance, noise))
 
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:
@@ -382,15 +383,13 @@ class HiddenNodes(NodeTable):
 
     def saved(self) -> SavedNodes:
         """Return the state, with the odometry samples that are needed; there must be a node."""
-        span = None if self._span is None else SavedSpan(
-            as_pose(self._span[0]), as_matrix(self._span[1]))
         after_ns, primaries = zip(*self._primaries, strict=True)
         needed_ns = self.stamps_ns[max(self.n_frozen - 1, 0):]
         return SavedNodes(
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
-            primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
+            primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
-            self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
+            self.frozen.copy(), float(self.travelled[0]), self.thinned,
             np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
@@ -399,8 +398,7 @@ class HiddenNodes(NodeTable):
         for after_ns, source in zip(saved.leads_after_ns.tolist(), saved.leads, strict=True):
             self._set_primary(after_ns, source)
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
-        if saved.bridge is not None:
-            self._span = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)
+        self._span = saved.bridge
         for name, stream in saved.streams.items():
             self.streams[name] = OdometryStream(self._config.odometry_source(name))
             self.streams[name].restore(stream)

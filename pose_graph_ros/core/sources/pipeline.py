@@ -28,41 +28,8 @@ from pose_graph_ros.core.sources.settings import SOURCES
 
 class WaitingMeasurement(NamedTuple):
     due_ns: int  # stamp that odometry must reach [ns]
-    arrival: int  # number of measurements that arrived before it
     source: str
     measurement: ms.PoseMeasurement
-
-
-class WaitingMeasurements:
-    """Waiting measurements, ordered by the stamp at which they are due."""
-
-    def __init__(self) -> None:
-        self._waiting: list[WaitingMeasurement] = []
-        self._arrival = itertools.count()
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def push(self, source: str, measurement: ms.PoseMeasurement) -> WaitingMeasurement | None:
-        """Add a measurement; of too many the one due last is dropped, and returned."""
-        waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
-        bisect.insort(self._waiting, waiting)
-        return self._waiting.pop() if len(self) > SOURCES.most_waiting else None
-
-    @property
-    def measurements(self) -> list[tuple[str, ms.PoseMeasurement]]:
-        return [(waiting.source, waiting.measurement) for waiting in self._waiting]
-
-    def until(self, stamp_ns: int) -> list[WaitingMeasurement]:
-        """Return the measurements due up to a stamp [ns], the earliest first."""
-        return self._waiting[:bisect.bisect_right(
-            self._waiting, stamp_ns, key=lambda each: each.due_ns)]
-
-    def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
-        """Remove and return the measurements due up to a stamp [ns], the earliest first."""
-        due = self.until(covered_ns)
-        del self._waiting[:len(due)]
-        return due
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +105,9 @@ class MeasurementPipeline:
         self.nodes, self._config = nodes, config
         # yaw rates, from which rotations between the hidden nodes are made
         self.gyros = Gyros(nodes, config)
-        # measurements that wait for odometry to reach their stamps
-        self.waiting = WaitingMeasurements()
+        # measurements that wait for odometry to reach their stamps, in the order of these, then of
+        # their arrival
+        self.waiting: list[WaitingMeasurement] = []
         self.seen = SeenStamps()  # stamps of the measurements that were accepted or wait
         self.queue: list[Queued] = []  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
@@ -198,8 +166,10 @@ class MeasurementPipeline:
 
     def _wait(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         """Let a measurement wait for odometry; if too many wait, drop the one due last."""
-        excess = self.waiting.push(source, measurement)
-        if excess is not None:
+        bisect.insort(self.waiting, WaitingMeasurement(due_ns(measurement), source, measurement),
+                      key=lambda each: each.due_ns)
+        if len(self.waiting) > SOURCES.most_waiting:
+            excess = self.waiting.pop()
             answer = ms.rejected(
                 'too_many_pending', f'{SOURCES.most_waiting} measurements wait for odometry')
             if excess.measurement is measurement:
@@ -213,9 +183,15 @@ class MeasurementPipeline:
         """Attach the measurements whose stamps odometry has reached, and make rotations."""
         if len(self.gyros.streams) > 0:
             self._take_turns()
-        if len(self.waiting) > 0:
-            for waiting in self.waiting.pop_due(self.nodes.covered_ns):
-                self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
+        due = self.waiting_until(self.nodes.covered_ns)
+        del self.waiting[:len(due)]
+        for waiting in due:
+            self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
+
+    def waiting_until(self, stamp_ns: int) -> list[WaitingMeasurement]:
+        """Return the measurements that wait for odometry up to a stamp [ns]."""
+        return self.waiting[:bisect.bisect_right(
+            self.waiting, stamp_ns, key=lambda each: each.due_ns)]
 
     def _attach(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         attachment = attach(self.nodes, measurement.stamp_ns)
@@ -248,8 +224,8 @@ class MeasurementPipeline:
     @property
     def needed_ns(self) -> int | None:
         """Earliest stamp that something is attached at, or may align [ns]; None without one."""
-        needed = [stamp_ns for _, measurement in self.waiting.measurements
-                  for stamp_ns in self._stamps_of(measurement)]
+        needed = [stamp_ns for each in self.waiting
+                  for stamp_ns in self._stamps_of(each.measurement)]
         needed += [stamp_ns for each in self.queue if each.factor.kind[0] != FactorKind.HEADING
                    for stamp_ns in (each.stamp_ns, each.reference_ns)]
         begin_ns = max(self.nodes.last_frozen_ns, 0)

@@ -200,11 +200,14 @@ def sparse_removal(graph: Graph, nodes: IntArray, factors: IntArray = NONE) -> G
     earlier = (np.isin(table.kind, (FactorKind.PRIOR, FactorKind.NODE_PRIOR))
                & np.isin(table.i, around) & np.isin(table.j, (*around, -1)))
     more = np.union1d(factors, ids[earlier])
-    sparse = _approximation(marginal(graph, nodes, more.tolist(), cuts))
-    if sparse is None:
+    prior = marginal(graph, nodes, more.tolist(), cuts)
+    try:
+        told = [] if prior is None else [
+            sparsify(prior, n_extra=round(LIMITS.extra * len(prior.nodes))).factors]
+    except np.linalg.LinAlgError:
         return None
     return GraphUpdate(
-        factors=Factors.joined([sparse.factors, *observed]), remove_nodes=nodes.tolist(),
+        factors=Factors.joined([*told, *observed]), remove_nodes=nodes.tolist(),
         # the others leave with the nodes
         drop=np.setdiff1d(more, with_nodes).tolist())
 
@@ -220,20 +223,20 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     update = marginalize(graph, nodes.tolist())
     factors, dense = [update.factors], list[Prior]()
     for prior in update.priors:
-        sparse = _of_window(graph, prior) if len(prior.nodes) <= LIMITS.window_poses else None
-        if sparse is not None:
-            dense += sparse.priors
-            factors.append(sparse.factors)
-        else:
-            dense.append(prior)
+        try:
+            sparse = _of_window(graph, prior) if len(prior.nodes) <= LIMITS.window_poses else None
+        except np.linalg.LinAlgError:   # too stiff for double precision
+            sparse = None
+        dense += [prior] if sparse is None else sparse.priors
+        factors += [] if sparse is None else [sparse.factors]
     return update._replace(factors=Factors.joined(factors), priors=dense)
 
 
 def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
     """Return what stands for a prior that a window leaves; None if it has to stay dense."""
     rows = graph.node_rows(prior.nodes)
-    order = np.argsort(~graph.is_pose[rows], kind='stable')
-    n = int(np.count_nonzero(graph.is_pose[rows]))
+    is_pose = graph.is_pose[rows]
+    n = int(np.count_nonzero(is_pose))
     n_biases = len(rows) - n
     if n == 0 or np.count_nonzero(graph.is_bias[rows]) < n_biases:
         return None
@@ -241,32 +244,14 @@ def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
         # alone they are as sparse as they can be
         if n <= 1 or not prior.anchored:
             return None
-        at = (3 * order[:, None] + np.arange(3)).ravel()
+        order = np.argsort(~is_pose, kind='stable')
+        at = columns_of(order)
         prior = replace(
             prior, nodes=prior.nodes[order], reference=prior.reference[order],
             information=prior.information[np.ix_(at, at)], vector=prior.vector[at])
     extra = min(LIMITS.window_extra, LIMITS.window_edges / n - 1.0)
-    return _approximation(prior, extra, LIMITS.window_enough, n_biases)
-
-
-def _approximation(
-    prior: Prior | None, extra: float = LIMITS.extra, enough: float = 1e-9, n_biases: int = 0,
-) -> SparsePrior | None:
-    """
-    Return what stands for a prior; None if it is too stiff for double precision.
-
-    There are at most `extra` edges beyond the tree for each of its nodes, and none is added once
-    the divergence is small `enough` [nats]. The last `n_biases` nodes are biases.
-    """
-    if prior is None:
-        return SparsePrior(Factors(), 0.0)
-    try:
-        return sparsify(
-            prior.nodes, prior.reference, prior.information, prior.vector, enough=enough,
-            anchored=prior.anchored, n_extra=round(extra * (len(prior.nodes) - n_biases)),
-            n_biases=n_biases)
-    except np.linalg.LinAlgError:
-        return None
+    return sparsify(
+        prior, n_extra=round(extra * n), enough=LIMITS.window_enough, n_biases=n_biases)
 
 
 def crowded_edges(graph: Graph, newest: int) -> Iterator[IntArray]:
