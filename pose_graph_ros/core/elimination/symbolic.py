@@ -79,8 +79,7 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     it, then the loose priors. The graph is `start` and `adjacency` of `ordering.minimum_degree`,
     its node k is `affected[k]`.
     """
-    cliques = tb.cliques(head)
-    nodes, factors, pool_i = tb.nodes(head), tb.factors(head), tb.pool_i(head)
+    nodes, factors, cliques = tb.nodes(head), tb.factors(head), tb.cliques(head)
     n = len(affected)
     serial = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = serial
@@ -103,10 +102,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     first = np.zeros(n + 1, np.int32)
     n_entries = 0
     for k in range(n_orphans):
-        row = cliques[orphans[k]]
-        begin = row.members + row.n_frontal
-        for m in range(begin, begin + row.n_separator):
-            first[nodes[pool_i[m]].index + 1] += 1
+        for v in pools.separator(head, orphans[k]):
+            first[nodes[v].index + 1] += 1
             n_entries += 2
     for k in range(n):
         first[k + 1] += first[k]
@@ -116,10 +113,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             entry = factors[entry >> 2].next[entry & 3]
     orphans_of, filled = np.empty(first[n], np.int32), first.copy()
     for k in range(n_orphans):
-        row = cliques[orphans[k]]
-        begin = row.members + row.n_frontal
-        for m in range(begin, begin + row.n_separator):
-            i = nodes[pool_i[m]].index
+        for v in pools.separator(head, orphans[k]):
+            i = nodes[v].index
             orphans_of[filled[i]] = n + k
             filled[i] += 1
     start = np.empty(n + n_orphans + 1, np.int32)
@@ -144,10 +139,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             entry = f.next[entry & 3]
     for k in range(n_orphans):
         start[n + k] = end
-        row = cliques[orphans[k]]
-        begin = row.members + row.n_frontal
-        for m in range(begin, begin + row.n_separator):
-            adjacency[end] = nodes[pool_i[m]].index
+        for v in pools.separator(head, orphans[k]):
+            adjacency[end] = nodes[v].index
             end += 1
     start[n + n_orphans] = end
     return orphans[:n_orphans], start, adjacency
