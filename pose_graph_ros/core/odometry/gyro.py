@@ -20,7 +20,7 @@ that both claim.
 
 import bisect
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -281,14 +281,14 @@ class Gyros:
     no part of that, and the mean rate measures the bias instead.
     """
 
-    def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
+    def __init__(
+        self, nodes: HiddenNodes, config: BackendConfig, counts: Counter[tuple[str, str]],
+    ) -> None:
         self._nodes, self._config = nodes, config
         self.streams: dict[str, GyroStream] = {}  # by the name of the source
-        # Number of rotations by source: 'rotations' that were made, those that a 'gap' in the
-        # rates has left out, and those 'before_window', whose nodes have left the graph. Whoever
-        # takes them clears it.
-        self.counts: Counter[tuple[str, str]] = Counter()
-        self.new: list[Turn] = []  # rotations not yet taken; whoever takes them clears the list
+        # among them numbers of rotations by source: 'rotations' that were made, those that a 'gap'
+        # in the rates has left out, and those 'before_window', whose nodes have left the graph
+        self._counts = counts
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for rotations that are made from now on."""
@@ -305,7 +305,7 @@ class Gyros:
         for stream in self.streams.values():
             stream.settle(stream.newest_ns)
 
-    def extend(self) -> None:
+    def extend(self) -> Iterator[Turn]:
         """Make the rotations up to the newest node that settled rates have reached."""
         for source, stream in self.streams.items():
             stamps_ns = self._nodes.stamps_ns
@@ -315,11 +315,11 @@ class Gyros:
             # before the first sample there is nothing to integrate
             begin = max(stream.next_node, int(np.searchsorted(stamps_ns, stream.first_ns)))
             for node in range(begin, end):
-                self._extend(source, stream, node)
+                yield from self._extend(source, stream, node)
             stream.next_node = max(begin, end)
             stream.forget_before(int(stamps_ns[stream.next_node - 1]))
 
-    def _extend(self, source: str, stream: GyroStream, node: int) -> None:
+    def _extend(self, source: str, stream: GyroStream, node: int) -> Iterator[Turn]:
         """Make the rotation to a node, given by its number."""
         nodes = self._nodes
         start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
@@ -329,14 +329,14 @@ class Gyros:
         integral = stream.integral(start_ns, end_ns)
         if integral is None:
             if stream.first_ns <= start_ns:
-                self.counts[source, 'gap'] += 1
+                self._counts[source, 'gap'] += 1
             return
         if nodes.has_left(node - 1) or nodes.has_left(node):
-            self.counts[source, 'before_window'] += 1
+            self._counts[source, 'before_window'] += 1
             return
         rotation = integral.between(start_ns, end_ns)
         at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
-        self.counts[source, 'rotations'] += 1
+        self._counts[source, 'rotations'] += 1
         odometry = nodes.streams[nodes.primary_at(end_ns)]
         if odometry.timeline.covers(start_ns) and odometry.timeline.covers(end_ns):
             motion = odometry.timeline.motion(start_ns, end_ns)
@@ -347,13 +347,13 @@ class Gyros:
         i, j = nodes.ids[node - 1:node + 1].tolist()
         middle_ns = (start_ns + end_ns) // 2
         if at_rest.seconds == 0.0:
-            self.new.append(Turn(source, i, j, middle_ns, *rotation))
+            yield Turn(source, i, j, middle_ns, *rotation)
             return
-        self.new.append(Turn(
+        yield Turn(
             source, i, j, middle_ns, rotation.angle - at_rest.angle + creep,
             rotation.variance - at_rest.variance + creep_variance,
             rotation.seconds - at_rest.seconds, (at_rest.angle - creep) / at_rest.seconds,
-            (at_rest.variance + creep_variance) / at_rest.seconds**2))
+            (at_rest.variance + creep_variance) / at_rest.seconds**2)
 
     def _at_rest(
         self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,

@@ -1,6 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Hidden nodes, which are made from odometry alone."""
+"""
+Hidden nodes, which are made from odometry alone.
+
+Of several sources the primary one makes the nodes; the others add edges. The preferred source
+becomes the primary one unless it begins later than another by more than the patience. A primary
+source that is silent for longer than the patience is replaced by the most preferred source that
+has samples then. The choice depends on the stamps alone if all sources deliver samples in the
+order of stamps, up to the reorder window: when one source settles a stamp, the earlier samples of
+all sources are known.
+"""
 
 from collections.abc import Callable, Iterable
 import math
@@ -17,12 +26,7 @@ from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.jumps import gap_motion
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
 from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, Span
-from pose_graph_ros.core.odometry.stream import (
-    choose_first,
-    find_silence,
-    first_with_sample,
-    OdometryStream,
-)
+from pose_graph_ros.core.odometry.stream import find_silence, OdometryStream
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 from pose_graph_ros.core.saved_columns import as_pose
 
@@ -132,16 +136,30 @@ class HiddenNodes(NodeTable):
         """Make the nodes and edges that are due after settling samples of a source."""
         for stamp_ns, pose in settled:
             if not self._primaries:
-                names = self._names
-                preferred = next(iter(self._config.odometry), names[0])
-                first = choose_first(self.streams, names, preferred, stamp_ns, self._patience_ns)
-                if first is not None:
-                    self._make_first_node(first)
+                self._choose_first(stamp_ns)
             elif stamp_ns - self.covered_ns > self._patience_ns:
                 self._replace_silent_primary(source, stamp_ns)
             if self._primaries and source == self.primary and stamp_ns > self.covered_ns:
                 self._extend(stamp_ns, pose)
         self._add_secondary_edges()
+
+    def _choose_first(self, settled_ns: int) -> None:
+        """Choose the first primary source, and make the first node, unless it is too early."""
+        names, ready_ns = self._names, []
+        preferred = next(iter(self._config.odometry), names[0])
+        for name in names:
+            begin_ns = self.streams[name].first_after(-1)
+            if begin_ns is not None and name != preferred:
+                begin_ns = self.streams[name].first_after(begin_ns + self._patience_ns - 1)
+            if begin_ns is not None and begin_ns <= settled_ns:
+                ready_ns.append(begin_ns)
+        if len(ready_ns) > 0:
+            self._make_first_node(self._first_with_sample(names, -1, min(ready_ns)))
+
+    def _first_with_sample(self, names: list[str], after_ns: int, until_ns: int) -> str:
+        """Return the first source with a sample in (after_ns, until_ns]; one at least has one."""
+        return next(name for name in names if (
+            self.streams[name].first_after(after_ns) or until_ns + 1) <= until_ns)
 
     def _make_first_node(self, source: str) -> None:
         """Make a source the primary one, and the first node at its first sample."""
@@ -170,12 +188,12 @@ class HiddenNodes(NodeTable):
         if silence is None:
             return
         # another source makes the nodes after the last sample before the silence
-        old, last_ns = self.streams[self.primary], silence.last_ns
+        old, (last_ns, known_ns) = self.streams[self.primary], silence
         for stamp_ns, pose in old.settle(last_ns):
             self._extend(stamp_ns, pose)
-        source = first_with_sample(self.streams, others, last_ns, silence.known_ns)
+        source = self._first_with_sample(others, last_ns, known_ns)
         stream = self.streams[source]
-        stream.settle_all(silence.known_ns)
+        stream.settle_all(known_ns)
         self._add_secondary_edges()
         timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
         self._set_primary(last_ns, source)

@@ -103,8 +103,6 @@ class MeasurementPipeline:
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
         self.nodes, self._config = nodes, config
-        # yaw rates, from which rotations between the hidden nodes are made
-        self.gyros = Gyros(nodes, config)
         # measurements that wait for odometry to reach their stamps, in the order of these, then of
         # their arrival
         self.waiting: list[WaitingMeasurement] = []
@@ -112,6 +110,8 @@ class MeasurementPipeline:
         self.queue: list[Queued] = []  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
         self.counts: Counter[tuple[str, str]] = Counter()
+        # yaw rates, from which rotations between the hidden nodes are made
+        self.gyros = Gyros(nodes, config, self.counts)
         self.beacons = Beacons(self.counts)  # and the ranges that wait for them
         # detail of the newest refusal by source and reason
         self.refusals: dict[tuple[str, str], str] = {}
@@ -136,13 +136,8 @@ class MeasurementPipeline:
 
     def _take_turns(self) -> None:
         """Make the rotations that are due, and count what happened to the rates."""
-        gyros = self.gyros
-        gyros.extend()
-        self.queue += itertools.chain.from_iterable(map(turn, gyros.new))
-        gyros.new.clear()
-        self.counts.update(gyros.counts)
-        gyros.counts.clear()
-        self.count_sorted(gyros.streams)
+        self.queue += itertools.chain.from_iterable(map(turn, self.gyros.extend()))
+        self.count_sorted(self.gyros.streams)
 
     def _add(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         settings = self._config.measurement_source(source, type(measurement))
