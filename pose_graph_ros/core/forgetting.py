@@ -225,7 +225,13 @@ class Forgetting:
             nodes.move_frozen(se2.compose(last, se2.inverse(nodes.frozen[-1])))
         leaving, judged = self._ask(leaving, sr.NONE, measured=True)
         parts.smoother.linearize(leaving)
-        poses, places = nodes.recent_poses(graph), self._other_anchors(first)
+        # anchors of thinned nodes that leave have a place in others
+        poses, thinned = nodes.recent_poses(graph), nodes.thinned
+        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
+        kept = np.setdiff1d(np.arange(first, len(nodes)), thinned.numbers)
+        ends, starts = graph.poses_of(nodes.ids[leave]), graph.poses_of(nodes.ids[kept])
+        nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
+        places = th.Places.now(parts.smoother, nodes.ids[leave], nodes.ids[kept[nearest]])
         gone = None if prior is WindowPrior.DENSE else self._solve(
             sr.sparse_marginalization(graph, leaving))
         if gone is None:
@@ -249,13 +255,3 @@ class Forgetting:
             for each in lost:
                 parts.pipeline.count(each.source, rejected(
                     'before_window', 'its hidden node left the graph before it was added'))
-
-    def _other_anchors(self, first: int) -> th.Places:
-        """Return the places in others of anchors of thinned nodes that leave, before a number."""
-        table, graph = self._parts.nodes, self._parts.graph
-        thinned = table.thinned
-        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
-        kept = np.setdiff1d(np.arange(first, len(table)), thinned.numbers)
-        ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
-        nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
-        return th.Places.now(self._parts.smoother, table.ids[leave], table.ids[kept[nearest]])

@@ -86,7 +86,7 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         parts.pipeline.seen.restore(saved.seen)
         parts.factors.restore(saved.sources)
         for name, gyro in saved.gyros.items():
-            parts.pipeline.gyros.restore(name, gyro)
+            parts.pipeline.gyros.stream(name).restore(gyro)
         parts.pipeline.beacons.ids |= saved.beacons
         parts.reweighting.restore(saved.losses)
         parts.alignment.load(saved.alignment)

@@ -22,11 +22,11 @@ translation changes no linear model.
 
 `TURN_SEEN` is the angle of the frame when the update matrix was added to the parent's front. The
 *slip* beta is by how much the frame has turned relative to the parent's frame since then. The
-parent works with a linear model of that rotation, and `interface_error2` returns its error, in the
+parent works with a linear model of that rotation, and `slip_error2` returns its error, in the
 units of the squared linearization error of a constraint.
 
-A prior is a clique without frontal nodes: `linearize_prior` writes its update matrix, and
-`prior_error2` is its `interface_error2`. `graph.priors` has the equations.
+A prior is a clique without frontal nodes, of which `linearize_prior` writes the update matrix.
+`graph.priors` has the equations.
 """
 
 import math
@@ -130,44 +130,6 @@ def frame_slip(head, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
-    """
-    Return the squared error [sigma^2] of the parent's linear model of a clique's slip beta [rad].
-
-    An infinitesimal rotation is in the null space of the update matrix U. Of a rotation of the
-    local coordinates v by beta this leaves `w = ((1 - cos beta) + (beta - sin beta) S) v`, with
-    S = ((0, -1), (1, 0)), and the error w^T U w. The gradient g = U delta' - u has rotated by beta
-    as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U. Work space is 9
-    numbers for each separator node.
-    """
-    nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
-    size = 3 * len(members)
-    phi = present_turn(head, c)
-    cos, sin = math.cos(phi), math.sin(phi)
-    first = nodes[members[0]]
-    px, py = first.pose[0], first.pose[1]
-    versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
-    w, local, gradient = work[:size], work[size:2 * size], work[2 * size:3 * size]
-    for a in range(len(members)):
-        f = nodes[members[a]]
-        x, y, th = local_delta(f, px, py, cos, sin, phi)
-        local[3 * a], local[3 * a + 1], local[3 * a + 2] = x, y, th
-        x, y = x + f.reference[0] - px, y + f.reference[1] - py
-        w[3 * a], w[3 * a + 1] = versine * x - lag * y, versine * y + lag * x
-        w[3 * a + 2] = 0.0
-    product(update, size, local, 1.0, gradient)
-    product(update, size, w, 0.0, local)
-    error2 = turned = 0.0
-    for i in range(size):
-        error2 += w[i] * local[i]
-    for i in range(0, size, 3):
-        scale = update[row_start(i, size) + i] + update[row_start(i + 1, size) + i + 1]
-        if scale > 0.0:
-            turned += 2.0 * (gradient[i] ** 2 + gradient[i + 1] ** 2) / scale
-    return max(error2, 0.0) + beta * beta * turned
-
-
-@kernel
 def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
     """
     Write the matrix and right-hand side of a prior whose frame has turned by phi, in map axes.
@@ -204,32 +166,45 @@ def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
+def slip_error2(head, c, work):  # type: ignore[no-untyped-def]
     """
-    Return the squared linearization error of a prior that turns with its nodes [sigma^2].
+    Return the squared error [sigma^2] of the parent's linear model of a clique's slip beta [rad].
 
-    Since it was linearized its frame has turned by beta against that of its parent, and positions
-    in the frame have changed by D. The displacement then differs from its linear model by
-    `w = ((1 - cos beta) + (beta - sin beta) S) p - beta S D`, p the positions, and gradients have
-    turned: that of the nodes by beta, as in `interface_error2`, and that of the
-    frame by `m g^T S D`. A large change of S D against p would falsify covariances in any case.
+    An infinitesimal rotation is in the null space of the update matrix U. Of a rotation of the
+    local coordinates p by beta this leaves `w = ((1 - cos beta) + (beta - sin beta) S) p`, with
+    S = ((0, -1), (1, 0)), and the error w^T U w. The gradient g = U delta' - u has rotated by beta
+    as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U.
+
+    Of a prior, positions in its frame have changed by D since it was linearized. That adds
+    `-beta S D` to w, and `m g^T S D` to the gradient of the frame. A large change of S D against p
+    would falsify covariances in any case. Work space is 15 numbers for each separator node.
     """
-    row, update = tb.cliques(head)[c], pools.update_matrix(head, c)
-    n = 3 * row.n_separator
-    beta = frame_slip(head, c)
-    prior_rows.evaluate(head, c, present_turn(head, c), work)
-    g, r, w = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
-    change = work[4 * n:5 * n]
-    # the reference poses, the energy, and r at the linearization: what of it has changed is S D
-    reference = update[triangle_size(n, n):]
-    for i in range(n):
-        change[i] = r[i] - reference[n + 1 + i]
-    if row.anchored != 0:   # make r the derivative of the coordinates in its frame by -phi
-        for i in range(0, n, 3):
-            r[i] -= reference[i + 1] - reference[1]
-            r[i + 1] += reference[i] - reference[0]
+    nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
+    row, n = tb.cliques(head)[c], 3 * len(members)
+    beta, phi = frame_slip(head, c), present_turn(head, c)
+    d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]    # r is S p
+    w, change = work[3 * n:4 * n], work[4 * n:5 * n]
+    if row.n_frontal == 0:
+        prior_rows.evaluate(head, c, phi, work)
+        # the reference poses, the energy, and r at the linearization: what of it changed is S D
+        reference = update[triangle_size(n, n):]
+        for i in range(n):
+            change[i] = r[i] - reference[n + 1 + i]
+        if row.anchored != 0:   # make r the derivative of the coordinates in its frame by -phi
+            for i in range(0, n, 3):
+                r[i] -= reference[i + 1] - reference[1]
+                r[i + 1] += reference[i] - reference[0]
+    else:
+        change[:] = 0.0
+        cos, sin, first = math.cos(phi), math.sin(phi), nodes[members[0]]
+        px, py = first.pose[0], first.pose[1]
+        for a in range(len(members)):
+            f, i = nodes[members[a]], 3 * a
+            d[i], d[i + 1], d[i + 2] = local_delta(f, px, py, cos, sin, phi)
+            r[i], r[i + 1] = py - d[i + 1] - f.reference[1], d[i] + f.reference[0] - px
+        product(update, n, d, 1.0, g)
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
-    of_nodes = of_frame = compliance = moved = arms = 0.0
+    of_nodes = of_frame = compliance = moved = arms = error2 = 0.0
     for i in range(0, n, 3):
         w[i] = versine * r[i + 1] + lag * r[i] - beta * change[i]
         w[i + 1] = -versine * r[i] + lag * r[i + 1] - beta * change[i + 1]
@@ -242,10 +217,8 @@ def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
         of_frame += change[i] * g[i] + change[i + 1] * g[i + 1]
         moved += iso * (change[i] ** 2 + change[i + 1] ** 2)
         arms += heading + iso * (r[i] ** 2 + r[i + 1] ** 2)
-    error2 = beta * beta * of_nodes + of_frame * of_frame * compliance
-    if moved > factors.MUCH_LONGER * arms:
-        error2 += moved / (arms + 1e-300)
-    product(update, n, w, 0.0, change)
+    product(update, n, w, 0.0, d)
     for i in range(n):
-        error2 += w[i] * change[i]
-    return max(error2, 0.0)
+        error2 += w[i] * d[i]
+    error2 = max(error2, 0.0) + beta * beta * of_nodes + of_frame * of_frame * compliance
+    return error2 + (moved / (arms + 1e-300) if moved > factors.MUCH_LONGER * arms else 0.0)

@@ -159,11 +159,10 @@ def add_energies(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def diagonal(head, c, k):  # type: ignore[no-untyped-def]
-    """Return the mean information of a prior on the position of a node, and on its heading."""
-    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
-    n, i, at = 3 * row.n_separator, 3 * k, row.values
-    position = pool_f[at + row_start(i, n) + i] + pool_f[at + row_start(i + 1, n) + i + 1]
-    return 0.5 * position, pool_f[at + row_start(i + 2, n) + i + 2]
+    """Return the mean information of an update matrix on a node's position, and on its heading."""
+    update, n, i = pools.update_matrix(head, c), 3 * tb.cliques(head)[c].n_separator, 3 * k
+    position = update[row_start(i, n) + i] + update[row_start(i + 1, n) + i + 1]
+    return 0.5 * position, update[row_start(i + 2, n) + i + 2]
 
 
 @kernel

@@ -58,18 +58,15 @@ class RateIntegral:
         self._begin_ns, self.scale = int(stamps_ns[0]), source.covariance_scale
         self._times = (stamps_ns - stamps_ns[0]) * 1e-9
         self.rates, steps = rates[:, 0], np.diff(self._times)
-        means = 0.5 * (self.rates[1:] + self.rates[:-1])
-        change = np.diff(self.rates)
-        self._slopes = change / steps
-        self._angles = np.append(0.0, np.cumsum(means * steps))
         # n independent errors of variance v during a time t: that of the angle grows by v t / n
         density = np.full(len(steps), source.sigma_rate**2)
         if source.noise_from is RateNoise.MESSAGE:
             known = np.minimum(rates[1:, 1], rates[:-1, 1]) > 0.0
             density[known] = (0.5 * (rates[1:, 1] + rates[:-1, 1]) * steps)[known]
-        bend = np.minimum(UNIFORM_WITHIN * steps**2 / 12.0, 0.25 * np.abs(change) * steps)
+        bend = np.minimum(UNIFORM_WITHIN * steps**2 / 12.0,
+                          0.25 * np.abs(np.diff(self.rates)) * steps)
+        means = 0.5 * (self.rates[1:] + self.rates[:-1])
         self._densities = density + source.sigma_turn**2 * np.abs(means) + bend**2 / steps
-        self._variances = np.append(0.0, np.cumsum(self._densities * steps))
 
     def rate(self, stamp_ns: int) -> float:
         """Return the rate at an instant [rad/s]."""
@@ -77,17 +74,11 @@ class RateIntegral:
 
     def between(self, start_ns: StampNs, end_ns: StampNs) -> Rotation:
         """Return the rotation between two instants that the samples cover."""
-        (begin, begin_variance), (end, end_variance) = self._at(start_ns), self._at(end_ns)
-        return Rotation(end - begin, self.scale * (end_variance - begin_variance),
-                        (end_ns - start_ns) * 1e-9)
-
-    def _at(self, stamp_ns: int) -> tuple[float, float]:
-        """Return the integral and its variance at an instant."""
-        time = (stamp_ns - self._begin_ns) * 1e-9
-        k = min(int(np.searchsorted(self._times, time, side='right')), len(self._slopes)) - 1
-        step = time - self._times[k]
-        angle = self._angles[k] + (self.rates[k] + 0.5 * self._slopes[k] * step) * step
-        return float(angle), float(self._variances[k] + self._densities[k] * step)
+        begin, end = ((stamp_ns - self._begin_ns) * 1e-9 for stamp_ns in (start_ns, end_ns))
+        times = np.clip(self._times, begin, end)
+        steps, rates = np.diff(times), np.interp(times, self._times, self.rates)
+        return Rotation(float(0.5 * (rates[1:] + rates[:-1]) @ steps),
+                        self.scale * float(self._densities @ steps), (end_ns - start_ns) * 1e-9)
 
 
 # Rotations of independent sensors that differ by more contradict each other [sigma].
@@ -296,10 +287,6 @@ class Gyros:
         for name, stream in self.streams.items():
             stream.configure(config.gyro(name))
 
-    def add(self, sample: YawRate, source: str) -> Answer:
-        """Return the answer to a sample, after adding it."""
-        return self._stream(source).add(sample)
-
     def finish(self) -> None:
         """Settle all samples."""
         for stream in self.streams.values():
@@ -378,7 +365,8 @@ class Gyros:
             variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
         return total, creep, variance
 
-    def _stream(self, source: str) -> GyroStream:
+    def stream(self, source: str) -> GyroStream:
+        """Return the stream of a gyroscope, a new one if there was none."""
         stream = self.streams.get(source)
         if stream is None:
             stream = self.streams[source] = GyroStream(self._config.gyro(source))
@@ -409,7 +397,3 @@ class Gyros:
         """Return the state of each gyroscope."""
         return {source: SavedGyro(stream.samples, stream.next_node)
                 for source, stream in self.streams.items()}
-
-    def restore(self, source: str, saved: SavedGyro) -> None:
-        """Restore the saved state of a gyroscope."""
-        self._stream(source).restore(saved)

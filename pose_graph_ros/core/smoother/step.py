@@ -267,7 +267,7 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
     """
     back_substitute(head)
     scalars, cliques, waiting = tb.scalars(head)[0], tb.cliques(head), tb.waiting(head)
-    work_i, work_f, iteration = tb.work_i(head), tb.work_f(head), head[tb.ITERATION]
+    work_i, iteration = tb.work_i(head), head[tb.ITERATION]
     checks, turned = work_i[head[tb.NODE_ROOM]:], work_i[2 * head[tb.NODE_ROOM]:]
     large = factors.LEAST_FRACTION * scalars.share
     scalars.error2_sum = 0.0
@@ -296,11 +296,7 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
     kept = 0
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
-        if cliques[c].n_frontal == 0:
-            error2 = clique_frames.prior_error2(head, c, work_f)
-        else:
-            error2 = clique_frames.interface_error2(
-                head, c, clique_frames.frame_slip(head, c), work_f)
+        error2 = clique_frames.slip_error2(head, c, tb.work_f(head))
         scalars.error2_sum += error2
         if error2 > large:
             cliques[c].slip_error2 = error2

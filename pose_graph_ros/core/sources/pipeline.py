@@ -124,7 +124,7 @@ class MeasurementPipeline:
 
     def add(self, measurement: ms.Measurement, source: str) -> ms.Answer:
         if isinstance(measurement, ms.YawRate):
-            answer = self.count(source, self.gyros.add(measurement, source))
+            answer = self.count(source, self.gyros.stream(source).add(measurement))
             self._take_turns()
             return answer
         return self.count(source, self._add(measurement, source))
