@@ -80,7 +80,6 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
     It is the one of the last factorisation, or a chord step from the present poses with it. Then
     `right` is -b there, from `evaluate`, shape (N, 3). The step overwrites it.
     """
-    nodes = tb.nodes(head)
     n_priors, n_cliques = head[tb.N_PRIORS], head[tb.N_CLIQUES]
     for c in range(n_priors, n_cliques if chord else n_priors):
         members, n_frontal, values, x = _clique(head, c, right)
@@ -95,7 +94,7 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
         backward_rows(values, 3 * n_frontal, len(x), x, not chord)
         for k in range(n_frontal):
             v = members[k]
-            f = nodes[v]
+            f = tb.nodes(head)[v]
             if f.fixed != 0:    # known, and zero but in a linear start
                 for m in range(3):
                     right[v, m] = f.delta[m]

@@ -227,11 +227,10 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
 @kernel
 def substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
     """Substitute the known solution of a fixed node: move its columns to the right-hand side."""
-    nodes = tb.nodes(head)
     right = ld - 1
     for m in range(3):
         r = at + m
-        x = nodes[v].delta[m]
+        x = tb.nodes(head)[v].delta[m]
         for k in range(r):
             front[k * ld + right] -= front[k * ld + r] * x
             front[k * ld + r] = 0.0

@@ -23,6 +23,7 @@ from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.rows import forget_touched
 
 # Number of the newest nodes that are eliminated last, since the next constraints involve them.
 NEWEST_LAST = 10
@@ -279,7 +280,6 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
 
     The last parents are those of the orphans, rows of cliques that there are already.
     """
-    nodes, pool_i = tb.nodes(head), tb.pool_i(head)
     first, n_frontal, parent = cliques.first, cliques.n_frontal, cliques.parent
     rows = np.empty(len(n_frontal), np.int32)
     for k in range(len(rows)):
@@ -287,10 +287,10 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
             head, np.int64(n_frontal[k]), np.int64(first[k + 1] - first[k] - n_frontal[k]))
         at = tb.cliques(head)[rows[k]].members
         for m in range(first[k], first[k + 1]):
-            pool_i[at + m - first[k]] = cliques.nodes[m]
+            tb.pool_i(head)[at + m - first[k]] = cliques.nodes[m]
         for m in range(first[k], first[k] + n_frontal[k]):
             transaction_log.log_node(head, cliques.nodes[m])
-            nodes[cliques.nodes[m]].clique = rows[k]
+            tb.nodes(head)[cliques.nodes[m]].clique = rows[k]
     for k in range(len(orphans)):
         transaction_log.log_clique(head, orphans[k])
     for m in range(len(parent)):
@@ -314,10 +314,8 @@ def plant_all(head, cliques):  # type: ignore[no-untyped-def]
     elimination, behind those of the priors. No node is touched afterwards, and the log of the
     update is empty: a rollback is not possible.
     """
-    nodes, touched = tb.nodes(head), tb.touched(head)
     prior_rows.remove_cliques(head)
-    for s in range(head[tb.N_TOUCHED]):
-        nodes[touched[s]].touched = 0
-    head[tb.N_TOUCHED] = head[tb.STRUCTURE] = 0
+    forget_touched(head)
+    head[tb.STRUCTURE] = 0
     plant(head, cliques, prior_rows.all_priors(head))
     head[tb.LOG_END] = head[tb.N_FREED] = 0

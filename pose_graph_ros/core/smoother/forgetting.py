@@ -122,7 +122,6 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
 def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
     """Drop all cliques below one, and all constraints in them and in it; return their energy."""
     pool_i, stack, cliques = tb.pool_i(head), tb.work_i(head), tb.cliques(head)
-    nodes = tb.nodes(head)
     stack[0] = top
     depth, energy = 1, 0.0
     while depth > 0:
@@ -133,7 +132,7 @@ def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
             prior_rows.add_to_scales(head, c, -1.0)
             energy += cliques[c].energy
         for m in range(row.members, row.members + row.n_frontal):
-            node = nodes[pool_i[m]]
+            node = tb.nodes(head)[pool_i[m]]
             at = node.factor_list
             while at >= 0:
                 e, f = at >> 2, tb.factors(head)[at >> 2]
