@@ -32,19 +32,14 @@ columns as well.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.core.batch.linear_starts import complex_of, NodeSystem, Terms
+from pose_graph_ros.core.batch.linear_starts import complex_of, Constrained, NodeSystem, Terms
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.sparse import BlockFactors, components
-
-if TYPE_CHECKING:
-    from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
-    from pose_graph_ros.core.graph.graph import Graph
 
 
 class NotCoveredError(PoseGraphError):
@@ -89,7 +84,7 @@ class Formulation:
         return np.where(self.number[:, None] > 0, poses, self.fixed)
 
 
-def formulate(graph: 'Graph | PlainGraph') -> Formulation:
+def formulate(graph: Constrained) -> Formulation:
     """
     Return the objective for a graph, or raise NotCoveredError with the reason.
 

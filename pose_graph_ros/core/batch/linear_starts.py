@@ -21,7 +21,7 @@ the cliques of a graph.
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -33,7 +33,6 @@ from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, 
 from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, order_of
 
 if TYPE_CHECKING:
-    from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
     from pose_graph_ros.core.graph.graph import Graph
 
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
@@ -48,6 +47,21 @@ What is known of fixed nodes, and what is returned, are complex numbers, the las
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
 _LINEAR = [*_PLACING, *(kind for kind, factor in FACTORS.items() if 0 not in factor.rows)]
+
+
+class Constrained(Protocol):
+    """What is needed of a graph, a `Graph` or a `PlainGraph`."""
+
+    @property
+    def node_kind(self) -> npt.NDArray[Any]: ...
+    @property
+    def n_priors(self) -> int: ...
+    @property
+    def poses(self) -> Poses: ...
+    @property
+    def fixed(self) -> BoolArray: ...
+    @property
+    def factors_by_row(self) -> Factors: ...  # with rows for ends
 
 
 class Terms(NamedTuple):
@@ -165,7 +179,7 @@ class NodeSystem:
         return solve
 
 
-def sparse_chordal(graph: 'Graph | PlainGraph', nodes: NodeSystem | None = None) -> ChordalSolve:
+def sparse_chordal(graph: Constrained, nodes: NodeSystem | None = None) -> ChordalSolve:
     """Return the `ChordalSolve` that is not compiled; `nodes` is that of the edges."""
     terms = Terms.of_factors(graph.factors_by_row, len(graph.poses)).informative()
     system = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
@@ -184,7 +198,7 @@ def sparse_chordal(graph: 'Graph | PlainGraph', nodes: NodeSystem | None = None)
     return solve
 
 
-def chordal(graph: 'Graph | PlainGraph', solve: ChordalSolve | None = None) -> Poses:
+def chordal(graph: Constrained, solve: ChordalSolve | None = None) -> Poses:
     """
     Return initial poses from the constraints and the poses of fixed nodes: headings come first.
 
@@ -263,7 +277,7 @@ def _known(poses: Poses) -> tuple[ComplexArray, ComplexArray]:
     return np.append(complex_of(poses), 0.0), np.append(np.exp(1j * poses[:, 2]), 1.0)
 
 
-def _poses(graph: 'Graph | PlainGraph', t: ComplexArray, u: ComplexArray) -> Poses:
+def _poses(graph: Constrained, t: ComplexArray, u: ComplexArray) -> Poses:
     """Return poses from t and u of all nodes and the map; those of fixed nodes stay."""
     poses = np.stack((t.real, t.imag, se2.wrap(np.angle(u))), axis=1)[:-1]
     return np.where(graph.fixed[:, None], graph.poses, poses)
