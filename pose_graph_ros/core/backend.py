@@ -15,8 +15,8 @@ from pose_graph_ros.core import (
     transaction as tr,
 )
 from pose_graph_ros.core.alignment import Alignment
-from pose_graph_ros.core.batch import final_optimization, optimizer
-from pose_graph_ros.core.batch.optimizer import Solve, Status
+from pose_graph_ros.core.batch import final_optimization
+from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, CovariancePolicy
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
@@ -56,16 +56,14 @@ class PoseGraphBackend:
     Parameters
     ----------
     config : BackendConfig, optional
-    solve : callable, optimises a whole graph in place; only tests replace it
     smoother : IncrementalSmoother, optional, empty; only tests pass one
 
     """
 
     def __init__(
-        self, config: BackendConfig | None = None, solve: Solve = optimizer.optimize,
-        smoother: IncrementalSmoother | None = None,
+        self, config: BackendConfig | None = None, smoother: IncrementalSmoother | None = None,
     ) -> None:
-        self._config, self._solve = config or BackendConfig(), solve
+        self._config = config or BackendConfig()
         self._smoother = smoother or IncrementalSmoother(self._config.smoother)
         self.graph = self._smoother.graph  # which only this object may change
         self._nodes = HiddenNodes(self._config, self._make_node)
@@ -392,7 +390,7 @@ class PoseGraphBackend:
     def _optimize_whole(self) -> UpdateReport:
         """Optimise the whole graph; a failure leaves all poses and weights unchanged."""
         result = final_optimization.optimize(
-            self.graph, self._reweighting, self._config.final_optimization, self._solve)
+            self.graph, self._reweighting, self._config.final_optimization)
         if result.status is not Status.FAILED and self.graph.has_touched:
             # the solver has not updated the factorisation of the smoother
             updated = self._smoother.update(GraphUpdate())

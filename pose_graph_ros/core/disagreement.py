@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.batch.optimizer import optimize, optimize_from_two_starts, Status
+from pose_graph_ros.core.batch.optimizer import optimize_from_two_starts, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
@@ -134,7 +134,7 @@ def _solved_without(graph: Graph, parts: Mapping[str, _Part], source: str) -> Gr
     copy.apply(GraphUpdate(weigh=dict.fromkeys(part.factors.tolist(), 0.0), factors=Factors.on(
         graph.node_ids[first], None, graph.poses[first], information,
         [FactorKind.GLOBAL_POSE] * len(first))))
-    result = optimize_from_two_starts(copy, SolverConfig(), optimize)
+    result = optimize_from_two_starts(copy, SolverConfig())
     return None if result.status is Status.FAILED else copy
 
 

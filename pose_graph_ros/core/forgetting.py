@@ -13,7 +13,6 @@ By thinning, nodes leave where a place is driven often, as `window.thinning` dec
 
 from collections.abc import Iterator
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -67,13 +66,6 @@ def _beyond(config: WindowConfig, table: NodeTable, factor: float) -> int:
     return most
 
 
-class _Asked(NamedTuple):
-    """What is to leave the graph, and what is known of it only until then."""
-
-    nodes: IntArray  # with the biases that nothing needs without them; ids, ascending
-    judged: list[Verdict]
-
-
 class Forgetting:
     """
     Keeps the graph within its window, and at the size of the area.
@@ -110,22 +102,24 @@ class Forgetting:
             last, first = nodes.poses(parts.graph)[nodes.n_frozen - 1:nodes.n_frozen + 1]
             self._joint = se2.between(last, first)
 
-    def _ask(self, nodes: IntArray, factors: IntArray, after: int | None) -> _Asked:
+    def _ask(
+        self, nodes: IntArray, factors: IntArray, *, measured: bool,
+    ) -> tuple[IntArray, list[Verdict]]:
         """
         Ask the owners of hidden nodes, and of further factors, what they must keep of them.
 
-        `after` is the pose from which on measurements stay; None if none of them leaves.
+        With the nodes come the biases that nothing needs without them, if measurements leave, and
+        what is known of the factors only until they leave. Ids are ascending.
         """
-        graph, tuner = self._parts.graph, self._tuner
-        factors = np.union1d(graph.factors_on(nodes), factors)
+        factors = np.union1d(self._parts.graph.factors_on(nodes), factors)
         # the judge may change weights
         judged = self._parts.judge.decide_leaving(factors)
-        biases = [] if after is None else tuner.leaving(factors)
-        return _Asked(np.union1d(nodes, biases).astype(np.int64), judged)
+        biases = self._tuner.leaving(factors) if measured else []
+        return np.union1d(nodes, biases).astype(np.int64), judged
 
-    def _tell(self, asked: _Asked, gone: Gone, places: th.Places) -> None:
+    def _tell(self, gone: Gone, judged: list[Verdict], places: th.Places) -> None:
         """Let all owners forget what has left the graph."""
-        self._parts.judge.forget(gone.nodes, gone.factors, asked.judged)
+        self._parts.judge.forget(gone.nodes, gone.factors, judged)
         self._parts.reweighting.forget(gone.factors)
         self._tuner.forget(gone.nodes, gone.factors)
         self._parts.nodes.thin(*places)
@@ -174,7 +168,7 @@ class Forgetting:
                 break
             inside = np.isin(places.nodes, segment.poses)
             group = self._present(places.rows(inside), config)
-            if not self._leave(group, segment.factors, segment.after):
+            if not self._leave(group, segment.factors, measured=True):
                 break
             places, older = places.rows(~inside), older[older >= segment.after]
             yield
@@ -198,13 +192,13 @@ class Forgetting:
         return th.certain(self._parts.smoother, places.nodes[free], places.anchors[free], config)
 
     def _leave(
-        self, places: th.Places, factors: IntArray = sr.NONE, after: int | None = None,
+        self, places: th.Places, factors: IntArray = sr.NONE, *, measured: bool = False,
     ) -> bool:
         """Let nodes and further factors leave, few others in their place; tell if they did."""
-        asked = self._ask(places.nodes, factors, after)
-        gone = self._solve(sr.sparse_removal(self._parts.graph, asked.nodes, factors))
+        nodes, judged = self._ask(places.nodes, factors, measured=measured)
+        gone = self._solve(sr.sparse_removal(self._parts.graph, nodes, factors))
         if gone is not None:
-            self._tell(asked, gone, places)
+            self._tell(gone, judged, places)
         return gone is not None
 
     def _held(self) -> IntArray:
@@ -229,40 +223,35 @@ class Forgetting:
             last = se2.compose(nodes.recent_poses(graph)[0], se2.inverse(self._joint))
             self._joint = None
             nodes.move_frozen(se2.compose(last, se2.inverse(nodes.frozen[-1])))
-        stays = graph.is_pose & ~np.isin(graph.node_ids, leaving)
-        asked = self._ask(leaving, sr.NONE, int(graph.node_ids[np.argmax(stays)]))
-        parts.smoother.linearize(asked.nodes)
-        poses, places = nodes.recent_poses(graph), self._other_anchors(first)
+        leaving, judged = self._ask(leaving, sr.NONE, measured=True)
+        parts.smoother.linearize(leaving)
+        # anchors of thinned nodes that leave have a place in others
+        poses, thinned = nodes.recent_poses(graph), nodes.thinned
+        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
+        kept = np.setdiff1d(np.arange(first, len(nodes)), thinned.numbers)
+        ends, starts = graph.poses_of(nodes.ids[leave]), graph.poses_of(nodes.ids[kept])
+        nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
+        places = th.Places.now(parts.smoother, nodes.ids[leave], nodes.ids[kept[nearest]])
         gone = None if prior is WindowPrior.DENSE else self._solve(
-            sr.sparse_marginalization(graph, asked.nodes))
+            sr.sparse_marginalization(graph, leaving))
         if gone is None:
             try:
-                gone = parts.smoother.forget(asked.nodes)
+                gone = parts.smoother.forget(leaving)
             except GraphUpdateError:
                 parts.pipeline.counts['solver', 'failed'] += 1
                 self._rest = len(nodes) + sr.LIMITS.rest
                 return
-        self._tell(asked, gone, places)
+        self._tell(gone, judged, places)
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[n - 1], poses[n])
         parts.alignment.forget()
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         # constraints that were to be added to nodes that have left
-        left = {*asked.nodes.tolist()}
+        left = {*leaving.tolist()}
         for queue in (parts.pipeline.queue, parts.quarantine):
             lost = [each for each in queue if not left.isdisjoint(each.nodes)]
             queue[:] = [each for each in queue if left.isdisjoint(each.nodes)]
             for each in lost:
                 parts.pipeline.count(each.source, rejected(
                     'before_window', 'its hidden node left the graph before it was added'))
-
-    def _other_anchors(self, first: int) -> th.Places:
-        """Return the places in others of anchors of thinned nodes that leave, before a number."""
-        table, graph = self._parts.nodes, self._parts.graph
-        thinned = table.thinned.places()
-        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
-        kept = np.setdiff1d(np.arange(first, len(table)), thinned.numbers)
-        ends, starts = graph.poses_of(table.ids[leave]), graph.poses_of(table.ids[kept])
-        nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
-        return th.Places.now(self._parts.smoother, table.ids[leave], table.ids[kept[nearest]])

@@ -90,7 +90,7 @@ def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     found = np.full((len(of.path), 3, 3), np.nan)
     inside = np.flatnonzero(rows >= 0)
     found[inside] = covariances[rows[inside]]
-    for number in thinned.places().numbers.tolist() if len(thinned) > 0 else ():
+    for number in thinned.numbers.tolist():
         place = thinned.place(number)
         assert place is not None, 'it is among them'
         found[number] = covariance.propagated(
@@ -150,7 +150,7 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
     Return what waits for odometry to be settled only, in the order of stamps, and if it is gated.
     """
     found = []
-    for _, _, source, given in parts.pipeline.waiting.until(parts.nodes.newest_ns):
+    for _, source, given in parts.pipeline.waiting_until(parts.nodes.newest_ns):
         attachment = parts.nodes.attach_ahead(given.stamp_ns)
         # the first one of a source may set the origin of the map, but not before it is attached
         if attachment is None or not parts.factors.has(source):

@@ -21,7 +21,7 @@ from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.judgement.texts import is_notable, sentence
 from pose_graph_ros.core.judgement.verdicts import Judged
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.saved_columns import as_matrix, MISMATCHES
+from pose_graph_ros.core.saved_columns import MISMATCHES
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
@@ -57,7 +57,8 @@ def capture(
     """
     if len(parts.nodes) == 0:
         raise NothingToSaveError('there is no hidden node yet, and so no graph to save')
-    left_out = parts.pipeline.waiting.measurements + parts.pipeline.beacons.measurements
+    left_out = [*(each[1:] for each in parts.pipeline.waiting),
+                *parts.pipeline.beacons.measurements]
     return SavedGraph(
         rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=parts.factors.saved(),
         seen=parts.pipeline.seen.saved(left_out),
@@ -66,7 +67,7 @@ def capture(
         set_aside=SavedQueue.of(parts.quarantine), judgement=parts.judge.saved(),
         verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
                   if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
-        newest_covariance=as_matrix(newest_covariance), chi2=chi2, n_left_out=len(left_out),
+        newest_covariance=newest_covariance.copy(), chi2=chi2, n_left_out=len(left_out),
         datum=datum, gyros=parts.pipeline.gyros.saved(),
         beacons=dict(parts.pipeline.beacons.ids))
 
@@ -85,7 +86,7 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         parts.pipeline.seen.restore(saved.seen)
         parts.factors.restore(saved.sources)
         for name, gyro in saved.gyros.items():
-            parts.pipeline.gyros.restore(name, gyro)
+            parts.pipeline.gyros.stream(name).restore(gyro)
         parts.pipeline.beacons.ids |= saved.beacons
         parts.reweighting.restore(saved.losses)
         parts.alignment.load(saved.alignment)

@@ -11,12 +11,7 @@ from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting, TUNING
 from pose_graph_ros.core.judgement.judge import Judge
-from pose_graph_ros.core.smoother.incremental import (
-    DIVERGED,
-    IncrementalSmoother,
-    Refinement,
-    UpdateResult,
-)
+from pose_graph_ros.core.smoother import incremental as inc
 from pose_graph_ros.core.transaction import checked, Transaction
 
 # Constraints with a loss that are looked at in turn without a change after an update.
@@ -27,7 +22,7 @@ class Refiner:
     """Takes the estimate from that of an update to the minimum, one bounded part at each call."""
 
     def __init__(
-        self, smoother: IncrementalSmoother, reweighting: Reweighting, judge: Judge,
+        self, smoother: inc.IncrementalSmoother, reweighting: Reweighting, judge: Judge,
         tuner: ErrorTuner,
     ) -> None:
         self._smoother, self._reweighting = smoother, reweighting
@@ -41,7 +36,7 @@ class Refiner:
         self.finished, self._tests = False, True
         self._unchanged = self._reweightings = 0
 
-    def reweight(self, result: UpdateResult) -> tuple[UpdateResult, bool]:
+    def reweight(self, result: inc.UpdateResult) -> tuple[inc.UpdateResult, bool]:
         """
         Return the last result after judging again and some reweightings, and if none was needed.
         """
@@ -65,7 +60,7 @@ class Refiner:
     def _may_reweight(self) -> bool:
         return len(self._reweighting) > 0 and not self._judge.solves_later
 
-    def _weigh(self, weights: Mapping[int, float]) -> UpdateResult:
+    def _weigh(self, weights: Mapping[int, float]) -> inc.UpdateResult:
         """
         Return the result of an update with new weights.
 
@@ -74,13 +69,13 @@ class Refiner:
         """
         update = GraphUpdate(weigh=weights)
         result = self._smoother.update(update, fall_back=False)
-        if result.reason == DIVERGED and self._judge.may_solve():
+        if result.reason == inc.DIVERGED and self._judge.may_solve():
             return self._smoother.update(update)
-        if result.reason == DIVERGED:
+        if result.reason == inc.DIVERGED:
             self._judge.solve_later(weights)
         return result
 
-    def refine(self) -> Refinement:
+    def refine(self) -> inc.Refinement:
         """
         Do one step of the tuner, test closures that wait, or do one iteration.
 
@@ -90,16 +85,16 @@ class Refiner:
         if self._smoother.graph.has_touched:
             self.finished = True    # an update that failed; the next one eliminates all nodes
         if self.finished:
-            return Refinement(finished=True, moved=0.0)
+            return inc.Refinement(finished=True, moved=0.0)
         if not self._tuner.is_idle:
             moved = self._tuner.step()
             if moved > 0.0:
                 self.restart()
-            return Refinement(finished=False, moved=moved)
+            return inc.Refinement(finished=False, moved=moved)
         self._tests = self._tests and self._judge.test()
         if self._tests:
             self.restart()
-            return Refinement(finished=False, moved=0.0)
+            return inc.Refinement(finished=False, moved=0.0)
         result = self._smoother.refine()
         if result.finished:
             result = self._reweight(result.moved)
@@ -108,7 +103,7 @@ class Refiner:
             return result._replace(finished=False)
         return result
 
-    def _reweight(self, moved: float) -> Refinement:
+    def _reweight(self, moved: float) -> inc.Refinement:
         graph, size = self._smoother.graph, len(self._reweighting)
         while (self._may_reweight and self._unchanged < min(size, LOOKED_AT)
                and self._reweightings < 100):
@@ -117,10 +112,10 @@ class Refiner:
                 self._unchanged, self._reweightings = 0, self._reweightings + 1
                 before = graph.poses.copy()
                 result = self._weigh(weights)
-                self.finished = result.status is Status.FAILED and result.reason != DIVERGED
+                self.finished = result.status is Status.FAILED and result.reason != inc.DIVERGED
                 by_weights = np.max(np.abs(graph.poses - before)[graph.is_pose, :2], initial=0.0)
-                return Refinement(finished=self.finished, moved=max(moved, float(by_weights)))
+                return inc.Refinement(finished=self.finished, moved=max(moved, float(by_weights)))
             self._unchanged += TUNING.part
             self._cursor = (self._cursor + TUNING.part) % size
         self.finished = True
-        return Refinement(finished=True, moved=moved)
+        return inc.Refinement(finished=True, moved=moved)

@@ -61,19 +61,12 @@ Rows4 = Annotated[FloatArray, Column(float, (4,))]
 Rows6 = Annotated[FloatArray, Column(float, (6,))]
 Rows8 = Annotated[FloatArray, Column(float, (8,))]
 Pairs = Annotated[IntArray, Column(int, (2,))]
-Matrix = tuple[Pose, Pose, Pose]
 
 
 def as_pose(numbers: FloatArray) -> Pose:
     """Return a pose, shape (3,), as plain numbers."""
     x, y, theta = numbers.tolist()
     return x, y, theta
-
-
-def as_matrix(numbers: FloatArray) -> Matrix:
-    """Return a matrix, shape (3, 3), as plain numbers."""
-    first, second, third = numbers
-    return as_pose(first), as_pose(second), as_pose(third)
 
 
 def encoded(value: Any, kind: Any = None) -> Any:

@@ -44,8 +44,8 @@ def test_all_is_solved_for_now_and_then_where_every_update_diverges(
 ) -> None:
     solved = []
     whole, trial = trials.optimize_copy, Trial.__init__
-    monkeypatch.setattr(trials, 'optimize_copy', lambda graph, copy: (
-        solved.append(graph.n_nodes), whole(graph, copy))[1])
+    monkeypatch.setattr(trials, 'optimize_copy', lambda copy, rows, leaving: (
+        solved.append(len(rows.poses)), whole(copy, rows, leaving))[1])
     monkeypatch.setattr(Trial, '__init__', lambda self, graph, *rest: (
         solved.append(graph.n_nodes), trial(self, graph, *rest))[1])
     # with odometry that is believed so little every direction is possible

@@ -61,7 +61,7 @@ def copy_kernels(folder: Path, *, without: str) -> None:
     """
     core = Path(core_package.__path__[0])
     for source in (core, *(each for each in core.iterdir() if each.is_dir())):
-        cache = kernel_cache.find_folders(source).own
+        cache = kernel_cache.find_folders(source)[0]
         if source.name in (without, '__pycache__') or cache is None:
             continue
         with pytest.MonkeyPatch.context() as patch:

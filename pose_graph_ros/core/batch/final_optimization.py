@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.batch import optimizer
-from pose_graph_ros.core.batch.optimizer import BatchResult, SAME_MINIMUM, Solve, Status
+from pose_graph_ros.core.batch.optimizer import BatchResult, SAME_MINIMUM, Status
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
@@ -43,21 +43,19 @@ class Tuning:
 TUNING = Tuning()
 
 
-def optimize(
-    graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
-) -> BatchResult:
+def optimize(graph: Graph, reweighting: Reweighting, config: SolverConfig) -> BatchResult:
     """
     Return the result of optimising a whole graph in place, with the weights of robust losses.
 
     With robust losses, chi2 is the robust cost. All poses and weights are restored if it fails;
-    an exception of `solve` counts as a failure.
+    an exception of the optimiser counts as a failure.
     """
     poses, weights = graph.poses.copy(), graph.weights
     try:
         if len(reweighting) == 0:
-            result = optimizer.optimize_from_two_starts(graph, config, solve)
+            result = optimizer.optimize_from_two_starts(graph, config)
         else:
-            result = _optimize_robustly(graph, reweighting, config, solve)
+            result = _optimize_robustly(graph, reweighting, config)
     except Exception as error:
         # whatever the error is, the poses and weights must be restored
         reason = f'{type(error).__name__}: {error}'
@@ -70,7 +68,7 @@ def optimize(
 
 
 def _optimize_robustly(
-    graph: Graph, reweighting: Reweighting, config: SolverConfig, solve: Solve,
+    graph: Graph, reweighting: Reweighting, config: SolverConfig,
 ) -> BatchResult:
     """
     Reweight from two starts and keep the result with the lower robust cost.
@@ -83,13 +81,13 @@ def _optimize_robustly(
     for weight, widened in ((1.0, TUNING.widened), (TUNING.small_weight, ())):
         graph.apply(GraphUpdate(weigh=dict(zip(
             reweighting['id'].tolist(), (weight * reweighting['base']).tolist(), strict=True))))
-        result = optimizer.optimize_from_two_starts(graph, config, solve)
+        result = optimizer.optimize_from_two_starts(graph, config)
         for factor in widened:
             if result.status is not Status.FAILED:
                 result = _solved_with(
-                    graph, reweighting.all_changes(graph, factor), config, solve) or result
+                    graph, reweighting.all_changes(graph, factor), config) or result
         if result.status is not Status.FAILED:
-            result = _reweighted(graph, reweighting, result, config, solve)
+            result = _reweighted(graph, reweighting, result, config)
         if best is None or result.is_better_than(best):
             best, poses, weights = result, graph.poses.copy(), graph.weights
     assert best is not None
@@ -100,7 +98,6 @@ def _optimize_robustly(
 
 def _reweighted(
     graph: Graph, reweighting: Reweighting, result: BatchResult, config: SolverConfig,
-    solve: Solve,
 ) -> BatchResult:
     """
     Reweight and solve until the weights converge; chi2 of the result is the robust cost.
@@ -113,7 +110,7 @@ def _reweighted(
     iterations, largest, cost = 0, 1.0, math.inf
     for k in range(TUNING.reweightings):
         before, cost_before = graph.weights, cost
-        found = _solved_with(graph, reweighting.all_changes(graph), config, solve)
+        found = _solved_with(graph, reweighting.all_changes(graph), config)
         if found is None:
             largest = 1.0
             break
@@ -135,7 +132,7 @@ def _reweighted(
 
 
 def _solved_with(
-    graph: Graph, weights: Mapping[int, float], config: SolverConfig, solve: Solve,
+    graph: Graph, weights: Mapping[int, float], config: SolverConfig,
 ) -> BatchResult | None:
     """
     Return the result of solving with other weights.
@@ -144,7 +141,7 @@ def _solved_with(
     """
     before = graph.weights
     graph.apply(GraphUpdate(weigh=weights))
-    result = solve(graph, config)
+    result = optimizer.optimize(graph, config)
     if result.status is not Status.FAILED or (
             min(weights.values(), default=1.0) > TUNING.small_weight):
         return result

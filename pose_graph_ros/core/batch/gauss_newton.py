@@ -17,12 +17,7 @@ import math
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
-from pose_graph_ros.core.elimination.assembly import (
-    eliminate_clique,
-    HEADINGS,
-    LINEARIZED,
-    POSITIONS,
-)
+from pose_graph_ros.core.elimination import assembly
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
@@ -47,15 +42,15 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)[0]
-    for v in range(head[tb.N_NODES] if terms == LINEARIZED else 0):
+    for v in range(head[tb.N_NODES] if terms == assembly.LINEARIZED else 0):
         factors.refer_to_pose(tb.nodes(head)[v])
-    for e in range(head[tb.N_FACTORS] if terms == LINEARIZED else 0):
+    for e in range(head[tb.N_FACTORS] if terms == assembly.LINEARIZED else 0):
         if tb.factors(head)[e].weight > 0.0:
             factors.linearize(head, e)
     scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
-        bad = eliminate_clique(head, c, terms)
+        bad = assembly.eliminate_clique(head, c, terms)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             break
@@ -85,7 +80,6 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
     It is the one of the last factorisation, or a chord step from the present poses with it. Then
     `right` is -b there, from `evaluate`, shape (N, 3). The step overwrites it.
     """
-    nodes = tb.nodes(head)
     n_priors, n_cliques = head[tb.N_PRIORS], head[tb.N_CLIQUES]
     for c in range(n_priors, n_cliques if chord else n_priors):
         members, n_frontal, values, x = _clique(head, c, right)
@@ -100,7 +94,7 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
         backward_rows(values, 3 * n_frontal, len(x), x, not chord)
         for k in range(n_frontal):
             v = members[k]
-            f = nodes[v]
+            f = tb.nodes(head)[v]
             if f.fixed != 0:    # known, and zero but in a linear start
                 for m in range(3):
                     right[v, m] = f.delta[m]
@@ -208,7 +202,7 @@ class CompiledSystem:
     def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         if chord:
             return float(step(self._head, self._right, True)), 0.0
-        if not eliminate(self._head, damping, LINEARIZED):
+        if not eliminate(self._head, damping, assembly.LINEARIZED):
             return math.inf, 0.0
         length = float(step(self._head, np.zeros_like(self._right), False))
         return length, float(np.sum(self._right * self._rows['delta']))
@@ -227,7 +221,8 @@ def solve_chordal(
     for field in ('reference', 'delta', 'seen', 'checked_turn'):
         rows[field] = 0.0
     delta[fixed, 0], delta[fixed, 1] = known.real[:-1][fixed], known.imag[:-1][fixed]
-    if not eliminate(memory.head, 0.0, HEADINGS if headings is None else POSITIONS):
+    terms = assembly.HEADINGS if headings is None else assembly.POSITIONS
+    if not eliminate(memory.head, 0.0, terms):
         raise LinearSolveError('chordal start: singular')
     step(memory.head, np.zeros((len(rows), 3)), False)
     return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])

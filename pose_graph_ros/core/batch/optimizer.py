@@ -8,7 +8,7 @@ these cliques (`levenberg_marquardt`). Afterwards the tables hold the cliques of
 poses, with which the incremental smoother can continue.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -34,12 +34,9 @@ from pose_graph_ros.core.graph import editing, tables as tb
 from pose_graph_ros.core.graph.graph import Graph
 
 __all__ = [
-    'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Solve', 'Start',
-    'Status', 'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start',
-    'optimize_from_two_starts', 'plant', 'to_the_end']
-
-Solve = Callable[[Graph, SolverConfig], BatchResult]
-"""Function that optimises a graph in place, such as `optimize`."""
+    'SAME_MINIMUM', 'TRUSTED_ITERATIONS', 'BatchResult', 'Optimization', 'Start', 'Status',
+    'chi2_of', 'in_parts', 'optimize', 'optimize_from_linear_start', 'optimize_from_two_starts',
+    'plant', 'to_the_end']
 
 
 def optimize(
@@ -134,7 +131,7 @@ def _from_starts(
     return replace(result, start=best.start, iterations=best.iterations + result.iterations)
 
 
-def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -> BatchResult:
+def optimize_from_two_starts(graph: Graph, config: SolverConfig) -> BatchResult:
     """
     Return the better result of optimising a graph from the present poses and a linear start.
 
@@ -144,13 +141,13 @@ def optimize_from_two_starts(graph: Graph, config: SolverConfig, solve: Solve) -
     Without observed nodes, only the present poses are a start.
     """
     before = graph.poses.copy()
-    result = solve(graph, config)
+    result = optimize(graph, config)
     if not _is_observed(graph):
         return result
     poses = before if result.status is Status.FAILED else graph.poses.copy()
     try:
         graph.set_poses(linear_starts.joint(graph))
-        other = solve(graph, config)
+        other = optimize(graph, config)
     except LinearSolveError:
         other = result
     if other.is_better_than(result):

@@ -14,14 +14,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from pose_graph_ros.core.batch.levenberg_marquardt import (
-    BatchResult,
-    is_trusted,
-    minimize,
-    Start,
-    to_the_end,
-    TRUSTED_ITERATIONS,
-)
+from pose_graph_ros.core.batch import levenberg_marquardt as lm
 from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, sparse_chordal
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -124,7 +117,7 @@ class PlainOptimizer:
         """Place of each node that is not fixed in the order of elimination."""
         self._factors: BlockFactors | None = None
 
-    def optimize(self, start: Start) -> BatchResult | None:
+    def optimize(self, start: lm.Start) -> lm.BatchResult | None:
         """
         Return the result of moving the poses to a minimum from a chordal start or where they are.
 
@@ -136,14 +129,14 @@ class PlainOptimizer:
         with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
             try:
                 first = chi2 = self.evaluate()[0]
-                if start is Start.CHORDAL and first < np.inf:
-                    steps = min(steps, TRUSTED_ITERATIONS)
+                if start is lm.Start.CHORDAL and first < np.inf:
+                    steps = min(steps, lm.TRUSTED_ITERATIONS)
                     graph.poses = chordal(graph, sparse_chordal(graph, self._nodes))
                     chi2 = self.evaluate()[0]
                 if chi2 < np.inf:
-                    result = to_the_end(minimize(
+                    result = lm.to_the_end(lm.minimize(
                         self, chi2, replace(self._config, max_iterations=steps)))
-                    if is_trusted(result, first if start is Start.CHORDAL else chi2):
+                    if lm.is_trusted(result, first if start is lm.Start.CHORDAL else chi2):
                         return replace(result, start=start)
             except LinearSolveError:
                 pass

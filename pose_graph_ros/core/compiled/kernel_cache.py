@@ -32,7 +32,7 @@ import pickle
 import sys
 import tempfile
 from types import CodeType, FunctionType, ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
@@ -48,16 +48,14 @@ SETTINGS = ('OPT', 'LOOP_VECTORIZE', 'SLP_VECTORIZE', 'BOUNDSCHECK', 'DEBUGINFO_
 
 # --- the folder ---------------------------------------------------------------------------------
 
-class Folders(NamedTuple):
-    """Where the code of the modules in a source folder is kept."""
-
-    own: Path | None    # the first one that can be written to
-    others: tuple[Path, ...]    # before it, from which code is only loaded
-
-
 @functools.cache
-def find_folders(source: Path) -> Folders:
-    """Return the cache folders for the modules in a source folder."""
+def find_folders(source: Path) -> tuple[Path | None, list[Path]]:
+    """
+    Return the cache folders for the modules in a source folder.
+
+    That is the first one that can be written to, and those before it, from which code is only
+    loaded.
+    """
     others, tried = [], []
     for folder in _candidates(source):
         try:
@@ -68,12 +66,12 @@ def find_folders(source: Path) -> Folders:
             if folder.is_dir() and os.access(folder, os.R_OK):
                 others.append(folder)
         else:
-            return Folders(folder, tuple(others))
+            return folder, others
     if len(others) == 0:
         logger.warning(
             'compiled kernels cannot be kept, every start compiles them again; set '
             'NUMBA_CACHE_DIR to a folder that can be written to; tried: %s', ', '.join(tried))
-    return Folders(None, tuple(others))
+    return None, others
 
 
 def _candidates(source: Path) -> Iterator[Path]:
@@ -176,7 +174,7 @@ class KernelCache:
         self._own, others = find_folders(source.parent)
         self._name = f'{source.stem}.{dispatcher.py_func.__qualname__}'.replace('<locals>.', '')
         # its own folder first
-        self._folders = others if self._own is None else (self._own, *others)
+        self._folders = others if self._own is None else [self._own, *others]
         self.cache_path = str(next(iter(self._folders), ''))    # empty without one
         self.is_writable = self._own is not None    # whether its code can be kept
 

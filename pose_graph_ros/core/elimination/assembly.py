@@ -14,7 +14,7 @@ from pose_graph_ros.core.graph import (
     transaction_log,
 )
 from pose_graph_ros.core.graph.factors import anchors
-from pose_graph_ros.core.graph.pools import row_start, triangle_size
+from pose_graph_ros.core.graph.pools import row_start, separator, triangle_size, update_matrix
 
 # Where factors are stiff in one direction and weak in another, as those of a turn on the spot,
 # small pivots are expected: the smallest one, as a fraction of what the factors of its node
@@ -166,26 +166,21 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
 @kernel
 def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
     """Add the update matrix of a child to the front; INDEX of the front's nodes must be set."""
-    pool_f, nodes, cliques = tb.pool_f(head), tb.nodes(head), tb.cliques(head)
-    work_f, pool_i = tb.work_f(head), tb.pool_i(head)
-    row = cliques[child]
-    n_frontal, n_separator = row.n_frontal, row.n_separator
+    row, members, nodes = tb.cliques(head)[child], separator(head, child), tb.nodes(head)
+    n_separator = len(members)
     size = 3 * n_separator
     if n_separator == 0:
         return
-    update = pool_f[row.values + triangle_size(3 * n_frontal, 3 * n_frontal + size):]
-    members = pool_i[row.members + n_frontal:row.members + n_frontal + n_separator]
+    update, turned = update_matrix(head, child), tb.work_f(head)[len(front) + len(front) // ld:]
     phi = clique_frames.present_turn(head, child)
-    if phi != cliques[child].turn_seen:
+    if phi != row.turn_seen:
         transaction_log.log_clique(head, child)
-    cliques[child].turn_seen = phi
-    if n_frontal == 0:
-        linear = work_f[len(front) + len(front) // ld:]
-        clique_frames.linearize_prior(head, child, phi, linear, linear[triangle_size(size, size):])
-        update = linear
+    row.turn_seen = phi
+    if row.n_frontal == 0:
+        clique_frames.linearize_prior(head, child, phi, turned, turned[triangle_size(size, size):])
+        update = turned
     elif phi != 0.0:
-        turned = work_f[len(front) + len(front) // ld:]
-        clique_frames.turned_update(update, n_separator, members, nodes, phi, turned)
+        clique_frames.turned_update(head, child, phi, turned)
         update = turned
     index = tb.work_i(head)[head[tb.NODE_ROOM]:]
     in_order = True
@@ -232,11 +227,10 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
 @kernel
 def substitute_fixed(head, v, at, front, n, ld):  # type: ignore[no-untyped-def]
     """Substitute the known solution of a fixed node: move its columns to the right-hand side."""
-    nodes = tb.nodes(head)
     right = ld - 1
     for m in range(3):
         r = at + m
-        x = nodes[v].delta[m]
+        x = tb.nodes(head)[v].delta[m]
         for k in range(r):
             front[k * ld + right] -= front[k * ld + r] * x
             front[k * ld + r] = 0.0

@@ -22,30 +22,27 @@ translation changes no linear model.
 
 `TURN_SEEN` is the angle of the frame when the update matrix was added to the parent's front. The
 *slip* beta is by how much the frame has turned relative to the parent's frame since then. The
-parent works with a linear model of that rotation, and `interface_error2` returns its error, in the
+parent works with a linear model of that rotation, and `slip_error2` returns its error, in the
 units of the squared linearization error of a constraint.
 
-A prior is a clique without frontal nodes: `linearize_prior` writes its update matrix, and
-`prior_error2` is its `interface_error2`. `graph.priors` has the equations.
+A prior is a clique without frontal nodes, of which `linearize_prior` writes the update matrix.
+`graph.priors` has the equations.
 """
 
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.graph import factors, prior_rows, tables as tb
-from pose_graph_ros.core.graph.pools import add_product, row_start, triangle_size
+from pose_graph_ros.core.graph import factors, pools, prior_rows, tables as tb
+from pose_graph_ros.core.graph.pools import product, row_start, triangle_size
 
 
 @kernel
 def mean_turn(head, c):  # type: ignore[no-untyped-def]
     """Return the mean heading solution (DELTA) of a clique's separator [rad]."""
-    cliques, pool_i, nodes = tb.cliques(head), tb.pool_i(head), tb.nodes(head)
-    row = cliques[c]
-    begin, n = row.members + row.n_frontal, row.n_separator
-    total = 0.0
-    for k in range(begin, begin + n):
-        total += nodes[pool_i[k]].delta[2]
-    return total / n if n > 0 else 0.0
+    total, members = 0.0, pools.separator(head, c)
+    for v in members:
+        total += tb.nodes(head)[v].delta[2]
+    return total / len(members) if len(members) > 0 else 0.0
 
 
 @kernel
@@ -70,30 +67,28 @@ def local_delta(f, px, py, cos, sin, phi):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def turned_update(update, n, members, nodes, phi, to):  # type: ignore[no-untyped-def]
+def turned_update(head, c, phi, to):  # type: ignore[no-untyped-def]
     """
-    Transform an update matrix of n nodes from a clique's frame, of angle phi, into map axes.
+    Transform the update matrix of a clique from its frame, of angle phi, into map axes.
 
-    The result, and 2 * 3n numbers of work space behind it, are in `to`.
+    The result, and 6 numbers of work space for each node behind it, are in `to`.
     """
-    size = 3 * n
-    cos, sin = math.cos(phi), math.sin(phi)
+    nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
+    size, cos, sin = 3 * len(members), math.cos(phi), math.sin(phi)
     first = nodes[members[0]]
     px, py = first.pose[0], first.pose[1]
-    # u - U m in local axes, with m of the module's docstring
+    # U m - u in local axes, with m of the module's docstring
     work = to[triangle_size(size, size):]
-    shift, right = work[:size], work[size:2 * size]
-    for a in range(n):
+    shift, rest = work[:size], work[size:2 * size]
+    for a in range(len(members)):
         f = nodes[members[a]]
         x, y = f.reference[0] - px, f.reference[1] - py
-        shift[3 * a], shift[3 * a + 1] = x - cos * x - sin * y, y - cos * y + sin * x
-        shift[3 * a + 2] = phi
+        shift[3 * a], shift[3 * a + 1] = cos * x + sin * y - x, cos * y - sin * x - y
+        shift[3 * a + 2] = -phi
+    product(update, size, shift, 1.0, rest)
     for i in range(size):
-        right[i] = update[row_start(i, size) + size]
-    add_product(update, size, shift, right)
-    for i in range(size):
-        to[row_start(i, size) + size] = right[i]
-    rotated_triangle(update, n, cos, sin, to)
+        to[row_start(i, size) + size] = -rest[i]
+    rotated_triangle(update, len(members), cos, sin, to)
 
 
 @kernel
@@ -135,66 +130,17 @@ def frame_slip(head, c):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def interface_error2(head, c, beta, work):  # type: ignore[no-untyped-def]
-    """
-    Return the squared error [sigma^2] of the parent's linear model of a clique's slip beta [rad].
-
-    An infinitesimal rotation is in the null space of the update matrix U. Of a rotation of the
-    local coordinates v by beta this leaves `w = ((1 - cos beta) + (beta - sin beta) S) v`, with
-    S = ((0, -1), (1, 0)), and the error w^T U w. The gradient g = U delta' - u has rotated by beta
-    as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U. Work space is 9
-    numbers for each separator node.
-    """
-    cliques, pool_i, pool_f = tb.cliques(head), tb.pool_i(head), tb.pool_f(head)
-    nodes = tb.nodes(head)
-    row = cliques[c]
-    n_frontal, n = row.n_frontal, row.n_separator
-    members = pool_i[row.members + n_frontal:row.members + n_frontal + n]
-    size = 3 * n
-    update = pool_f[row.values + triangle_size(3 * n_frontal, 3 * (n_frontal + n)):]
-    phi = present_turn(head, c)
-    cos, sin = math.cos(phi), math.sin(phi)
-    first = nodes[members[0]]
-    px, py = first.pose[0], first.pose[1]
-    versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
-    w, local, gradient = work[:size], work[size:2 * size], work[2 * size:3 * size]
-    for a in range(n):
-        f = nodes[members[a]]
-        x, y, th = local_delta(f, px, py, cos, sin, phi)
-        local[3 * a], local[3 * a + 1], local[3 * a + 2] = x, y, th
-        x, y = x + f.reference[0] - px, y + f.reference[1] - py
-        w[3 * a], w[3 * a + 1] = versine * x - lag * y, versine * y + lag * x
-        w[3 * a + 2] = 0.0
-    for i in range(size):
-        gradient[i] = -update[row_start(i, size) + size]
-    add_product(update, size, local, gradient)
-    local[:] = 0.0
-    add_product(update, size, w, local)
-    error2 = turned = 0.0
-    for i in range(size):
-        error2 += w[i] * local[i]
-    for i in range(0, size, 3):
-        scale = update[row_start(i, size) + i] + update[row_start(i + 1, size) + i + 1]
-        if scale > 0.0:
-            turned += 2.0 * (gradient[i] ** 2 + gradient[i + 1] ** 2) / scale
-    return max(error2, 0.0) + beta * beta * turned
-
-
-@kernel
 def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
     """
     Write the matrix and right-hand side of a prior whose frame has turned by phi, in map axes.
 
     They are linearized at the present poses. Work space is 12 numbers for each node.
     """
-    nodes, pool_i, pool_f = tb.nodes(head), tb.pool_i(head), tb.pool_f(head)
-    row = tb.cliques(head)[c]
-    n, begin = 3 * row.n_separator, row.members
-    update = pool_f[row.values:]
+    nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
+    n = 3 * len(members)
     prior_rows.evaluate(head, c, phi, work)
     g, r, z = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
-    z[:] = 0.0
-    add_product(update, n, r, z)
+    product(update, n, r, 0.0, z)
     prior_rows.keep_linearization(head, c, r)
     turned = stiff = 0.0
     for i in range(n):
@@ -210,50 +156,60 @@ def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
             to[at + k] = update[at + k] - z[i] * of_k - of_i * z[k] + stiff * of_i * of_k
         to[at + n] = g[i] - of_i * turned
     if phi != 0.0:
-        rotated_triangle(to, row.n_separator, math.cos(phi), math.sin(phi), to)
+        rotated_triangle(to, len(members), math.cos(phi), math.sin(phi), to)
     # the unknowns are the solutions of the nodes, not changes of them
     for i in range(n):
-        g[i] = -to[row_start(i, n) + n]
-        z[i] = nodes[pool_i[begin + i // 3]].delta[i % 3]
-    add_product(to, n, z, g)
+        z[i] = nodes[members[i // 3]].delta[i % 3]
+    product(to, n, z, 1.0, g)
     for i in range(n):
         to[row_start(i, n) + n] = g[i]
 
 
 @kernel
-def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
+def slip_error2(head, c, work):  # type: ignore[no-untyped-def]
     """
-    Return the squared linearization error of a prior that turns with its nodes [sigma^2].
+    Return the squared error [sigma^2] of the parent's linear model of a clique's slip beta [rad].
 
-    Since it was linearized its frame has turned by beta against that of its parent, and positions
-    in the frame have changed by D. The displacement then differs from its linear model by
-    `w = ((1 - cos beta) + (beta - sin beta) S) p - beta S D`, p the positions, and gradients have
-    turned: that of the nodes by beta, as in `interface_error2`, and that of the
-    frame by `m g^T S D`. A large change of S D against p would falsify covariances in any case.
+    An infinitesimal rotation is in the null space of the update matrix U. Of a rotation of the
+    local coordinates p by beta this leaves `w = ((1 - cos beta) + (beta - sin beta) S) p`, with
+    S = ((0, -1), (1, 0)), and the error w^T U w. The gradient g = U delta' - u has rotated by beta
+    as well, which adds beta^2 g^T U^-1 g, approximated by the diagonal of U.
+
+    Of a prior, positions in its frame have changed by D since it was linearized. That adds
+    `-beta S D` to w, and `m g^T S D` to the gradient of the frame. A large change of S D against p
+    would falsify covariances in any case. Work space is 15 numbers for each separator node.
     """
-    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
-    n = 3 * row.n_separator
-    beta = frame_slip(head, c)
-    prior_rows.evaluate(head, c, present_turn(head, c), work)
-    g, r, w = work[n:2 * n], work[2 * n:3 * n], work[3 * n:4 * n]
-    change = work[4 * n:5 * n]
-    # the reference poses, the energy, and r at the linearization: what of it has changed is S D
-    reference = pool_f[row.values + triangle_size(n, n):]
-    for i in range(n):
-        change[i] = r[i] - reference[n + 1 + i]
-    if row.anchored != 0:   # make r the derivative of the coordinates in its frame by -phi
-        for i in range(0, n, 3):
-            r[i] -= reference[i + 1] - reference[1]
-            r[i + 1] += reference[i] - reference[0]
+    nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
+    row, n = tb.cliques(head)[c], 3 * len(members)
+    beta, phi = frame_slip(head, c), present_turn(head, c)
+    d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]    # r is S p
+    w, change = work[3 * n:4 * n], work[4 * n:5 * n]
+    if row.n_frontal == 0:
+        prior_rows.evaluate(head, c, phi, work)
+        # the reference poses, the energy, and r at the linearization: what of it changed is S D
+        reference = update[triangle_size(n, n):]
+        for i in range(n):
+            change[i] = r[i] - reference[n + 1 + i]
+        if row.anchored != 0:   # make r the derivative of the coordinates in its frame by -phi
+            for i in range(0, n, 3):
+                r[i] -= reference[i + 1] - reference[1]
+                r[i + 1] += reference[i] - reference[0]
+    else:
+        change[:] = 0.0
+        cos, sin, first = math.cos(phi), math.sin(phi), nodes[members[0]]
+        px, py = first.pose[0], first.pose[1]
+        for a in range(len(members)):
+            f, i = nodes[members[a]], 3 * a
+            d[i], d[i + 1], d[i + 2] = local_delta(f, px, py, cos, sin, phi)
+            r[i], r[i + 1] = py - d[i + 1] - f.reference[1], d[i] + f.reference[0] - px
+        product(update, n, d, 1.0, g)
     versine, lag = 1.0 - math.cos(beta), beta - math.sin(beta)
-    of_nodes = of_frame = compliance = moved = arms = 0.0
+    of_nodes = of_frame = compliance = moved = arms = error2 = 0.0
     for i in range(0, n, 3):
         w[i] = versine * r[i + 1] + lag * r[i] - beta * change[i]
         w[i + 1] = -versine * r[i] + lag * r[i + 1] - beta * change[i + 1]
         w[i + 2] = 0.0
-        k = row.values + row_start(i, n) + i
-        iso = 0.5 * (pool_f[k] + pool_f[row.values + row_start(i + 1, n) + i + 1])
-        heading = pool_f[row.values + row_start(i + 2, n) + i + 2]
+        iso, heading = prior_rows.diagonal(head, c, i // 3)
         if iso > 0.0:
             of_nodes += (g[i] ** 2 + g[i + 1] ** 2) / iso
         if heading > 0.0:
@@ -261,11 +217,8 @@ def prior_error2(head, c, work):  # type: ignore[no-untyped-def]
         of_frame += change[i] * g[i] + change[i + 1] * g[i + 1]
         moved += iso * (change[i] ** 2 + change[i + 1] ** 2)
         arms += heading + iso * (r[i] ** 2 + r[i + 1] ** 2)
-    error2 = beta * beta * of_nodes + of_frame * of_frame * compliance
-    if moved > factors.MUCH_LONGER * arms:
-        error2 += moved / (arms + 1e-300)
-    change[:] = 0.0
-    add_product(pool_f[row.values:], n, w, change)
+    product(update, n, w, 0.0, d)
     for i in range(n):
-        error2 += w[i] * change[i]
-    return max(error2, 0.0)
+        error2 += w[i] * d[i]
+    error2 = max(error2, 0.0) + beta * beta * of_nodes + of_frame * of_frame * compliance
+    return error2 + (moved / (arms + 1e-300) if moved > factors.MUCH_LONGER * arms else 0.0)

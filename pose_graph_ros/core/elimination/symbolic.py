@@ -23,6 +23,7 @@ from pose_graph_ros.core.compiled.jit import INDICES, INTEGER, kernel
 from pose_graph_ros.core.elimination.assembly import work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.rows import forget_touched
 
 # Number of the newest nodes that are eliminated last, since the next constraints involve them.
 NEWEST_LAST = 10
@@ -79,8 +80,7 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     it, then the loose priors. The graph is `start` and `adjacency` of `ordering.minimum_degree`,
     its node k is `affected[k]`.
     """
-    cliques = tb.cliques(head)
-    nodes, factors, pool_i = tb.nodes(head), tb.factors(head), tb.pool_i(head)
+    nodes, factors, cliques = tb.nodes(head), tb.factors(head), tb.cliques(head)
     n = len(affected)
     serial = head[tb.FRONT_SERIAL] + 1
     head[tb.FRONT_SERIAL] = serial
@@ -103,10 +103,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
     first = np.zeros(n + 1, np.int32)
     n_entries = 0
     for k in range(n_orphans):
-        row = cliques[orphans[k]]
-        begin = row.members + row.n_frontal
-        for m in range(begin, begin + row.n_separator):
-            first[nodes[pool_i[m]].index + 1] += 1
+        for v in pools.separator(head, orphans[k]):
+            first[nodes[v].index + 1] += 1
             n_entries += 2
     for k in range(n):
         first[k + 1] += first[k]
@@ -116,10 +114,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             entry = factors[entry >> 2].next[entry & 3]
     orphans_of, filled = np.empty(first[n], np.int32), first.copy()
     for k in range(n_orphans):
-        row = cliques[orphans[k]]
-        begin = row.members + row.n_frontal
-        for m in range(begin, begin + row.n_separator):
-            i = nodes[pool_i[m]].index
+        for v in pools.separator(head, orphans[k]):
+            i = nodes[v].index
             orphans_of[filled[i]] = n + k
             filled[i] += 1
     start = np.empty(n + n_orphans + 1, np.int32)
@@ -144,10 +140,8 @@ def structure(head, marked, loose, affected):  # type: ignore[no-untyped-def]
             entry = f.next[entry & 3]
     for k in range(n_orphans):
         start[n + k] = end
-        row = cliques[orphans[k]]
-        begin = row.members + row.n_frontal
-        for m in range(begin, begin + row.n_separator):
-            adjacency[end] = nodes[pool_i[m]].index
+        for v in pools.separator(head, orphans[k]):
+            adjacency[end] = nodes[v].index
             end += 1
     start[n + n_orphans] = end
     return orphans[:n_orphans], start, adjacency
@@ -286,7 +280,6 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
 
     The last parents are those of the orphans, rows of cliques that there are already.
     """
-    nodes, pool_i = tb.nodes(head), tb.pool_i(head)
     first, n_frontal, parent = cliques.first, cliques.n_frontal, cliques.parent
     rows = np.empty(len(n_frontal), np.int32)
     for k in range(len(rows)):
@@ -294,10 +287,10 @@ def plant(head, cliques, orphans):  # type: ignore[no-untyped-def]
             head, np.int64(n_frontal[k]), np.int64(first[k + 1] - first[k] - n_frontal[k]))
         at = tb.cliques(head)[rows[k]].members
         for m in range(first[k], first[k + 1]):
-            pool_i[at + m - first[k]] = cliques.nodes[m]
+            tb.pool_i(head)[at + m - first[k]] = cliques.nodes[m]
         for m in range(first[k], first[k] + n_frontal[k]):
             transaction_log.log_node(head, cliques.nodes[m])
-            nodes[cliques.nodes[m]].clique = rows[k]
+            tb.nodes(head)[cliques.nodes[m]].clique = rows[k]
     for k in range(len(orphans)):
         transaction_log.log_clique(head, orphans[k])
     for m in range(len(parent)):
@@ -321,10 +314,8 @@ def plant_all(head, cliques):  # type: ignore[no-untyped-def]
     elimination, behind those of the priors. No node is touched afterwards, and the log of the
     update is empty: a rollback is not possible.
     """
-    nodes, touched = tb.nodes(head), tb.touched(head)
     prior_rows.remove_cliques(head)
-    for s in range(head[tb.N_TOUCHED]):
-        nodes[touched[s]].touched = 0
-    head[tb.N_TOUCHED] = head[tb.STRUCTURE] = 0
+    forget_touched(head)
+    head[tb.STRUCTURE] = 0
     plant(head, cliques, prior_rows.all_priors(head))
     head[tb.LOG_END] = head[tb.N_FREED] = 0

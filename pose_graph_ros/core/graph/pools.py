@@ -35,9 +35,32 @@ def triangle_size(rows, n):  # type: ignore[no-untyped-def]
     return rows * (n + 1) - rows * (rows - 1) // 2
 
 
+# Numba returns no arrays but arguments otherwise
+@kernel(inline='always')
+def separator(head, c):  # type: ignore[no-untyped-def]
+    """Return the nodes of a clique's separator; a prior has no others."""
+    row = tb.cliques(head)[c]
+    begin = row.members + row.n_frontal
+    return tb.pool_i(head)[begin:begin + row.n_separator]
+
+
+@kernel(inline='always')
+def update_matrix(head, c):  # type: ignore[no-untyped-def]
+    """Return the update matrix of a clique, and what is behind it."""
+    row = tb.cliques(head)[c]
+    rows = 3 * row.n_frontal
+    return tb.pool_f(head)[row.values + triangle_size(rows, rows + 3 * row.n_separator):]
+
+
 @kernel
-def add_product(update, size, x, out):  # type: ignore[no-untyped-def]
-    """Add U x to a vector; U is an upper triangle laid out by `row_start`."""
+def product(update, size, x, minus, out):  # type: ignore[no-untyped-def]
+    """
+    Write U x, less `minus` times u; U is an upper triangle laid out by `row_start`.
+
+    u is its right-hand side.
+    """
+    for i in range(size):
+        out[i] = -minus * update[row_start(i, size) + size]
     for i in range(size):
         r = update[row_start(i, size):]
         total = r[i] * x[i]

@@ -25,7 +25,7 @@ from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.factors import wrap
 from pose_graph_ros.core.graph.normal_equations import weakest_of
-from pose_graph_ros.core.graph.pools import add_product, row_start, triangle_size
+from pose_graph_ros.core.graph.pools import product, row_start, triangle_size
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.graph.rows import add_to_scale, touch
 from pose_graph_ros.core.graph.transaction_log import copied
@@ -42,22 +42,15 @@ def is_prior(head, c):  # type: ignore[no-untyped-def]
     return row.n_frontal == 0 and row.parent != REMOVED
 
 
-@kernel(inline='always')
-def _nodes(head, c):  # type: ignore[no-untyped-def]
-    """Return the nodes of a prior."""
-    row = tb.cliques(head)[c]
-    return tb.pool_i(head)[row.members:row.members + row.n_separator]
-
-
 @kernel
 def turns(head, c):  # type: ignore[no-untyped-def]
     """Tell whether a prior has a frame that turns with its nodes; see `priors.turns`."""
     if tb.cliques(head)[c].anchored == 0:
         return True
-    for v in _nodes(head, c):
+    for v in pools.separator(head, c):
         if tb.nodes(head)[v].kind != _POSE:
             return False
-    return len(_nodes(head, c)) > 1
+    return len(pools.separator(head, c)) > 1
 
 
 @kernel
@@ -65,8 +58,8 @@ def present_frame(head, c):  # type: ignore[no-untyped-def]
     """Return the mean turn of the nodes of a prior [rad], which is 0 if it does not turn."""
     if not turns(head, c):
         return 0.0
-    nodes, members, n = tb.nodes(head), _nodes(head, c), 3 * tb.cliques(head)[c].n_separator
-    reference = tb.pool_f(head)[tb.cliques(head)[c].values + triangle_size(n, n):]
+    nodes, members = tb.nodes(head), pools.separator(head, c)
+    reference = pools.update_matrix(head, c)[triangle_size(3 * len(members), 3 * len(members)):]
     first = wrap(nodes[members[0]].pose[2] - reference[2])
     total = 0.0
     for k in range(1, len(members)):
@@ -83,14 +76,14 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
     in the frame, and r, the derivative of d by -phi, zero if the prior does not turn. phi is that
     of `present_frame`.
     """
-    nodes, members, row = tb.nodes(head), _nodes(head, c), tb.cliques(head)[c]
-    pool_f, n = tb.pool_f(head), 3 * row.n_separator
-    reference = pool_f[row.values + triangle_size(n, n):]
+    nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
+    n = 3 * len(members)
+    reference = update[triangle_size(n, n):]
     d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]
     cos, sin = math.cos(phi), math.sin(phi)
     first = nodes[members[0]]
     turn = wrap(first.pose[2] - reference[2])
-    anchored = row.anchored != 0
+    anchored = tb.cliques(head)[c].anchored != 0
     # the point about which it turns, and how much of a rigid turn about it is displacement
     px = reference[0] if anchored else first.pose[0]
     py = reference[1] if anchored else first.pose[1]
@@ -105,13 +98,10 @@ def evaluate(head, c, phi, work):  # type: ignore[no-untyped-def]
         d[i + 2] = (turn - (1.0 - tangent) * phi + wrap(f.pose[2] - reference[i + 2] - turn))
         r[i], r[i + 1] = turning * (tangent * ry - y), turning * (x - tangent * rx)
         r[i + 2] = 1.0 - tangent
-    energy, update = reference[n], pool_f[row.values:]
+    product(update, n, d, 1.0, g)
+    energy = reference[n]
     for i in range(n):
-        g[i] = -update[row_start(i, n) + n]
-        energy += d[i] * g[i]
-    add_product(update, n, d, g)
-    for i in range(n):
-        energy += d[i] * g[i]
+        energy += d[i] * (g[i] - update[row_start(i, n) + n])
     return energy
 
 
@@ -169,28 +159,25 @@ def add_energies(head):  # type: ignore[no-untyped-def]
 
 @kernel
 def diagonal(head, c, k):  # type: ignore[no-untyped-def]
-    """Return the mean information of a prior on the position of a node, and on its heading."""
-    row, pool_f = tb.cliques(head)[c], tb.pool_f(head)
-    n, i, at = 3 * row.n_separator, 3 * k, row.values
-    position = pool_f[at + row_start(i, n) + i] + pool_f[at + row_start(i + 1, n) + i + 1]
-    return 0.5 * position, pool_f[at + row_start(i + 2, n) + i + 2]
+    """Return the mean information of an update matrix on a node's position, and on its heading."""
+    update, n, i = pools.update_matrix(head, c), 3 * tb.cliques(head)[c].n_separator, 3 * k
+    position = update[row_start(i, n) + i] + update[row_start(i + 1, n) + i + 1]
+    return 0.5 * position, update[row_start(i + 2, n) + i + 2]
 
 
 @kernel
 def is_in_separator(head, c, v):  # type: ignore[no-untyped-def]
     """Tell whether a node is in the separator of a clique; a prior is nothing else."""
-    row = tb.cliques(head)[c]
-    begin = row.members + row.n_frontal
-    m, end = begin, begin + row.n_separator
-    while m < end and tb.pool_i(head)[m] != v:
-        m += 1
-    return m < end
+    found = False
+    for u in pools.separator(head, c):
+        found = found or u == v
+    return found
 
 
 @kernel
 def weakest(head, c, v):  # type: ignore[no-untyped-def]
     """Return the information of a prior on a node in its weakest direction."""
-    pool_f, nodes, at = tb.pool_f(head), _nodes(head, c), tb.cliques(head)[c].values
+    pool_f, nodes, at = tb.pool_f(head), pools.separator(head, c), tb.cliques(head)[c].values
     n = 3 * len(nodes)
     for k in range(len(nodes)):
         if nodes[k] == v:
@@ -205,7 +192,7 @@ def weakest(head, c, v):  # type: ignore[no-untyped-def]
 @kernel
 def start(head, c, anchored):  # type: ignore[no-untyped-def]
     """Initialise the row of a prior that has its nodes and numbers; add its energy to chi2."""
-    nodes, members, f = tb.nodes(head), _nodes(head, c), tb.cliques(head)[c]
+    nodes, members, f = tb.nodes(head), pools.separator(head, c), tb.cliques(head)[c]
     f.anchored = 1 if anchored else 0
     f.turn_seen = f.drift = f.energy = 0.0
     scale, first = 0.0, nodes[members[0]]
@@ -250,7 +237,7 @@ def remove_cliques(head):  # type: ignore[no-untyped-def]
         c = transaction_log.take_clique(head, 0, old.n_separator)
         row = tb.cliques(head)[c]
         at, size = row.values, pools.n_values(0, old.n_separator)
-        copied(nodes[old.members:], _nodes(head, c))
+        copied(nodes[old.members:], pools.separator(head, c))
         copied(values[old.values:], tb.pool_f(head)[at:at + size])
         row.turn_seen = row.drift = 0.0
         row.anchored, row.energy, row.slip_scale = old.anchored, old.energy, old.slip_scale
@@ -261,15 +248,21 @@ def remove_cliques(head):  # type: ignore[no-untyped-def]
 # --- edits, within an update --------------------------------------------------------------------
 
 @kernel
+def add_to_scales(head, c, sign):  # type: ignore[no-untyped-def]
+    """Add the information of a prior to the diagonal scales of its nodes, or subtract it."""
+    nodes = pools.separator(head, c)
+    for k in range(len(nodes)):
+        position, heading = diagonal(head, c, k)
+        add_to_scale(head, nodes[k], sign * position, sign * heading)
+
+
+@kernel
 def _touch_nodes(head, c, sign):  # type: ignore[no-untyped-def]
     """Touch the nodes of a prior, and add its information to their scales, or subtract it."""
-    nodes = _nodes(head, c)
-    for k in range(len(nodes)):
-        v = nodes[k]
+    for v in pools.separator(head, c):
         transaction_log.log_node(head, v)
-        position, heading = diagonal(head, c, k)
-        add_to_scale(head, v, sign * position, sign * heading)
         touch(head, v)
+    add_to_scales(head, c, sign)
     head[tb.STRUCTURE] = 1
 
 
@@ -278,7 +271,7 @@ def add(head, nodes, values, anchored):  # type: ignore[no-untyped-def]
     """Add a prior on nodes, by row, with numbers from `priors.packed`; tables have room."""
     c = transaction_log.take_clique(head, 0, len(nodes))
     row = tb.cliques(head)[c]
-    copied(nodes, _nodes(head, c))
+    copied(nodes, pools.separator(head, c))
     copied(values, tb.pool_f(head)[row.values:row.values + len(values)])
     start(head, c, anchored)
     row.sibling, head[tb.LOOSE] = head[tb.LOOSE], c     # without a parent

@@ -68,6 +68,14 @@ def touch(head, v):  # type: ignore[no-untyped-def]
         head[tb.N_TOUCHED] += 1
 
 
+@kernel
+def forget_touched(head):  # type: ignore[no-untyped-def]
+    """Empty the list of the touched nodes, which have been eliminated."""
+    for k in range(head[tb.N_TOUCHED]):
+        tb.nodes(head)[tb.touched(head)[k]].touched = 0
+    head[tb.N_TOUCHED] = 0
+
+
 # --- diagonal scales: the information that the constraints of each node have on it alone --------
 
 @kernel

@@ -10,7 +10,7 @@ to the pools on commit. The first entry of the log holds the counters, scalars a
 the update began.
 """
 
-from pose_graph_ros.core.compiled.jit import kernel, ROWS
+from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import pools, tables as tb
 from pose_graph_ros.core.graph.constraints import NodeKind
 
@@ -248,18 +248,6 @@ def rollback(head):  # type: ignore[no-untyped-def]
         copied(lists, tb.touched(head)[:n_touched])
         copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
     head[tb.N_FREED] = head[tb.LOG_END] = 0
-
-
-@kernel(signature=(tb.HEAD, ROWS))
-def poses_before(head, poses):  # type: ignore[no-untyped-def]
-    """Write the poses, shape (N, 3), as the update found them; those of new nodes as they are."""
-    nodes, log, end = tb.nodes(head), tb.log(head), head[tb.LOG_END]
-    for v in range(head[tb.N_NODES]):
-        copied(nodes[v].pose, poses[v])
-    while end > 0 and log[end - 1] != START:
-        end, row, kind = _entry(head, end)
-        if kind in (NODE, SOLUTION):    # a record begins with the pose
-            copied(tb.log_numbers(head)[end:], poses[row])
 
 
 @kernel

@@ -48,7 +48,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -64,6 +64,7 @@ from pose_graph_ros.core.io import g2o_text as gt
 from pose_graph_ros.core.odometry.motion import as_calibrated
 
 if TYPE_CHECKING:
+    from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
     from pose_graph_ros.core.graph.graph import Graph
 
 # Formats of EDGE2.
@@ -319,11 +320,7 @@ def _fixed(text: gt.GraphText, ids: IntArray) -> BoolArray:
     return fixed
 
 
-class _HasRows(Protocol):
-    def rows(self) -> GraphRows: ...
-
-
-def write_g2o(graph: _HasRows, path: Path, ids: IntArray | None = None) -> None:
+def write_g2o(graph: 'Graph | PlainGraph', path: Path, ids: IntArray | None = None) -> None:
     """
     Write a graph so that its numbers read back bit for bit.
 

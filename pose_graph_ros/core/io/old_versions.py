@@ -39,8 +39,8 @@ _EDGES_IN_G2O = ('odometry', 'loop_closure', 'prior')
 _KEPT = ('fixed', 'biases', 'bias_values', 'node_ids', 'priors', 'bias_dimensions', 'landmarks')
 _NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
 _NOTHING: dict[str, Any] = {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
-    'sources', 'scales', 'left', 'held', 'edge', 'observed', 'source', 'number', 'stamps_ns',
-    'since_ns', 'distance')}}
+    'sources', 'scales', 'left', 'held', 'added', 'source', 'number', 'stamps_ns', 'since_ns',
+    'distance')}}
 _NOT_JUDGED: dict[str, Any] = {
     'closures': _NOTHING, 'fixes': _NOTHING, 'loosened': [], 'weights': [], 'odometry_left': {}}
 
@@ -70,10 +70,8 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
             dict(zip(TURN, (name, *ends, stamp_ns, *numbers), strict=True))
             for stamp_ns, ends, numbers in zip(
                 gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
-    if 3 <= version < 6:
-        members['judgement'] = _judgement(**members['judgement'])
     if version < 6:
-        members = _with_one_table(members)
+        members = _with_one_table(members, judged=version >= 3)
     if version < 7:
         members = _with_states(members)
     # measurements for the next check of the alignment, which the judge's bank has now
@@ -104,20 +102,24 @@ def _list_samples(stream: dict[str, Any]) -> None:
 
 
 def _judgement(
-    closures: dict[str, Any], fixes: dict[str, Any], odometry: dict[str, Any],
+    moved: Callable[[list[int]], list[int]], closures: dict[str, Any], fixes: dict[str, Any],
+    odometry: dict[str, Any],
 ) -> dict[str, Any]:
+    """Return judgements as one table of each kind, with the new ids of observed nodes."""
     # odometry that closures had doubted keeps the weight that it has in the file
-    n = len(closures['rows'])
+    held = [number if is_edge else moved([number])[0]
+            for number, is_edge in zip(fixes['rows'], fixes['edges'], strict=True)]
     return {
         'closures': {
             **_common(closures, [[n - used - doubted, used, 0, doubted]
                                  for n, used, doubted in closures.get('left', [])]),
-            'scales': closures['scales'], 'edge': [True] * n, 'observed': [-1] * n,
+            'scales': closures['scales'], 'held': closures['rows'], 'added': closures['rows'],
             'stamps_ns': closures['stamps_ns'], 'state': closures['state']},
         'fixes': {
             **_common(fixes, [[0, n - unused, 0, unused] for n, unused in fixes.get('left', [])]),
-            'scales': [1.0] * len(fixes['sources']), 'edge': fixes['edges'],
-            'observed': fixes['observed'],
+            'scales': [1.0] * len(fixes['sources']), 'held': held,
+            'added': [number if seen < 0 else moved([seen])[0]
+                      for number, seen in zip(held, fixes['observed'], strict=True)],
             'stamps_ns': [[stamp, -1] for stamp in fixes['stamps_ns']],
             'state': {'names': ['doubted', 'believed'], 'of': fixes['believed']}},
         'loosened': fixes['loosened'], 'weights': fixes['weights'],
@@ -131,11 +133,11 @@ def _common(old: dict[str, Any], left: list[list[int]]) -> dict[str, Any]:
     counted = defaultdict[int, Iterator[int]](count)
     return {
         **{name: old[name] for name in ('sources', 'source', 'since_ns', 'decision', 'distance')},
-        'held': old['rows'], 'left': left or [[0] * 4] * len(old['sources']),
+        'left': left or [[0] * 4] * len(old['sources']),
         'number': old.get('numbers') or [next(counted[source]) for source in old['source']]}
 
 
-def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
+def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
     """Return members in which edges and observed nodes have the same ids."""
     rows = members['graph']
     n_edges, n_observed = (len(rows[f'{name}_weight']) for name in ('edge', 'observed'))
@@ -175,22 +177,13 @@ def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
             'rows': members['edge_losses']['rows'] + moved(losses['rows']),
             **{name: members['edge_losses'][name] + losses[name]
                for name in ('thresholds', 'shares')}, 'cursor': 0},
-        'judgement': {**members['judgement'], **{
-            name: _with_ids(members['judgement'][name], moved) for name in ('closures', 'fixes')}},
+        'judgement': _judgement(moved, **members['judgement']) if judged else (
+            members['judgement']),
         'sources': {name: _of_source(source, moved)
                     for name, source in members['sources'].items()}}
     if end['node'] is not None:
         members['graph']['next_ids'] = {'node': end['node'], 'factor': first + end['observed']}
     return members
-
-
-def _with_ids(table: dict[str, Any], moved: Callable[[list[int]], list[int]]) -> dict[str, Any]:
-    """Return the columns of judged constraints with the new ids of observed nodes."""
-    held = [number if is_edge else moved([number])[0]
-            for number, is_edge in zip(table['held'], table['edge'], strict=True)]
-    return {name: table[name] for name in table if name not in {'edge', 'observed'}} | {
-        'held': held, 'added': [number if seen < 0 else moved([seen])[0] for number, seen in zip(
-            held, table['observed'], strict=True)]}
 
 
 def _of_source(source: dict[str, Any], moved: Callable[[list[int]], list[int]]) -> dict[str, Any]:

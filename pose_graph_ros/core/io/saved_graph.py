@@ -20,7 +20,7 @@ from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.odometry.gyro import SavedGyro
 from pose_graph_ros.core.odometry.node_table import SavedNodes
-from pose_graph_ros.core.saved_columns import Matrix
+from pose_graph_ros.core.saved_columns import Rows3
 from pose_graph_ros.core.sources.factor_builder import SourceState
 from pose_graph_ros.core.sources.pipeline import SavedStamps
 from pose_graph_ros.core.sources.queued import SavedQueue
@@ -47,7 +47,7 @@ class SavedGraph:
     judgement: SavedJudgement  # what is believed, and who has decided so
     # the same for people, of all closures and all that is not believed: a sentence by id
     verdicts: Mapping[str, str]
-    newest_covariance: Matrix  # of the newest hidden node, in map axes
+    newest_covariance: Rows3  # of the newest hidden node, in map axes
     chi2: float
     n_left_out: int  # received measurements that are neither in the graph nor saved
     datum: MapOrigin | None  # of the map, if it has one

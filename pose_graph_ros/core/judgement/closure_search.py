@@ -205,7 +205,7 @@ def decide(
     if result.status is not Status.FAILED and len(others) > 0:
         for number, weight in weights.items():
             others.set_base_weight(number, weight)
-        result = final_optimization.optimize(copy, others, CONFIG, optimizer.optimize)
+        result = final_optimization.optimize(copy, others, CONFIG)
     if result.status is Status.FAILED:
         return None
     problem = TruncatedProblem(copy, ids, start=copy.poses.copy())

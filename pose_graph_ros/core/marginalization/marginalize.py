@@ -161,9 +161,8 @@ def standing_for(rows: GraphRows) -> Factors:
         U, u = schur_complement(linear.information, -linear.gradient, np.flatnonzero(~is_pose))
         if not np.any(np.diagonal(U) > 1e-12):
             continue    # it tells of biases alone, but for rounding
-        sparse = sparsify(prior.nodes[is_pose], rows.poses[at[is_pose]], U, u,
-                          anchored=prior.anchored)
-        factors.append(sparse.factors)
+        factors.append(sparsify(Prior(
+            prior.nodes[is_pose], rows.poses[at[is_pose]], U, u, 0.0, prior.anchored)).factors)
     return Factors.joined(factors)
 
 

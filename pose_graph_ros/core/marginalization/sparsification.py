@@ -63,18 +63,8 @@ class _Candidates(NamedTuple):
     weights: FloatArray     # (C,) `log det` of the covariance
 
 
-class _OfBias(NamedTuple):
-    """The measurement of a bias that is most certain: its difference from what a pose tells."""
-
-    pose: int
-    gain: FloatArray    # (3, 3) what displacements of the pose tell of the bias
-    rows: FloatArray    # (3, r) and
-    root: FloatArray    # (3, 3), as of candidates
-
-
 def sparsify(
-    nodes: IntArray, poses: FloatArray, information: FloatArray, vector: FloatArray, *,
-    anchored: bool, n_extra: int = 0, enough: float = 1e-9, n_biases: int = 0,
+    prior: Prior, *, n_extra: int = 0, enough: float = 1e-9, n_biases: int = 0,
 ) -> SparsePrior:
     """
     Return edges and observed nodes that approximate a prior and tell no more than it.
@@ -87,19 +77,22 @@ def sparsify(
     prior is too stiff for double precision, or if what it does not tell of a bias is not that of a
     pose.
     """
-    k = len(nodes) - n_biases
-    basis, free = _basis(poses, information, anchored)
+    nodes, poses, k = prior.nodes, prior.reference, len(prior.nodes) - n_biases
+    basis, free = _basis(prior, _RANK)
     try:
-        found = _candidates(poses[:k], basis[:3 * k], free[:3 * k], anchored)
+        found = _candidates(poses[:k], basis, free, prior.anchored)
     except np.linalg.LinAlgError:
-        basis, free = _basis(poses, information, anchored, _SURER_RANK)
-        found = _candidates(poses[:k], basis[:3 * k], free[:3 * k], anchored)
-    delta = _minimum(basis, vector, k)
+        basis, free = _basis(prior, _SURER_RANK)
+        found = _candidates(poses[:k], basis, free, prior.anchored)
+    displaced = poses, _minimum(basis, prior.vector, k).reshape(-1, 3)
     # a bias of less than three coordinates is padded, which rounding is not to tell of
-    basis[3 * k:][np.diagonal(information)[3 * k:] == 0.0] = 0.0
-    of_biases = [_of_bias(basis, free, k, row) for row in range(k, k + n_biases)]
-    found = _with_biases(found, of_biases, k)
-    chosen = _spanning_tree(found, k + n_biases + (1 if anchored else 0))
+    basis[3 * k:][np.diagonal(prior.information)[3 * k:] == 0.0] = 0.0
+    gains = list[FloatArray]()
+    for row in range(k, k + n_biases):
+        gain, measured = _of_bias(basis, free, k, row)
+        gains.append(gain)
+        found = _Candidates(*map(np.concatenate, zip(*[found, measured], strict=True)))
+    chosen = _spanning_tree(found, k + n_biases + (1 if prior.anchored else 0))
     chosen = chosen[np.any(found.rows[chosen] != 0.0, axis=(1, 2))]
     if len(chosen) == 0:
         return SparsePrior(Factors(), 0.0)
@@ -117,7 +110,6 @@ def sparsify(
     in_map = np.matmul(np.matmul(roots, blocks), np.swapaxes(roots, 1, 2))
     i, j = found.i[chosen], found.j[chosen]
     is_edge, is_seen = (i < k) & (j < k), i == k
-    displaced = poses, delta.reshape(-1, 3)
     edges = edges_between(nodes, displaced, i[is_edge], j[is_edge], in_map[is_edge])
     rows = j[is_seen]
     mean = se2.wrapped(poses[rows] + displaced[1][rows])
@@ -125,25 +117,24 @@ def sparsify(
         nodes[rows], mean=mean, information=turned(in_map[is_seen], mean[:, 2]),
         kind=np.full(len(rows), FactorKind.NODE_PRIOR, dtype=np.uint8))
     priors = tuple(
-        _on_bias(nodes, displaced, (of.pose, int(row) - 1), of.gain, in_map[at])
-        for at, row in enumerate(j) if row > k for of in (of_biases[row - k - 1],))
+        _on_bias(nodes, displaced, np.array((i[at], j[at] - 1)), gains[j[at] - k - 1], in_map[at])
+        for at in np.flatnonzero(j > k))
     return SparsePrior(Factors.joined([edges, seen]), distance, priors)
 
 
-def _basis(
-    poses: FloatArray, information: FloatArray, anchored: bool, rank: float = _RANK,
-) -> tuple[FloatArray, FloatArray]:
+def _basis(prior: Prior, rank: float) -> tuple[FloatArray, FloatArray]:
     """
     Return T, (3 k, r), with `T^T information T = I`, and a basis of the null space, (3 k, n).
 
     The null space of a prior that is not anchored is known, and is kept to rounding; of that basis
     it is left out, as no relative pose sees it.
     """
+    poses, information = prior.reference, prior.information
     units = np.tile(_LEAST_KNOWN, len(poses))
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information), units**-2.0))
     scaled = 0.5 * (information + information.T) * scale[:, None] * scale
     n_gauge = 0
-    if not anchored:
+    if not prior.anchored:
         motions = np.tile(np.eye(3), (len(poses), 1))   # of all poses as one body
         motions[0::3, 2] = -(poses[:, 1] - poses[0, 1])
         motions[1::3, 2] = poses[:, 0] - poses[0, 0]
@@ -187,30 +178,28 @@ def _candidates(
 ) -> _Candidates:
     """Return all measurements that a tree may consist of."""
     n = len(poses)
+    of_poses = [each[:3 * n].reshape(n, 3, -1) for each in (basis, free)]
     i, j = np.triu_indices(n, 1)
-    rows, seen = (_relative(poses, each.reshape(n, 3, -1), i, j) for each in (basis, free))
+    rows, seen = (_relative(poses, each, i, j) for each in of_poses)
     if anchored:
-        rows = np.concatenate((rows, basis.reshape(n, 3, -1)))
-        seen = np.concatenate((seen, free.reshape(n, 3, -1)))
+        rows, seen = map(np.concatenate, zip((rows, seen), of_poses, strict=True))
         i, j = np.append(i, np.full(n, n)), np.append(j, np.arange(n))
-    roots, whitened = np.zeros((len(rows), 3, 3)), np.zeros_like(rows)
     # both in units of the measurement's own coordinates
     size = np.sqrt(np.sum(rows**2, axis=2) + np.sum(seen**2, axis=2))
     size[size == 0.0] = 1.0
     left, values, _ = np.linalg.svd(seen / size[:, :, None])
     n_seen = np.count_nonzero(values > _SEEN, axis=1)
+    is_seen = np.arange(3) < n_seen[:, None]
+    # each is restricted to what the prior determines of it; what it does not is padding
+    known = np.where(is_seen[:, None], 0.0, left / size[:, :, None])
+    reduced = np.swapaxes(known, 1, 2) @ rows
+    factors = np.linalg.cholesky(
+        reduced @ np.swapaxes(reduced, 1, 2) + np.eye(3) * is_seen[:, None])
+    inverse = np.linalg.inv(factors)
     # undetermined directions count more than any covariance
-    weights = 1e3 * n_seen + 2.0 * np.sum(np.log(size), axis=1)
-    for n_unknown in range(3):  # each is restricted to what the prior determines of it
-        at, n_known = np.flatnonzero(n_seen == n_unknown), 3 - n_unknown
-        known = left[at, :, n_unknown:] / size[at, :, None]  # (., 3, n_known)
-        reduced = np.matmul(np.swapaxes(known, 1, 2), rows[at])
-        factors = np.linalg.cholesky(np.matmul(reduced, np.swapaxes(reduced, 1, 2)))
-        inverse = np.linalg.inv(factors)
-        whitened[at, :n_known] = np.matmul(inverse, reduced)
-        roots[at, :, :n_known] = np.matmul(known, np.swapaxes(inverse, 1, 2))
-        weights[at] += 2.0 * np.sum(np.log(np.diagonal(factors, axis1=1, axis2=2)), axis=1)
-    return _Candidates(i, j, whitened, roots, weights)
+    weights = 1e3 * n_seen + 2.0 * np.sum(np.log(size), axis=1) + 2.0 * np.sum(
+        np.log(np.diagonal(factors, axis1=1, axis2=2)), axis=1)
+    return _Candidates(i, j, inverse @ reduced, known @ np.swapaxes(inverse, 1, 2), weights)
 
 
 def _relative(poses: FloatArray, at: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
@@ -221,18 +210,6 @@ def _relative(poses: FloatArray, at: FloatArray, i: IntArray, j: IntArray) -> Fl
     difference[:, 0] += arm[:, 1, None] * start[:, 2]
     difference[:, 1] -= arm[:, 0, None] * start[:, 2]
     return difference
-
-
-def _with_biases(found: _Candidates, of_biases: list[_OfBias], n_poses: int) -> _Candidates:
-    """Return candidates with one for each bias; their ends are a pose and n_poses + 1 and on."""
-    if not of_biases:
-        return found
-    return _Candidates(
-        np.append(found.i, [of.pose for of in of_biases]),
-        np.append(found.j, n_poses + 1 + np.arange(len(of_biases))),
-        np.concatenate((found.rows, [of.rows for of in of_biases])),
-        np.concatenate((found.roots, [of.root for of in of_biases])),
-        np.append(found.weights, np.zeros(len(of_biases))))
 
 
 def _spanning_tree(found: _Candidates, n: int) -> IntArray:
@@ -258,11 +235,14 @@ def _overestimated(found: _Candidates, chosen: IntArray, blocks: FloatArray) -> 
     return others[np.argsort(-gain, kind='stable')]
 
 
-def _of_bias(basis: FloatArray, free: FloatArray, n_poses: int, row: int) -> _OfBias:
+def _of_bias(
+    basis: FloatArray, free: FloatArray, n_poses: int, row: int,
+) -> tuple[FloatArray, _Candidates]:
     """
-    Return the measurement `b - gain h` of a bias with the least `log det` of all poses.
+    Return the gain of the measurement `b - gain h` of a bias with the least `log det`, and itself.
 
-    Its gain is such that it sees nothing undetermined; `row` is that of the bias.
+    Its gain is such that it sees nothing undetermined; `row` is that of the bias. Its ends are a
+    pose and `row + 1`, as the map comes before the biases.
     """
     at = slice(3 * row, 3 * row + 3)
     used = np.any(basis[at] != 0.0, axis=1)
@@ -288,16 +268,18 @@ def _of_bias(basis: FloatArray, free: FloatArray, n_poses: int, row: int) -> _Of
         raise np.linalg.LinAlgError('a bias is not determined by any pose')
     pose, gain, rows, covariance = best
     inverse = np.linalg.inv(np.linalg.cholesky(covariance))
-    return _OfBias(pose, gain * used[:, None], inverse @ rows, inverse.T * used[:, None])
+    return gain * used[:, None], _Candidates(
+        np.array([pose]), np.array([row + 1]), (inverse @ rows)[None],
+        (inverse.T * used[:, None])[None], np.zeros(1))
 
 
 def _on_bias(
-    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], rows: tuple[int, int],
-    gain: FloatArray, information: FloatArray,
+    nodes: IntArray, displaced: tuple[FloatArray, FloatArray], at: IntArray, gain: FloatArray,
+    information: FloatArray,
 ) -> Prior:
     """Return the prior that a measurement of a bias is, given rows of the pose and the bias."""
     poses, delta = displaced
-    jacobian, at = np.hstack((-gain, np.eye(3))), np.array(rows)
+    jacobian = np.hstack((-gain, np.eye(3)))
     whole = jacobian.T @ information @ jacobian
     whole = 0.5 * (whole + whole.T)
     return Prior(nodes[at], poses[at].copy(), whole, whole @ delta[at].ravel(), 0.0, True)

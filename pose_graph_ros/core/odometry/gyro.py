@@ -20,7 +20,7 @@ that both claim.
 
 import bisect
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -58,18 +58,15 @@ class RateIntegral:
         self._begin_ns, self.scale = int(stamps_ns[0]), source.covariance_scale
         self._times = (stamps_ns - stamps_ns[0]) * 1e-9
         self.rates, steps = rates[:, 0], np.diff(self._times)
-        means = 0.5 * (self.rates[1:] + self.rates[:-1])
-        change = np.diff(self.rates)
-        self._slopes = change / steps
-        self._angles = np.append(0.0, np.cumsum(means * steps))
         # n independent errors of variance v during a time t: that of the angle grows by v t / n
         density = np.full(len(steps), source.sigma_rate**2)
         if source.noise_from is RateNoise.MESSAGE:
             known = np.minimum(rates[1:, 1], rates[:-1, 1]) > 0.0
             density[known] = (0.5 * (rates[1:, 1] + rates[:-1, 1]) * steps)[known]
-        bend = np.minimum(UNIFORM_WITHIN * steps**2 / 12.0, 0.25 * np.abs(change) * steps)
+        bend = np.minimum(UNIFORM_WITHIN * steps**2 / 12.0,
+                          0.25 * np.abs(np.diff(self.rates)) * steps)
+        means = 0.5 * (self.rates[1:] + self.rates[:-1])
         self._densities = density + source.sigma_turn**2 * np.abs(means) + bend**2 / steps
-        self._variances = np.append(0.0, np.cumsum(self._densities * steps))
 
     def rate(self, stamp_ns: int) -> float:
         """Return the rate at an instant [rad/s]."""
@@ -77,17 +74,11 @@ class RateIntegral:
 
     def between(self, start_ns: StampNs, end_ns: StampNs) -> Rotation:
         """Return the rotation between two instants that the samples cover."""
-        (begin, begin_variance), (end, end_variance) = self._at(start_ns), self._at(end_ns)
-        return Rotation(end - begin, self.scale * (end_variance - begin_variance),
-                        (end_ns - start_ns) * 1e-9)
-
-    def _at(self, stamp_ns: int) -> tuple[float, float]:
-        """Return the integral and its variance at an instant."""
-        time = (stamp_ns - self._begin_ns) * 1e-9
-        k = min(int(np.searchsorted(self._times, time, side='right')), len(self._slopes)) - 1
-        step = time - self._times[k]
-        angle = self._angles[k] + (self.rates[k] + 0.5 * self._slopes[k] * step) * step
-        return float(angle), float(self._variances[k] + self._densities[k] * step)
+        begin, end = ((stamp_ns - self._begin_ns) * 1e-9 for stamp_ns in (start_ns, end_ns))
+        times = np.clip(self._times, begin, end)
+        steps, rates = np.diff(times), np.interp(times, self._times, self.rates)
+        return Rotation(float(0.5 * (rates[1:] + rates[:-1]) @ steps),
+                        self.scale * float(self._densities @ steps), (end_ns - start_ns) * 1e-9)
 
 
 # Rotations of independent sensors that differ by more contradict each other [sigma].
@@ -281,14 +272,14 @@ class Gyros:
     no part of that, and the mean rate measures the bias instead.
     """
 
-    def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
+    def __init__(
+        self, nodes: HiddenNodes, config: BackendConfig, counts: Counter[tuple[str, str]],
+    ) -> None:
         self._nodes, self._config = nodes, config
         self.streams: dict[str, GyroStream] = {}  # by the name of the source
-        # Number of rotations by source: 'rotations' that were made, those that a 'gap' in the
-        # rates has left out, and those 'before_window', whose nodes have left the graph. Whoever
-        # takes them clears it.
-        self.counts: Counter[tuple[str, str]] = Counter()
-        self.new: list[Turn] = []  # rotations not yet taken; whoever takes them clears the list
+        # among them numbers of rotations by source: 'rotations' that were made, those that a 'gap'
+        # in the rates has left out, and those 'before_window', whose nodes have left the graph
+        self._counts = counts
 
     def configure(self, config: BackendConfig) -> None:
         """Set the settings for rotations that are made from now on."""
@@ -296,16 +287,12 @@ class Gyros:
         for name, stream in self.streams.items():
             stream.configure(config.gyro(name))
 
-    def add(self, sample: YawRate, source: str) -> Answer:
-        """Return the answer to a sample, after adding it."""
-        return self._stream(source).add(sample)
-
     def finish(self) -> None:
         """Settle all samples."""
         for stream in self.streams.values():
             stream.settle(stream.newest_ns)
 
-    def extend(self) -> None:
+    def extend(self) -> Iterator[Turn]:
         """Make the rotations up to the newest node that settled rates have reached."""
         for source, stream in self.streams.items():
             stamps_ns = self._nodes.stamps_ns
@@ -315,11 +302,11 @@ class Gyros:
             # before the first sample there is nothing to integrate
             begin = max(stream.next_node, int(np.searchsorted(stamps_ns, stream.first_ns)))
             for node in range(begin, end):
-                self._extend(source, stream, node)
+                yield from self._extend(source, stream, node)
             stream.next_node = max(begin, end)
             stream.forget_before(int(stamps_ns[stream.next_node - 1]))
 
-    def _extend(self, source: str, stream: GyroStream, node: int) -> None:
+    def _extend(self, source: str, stream: GyroStream, node: int) -> Iterator[Turn]:
         """Make the rotation to a node, given by its number."""
         nodes = self._nodes
         start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
@@ -329,14 +316,14 @@ class Gyros:
         integral = stream.integral(start_ns, end_ns)
         if integral is None:
             if stream.first_ns <= start_ns:
-                self.counts[source, 'gap'] += 1
+                self._counts[source, 'gap'] += 1
             return
         if nodes.has_left(node - 1) or nodes.has_left(node):
-            self.counts[source, 'before_window'] += 1
+            self._counts[source, 'before_window'] += 1
             return
         rotation = integral.between(start_ns, end_ns)
         at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
-        self.counts[source, 'rotations'] += 1
+        self._counts[source, 'rotations'] += 1
         odometry = nodes.streams[nodes.primary_at(end_ns)]
         if odometry.timeline.covers(start_ns) and odometry.timeline.covers(end_ns):
             motion = odometry.timeline.motion(start_ns, end_ns)
@@ -347,13 +334,13 @@ class Gyros:
         i, j = nodes.ids[node - 1:node + 1].tolist()
         middle_ns = (start_ns + end_ns) // 2
         if at_rest.seconds == 0.0:
-            self.new.append(Turn(source, i, j, middle_ns, *rotation))
+            yield Turn(source, i, j, middle_ns, *rotation)
             return
-        self.new.append(Turn(
+        yield Turn(
             source, i, j, middle_ns, rotation.angle - at_rest.angle + creep,
             rotation.variance - at_rest.variance + creep_variance,
             rotation.seconds - at_rest.seconds, (at_rest.angle - creep) / at_rest.seconds,
-            (at_rest.variance + creep_variance) / at_rest.seconds**2))
+            (at_rest.variance + creep_variance) / at_rest.seconds**2)
 
     def _at_rest(
         self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
@@ -378,7 +365,8 @@ class Gyros:
             variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
         return total, creep, variance
 
-    def _stream(self, source: str) -> GyroStream:
+    def stream(self, source: str) -> GyroStream:
+        """Return the stream of a gyroscope, a new one if there was none."""
         stream = self.streams.get(source)
         if stream is None:
             stream = self.streams[source] = GyroStream(self._config.gyro(source))
@@ -409,7 +397,3 @@ class Gyros:
         """Return the state of each gyroscope."""
         return {source: SavedGyro(stream.samples, stream.next_node)
                 for source, stream in self.streams.items()}
-
-    def restore(self, source: str, saved: SavedGyro) -> None:
-        """Restore the saved state of a gyroscope."""
-        self._stream(source).restore(saved)

@@ -1,6 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Hidden nodes, which are made from odometry alone."""
+"""
+Hidden nodes, which are made from odometry alone.
+
+Of several sources the primary one makes the nodes; the others add edges. The preferred source
+becomes the primary one unless it begins later than another by more than the patience. A primary
+source that is silent for longer than the patience is replaced by the most preferred source that
+has samples then. The choice depends on the stamps alone if all sources deliver samples in the
+order of stamps, up to the reorder window: when one source settles a stamp, the earlier samples of
+all sources are known.
+"""
 
 from collections.abc import Callable, Iterable
 import math
@@ -16,15 +25,10 @@ from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
 from pose_graph_ros.core.odometry.jumps import gap_motion
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
-from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, SavedSpan
-from pose_graph_ros.core.odometry.stream import (
-    choose_first,
-    find_silence,
-    first_with_sample,
-    OdometryStream,
-)
+from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, Span
+from pose_graph_ros.core.odometry.stream import find_silence, OdometryStream
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
-from pose_graph_ros.core.saved_columns import as_matrix, as_pose
+from pose_graph_ros.core.saved_columns import as_pose
 
 
 class NewNode(NamedTuple):
@@ -60,9 +64,9 @@ class HiddenNodes(NodeTable):
         self.covered_ns = -1
         # stamp and odometry pose from which the motion to the next node is measured
         self._base_ns, self._base = -1, (0.0, 0.0, 0.0)
-        # motion from the newest node to `_base_ns`, shape (3,), and covariance, shape (3, 3),
-        # where the primary source has no sample as old as that node; else None
-        self._span: tuple[FloatArray, FloatArray] | None = None
+        # motion from the newest node to `_base_ns`, where the primary source has no sample as old
+        # as that node; else None
+        self._span: Span | None = None
         self._secondary: list[tuple[str, Factors]] = []  # edges not yet taken, with their sources
         # stamp before which samples may have been dropped as nodes were thinned out [ns]
         self._samples_since_ns = -1
@@ -132,16 +136,30 @@ class HiddenNodes(NodeTable):
         """Make the nodes and edges that are due after settling samples of a source."""
         for stamp_ns, pose in settled:
             if not self._primaries:
-                names = self._names
-                preferred = next(iter(self._config.odometry), names[0])
-                first = choose_first(self.streams, names, preferred, stamp_ns, self._patience_ns)
-                if first is not None:
-                    self._make_first_node(first)
+                self._choose_first(stamp_ns)
             elif stamp_ns - self.covered_ns > self._patience_ns:
                 self._replace_silent_primary(source, stamp_ns)
             if self._primaries and source == self.primary and stamp_ns > self.covered_ns:
                 self._extend(stamp_ns, pose)
         self._add_secondary_edges()
+
+    def _choose_first(self, settled_ns: int) -> None:
+        """Choose the first primary source, and make the first node, unless it is too early."""
+        names, ready_ns = self._names, []
+        preferred = next(iter(self._config.odometry), names[0])
+        for name in names:
+            begin_ns = self.streams[name].first_after(-1)
+            if begin_ns is not None and name != preferred:
+                begin_ns = self.streams[name].first_after(begin_ns + self._patience_ns - 1)
+            if begin_ns is not None and begin_ns <= settled_ns:
+                ready_ns.append(begin_ns)
+        if len(ready_ns) > 0:
+            self._make_first_node(self._first_with_sample(names, -1, min(ready_ns)))
+
+    def _first_with_sample(self, names: list[str], after_ns: int, until_ns: int) -> str:
+        """Return the first source with a sample in (after_ns, until_ns]; one at least has one."""
+        return next(name for name in names if (
+            self.streams[name].first_after(after_ns) or until_ns + 1) <= until_ns)
 
     def _make_first_node(self, source: str) -> None:
         """Make a source the primary one, and the first node at its first sample."""
@@ -170,12 +188,12 @@ class HiddenNodes(NodeTable):
         if silence is None:
             return
         # another source makes the nodes after the last sample before the silence
-        old, last_ns = self.streams[self.primary], silence.last_ns
+        old, (last_ns, known_ns) = self.streams[self.primary], silence
         for stamp_ns, pose in old.settle(last_ns):
             self._extend(stamp_ns, pose)
-        source = first_with_sample(self.streams, others, last_ns, silence.known_ns)
+        source = self._first_with_sample(others, last_ns, known_ns)
         stream = self.streams[source]
-        stream.settle_all(silence.known_ns)
+        stream.settle_all(known_ns)
         self._add_secondary_edges()
         timeline, node_ns = stream.timeline, int(self.stamps_ns[-1])
         self._set_primary(last_ns, source)
@@ -189,8 +207,8 @@ class HiddenNodes(NodeTable):
             self._base_ns = begin_ns
             if begin_ns > last_ns:
                 mean, noise = gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns)
-                self._span = (se2.compose(self._span[0], mean),
-                              passed_on(mean, self._span[1], noise))
+                self._span = Span(se2.compose(self._span.mean, mean),
+                                  passed_on(mean, self._span.covariance, noise))
         self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
         self._catch_up()
 
@@ -279,12 +297,13 @@ class HiddenNodes(NodeTable):
 
     def _since_node(
         self, stream: OdometryStream, motion: Motion, *, floor: bool = True,
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> Span:
         """Return a motion from `_base_ns` on as one from the newest node, and its covariance."""
         mean, noise = motion.increment, stream.covariance(motion, floor=floor)
         if self._span is None:
-            return mean, noise
-        return se2.compose(self._span[0], mean), passed_on(mean, self._span[1], noise)
+            return Span(mean, noise)
+        return Span(se2.compose(self._span.mean, mean),
+                    passed_on(mean, self._span.covariance, noise))
 
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:
@@ -382,15 +401,13 @@ class HiddenNodes(NodeTable):
 
     def saved(self) -> SavedNodes:
         """Return the state, with the odometry samples that are needed; there must be a node."""
-        span = None if self._span is None else SavedSpan(
-            as_pose(self._span[0]), as_matrix(self._span[1]))
         after_ns, primaries = zip(*self._primaries, strict=True)
         needed_ns = self.stamps_ns[max(self.n_frozen - 1, 0):]
         return SavedNodes(
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
-            primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, span,
+            primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
-            self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
+            self.frozen.copy(), float(self.travelled[0]), self.thinned,
             np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
@@ -399,8 +416,7 @@ class HiddenNodes(NodeTable):
         for after_ns, source in zip(saved.leads_after_ns.tolist(), saved.leads, strict=True):
             self._set_primary(after_ns, source)
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
-        if saved.bridge is not None:
-            self._span = np.array(saved.bridge.mean), np.array(saved.bridge.covariance)
+        self._span = saved.bridge
         for name, stream in saved.streams.items():
             self.streams[name] = OdometryStream(self._config.odometry_source(name))
             self.streams[name].restore(stream)

@@ -1,15 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-One source of odometry: its samples in the order of their stamps, without jumps.
-
-Of several sources the primary one makes the nodes; the others add edges. The preferred source
-becomes the primary one unless it begins later than another by more than the patience. A primary
-source that is silent for longer than the patience is replaced by the most preferred source that
-has samples then. The choice depends on the stamps alone if all sources deliver samples in the
-order of stamps, up to the reorder window: when one source settles a stamp, the earlier samples of
-all sources are known.
-"""
+"""One source of odometry: its samples in the order of their stamps, without jumps."""
 
 import bisect
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,28 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, OdometrySource
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, IntArray, Pose
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.measurements import (
-    ACCEPTED,
-    Answer,
-    LARGEST_COORDINATE,
-    OdometrySample,
-    rejected,
-)
-from pose_graph_ros.core.odometry import jumps
-from pose_graph_ros.core.odometry.motion import (
-    integrated,
-    Motion,
-    odometry_covariance,
-    step_variance,
-    Variances,
-)
+from pose_graph_ros.core.odometry import jumps, motion as mo
 from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
-from pose_graph_ros.core.quantities import StampNs, StampsNs
+from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Flags, Integers, Rows8
 
 NO_TWIST: Pose = (0.0, 0.0, 0.0)
@@ -53,7 +31,7 @@ class Received(NamedTuple):
     stamp_ns: int
     pose: Pose
     speed: float  # by the twist; 0 if it is unknown
-    variance: Variances | None  # of the twist; 0 where it is unknown
+    variance: mo.Variances | None  # of the twist; 0 where it is unknown
     twist: Pose = NO_TWIST  # (v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated
 
 
@@ -133,24 +111,24 @@ class OdometryStream(ReorderBuffer[Received]):
         self._compute_ahead()
         return self.n_jumps + sum(instant.jumped for instant in self._ahead)
 
-    def add(self, sample: OdometrySample) -> Answer:
+    def add(self, sample: ms.OdometrySample) -> ms.Answer:
         """Add a sample; return whether it is accepted, or the reason for its rejection."""
         x, y, theta = sample.pose.tolist()
         twist, variance = sample.twist or NO_TWIST, sample.twist_variance
-        for what, numbers, largest in (('odometry pose', (x, y, theta), LARGEST_COORDINATE),
+        for what, numbers, largest in (('odometry pose', (x, y, theta), ms.LARGEST_COORDINATE),
                                        ('twist', twist, LARGEST_SPEED)):
             if not all(abs(number) <= largest for number in numbers):
-                return rejected('too_large' if all(map(math.isfinite, numbers)) else 'not_finite',
-                                f'{what} {numbers}')
+                reason = 'too_large' if all(map(math.isfinite, numbers)) else 'not_finite'
+                return ms.rejected(reason, f'{what} {numbers}')
         at = self._insert(Received(
             sample.stamp_ns, (x, y, se2.wrap_one(theta)),
             sample.speed if math.isfinite(sample.speed) else 0.0,
             None if variance is None else tuple(
                 np.nan_to_num(variance, posinf=0.0, neginf=0.0).tolist()), twist))
-        if isinstance(at, Answer):
+        if isinstance(at, ms.Answer):
             return at
         del self._ahead[at:], self._ahead[len(self._waiting):]
-        return ACCEPTED
+        return ms.ACCEPTED
 
     def _was_settled(self, stamp_ns: int) -> bool:
         stamps = self.timeline.stamps_ns
@@ -260,14 +238,14 @@ class OdometryStream(ReorderBuffer[Received]):
                             sigma_heading_distance=heading, sigma_heading_turn=0.0)
         return noise.scaled(math.sqrt(self._source.covariance_scale))
 
-    def covariance(self, motion: Motion, *, floor: bool = True) -> FloatArray:
+    def covariance(self, motion: mo.Motion, *, floor: bool = True) -> FloatArray:
         """
         Return the covariance, shape (3, 3), of a motion by this odometry in the frame at its end.
         """
-        return np.asarray(self._source.covariance_scale * odometry_covariance(
+        return np.asarray(self._source.covariance_scale * mo.odometry_covariance(
             self._noise, motion, floor=floor))
 
-    def newest(self, since_ns: int) -> tuple[Motion, FloatArray]:
+    def newest(self, since_ns: int) -> tuple[mo.Motion, FloatArray]:
         """
         Return the motion from a settled instant [ns] to the newest sample, settled or not.
 
@@ -280,7 +258,7 @@ class OdometryStream(ReorderBuffer[Received]):
             raise ValueError('there is no odometry')
         return self.timeline.motion_to(since_ns, last.row), np.array(last.raw)
 
-    def motion_ahead(self, since_ns: int, stamp_ns: int) -> Motion | None:
+    def motion_ahead(self, since_ns: int, stamp_ns: int) -> mo.Motion | None:
         """
         Return the motion from a settled instant to one after it that may not be settled [ns].
 
@@ -296,8 +274,9 @@ class OdometryStream(ReorderBuffer[Received]):
             return None
         first = self.timeline.motion_to(since_ns, rows[after - 1])
         last = ends.motion(rows[after - 1].stamp_ns, stamp_ns)
-        return Motion(se2.compose(first.increment, last.increment), first.distance + last.distance,
-                      first.turn + last.turn, first.variance + last.variance)
+        return mo.Motion(
+            se2.compose(first.increment, last.increment), first.distance + last.distance,
+            first.turn + last.turn, first.variance + last.variance)
 
     def _compute_ahead(self) -> None:
         """Compute the states at all samples that are not settled."""
@@ -314,7 +293,7 @@ class OdometryStream(ReorderBuffer[Received]):
                 raw, next_row(None, stamp_ns, raw), None, window, jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
         integrates = self._source.integrate is Integrate.TWIST
-        motion = (integrated(before.twist, twist, elapsed) if integrates
+        motion = (mo.integrated(before.twist, twist, elapsed) if integrates
                   else between_one(before.raw, raw))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
         # twists are not integrated over a longer gap [s]
@@ -336,7 +315,7 @@ class OdometryStream(ReorderBuffer[Received]):
             pose = compose_one(before.row.pose, motion)
         else:
             pose = raw if before.offset is None else compose_one(before.offset, raw)
-        variance = (step_variance(self._source, sample.variance, step, elapsed)
+        variance = (mo.step_variance(self._source, sample.variance, step, elapsed)
                     if self._source.noise_from is NoiseFrom.TWIST else NOTHING)
         row = next_row(before.row, stamp_ns, pose, variance)
         return Instant(raw, row, before.offset, before.window.moved(stamp_ns, pose, step),
@@ -344,7 +323,7 @@ class OdometryStream(ReorderBuffer[Received]):
 
 
 def _elsewhere(
-    before: Instant, sample: Received, pose: Pose, variance: Variances,
+    before: Instant, sample: Received, pose: Pose, variance: mo.Variances,
     speeds: jumps.Speeds = jumps.UNKNOWN, *, restarted: bool = False,
 ) -> Instant:
     """Return the state at a sample from which on odometry has another origin."""
@@ -354,49 +333,16 @@ def _elsewhere(
                    jumped=True, restarted=restarted, twist=sample.twist)
 
 
-Streams = Mapping[str, OdometryStream]
-
-
-class Silence(NamedTuple):
-    """A silence of the primary source during which another source has samples."""
-
-    last_ns: int  # stamp of the last sample before the silence [ns]
-    known_ns: int  # stamp of the sample of another source that proves the silence too long [ns]
-
-
-def choose_first(
-    streams: Streams, names: Sequence[str], preferred: str, settled_ns: StampNs, patience_ns: int,
-) -> str | None:
-    """Return the source that becomes the first primary one, or None if that is not decided yet."""
-    ready_ns = []
-    for name in names:
-        begin_ns = streams[name].first_after(-1)
-        if begin_ns is not None and name != preferred:
-            begin_ns = streams[name].first_after(begin_ns + patience_ns - 1)
-        if begin_ns is not None and begin_ns <= settled_ns:
-            ready_ns.append(begin_ns)
-    return first_with_sample(streams, names, -1, min(ready_ns)) if len(ready_ns) > 0 else None
-
-
-def first_with_sample(
-    streams: Streams, names: Sequence[str], after_ns: StampNs, until_ns: StampNs,
-) -> str:
-    """
-    Return the first source that has a sample in (after_ns, until_ns]; at least one must have.
-    """
-    return next(name for name in names
-                if (streams[name].first_after(after_ns) or until_ns + 1) <= until_ns)
-
-
 def find_silence(
-    streams: Streams, names: Sequence[str], last_ns: int, settled: tuple[str, int],
-    patience_ns: int,
-) -> Silence | None:
+    streams: Mapping[str, OdometryStream], names: Sequence[str], last_ns: int,
+    settled: tuple[str, int], patience_ns: int,
+) -> tuple[int, int] | None:
     """
     Return the first silence of the primary source that is longer than the patience, if any.
 
-    `names` begin with the primary source; the search starts at its sample at `last_ns`. The
-    samples before a settled one, given by source and stamp, are known.
+    That is the stamp of the last sample before it, and of the sample of another source that proves
+    it [ns]. `names` begin with the primary source; the search starts at its sample at `last_ns`.
+    The samples before a settled one, given by source and stamp, are known.
     """
     primary, *others = names
     source, settled_ns = settled
@@ -407,7 +353,7 @@ def find_silence(
         after = (streams[name].first_after(last_ns + patience_ns) for name in others)
         known = [stamp_ns for stamp_ns in after if stamp_ns is not None and stamp_ns < until_ns]
         if len(known) > 0:
-            return Silence(last_ns, min(known))
+            return last_ns, min(known)
         if next_ns is None or next_ns >= settled_ns:
             return None
         last_ns = next_ns

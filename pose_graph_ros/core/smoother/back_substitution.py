@@ -24,7 +24,7 @@ from pose_graph_ros.core.compiled.simd import fetch
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import backward_rows
 from pose_graph_ros.core.graph import factors, prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.pools import triangle_size
+from pose_graph_ros.core.graph.pools import separator, triangle_size
 
 # Energy of a constraint that is assumed to predict its linearization error from a turn [sigma^2].
 USUAL_ENERGY = 0.1
@@ -125,33 +125,28 @@ def _rigid_motion(head, c, limit):  # type: ignore[no-untyped-def]
     stops [sigma]; then its angle and the mean positions before and after it: it is
     `x -> R_turn (x - pivot) + goal`.
     """
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    begin = cliques[c].members + cliques[c].n_frontal
-    n = cliques[c].n_separator
-    iteration = head[tb.ITERATION]
+    nodes, members, iteration = tb.nodes(head), separator(head, c), head[tb.ITERATION]
     turn = pivot_x = pivot_y = goal_x = goal_y = 0.0
-    for m in range(begin, begin + n):
-        v = pool_i[m]
+    for v in members:
         f = nodes[v]
         goal_x += f.pose[0]
         goal_y += f.pose[1]
-        if nodes[v].changed == iteration:
+        if f.changed == iteration:
             turn += f.delta[2] - f.seen[2]
             pivot_x += f.seen[0] - f.delta[0]
             pivot_y += f.seen[1] - f.delta[1]
-    weight = 1.0 / n
+    weight = 1.0 / len(members)
     turn *= weight
     goal_x, goal_y = goal_x * weight, goal_y * weight
     pivot_x, pivot_y = goal_x + pivot_x * weight, goal_y + pivot_y * weight
-    if n == 1:
+    if len(members) == 1:
         return 0.0, turn, pivot_x, pivot_y, goal_x, goal_y
     versine, sine = math.cos(turn) - 1.0, math.sin(turn)
     deviation = 0.0
-    for m in range(begin, begin + n):
-        v = pool_i[m]
+    for v in members:
         f = nodes[v]
         dx = dy = dth = 0.0
-        if nodes[v].changed == iteration:
+        if f.changed == iteration:
             dx, dy = f.delta[0] - f.seen[0], f.delta[1] - f.seen[1]
             dth = f.delta[2] - f.seen[2]
         x, y = f.pose[0] - dx - pivot_x, f.pose[1] - dy - pivot_y
@@ -208,26 +203,24 @@ def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
     Return _AS_IT_IS: its separator has not moved; _PROPAGATED: that has moved as a rigid body, and
     all nodes at and below the clique were moved with it; or _SOLVED: it is to be solved for.
     """
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    row, iteration = cliques[c], head[tb.ITERATION]
+    row = tb.cliques(head)[c]
     if row.built >= head[tb.SINCE]:
         return _SOLVED
     limit = FREE_FRACTION * tb.scalars(head)[0].alpha
-    begin = row.members + row.n_frontal
-    for m in range(begin, begin + row.n_separator):
-        if nodes[pool_i[m]].changed == iteration:
+    for v in separator(head, c):
+        if tb.nodes(head)[v].changed == head[tb.ITERATION]:
             if row.anchored != 0:
                 return _SOLVED
-            slack = limit - cliques[c].drift
+            slack = limit - row.drift
             motion = _rigid_motion(head, c, slack)
             if motion[0] > slack:
                 return _SOLVED
             if motion[0] > 0.0:
                 transaction_log.log_clique(head, c)
-                cliques[c].drift += motion[0]
+                row.drift += motion[0]
             tb.scalars(head)[0].n_moved += _propagate(head, c, motion, stack, depth)
             return _PROPAGATED
-    return _SOLVED if cliques[c].drift > limit else _AS_IT_IS
+    return _SOLVED if row.drift > limit else _AS_IT_IS
 
 
 @kernel

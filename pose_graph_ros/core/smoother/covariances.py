@@ -35,7 +35,7 @@ from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, 
 from pose_graph_ros.core.graph import factors, tables as tb
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.factors import write_data
-from pose_graph_ros.core.graph.pools import row_start
+from pose_graph_ros.core.graph.pools import row_start, separator
 
 _FAST = {'reassoc', 'contract', 'nsz'}
 
@@ -268,12 +268,10 @@ def _rotate(block, angle):  # type: ignore[no-untyped-def]
 @kernel
 def _read_separator(head, child, inverse, block):  # type: ignore[no-untyped-def]
     """Copy Z_ss of a child from the inverse of its parent, whose nodes have their INDEX set."""
-    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    row = cliques[child]
-    members = pool_i[row.members + row.n_frontal:]
-    for a in range(row.n_separator):
+    nodes, members = tb.nodes(head), separator(head, child)
+    for a in range(len(members)):
         i = nodes[members[a]].index
-        for b in range(row.n_separator):
+        for b in range(len(members)):
             j = nodes[members[b]].index
             for m in range(3):
                 for q in range(3):

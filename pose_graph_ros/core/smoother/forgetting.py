@@ -17,8 +17,8 @@ from pose_graph_ros.core.compiled.jit import INTEGERS, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import pools, prior_rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.editing import unlink
-from pose_graph_ros.core.graph.pools import add_product, row_start, triangle_size
-from pose_graph_ros.core.graph.rows import add_to_scale, scale_by, touch
+from pose_graph_ros.core.graph.pools import product, row_start, triangle_size
+from pose_graph_ros.core.graph.rows import scale_by, touch
 from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_MEMORY, ORDERED_FIRST
 
 # States of cliques: whether all nodes at and below them leave.
@@ -119,19 +119,9 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _scale_by_prior(head, c, sign):  # type: ignore[no-untyped-def]
-    """Add the information of a prior to the diagonal scales of its nodes, or subtract it."""
-    pool_i, row = tb.pool_i(head), tb.cliques(head)[c]
-    for k in range(row.n_separator):
-        position, heading = prior_rows.diagonal(head, c, k)
-        add_to_scale(head, pool_i[row.members + k], sign * position, sign * heading)
-
-
-@kernel
 def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
     """Drop all cliques below one, and all constraints in them and in it; return their energy."""
     pool_i, stack, cliques = tb.pool_i(head), tb.work_i(head), tb.cliques(head)
-    nodes = tb.nodes(head)
     stack[0] = top
     depth, energy = 1, 0.0
     while depth > 0:
@@ -139,10 +129,10 @@ def _drop_subtree(head, top, leaves):  # type: ignore[no-untyped-def]
         c = stack[depth]
         row = cliques[c]
         if row.n_frontal == 0:
-            _scale_by_prior(head, c, -1.0)
+            prior_rows.add_to_scales(head, c, -1.0)
             energy += cliques[c].energy
         for m in range(row.members, row.members + row.n_frontal):
-            node = nodes[pool_i[m]]
+            node = tb.nodes(head)[pool_i[m]]
             at = node.factor_list
             while at >= 0:
                 e, f = at >> 2, tb.factors(head)[at >> 2]
@@ -176,24 +166,20 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
     Its energy at the present poses is given [sigma^2].
     """
     nodes, pool_f, work_f = tb.nodes(head), tb.pool_f(head), tb.work_f(head)
-    cliques, pool_i = tb.cliques(head), tb.pool_i(head)
-    row = cliques[c]
+    pool_i, row = tb.pool_i(head), tb.cliques(head)[c]
     n_frontal, n = row.n_frontal, row.n_separator
-    size, old_nodes, old_values = 3 * n, row.members, row.values
-    members = pool_i[old_nodes + n_frontal:old_nodes + n_frontal + n]
-    phi, seen = clique_frames.present_turn(head, c), cliques[c].turn_seen
+    size, old_nodes, old_values, members = 3 * n, row.members, row.values, pools.separator(head, c)
+    phi, seen = clique_frames.present_turn(head, c), row.turn_seen
     # the update matrix in map axes, with the right-hand side at the present poses
-    at = old_values + triangle_size(3 * n_frontal, 3 * n_frontal + size)
+    clique_frames.turned_update(head, c, phi, work_f)
     n_numbers = triangle_size(size, size)
-    clique_frames.turned_update(pool_f[at:], n, members, nodes, phi, work_f)
     work = work_f[n_numbers:]
-    minus_x, right = work[:size], work[size:2 * size]
+    x, rest = work[:size], work[size:2 * size]
     for i in range(size):
-        minus_x[i] = -nodes[members[i // 3]].delta[i % 3]
-        right[i] = work_f[row_start(i, size) + size]
-    add_product(work_f, size, minus_x, right)
+        x[i] = nodes[members[i // 3]].delta[i % 3]
+    product(work_f, size, x, 1.0, rest)
     for i in range(size):
-        work_f[row_start(i, size) + size] = right[i]
+        work_f[row_start(i, size) + size] = -rest[i]
     row.members = pools.take(head, pools.NODES, n)
     row.values = pools.take(head, pools.VALUES, pools.n_values(0, n))
     transaction_log.copied(members, pool_i[row.members:row.members + n])
@@ -209,8 +195,8 @@ def _turn_into_prior(head, c, energy):  # type: ignore[no-untyped-def]
     head[tb.N_PRIORS] += 1
     prior_rows.start(head, c, row.anchored != 0)
     prior_rows.keep_linearization(head, c, work_f[2 * size:3 * size])
-    cliques[c].turn_seen = seen - phi
-    _scale_by_prior(head, c, 1.0)
+    row.turn_seen = seen - phi
+    prior_rows.add_to_scales(head, c, 1.0)
 
 
 @kernel(signature=(tb.HEAD, INTEGERS), allocates=True)
@@ -222,7 +208,7 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
     must grow to `NEED_F` and `NEED_I` of the head. No node may be touched.
     """
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
-    pool_f, waiting, scalars = tb.pool_f(head), tb.waiting(head), tb.scalars(head)[0]
+    waiting, scalars = tb.waiting(head), tb.scalars(head)[0]
     state, leaves = _states(head, leaving)
     tops = np.empty(len(leaving), np.int32)
     n_tops, need_f, need_i = 0, head[tb.POOL_F_END], head[tb.POOL_I_END]
@@ -238,11 +224,10 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
         return MORE_MEMORY
     for t in range(n_tops):
         # rows and columns of the update matrix that are what rounding has left of zero
-        row = cliques[tops[t]]
-        rows, size = 3 * row.n_frontal, 3 * row.n_separator
-        update = pool_f[row.values + triangle_size(rows, rows + size):]
+        members, update = pools.separator(head, tops[t]), pools.update_matrix(head, tops[t])
+        size = 3 * len(members)
         for i in range(size):
-            node = nodes[pool_i[row.members + (rows + i) // 3]]
+            node = nodes[members[i // 3]]
             scale = node.scale_t if i % 3 < 2 else node.scale_r
             if update[row_start(i, size) + i] <= 1e-14 * scale * scale:
                 for k in range(i):
@@ -251,7 +236,7 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
                     update[row_start(i, size) + k] = 0.0
         energy = _drop_subtree(head, tops[t], leaves)
         scalars.chi2 -= energy
-        if row.n_separator > 0:
+        if size > 0:
             _turn_into_prior(head, tops[t], energy)
         else:
             transaction_log.give_clique(head, tops[t])

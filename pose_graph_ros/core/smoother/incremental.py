@@ -258,11 +258,7 @@ class IncrementalSmoother:
 
     def newest_covariance(self) -> se2.Covariance:
         """Return the covariance of the newest pose in map axes."""
-        head = self._memory.head
-        if head[tb.NEWEST] < 0 or head[tb.N_TOUCHED] > 0:
-            # raises an error with the cause
-            return self.covariance(self.graph.newest_pose)
-        return self._covariance(head[tb.NEWEST])
+        return self.covariance(self.graph.newest_pose)
 
     def covariance(self, node: int) -> se2.Covariance:
         """
@@ -270,10 +266,7 @@ class IncrementalSmoother:
 
         Raises ValueError if there is no such node, or edits of the graph are not solved for.
         """
-        return self._covariance(*self._eliminated([node]))
-
-    def _covariance(self, row: int) -> se2.Covariance:
-        out = np.empty((3, 3))
+        row, out = self._eliminated([node])[0], np.empty((3, 3))
         covariances.write_covariance(self._memory.head, row, _UNIT, -1, _UNIT, out)
         return out
 
@@ -360,13 +353,15 @@ class IncrementalSmoother:
 
         This is done on a copy, which replaces the graph on success.
         """
+        rows, leaving = self.graph.rows(), self.graph.leaving()
+        self.graph.rollback()
+        # the start if the linear start leads to a higher chi2
+        rows.poses[:self.graph.n_nodes] = self.graph.poses
         other = IncrementalSmoother(self._config)
-        if trial.optimize_copy(self.graph, other.graph):
+        if trial.optimize_copy(other.graph, rows, leaving):
             result = other._eliminate()
             if result.status is not Status.FAILED:
                 self.graph.memory = self._memory = other.graph.memory
-                self.graph.commit()
                 return result
-        self.graph.rollback()
         return UpdateResult(
             Status.FAILED, 'the iterations do not converge, and there is no batch solution')

@@ -25,7 +25,7 @@ import math
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.graph import factors, tables as tb, transaction_log
-from pose_graph_ros.core.graph.rows import touch
+from pose_graph_ros.core.graph.rows import forget_touched, touch
 from pose_graph_ros.core.smoother import tree_update
 from pose_graph_ros.core.smoother.back_substitution import back_substitute
 
@@ -77,7 +77,7 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
         if code != tree_update.DONE:
             return code
         head[tb.STRUCTURE] = 0
-        tree_update.forget_touched(head)
+        forget_touched(head)
         head[tb.N_ELIMINATED] += len(affected)
         error2 = _solve_and_check(head)
         settled = error2 <= _budget(head)
@@ -123,7 +123,7 @@ def _iterate(head):  # type: ignore[no-untyped-def]
     code = tree_update.refresh(head, marked, True)
     if code != tree_update.DONE:
         return code
-    tree_update.forget_touched(head)
+    forget_touched(head)
     head[tb.N_ELIMINATED], head[tb.SINCE] = len(affected), head[tb.REFINED]
     _solve_and_check(head)
     # Gauss-Newton goes uphill, by at most 0.1 sigma^2, where it swings a soft mode
@@ -194,17 +194,16 @@ def _relinearize(head):  # type: ignore[no-untyped-def]
     The nodes of the relinearized factors are touched; the lists of the waiting are emptied.
     """
     allowed = 0.4 * _budget(head)
-    work_f, waiting, cliques = tb.work_f(head), tb.waiting(head), tb.cliques(head)
-    work_i = tb.work_i(head)
+    waiting, cliques = tb.waiting(head), tb.cliques(head)
     # sums of the errors by powers of two of their ratio to `allowed`, largest first
-    bins = work_f[:64]
+    bins = tb.work_f(head)[:64]
     bins[:] = 0.0
     left, cut = 0.0, 0
     for n in range(head[tb.N_WAITING]):
         error2 = tb.factors(head)[waiting[n]].error2
         bins[_bin(error2 / allowed)] += error2
         left += error2
-    turned = work_i[2 * head[tb.NODE_ROOM]:]
+    turned = tb.work_i(head)[2 * head[tb.NODE_ROOM]:]
     for n in range(head[tb.N_TURNED]):
         error2 = cliques[turned[n]].slip_error2
         bins[_bin(error2 / allowed)] += error2
@@ -267,7 +266,7 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
     """
     back_substitute(head)
     scalars, cliques, waiting = tb.scalars(head)[0], tb.cliques(head), tb.waiting(head)
-    work_i, work_f, iteration = tb.work_i(head), tb.work_f(head), head[tb.ITERATION]
+    work_i, iteration = tb.work_i(head), head[tb.ITERATION]
     checks, turned = work_i[head[tb.NODE_ROOM]:], work_i[2 * head[tb.NODE_ROOM]:]
     large = factors.LEAST_FRACTION * scalars.share
     scalars.error2_sum = 0.0
@@ -296,11 +295,7 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
     kept = 0
     for n in range(head[tb.N_TURNED]):
         c = turned[n]
-        if cliques[c].n_frontal == 0:
-            error2 = clique_frames.prior_error2(head, c, work_f)
-        else:
-            error2 = clique_frames.interface_error2(
-                head, c, clique_frames.frame_slip(head, c), work_f)
+        error2 = clique_frames.slip_error2(head, c, tb.work_f(head))
         scalars.error2_sum += error2
         if error2 > large:
             cliques[c].slip_error2 = error2

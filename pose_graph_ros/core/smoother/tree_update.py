@@ -180,12 +180,3 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
             ready[n_ready] = parent
             n_ready += 1
     return DONE
-
-
-@kernel
-def forget_touched(head):  # type: ignore[no-untyped-def]
-    """Empty the list of the touched nodes, which have been eliminated."""
-    nodes, touched = tb.nodes(head), tb.touched(head)
-    for k in range(head[tb.N_TOUCHED]):
-        nodes[touched[k]].touched = 0
-    head[tb.N_TOUCHED] = 0

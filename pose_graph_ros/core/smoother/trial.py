@@ -28,8 +28,7 @@ from pose_graph_ros.core.batch.optimizer import BatchResult, Optimization, Start
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import IntArray, Poses
-from pose_graph_ros.core.graph import transaction_log
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.graph import Graph, GraphRows, GraphUpdate
 from pose_graph_ros.core.graph.priors import packed
 
 _OF_STEP = SolverConfig(max_iterations=50, step_tolerance=1e-6)
@@ -42,13 +41,10 @@ _CONFIG = SolverConfig(max_iterations=optimizer.TRUSTED_ITERATIONS, step_toleran
 _STARTS = (Start.CHORDAL, Start.PRESENT)
 
 
-def optimize_copy(graph: Graph, copy: Graph) -> bool:
-    """Return whether the batch optimiser finds a solution for a copy of the graph."""
-    poses = np.empty((graph.n_nodes, 3))
-    # the start if the linear start leads to a higher chi2
-    transaction_log.poses_before(graph.memory.head, poses)
-    copy.fill(graph.rows()._replace(poses=poses))
-    copy.apply(graph.leaving())
+def optimize_copy(copy: Graph, rows: GraphRows, leaving: GraphUpdate) -> bool:
+    """Return whether the batch optimiser finds a solution for a copy, once some of it has left."""
+    copy.fill(rows)
+    copy.apply(leaving)
     result = optimizer.optimize(copy, _OF_STEP, _STARTS_OF_STEP)
     if result.status is Status.FAILED:
         return False

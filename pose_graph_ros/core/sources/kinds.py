@@ -105,18 +105,6 @@ def _before_window(stamp_ns: int, nodes: HiddenNodes) -> ms.Answer:
                        f'{1e-9 * nodes.last_frozen_ns:.3f} s')
 
 
-def attach_reference(nodes: HiddenNodes, closure: ms.LoopClosure) -> Attachment | ms.Answer:
-    """Return the attachment of the reference pose of a loop closure, or why it has none."""
-    if closure.reference_ns is not None:
-        return attach(nodes, closure.reference_ns)
-    node = closure.reference_node
-    if node is None or not 0 <= node < len(nodes):
-        return ms.rejected('unknown_node', f'there is no hidden node {node}')
-    if node < nodes.n_frozen:
-        return _before_window(int(nodes.stamps_ns[node]), nodes)
-    return nodes.attachment(node, np.zeros(3), np.zeros((3, 3)))
-
-
 def _observe(given: ms.Absolute, source: str, at: Attachment, to: Target) -> ms.Answer:
     to.queue.append(observed(source, given, at))
     return ms.ACCEPTED
@@ -131,14 +119,19 @@ def _observe_fix(fix: ms.Fix, source: str, at: Attachment, to: Target) -> ms.Ans
 
 
 def _join(closure: ms.LoopClosure, source: str, at: Attachment, to: Target) -> ms.Answer:
-    reference = attach_reference(to.nodes, closure)
+    nodes, node, reference_ns = to.nodes, closure.reference_node, closure.reference_ns
+    if reference_ns is not None:
+        reference = attach(nodes, reference_ns)
+    elif node is None or not 0 <= node < len(nodes):
+        return ms.rejected('unknown_node', f'there is no hidden node {node}')
+    else:
+        reference_ns = int(nodes.stamps_ns[node])
+        reference = (_before_window(reference_ns, nodes) if node < nodes.n_frozen
+                     else nodes.attachment(node, np.zeros(3), np.zeros((3, 3))))
     if isinstance(reference, ms.Answer):
         return reference
     if reference.node == at.node:
         return ms.rejected('same_node', f'both ends are attached to hidden node {at.node}')
-    reference_ns = closure.reference_ns
-    if reference_ns is None:
-        reference_ns = int(to.nodes.stamps_ns[closure.reference_node])
     to.queue.append(Queued(
         source, loop_closure_constraint(closure, reference, at), closure.stamp_ns,
         reference_ns))

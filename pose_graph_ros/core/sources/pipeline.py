@@ -28,41 +28,8 @@ from pose_graph_ros.core.sources.settings import SOURCES
 
 class WaitingMeasurement(NamedTuple):
     due_ns: int  # stamp that odometry must reach [ns]
-    arrival: int  # number of measurements that arrived before it
     source: str
     measurement: ms.PoseMeasurement
-
-
-class WaitingMeasurements:
-    """Waiting measurements, ordered by the stamp at which they are due."""
-
-    def __init__(self) -> None:
-        self._waiting: list[WaitingMeasurement] = []
-        self._arrival = itertools.count()
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def push(self, source: str, measurement: ms.PoseMeasurement) -> WaitingMeasurement | None:
-        """Add a measurement; of too many the one due last is dropped, and returned."""
-        waiting = WaitingMeasurement(due_ns(measurement), next(self._arrival), source, measurement)
-        bisect.insort(self._waiting, waiting)
-        return self._waiting.pop() if len(self) > SOURCES.most_waiting else None
-
-    @property
-    def measurements(self) -> list[tuple[str, ms.PoseMeasurement]]:
-        return [(waiting.source, waiting.measurement) for waiting in self._waiting]
-
-    def until(self, stamp_ns: int) -> list[WaitingMeasurement]:
-        """Return the measurements due up to a stamp [ns], the earliest first."""
-        return self._waiting[:bisect.bisect_right(
-            self._waiting, stamp_ns, key=lambda each: each.due_ns)]
-
-    def pop_due(self, covered_ns: int) -> list[WaitingMeasurement]:
-        """Remove and return the measurements due up to a stamp [ns], the earliest first."""
-        due = self.until(covered_ns)
-        del self._waiting[:len(due)]
-        return due
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,14 +103,15 @@ class MeasurementPipeline:
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
         self.nodes, self._config = nodes, config
-        # yaw rates, from which rotations between the hidden nodes are made
-        self.gyros = Gyros(nodes, config)
-        # measurements that wait for odometry to reach their stamps
-        self.waiting = WaitingMeasurements()
+        # measurements that wait for odometry to reach their stamps, in the order of these, then of
+        # their arrival
+        self.waiting: list[WaitingMeasurement] = []
         self.seen = SeenStamps()  # stamps of the measurements that were accepted or wait
         self.queue: list[Queued] = []  # constraints for the next update
         # how often each source got each answer: (source, 'accepted' or the reason)
         self.counts: Counter[tuple[str, str]] = Counter()
+        # yaw rates, from which rotations between the hidden nodes are made
+        self.gyros = Gyros(nodes, config, self.counts)
         self.beacons = Beacons(self.counts)  # and the ranges that wait for them
         # detail of the newest refusal by source and reason
         self.refusals: dict[tuple[str, str], str] = {}
@@ -156,7 +124,7 @@ class MeasurementPipeline:
 
     def add(self, measurement: ms.Measurement, source: str) -> ms.Answer:
         if isinstance(measurement, ms.YawRate):
-            answer = self.count(source, self.gyros.add(measurement, source))
+            answer = self.count(source, self.gyros.stream(source).add(measurement))
             self._take_turns()
             return answer
         return self.count(source, self._add(measurement, source))
@@ -168,13 +136,8 @@ class MeasurementPipeline:
 
     def _take_turns(self) -> None:
         """Make the rotations that are due, and count what happened to the rates."""
-        gyros = self.gyros
-        gyros.extend()
-        self.queue += itertools.chain.from_iterable(map(turn, gyros.new))
-        gyros.new.clear()
-        self.counts.update(gyros.counts)
-        gyros.counts.clear()
-        self.count_sorted(gyros.streams)
+        self.queue += itertools.chain.from_iterable(map(turn, self.gyros.extend()))
+        self.count_sorted(self.gyros.streams)
 
     def _add(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         settings = self._config.measurement_source(source, type(measurement))
@@ -198,8 +161,10 @@ class MeasurementPipeline:
 
     def _wait(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         """Let a measurement wait for odometry; if too many wait, drop the one due last."""
-        excess = self.waiting.push(source, measurement)
-        if excess is not None:
+        bisect.insort(self.waiting, WaitingMeasurement(due_ns(measurement), source, measurement),
+                      key=lambda each: each.due_ns)
+        if len(self.waiting) > SOURCES.most_waiting:
+            excess = self.waiting.pop()
             answer = ms.rejected(
                 'too_many_pending', f'{SOURCES.most_waiting} measurements wait for odometry')
             if excess.measurement is measurement:
@@ -213,9 +178,15 @@ class MeasurementPipeline:
         """Attach the measurements whose stamps odometry has reached, and make rotations."""
         if len(self.gyros.streams) > 0:
             self._take_turns()
-        if len(self.waiting) > 0:
-            for waiting in self.waiting.pop_due(self.nodes.covered_ns):
-                self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
+        due = self.waiting_until(self.nodes.covered_ns)
+        del self.waiting[:len(due)]
+        for waiting in due:
+            self.count(waiting.source, self._attach(waiting.measurement, waiting.source))
+
+    def waiting_until(self, stamp_ns: int) -> list[WaitingMeasurement]:
+        """Return the measurements that wait for odometry up to a stamp [ns]."""
+        return self.waiting[:bisect.bisect_right(
+            self.waiting, stamp_ns, key=lambda each: each.due_ns)]
 
     def _attach(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         attachment = attach(self.nodes, measurement.stamp_ns)
@@ -248,8 +219,8 @@ class MeasurementPipeline:
     @property
     def needed_ns(self) -> int | None:
         """Earliest stamp that something is attached at, or may align [ns]; None without one."""
-        needed = [stamp_ns for _, measurement in self.waiting.measurements
-                  for stamp_ns in self._stamps_of(measurement)]
+        needed = [stamp_ns for each in self.waiting
+                  for stamp_ns in self._stamps_of(each.measurement)]
         needed += [stamp_ns for each in self.queue if each.factor.kind[0] != FactorKind.HEADING
                    for stamp_ns in (each.stamp_ns, each.reference_ns)]
         begin_ns = max(self.nodes.last_frozen_ns, 0)

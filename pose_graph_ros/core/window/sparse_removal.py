@@ -34,16 +34,7 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.priors import model, Prior
-from pose_graph_ros.core.marginalization.marginalize import (
-    as_observed,
-    columns_of,
-    Cut,
-    equations,
-    marginal,
-    marginalize,
-    part_of,
-    schur_complement,
-)
+from pose_graph_ros.core.marginalization import marginalize as mg
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
 
 
@@ -102,7 +93,7 @@ LIMITS = Limits()
 NONE: IntArray = np.empty(0, dtype=np.int64)
 
 
-def cut_chains(graph: Graph, biases: IntArray) -> tuple[list[Cut], list[Factors]] | None:
+def cut_chains(graph: Graph, biases: IntArray) -> tuple[list[mg.Cut], list[Factors]] | None:
     """
     Return where the chains of some biases, ascending, are cut; None if one has several such ends.
 
@@ -119,7 +110,7 @@ def cut_chains(graph: Graph, biases: IntArray) -> tuple[list[Cut], list[Factors]
     between = np.searchsorted(biases, ends[inside]).T
     near = np.zeros((len(biases), len(biases)), dtype=bool)
     near[tuple(between)] = True
-    cuts, observed, seen = list[Cut](), list[Factors](), set[int]()
+    cuts, observed, seen = list[mg.Cut](), list[Factors](), set[int]()
     for row, pair, first in zip(rows[~inside].tolist(), ends[~inside].tolist(),
                                 leaves[~inside, 0].tolist(), strict=True):
         x, y = pair if first else pair[::-1]
@@ -135,7 +126,7 @@ def cut_chains(graph: Graph, biases: IntArray) -> tuple[list[Cut], list[Factors]
     return cuts, observed
 
 
-def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cut, Factors]:
+def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[mg.Cut, Factors]:
     """Return a cut, and what it leaves on the state that stays: the last one of the nodes."""
     factors = graph.factors
     chain = inside[np.isin(factors.i[inside], nodes)]
@@ -147,34 +138,35 @@ def _cut(graph: Graph, nodes: IntArray, inside: IntArray, edge: int) -> tuple[Cu
         if np.any(known):
             rows = graph.node_rows(prior.nodes)
             linear = model(prior, graph.poses[rows], graph.is_pose[rows])
-            U, u = schur_complement(linear.information, -linear.gradient, np.flatnonzero(~known))
+            U, u = mg.schur_complement(
+                linear.information, -linear.gradient, np.flatnonzero(~known))
             priors.append(Prior(prior.nodes[known], graph.poses[rows[known]], U, u, 0.0, True))
-    part = part_of(
-        graph, np.sort(nodes), np.sort(np.concatenate((chain, seen, (edge,)))), priors)
+    rows = np.sort(np.concatenate((chain, seen, (edge,))))
+    part = mg.part_of(graph, np.sort(nodes), rows, priors)
     x, first, y = part.node_rows(nodes[[0, -2, -1]])
-    H, b = equations(part)
-    part.apply(GraphUpdate(weigh={int(graph.factor_ids[edge]): 0.0}))
-    without, without_b = equations(part)
+    H, b = mg.equations(part)
+    number = int(graph.factor_ids[edge])
+    part.apply(GraphUpdate(weigh={number: 0.0}))
+    without, without_b = mg.equations(part)
     own = _of_one(without, without_b, x)
     after, of_edge = _of_one(H, b, y), (H - without)[3 * y, 3 * y]
     # the same if the first state were known: so much of the variance of y is new since then
-    at = columns_of(np.array([first]))
+    at = mg.columns_of(np.array([first]))
     H[at], H[:, at], b[at] = 0.0, 0.0, 0.0
     later = _of_one(H, b, y)
     new = min(float(after[0][0, 0] / max(later[0][0, 0], 1e-300)), 1.0 - 1e-9)
     given = 1.0 / (1.0 - 0.5 * math.log(1.0 - new))
     if after[0][0, 0] < 1e-9 * of_edge:
         # a chain of which nothing is known but its steps, and the rest is rounding
-        return Cut(int(graph.factor_ids[edge]), int(nodes[0]), 0.0 * own[0], 0.0 * own[1]), (
-            Factors())
-    rest = as_observed(Prior(
+        return mg.Cut(number, int(nodes[0]), 0.0 * own[0], 0.0 * own[1]), Factors()
+    rest = mg.as_observed(Prior(
         nodes[-1:], graph.poses_of(nodes[-1:]), given * after[0], given * after[1], 0.0, True))
-    return Cut(int(graph.factor_ids[edge]), int(nodes[0]), given * own[0], given * own[1]), rest
+    return mg.Cut(number, int(nodes[0]), given * own[0], given * own[1]), rest
 
 
 def _of_one(H: FloatArray, b: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
     """Return what the equations of a chain tell of one of its nodes."""
-    return schur_complement(H, b, np.delete(np.arange(len(b) // 3), row))
+    return mg.schur_complement(H, b, np.delete(np.arange(len(b) // 3), row))
 
 
 def sparse_removal(graph: Graph, nodes: IntArray, factors: IntArray = NONE) -> GraphUpdate | None:
@@ -200,11 +192,14 @@ def sparse_removal(graph: Graph, nodes: IntArray, factors: IntArray = NONE) -> G
     earlier = (np.isin(table.kind, (FactorKind.PRIOR, FactorKind.NODE_PRIOR))
                & np.isin(table.i, around) & np.isin(table.j, (*around, -1)))
     more = np.union1d(factors, ids[earlier])
-    sparse = _approximation(marginal(graph, nodes, more.tolist(), cuts))
-    if sparse is None:
+    prior = mg.marginal(graph, nodes, more.tolist(), cuts)
+    try:
+        told = [] if prior is None else [
+            sparsify(prior, n_extra=round(LIMITS.extra * len(prior.nodes))).factors]
+    except np.linalg.LinAlgError:
         return None
     return GraphUpdate(
-        factors=Factors.joined([sparse.factors, *observed]), remove_nodes=nodes.tolist(),
+        factors=Factors.joined([*told, *observed]), remove_nodes=nodes.tolist(),
         # the others leave with the nodes
         drop=np.setdiff1d(more, with_nodes).tolist())
 
@@ -217,23 +212,23 @@ def sparse_marginalization(graph: Graph, nodes: IntArray) -> GraphUpdate:
     becomes smaller, and those with biases small priors of each bias and a pose as well. Those with
     landmarks stay dense, and so do those on many nodes.
     """
-    update = marginalize(graph, nodes.tolist())
+    update = mg.marginalize(graph, nodes.tolist())
     factors, dense = [update.factors], list[Prior]()
     for prior in update.priors:
-        sparse = _of_window(graph, prior) if len(prior.nodes) <= LIMITS.window_poses else None
-        if sparse is not None:
-            dense += sparse.priors
-            factors.append(sparse.factors)
-        else:
-            dense.append(prior)
+        try:
+            sparse = _of_window(graph, prior) if len(prior.nodes) <= LIMITS.window_poses else None
+        except np.linalg.LinAlgError:   # too stiff for double precision
+            sparse = None
+        dense += [prior] if sparse is None else sparse.priors
+        factors += [] if sparse is None else [sparse.factors]
     return update._replace(factors=Factors.joined(factors), priors=dense)
 
 
 def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
     """Return what stands for a prior that a window leaves; None if it has to stay dense."""
     rows = graph.node_rows(prior.nodes)
-    order = np.argsort(~graph.is_pose[rows], kind='stable')
-    n = int(np.count_nonzero(graph.is_pose[rows]))
+    is_pose = graph.is_pose[rows]
+    n = int(np.count_nonzero(is_pose))
     n_biases = len(rows) - n
     if n == 0 or np.count_nonzero(graph.is_bias[rows]) < n_biases:
         return None
@@ -241,32 +236,14 @@ def _of_window(graph: Graph, prior: Prior) -> SparsePrior | None:
         # alone they are as sparse as they can be
         if n <= 1 or not prior.anchored:
             return None
-        at = (3 * order[:, None] + np.arange(3)).ravel()
+        order = np.argsort(~is_pose, kind='stable')
+        at = mg.columns_of(order)
         prior = replace(
             prior, nodes=prior.nodes[order], reference=prior.reference[order],
             information=prior.information[np.ix_(at, at)], vector=prior.vector[at])
     extra = min(LIMITS.window_extra, LIMITS.window_edges / n - 1.0)
-    return _approximation(prior, extra, LIMITS.window_enough, n_biases)
-
-
-def _approximation(
-    prior: Prior | None, extra: float = LIMITS.extra, enough: float = 1e-9, n_biases: int = 0,
-) -> SparsePrior | None:
-    """
-    Return what stands for a prior; None if it is too stiff for double precision.
-
-    There are at most `extra` edges beyond the tree for each of its nodes, and none is added once
-    the divergence is small `enough` [nats]. The last `n_biases` nodes are biases.
-    """
-    if prior is None:
-        return SparsePrior(Factors(), 0.0)
-    try:
-        return sparsify(
-            prior.nodes, prior.reference, prior.information, prior.vector, enough=enough,
-            anchored=prior.anchored, n_extra=round(extra * (len(prior.nodes) - n_biases)),
-            n_biases=n_biases)
-    except np.linalg.LinAlgError:
-        return None
+    return sparsify(
+        prior, n_extra=round(extra * n), enough=LIMITS.window_enough, n_biases=n_biases)
 
 
 def crowded_edges(graph: Graph, newest: int) -> Iterator[IntArray]:

@@ -193,7 +193,7 @@ class Places:
         monkeypatch.setenv('HOME', str(self.home))
 
     def find(self) -> Path | None:
-        found = kernel_cache.find_folders.__wrapped__(self.source).own
+        found = kernel_cache.find_folders.__wrapped__(self.source)[0]
         assert found is None or found.is_dir()
         return found
 

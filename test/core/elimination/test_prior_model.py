@@ -10,7 +10,7 @@ from random_graphs import random_poses
 from random_priors import random_prior
 from slow_smoother import EXACT
 
-from pose_graph_ros.core.elimination.clique_frames import prior_error2
+from pose_graph_ros.core.elimination.clique_frames import slip_error2
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph import prior_rows
@@ -55,7 +55,7 @@ def test_the_error_of_a_turned_prior_is_that_of_its_displacement(
     nodes['pose'] = after
     nodes['delta'] += change
     c, = prior_rows.all_priors(head)
-    found = prior_error2(head, int(c), np.zeros(15 * K))
+    found = slip_error2(head, int(c), np.zeros(15 * K))
 
     step = 1e-6
     J = np.column_stack([

@@ -13,13 +13,13 @@ import numpy as np
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
+from pose_graph_ros.core.geometry.se2 import Pose
 from pose_graph_ros.core.saved_columns import (
     Choices,
     decoded,
     encoded,
     Flags,
     Integers,
-    Matrix,
     Numbers,
     Pairs,
     Records,
@@ -32,7 +32,7 @@ class Inner:
     name: str
     used: bool
     pairs: Pairs
-    matrix: Matrix | None
+    matrix: tuple[Pose, Pose, Pose] | None
 
 
 class Size(Enum):

@@ -37,7 +37,6 @@ from pose_graph_ros.core.measurements import (
     Measurement,
     OdometrySample,
 )
-from pose_graph_ros.core.sources.pipeline import WaitingMeasurements
 
 
 def through_files(saved: SavedGraph) -> SavedGraph:
@@ -52,12 +51,12 @@ def events(kind: str) -> list[Event]:
 
 
 def left_out(backend: PoseGraphBackend) -> list[tuple[str, Measurement]]:
-    return backend._pipeline.waiting.measurements
+    return [each[1:] for each in backend._pipeline.waiting]
 
 
 def of_the_graph(backend: PoseGraphBackend) -> Estimate:
     """Return the estimate without what waits, which is not saved but sent again."""
-    waiting, backend._pipeline.waiting = backend._pipeline.waiting, WaitingMeasurements()
+    waiting, backend._pipeline.waiting = backend._pipeline.waiting, []
     estimate, backend._pipeline.waiting = backend.estimate(), waiting
     assert estimate is not None
     return estimate

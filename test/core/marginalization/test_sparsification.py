@@ -14,6 +14,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
+from pose_graph_ros.core.graph.priors import Prior as DensePrior
 from pose_graph_ros.core.marginalization.sparsification import SparsePrior, sparsify
 
 ROUNDING = 1e-8
@@ -43,8 +44,9 @@ class Prior:
         return matrix * self.sigmas * self.sigmas[:, None]
 
     def sparsified(self, n_extra: int = 0, enough: float = 1e-9) -> SparsePrior:
-        return sparsify(np.arange(self.k), self.poses, self.information, self.vector,
-                        anchored=self.anchored, n_extra=n_extra, enough=enough)
+        return sparsify(DensePrior(
+            np.arange(self.k), self.poses, self.information, self.vector, 0.0, self.anchored),
+            n_extra=n_extra, enough=enough)
 
     def system_of(self, sparse: SparsePrior) -> tuple[FloatArray, FloatArray]:
         """Return information and vector of the constraints that stand for the prior."""
@@ -243,8 +245,8 @@ def test_biases_have_priors_with_one_pose_each(
     information = np.einsum('mik,mjk->ij', roots, roots) * used * used[:, None]
     vector = information @ rng.standard_normal(3 * n)
     poses = np.vstack((random_poses(rng, k), np.zeros((len(dimensions), 3))))
-    sparse = sparsify(np.arange(n), poses, information, vector, anchored=True, n_extra=n_extra,
-                      n_biases=len(dimensions))
+    sparse = sparsify(DensePrior(np.arange(n), poses, information, vector, 0.0, True),
+                      n_extra=n_extra, n_biases=len(dimensions))
     assert [prior.nodes[1] for prior in sparse.priors] == list(range(k, n))
     assert all(prior.nodes[0] < k for prior in sparse.priors)
     graph = Graph()

@@ -1,6 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Waiting measurements and stamps seen so far, compared with plain lists and sets."""
+"""Stamps seen so far, compared with plain sets."""
 
 
 from hypothesis import given, strategies as st
@@ -11,7 +11,7 @@ from pose_graph_ros.core.measurements import (
     LoopClosure,
     Measurement,
 )
-from pose_graph_ros.core.sources.pipeline import SeenStamps, WaitingMeasurements
+from pose_graph_ros.core.sources.pipeline import SeenStamps
 
 
 def heading(stamp: int) -> HeadingOnly:
@@ -20,21 +20,6 @@ def heading(stamp: int) -> HeadingOnly:
 
 def closure(stamp: int, **reference: int) -> LoopClosure:
     return LoopClosure(stamp, np.zeros(3), np.eye(3), **reference)
-
-
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 20)), max_size=60))
-def test_what_is_due_comes_out_by_stamp_then_by_arrival(steps: list[tuple[bool, int]]) -> None:
-    pending, plain = WaitingMeasurements(), []
-    for k, (push, number) in enumerate(steps):
-        if push:
-            one = heading(number)
-            assert pending.push(f'{k}', one) is None
-            plain.append((number, k))
-        else:
-            due = sorted(item for item in plain if item[0] <= number)
-            plain = [item for item in plain if item[0] > number]
-            assert [(w.due_ns, int(w.source)) for w in pending.pop_due(number)] == due
-        assert len(pending) == len(plain)
 
 
 @given(st.lists(st.tuples(
