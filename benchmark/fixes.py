@@ -27,7 +27,7 @@ from benchmark.drives import (
 )
 from benchmark.recordings import drain
 from benchmark.section import about, Options, Section
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, POSITIONS, Robust
 from pose_graph_ros.core.geometry import se2

@@ -14,7 +14,7 @@ import numpy as np
 from benchmark import drives
 from benchmark.drives import Drive, Event, nees, off_truth, path_rms, rms, SECOND
 from benchmark.section import about, Options, Section
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
     BackendConfig,

@@ -20,7 +20,7 @@ from benchmark.metrics import RATIO
 from benchmark.runs import interleaved, Plan, Run, sample_steps, timing, Tool
 from benchmark.section import about, Options, Section
 from benchmark.worlds import chain, laps, World
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import (
     BackendConfig,

@@ -34,7 +34,6 @@ CORE = {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination', 'core.batch'},
     'core.odometry': {'core.compiled', 'core.geometry', 'core.graph'},
     'core.sources': {'core.compiled', 'core.geometry', 'core.graph', 'core.odometry'},
-    'core.alignment': {'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
     'core.belief': {
         'core.compiled', 'core.geometry', 'core.graph', 'core.odometry', 'core.sources'},
     'core.judgement': {
@@ -44,6 +43,9 @@ CORE = {
         'core.compiled', 'core.geometry', 'core.graph', 'core.elimination',
         'core.marginalization', 'core.batch', 'core.smoother', 'core.odometry'},
 }
+CORE['core.alignment'] = {
+    'core.belief', 'core.geometry', 'core.graph', 'core.judgement', 'core.odometry',
+    'core.sources'}
 CORE['core.io'] = set(CORE)
 # What only tools use, and the packages of `core` that each may import.
 OFFLINE = {

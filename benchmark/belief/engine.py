@@ -9,7 +9,7 @@ import numpy as np
 from benchmark.drives import Drive, feed, off_truth, rms, SECOND
 from benchmark.fixes import doubted
 from benchmark.recordings import drain
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
 from pose_graph_ros.core.estimate import Estimate

@@ -7,17 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 import logging
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, Span, WHOLE
-from pose_graph_ros.adapters.sources import (
-    CLOSURES,
-    Kind,
-    KNOWN_SOURCES,
-    MessageReader,
-    ODOMETRY,
-    Source,
-)
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, KNOWN_SOURCES, MessageReader, Source
 
 logger = logging.getLogger(__name__)
 
@@ -53,14 +46,6 @@ class Inputs:
     def fixes(self) -> list[str]:
         """Names of the sources of fixes."""
         return self.of(lambda kind: kind.on_earth)
-
-
-class InputMessage(NamedTuple):
-    """One message of a bag and the source that it belongs to."""
-
-    source: str
-    message: BagMessage
-    held_out: bool  # whether it is kept out of the graph
 
 
 def choose_inputs(
@@ -109,8 +94,8 @@ def choose_inputs(
     inputs = Inputs(ordered, {name: kinds[name] for name in ordered}, hold_out, span)
     if len(inputs.odometry) == 0:
         other = '' if truth is None else f' but that of the truth, {truth}'
-        raise BagError(f'{reader.path}: no topic of type {ODOMETRY.message_type} for the '
-                       f'odometry{other}; the bag has {reader.describe()}')
+        raise BagError(f'{reader.path}: no topic of type {KNOWN_SOURCES["odom"][0].message_type} '
+                       f'for the odometry{other}; the bag has {reader.describe()}')
     return inputs
 
 
@@ -143,18 +128,21 @@ def _guess(
     return free[0]
 
 
-def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[InputMessage]:
-    """Iterate over the messages of the inputs in the order in which they were recorded."""
+def read_inputs(reader: Bag, inputs: Inputs) -> Iterator[tuple[str, BagMessage, bool]]:
+    """
+    Yield source, message, and whether it is kept out of the graph, of the messages of the inputs.
+
+    They come in the order in which they were recorded.
+    """
     sources: dict[str, list[str]] = {}
     for source, topic in inputs.topics.items():
         sources.setdefault(topic, []).append(source)
-    held = inputs.fixes or inputs.of(lambda kind: kind.in_map)
-    count = 0
+    held, count = inputs.fixes or inputs.of(lambda kind: kind.in_map), 0
     for message in reader.messages(list(sources), inputs.span):
         for source in sources[message.topic]:
             count += source in held
-            yield InputMessage(source, message, source in held and inputs.hold_out > 0
-                               and count % inputs.hold_out == 0)
+            yield source, message, (
+                source in held and inputs.hold_out > 0 and count % inputs.hold_out == 0)
 
 
 def read_static_frames(reader: Bag) -> list[BagMessage]:

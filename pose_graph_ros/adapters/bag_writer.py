@@ -20,8 +20,6 @@ from pose_graph_ros.adapters.bags import BagError, BagMessage, MessageError
 from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
-STATIC_TRANSFORMS = '/tf_static'
-HEADER = 'std_msgs/msg/Header'
 # the "infinite" duration of rmw, 2^63 - 1 ns
 FOREVER = interfaces.QosTime(9223372036, 854775807)
 Convert = Callable[[bytes], bytes | memoryview]
@@ -52,7 +50,7 @@ class BagWriter:
                         for each in self.folder.iterdir()):
                 raise BagError(
                     f'{folder}: is no rosbag2 folder or holds other files, not overwritten')
-        self._latched = {STATIC_TRANSFORMS, *latched}
+        self._latched = {'/tf_static', *latched}
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[tuple[str, str], Connection] = {}
         # by type, of ROS 1: name and types in ROS 2, and how its messages are converted
@@ -64,9 +62,8 @@ class BagWriter:
                 prefix=f'.{self.folder.name}-', dir=self.folder.parent))
         except OSError as error:
             raise BagError(f'{folder}: cannot be written: {bags.one_line(error)}') from error
-        self._writer = Writer(
-            self._scratch / self.folder.name, version=BAG_VERSION,
-            storage_plugin=StoragePlugin.MCAP)
+        self._writer = Writer(self._scratch / self.folder.name, version=BAG_VERSION,
+                              storage_plugin=StoragePlugin.MCAP)
         self._writer.open()
 
     def __enter__(self) -> Self:
@@ -96,9 +93,8 @@ class BagWriter:
             try:
                 message = self._types.serialize_cdr(message, type_name)
             except Exception as error:  # generated code on a foreign object
-                raise BagError(
-                    f'{self.folder}: {topic}: no valid {type_name}: {bags.one_line(error)}',
-                ) from error
+                raise BagError(f'{self.folder}: {topic}: no valid {type_name}: '
+                               f'{bags.one_line(error)}') from error
         self._writer.write(self._connections[key], recorded_ns, message)
 
     def copy(self, message: BagMessage) -> None:
@@ -115,9 +111,8 @@ class BagWriter:
             try:
                 data = bytes(convert(data))
             except Exception as error:  # generated code can raise anything on invalid bytes
-                raise MessageError(
-                    f'{message.topic}: message recorded at {message.recorded_ns} ns is no '
-                    f'{message.type}: {bags.one_line(error)}') from error
+                raise MessageError(f'{message.topic}: message recorded at {message.recorded_ns} '
+                                   f'ns is no {message.type}: {bags.one_line(error)}') from error
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):
@@ -141,10 +136,9 @@ class BagWriter:
 def _qos(*, latched: bool) -> Qos:
     depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
                          else (10, QosDurability.VOLATILE))
-    return Qos(
-        interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE, durability,
-        FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
-        avoid_ros_namespace_conventions=False)
+    return Qos(interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE,
+               durability, FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
+               avoid_ros_namespace_conventions=False)
 
 
 def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Convert]:
@@ -158,8 +152,8 @@ def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Co
     own = bags.own_types(source) or get_typestore(Stores.ROS1_NOETIC)
     name, types = converter.STATIC_MSGTYPE_RENAMES.get(source.msgtype, source.msgtype), jazzy
     if name not in jazzy.fielddefs:
-        types = get_typestore(Stores.EMPTY)
-        types.register({**own.fielddefs, HEADER: jazzy.fielddefs[HEADER]})
+        types, header = get_typestore(Stores.EMPTY), 'std_msgs/msg/Header'
+        types.register({**own.fielddefs, header: jazzy.fielddefs[header]})
     if converter.is_same_wireformat(own, types, source.msgtype, name):
         return name, types, partial(types.ros1_to_cdr, typename=name)
     return name, types, partial(

@@ -34,7 +34,6 @@ from pose_graph_ros.core.exceptions import PoseGraphError
 logger = logging.getLogger(__name__)
 
 BAG_FILE_SUFFIXES = ('.mcap', '.db3', '.bag')
-IDL_SEPARATOR = '=' * 80 + '\n'
 JOURNALS = ('.db3-wal', '.db3-journal')
 
 
@@ -70,9 +69,8 @@ class BagMessage:
         try:
             return self._decode(self.raw)
         except Exception as error:  # generated code can raise anything on invalid bytes
-            raise MessageError(
-                f'{self.topic}: message recorded at {self.recorded_ns} ns is no {self.type}: '
-                f'{one_line(error)}') from error
+            raise MessageError(f'{self.topic}: message recorded at {self.recorded_ns} ns is no '
+                               f'{self.type}: {one_line(error)}') from error
 
 
 class Span(NamedTuple):
@@ -167,9 +165,8 @@ class Bag:
                     is_ros1 = isinstance(reader, Rosbag1Reader)
                     types = own_types(connection) or get_typestore(
                         Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
-                    self._decoders[path, kind] = partial(
-                        types.deserialize_ros1 if is_ros1 else types.deserialize_cdr,
-                        typename=kind)
+                    self._decoders[path, kind] = partial(types.deserialize_ros1 if is_ros1
+                                                         else types.deserialize_cdr, typename=kind)
                 yield BagMessage(topic, kind, recorded_ns, bytes(raw), connection,
                                  self._decoders[path, kind])
         except Exception as error:  # the parsers can raise anything on a damaged file
@@ -206,9 +203,8 @@ def _reader(path: Path, stack: ExitStack) -> Reader:
     if not path.exists():
         raise BagError(f'{path}: does not exist')
     if path.is_file() and path.suffix not in BAG_FILE_SUFFIXES:
-        raise BagError(
-            f'{path}: no bag, expected a rosbag2 folder or a file ending in '
-            f'{", ".join(BAG_FILE_SUFFIXES)}')
+        raise BagError(f'{path}: no bag, expected a rosbag2 folder or a file ending in '
+                       f'{", ".join(BAG_FILE_SUFFIXES)}')
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         rest = _repaired(path, 'the recording was not ended, it has no metadata.yaml', stack)
         if rest is None:
@@ -260,7 +256,7 @@ def own_types(connection: Connection) -> Typestore | None:
             types.register(get_types_from_msg(text, connection.msgtype))
         else:
             # several definitions, each after a separator and a line 'IDL: <name>'
-            for part in text.split(IDL_SEPARATOR):
+            for part in text.split('=' * 80 + '\n'):
                 idl = part.partition('\n')[2] if part.startswith('IDL: ') else part
                 if idl.strip():
                     types.register(get_types_from_idl(idl))

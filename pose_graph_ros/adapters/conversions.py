@@ -18,21 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pose_graph_ros.adapters.surroundings import frame, IntegratedTwist, Message, Surroundings
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import Integrate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose, wrap_one
-from pose_graph_ros.core.measurements import (
-    Answer,
-    Fix,
-    GlobalPose,
-    HeadingOnly,
-    LARGEST_COORDINATE,
-    LoopClosure,
-    OdometrySample,
-    Range,
-    rejected,
-    YawRate,
-)
+from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
 from pose_graph_ros.core.odometry.motion import integrated
 from pose_graph_ros.core.quantities import NANOSECONDS
 
@@ -69,9 +59,7 @@ def planar_pose(pose: Message) -> FloatArray | Answer:
     return np.array((p.x, p.y, wrap_one(yaw)))
 
 
-def odometry_sample(
-    message: Message, source: 'Source', _by: Surroundings,
-) -> OdometrySample | Answer:
+def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometrySample | Answer:
     """
     Return the sample in a nav_msgs/Odometry, or the reason for rejecting it.
 
@@ -81,7 +69,7 @@ def odometry_sample(
     if isinstance(pose, Answer):
         return pose
     x, y, _ = pose.tolist()
-    if max(abs(x), abs(y)) > LARGEST_COORDINATE:
+    if max(abs(x), abs(y)) > ms.LARGEST_COORDINATE:
         return rejected('too_large', f'odometry pose {pose.tolist()}')
     linear = message.twist.twist.linear
     speed = math.hypot(linear.x, linear.y)
@@ -89,9 +77,8 @@ def odometry_sample(
     twist = planar_twist(message.twist.twist) if by_twist else None
     if isinstance(twist, Answer):
         return twist
-    return OdometrySample(
-        stamp_ns(message, source.time_offset_ns), pose, speed if math.isfinite(speed) else 0.0,
-        twist_variance(message.twist.covariance), twist)
+    return OdometrySample(stamp_ns(message, source.time_offset_ns), pose, speed if math.isfinite(
+        speed) else 0.0, twist_variance(message.twist.covariance), twist)
 
 
 def planar_twist(twist: Message) -> Pose | Answer:
@@ -110,12 +97,12 @@ def twist_variance(values: Sequence[float]) -> FloatArray | None:
     return np.array(variance) if usable and any(variance) else None
 
 
-def global_pose(message: Message, source: 'Source', by: Surroundings) -> GlobalPose | Answer:
+def global_pose(message: Message, source: 'Source', by: Surroundings) -> ms.GlobalPose | Answer:
     """Return the pose in the map of a PoseWithCovarianceStamped, or why it is rejected."""
     return pose_in(message, (by.map_frame,), source.time_offset_ns)
 
 
-def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> GlobalPose | Answer:
+def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> ms.GlobalPose | Answer:
     """
     Return the pose in a PoseWithCovarianceStamped, or the reason for rejecting it.
 
@@ -126,11 +113,11 @@ def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> Glob
         return rejected('wrong_frame', f'expected frame {" or ".join(map(repr, frames))}, got '
                                        f'{named!r}')
     pose = planar_pose(message.pose.pose)
-    return pose if isinstance(pose, Answer) else GlobalPose(
+    return pose if isinstance(pose, Answer) else ms.GlobalPose(
         stamp_ns(message, offset_ns), pose, _planar(message.pose.covariance))
 
 
-def heading(message: Message, source: 'Source', by: Surroundings) -> HeadingOnly | Answer:
+def heading(message: Message, source: 'Source', by: Surroundings) -> ms.HeadingOnly | Answer:
     """
     Return the heading in a sensor_msgs/Imu with an absolute yaw, or the reason for rejecting it.
     """
@@ -140,12 +127,12 @@ def heading(message: Message, source: 'Source', by: Surroundings) -> HeadingOnly
     if yaw is None:
         q = message.orientation
         return rejected('not_finite', f'quaternion ({q.x}, {q.y}, {q.z}, {q.w})')
-    return HeadingOnly(stamp_ns(message, source.time_offset_ns),
-                       float(se2.wrap(yaw + source.yaw_offset - by.datum.yaw)),
-                       float(message.orientation_covariance[8]))
+    turned = float(se2.wrap(yaw + source.yaw_offset - by.datum.yaw))
+    return ms.HeadingOnly(stamp_ns(message, source.time_offset_ns), turned,
+                          float(message.orientation_covariance[8]))
 
 
-def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> LoopClosure | Answer:
+def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> ms.LoopClosure | Answer:
     """
     Return the loop closure in a PoseWithCovarianceStamped, or the reason for rejecting it.
 
@@ -159,16 +146,15 @@ def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> LoopC
     named, stamp = message.header.frame_id, stamp_ns(message, offset_ns)
     cov = _planar(message.pose.covariance)
     if (node := _REFERENCE_NODE.fullmatch(named)) is not None:
-        return LoopClosure(stamp, pose, cov, reference_node=int(node[1]))
+        return ms.LoopClosure(stamp, pose, cov, reference_node=int(node[1]))
     if (time := _REFERENCE_TIME.fullmatch(named)) is not None:
-        nanoseconds = int((time[2] or '').ljust(9, '0'))
-        return LoopClosure(stamp, pose, cov, reference_ns=(
-            int(time[1]) * NANOSECONDS + nanoseconds + offset_ns))
+        return ms.LoopClosure(stamp, pose, cov, reference_ns=(
+            int(time[1]) * NANOSECONDS + int((time[2] or '').ljust(9, '0')) + offset_ns))
     return rejected('wrong_frame', f'expected a hidden node such as x42 or a time such as '
                                    f'@1695.250000000, got {named!r}')
 
 
-def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
+def fix(message: Message, source: 'Source', by: Surroundings) -> ms.Fix | Answer:
     """
     Return the fix in a sensor_msgs/NavSatFix, or the reason for rejecting it.
 
@@ -194,11 +180,11 @@ def fix(message: Message, source: 'Source', by: Surroundings) -> Fix | Answer:
     if np.all(np.isfinite(cov)):
         with np.errstate(over='ignore', invalid='ignore'):
             cov = covariance.turned(cov, by.datum.yaw)
-    return Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
-               by.lever_arm(frame(message.header.frame_id), source))
+    return ms.Fix(stamp, partial(by.datum.place, latitude, longitude, altitude), cov,
+                  by.lever_arm(frame(message.header.frame_id), source))
 
 
-def beacon_range(message: Message, source: 'Source', by: Surroundings) -> Range | Answer:
+def beacon_range(message: Message, source: 'Source', by: Surroundings) -> ms.Range | Answer:
     """
     Return the range in a sensor_msgs/Range, or the reason for rejecting it.
 
@@ -214,12 +200,12 @@ def beacon_range(message: Message, source: 'Source', by: Surroundings) -> Range 
         return rejected('out_of_range', f'range {distance} m, not from {least} to {most} m')
     place = source.beacons.get(beacon)
     # older messages have no variance
-    return Range(stamp_ns(message, source.time_offset_ns), beacon, distance,
-                 float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
-                 None if place is None else np.array(place))
+    return ms.Range(stamp_ns(message, source.time_offset_ns), beacon, distance,
+                    float(getattr(message, 'variance', 0.0)), by.lever_arm(antenna, source),
+                    None if place is None else np.array(place))
 
 
-def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> YawRate | Answer:
+def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate | Answer:
     """Return the yaw rate in a sensor_msgs/Imu, or the reason for rejecting it."""
     values = message.angular_velocity_covariance
     if values[0] == -1.0:   # by the definition of the message
@@ -239,13 +225,11 @@ def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> YawRate | 
     if not math.isfinite(rate):
         return rejected('not_finite', (
             f'angular velocity ({velocity.x}, {velocity.y}, {velocity.z})'))
-    return YawRate(stamp_ns(message, source.time_offset_ns), float(rate),
-                   float(variance) if variance > 0.0 else 0.0)
+    return ms.YawRate(stamp_ns(message, source.time_offset_ns), float(rate),
+                      float(variance) if variance > 0.0 else 0.0)
 
 
-def twist_odometry(
-    message: Message, source: 'Source', by: Surroundings,
-) -> OdometrySample | Answer:
+def twist(message: Message, source: 'Source', by: Surroundings) -> OdometrySample | Answer:
     """Return the odometry by a TwistWithCovarianceStamped, or the reason for rejecting it."""
     twist = planar_twist(message.twist.twist)
     if isinstance(twist, Answer):

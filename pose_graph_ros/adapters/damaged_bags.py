@@ -113,9 +113,9 @@ class _Mcap:
             elif kind == _CHANNEL and number not in self._topics:
                 of_type, text = self._types[int.from_bytes(stream.read(2), 'little')]
                 name, form = (storage_mcap.read_string(stream) for _ in range(2))
-                self._topics[number] = self._connect(
-                    name, of_type, form, text,
-                    storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
+                self._topics[
+                    number] = self._connect(name, of_type, form, text,
+                                            storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
 
     def _message(self, data: bytes) -> Iterator[_Message]:
         """Yield the message in a record, if it is of a known topic."""
@@ -154,11 +154,11 @@ class _Sqlite:
 
     def messages(self) -> Iterator[_Message]:
         """Yield all messages; where rows cannot be read, the next ones are looked for."""
-        definitions, topics = dict[str, str](), dict[int, Connection]()
+        select, definitions, topics = self._database.execute, dict[str, str](), {}
         with suppress(sqlite3.Error):   # older ones have none
-            definitions = dict(self._database.execute(
+            definitions = dict(select(
                 'SELECT topic_type, encoded_message_definition FROM message_definitions'))
-        for number, name, of_type, form, profiles in self._database.execute(
+        for number, name, of_type, form, profiles in select(
                 'SELECT id, name, type, serialization_format, offered_qos_profiles FROM topics'):
             qualities: list[Qos] = []
             with suppress(Exception):   # the parser can raise anything
@@ -168,9 +168,8 @@ class _Sqlite:
         last, step = 0, 1
         while step < 2**40:
             try:
-                with closing(self._database.execute(
-                        'SELECT id, timestamp, topic_id, data FROM messages WHERE id >= ? '
-                        'ORDER BY id LIMIT 1000', (last + 1,))) as rows:
+                with closing(select('SELECT id, timestamp, topic_id, data FROM messages '
+                                    'WHERE id >= ? ORDER BY id LIMIT 1000', (last + 1,))) as rows:
                     n = 0
                     for number, recorded_ns, topic, data in rows:
                         if number > last + 10**6:   # it is wrong
@@ -178,8 +177,7 @@ class _Sqlite:
                         if number <= last:
                             raise sqlite3.DatabaseError('rows are not in their order')
                         n, step, last = n + 1, 1, number
-                        if topic in topics and isinstance(recorded_ns, int) and (
-                                isinstance(data, bytes)):
+                        if topic in topics and type(recorded_ns) is int and type(data) is bytes:
                             yield topics[topic], recorded_ns, data
                     if n == 0:
                         break
@@ -202,10 +200,8 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
     if about.get('compression_format'):
         return False    # what rosbag2 itself has compressed is not unpacked here
     listed = [Path(str(name)).name for name in about.get('relative_file_paths') or ()]
-    files = [path]
-    if path.is_dir():
-        files = [path / name for name in listed if (path / name).is_file()] or sorted(
-            path.iterdir())
+    files = [path] if path.is_file() else [
+        path / name for name in listed if (path / name).is_file()] or sorted(path.iterdir())
     files = [each for each in files if each.suffix in {'.mcap', '.db3'}]
     found: list[_Mcap | _Sqlite] = []
     connections: dict[tuple[str, str], Connection] = {}
@@ -215,8 +211,8 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
     ) -> Connection:
         if (topic, of_type) not in connections:
             connections[topic, of_type] = writer.add_connection(
-                topic, of_type, msgdef=definition, rihs01=NO_HASH,
-                serialization_format=encoding, offered_qos_profiles=qualities)
+                topic, of_type, msgdef=definition, rihs01=NO_HASH, serialization_format=encoding,
+                offered_qos_profiles=qualities)
         return connections[topic, of_type]
 
     with Writer(copy, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -235,12 +231,11 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
         with suppress(KeyError, TypeError, ValueError):
             wanted_ns = (int(about['starting_time']['nanoseconds_since_epoch'])
                          + int(about['duration']['nanoseconds']))
-            missing_s = max(1e-9 * (wanted_ns + 1 - end_ns), 0.0)
-            missing = f'{missing_s:.1f} s at the end are missing'
+            missing = f'{max(1e-9 * (wanted_ns + 1 - end_ns), 0.0):.1f} s at the end are missing'
     if len(found) == len(files) and all(each.complete for each in found):
         missing = 'its end is there'
-    logger.warning(
-        '%s: %s; what can be read of it is used: %d messages in %.1f s, %d damaged parts are left '
-        'out, %s', path, reason, n, 1e-9 * (end_ns - writer.min_timestamp),
-        sum(each.n_damaged for each in found), missing)
+    logger.warning('%s: %s; what can be read of it is used: '
+                   '%d messages in %.1f s, %d damaged parts are left out, %s', path, reason, n,
+                   1e-9 * (end_ns - writer.min_timestamp), sum(each.n_damaged for each in found),
+                   missing)
     return True

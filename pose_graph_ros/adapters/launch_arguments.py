@@ -39,8 +39,7 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
         'sources': (AS_IN_FILE, 'names of the sources, such as [odom, fix, gyro]'),
         **inputs,
         **{name: (AS_IN_FILE, f'topic of the output, {type_name}; sets outputs.{name}, by default '
-                              f'{topic}') for name, (topic, type_name, _) in OUTPUTS.items()},
-    }
+                              f'{topic}') for name, (topic, type_name, _) in OUTPUTS.items()}}
 
 
 def switch(given: Mapping[str, str], name: str) -> bool:
@@ -96,6 +95,5 @@ def remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
 
 def display_remappings(given: Mapping[str, str]) -> list[tuple[str, str]]:
     """Return the remaps of topics by the arguments for RViz, which has no parameters of them."""
-    return remappings(given) + [
-        (topic, given[name]) for name, (topic, *_) in OUTPUTS.items()
-        if given[name] not in ('', AS_IN_FILE)]
+    return remappings(given) + [(topic, given[name]) for name, (topic, *_) in OUTPUTS.items()
+                                if given[name] not in ('', AS_IN_FILE)]

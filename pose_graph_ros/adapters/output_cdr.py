@@ -7,10 +7,10 @@ Filling in message objects would take ten times as long. In CDR every number is 
 size, counted from the end of the four bytes at the start of the stream.
 """
 
-from dataclasses import dataclass
 import functools
 import math
 import struct
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -61,10 +61,9 @@ def odometry_cdr(
     numbers = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z, *twist.covariance)
     # a finite sum is the quick way to tell
     finite = math.isfinite(sum(numbers)) or all(map(math.isfinite, numbers))
-    return b''.join((
-        _head(stamp_ns, map_frame, base_frame),
-        _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
-        _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
+    return b''.join((_head(stamp_ns, map_frame, base_frame),
+                     _pose_with_covariance_cdr(prediction, UNKNOWN_VARIANCE),
+                     _TWIST_WITH_COVARIANCE.pack(*numbers) if finite else _UNKNOWN_TWIST))
 
 
 def stamped_pose_cdr(stamp_ns: int, prediction: Prediction, map_frame: str) -> bytes:
@@ -148,8 +147,7 @@ class CdrStream:
         self.data += bytes(-len(self.data) % 4) + _LENGTH.pack(len(name)) + name
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
+class Look(NamedTuple):
     """Colours (red, green, blue, alpha) and sizes [m] of the markers of the graph."""
 
     # of constraints by their errors [sigma], interpolated between
@@ -169,9 +167,8 @@ class Look:
 LOOK = Look()
 # Constants of visualization_msgs/Marker.
 LINE_LIST, POINTS, ADD, DELETEALL = 5, 8, 0, 3
-NAMESPACES = (
-    'hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes',
-    'weak_closures', 'waiting_closures', 'doubted', 'unused_errors', 'unused_nodes')
+NAMESPACES = ('hidden_nodes', 'odometry', 'loop_closures', 'observed_errors', 'observed_nodes',
+              'weak_closures', 'waiting_closures', 'doubted', 'unused_errors', 'unused_nodes')
 """Namespaces of the markers by id."""
 
 def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
@@ -207,9 +204,8 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
 
 def colours(sigmas: FloatArray) -> Colours:
     """Return the colours, shape (M, 4), of constraints with these errors, shape (M,) [sigma]."""
-    return np.column_stack([
-        np.interp(sigmas, LOOK.sigmas, channel) for channel in zip(*LOOK.colours, strict=True)
-    ]).astype(np.float32)
+    return np.column_stack([np.interp(sigmas, LOOK.sigmas, channel)
+                            for channel in zip(*LOOK.colours, strict=True)]).astype(np.float32)
 
 
 def _lines(lines: Lines) -> tuple[FloatArray, Colours]:
@@ -237,16 +233,15 @@ def _add_marker(  # noqa: PLR0917  fields of a marker
 ) -> None:
     """Add a visualization_msgs/Marker field by field."""
     def add_header() -> None:
-        stream.add('<i4', header[0])
-        stream.add('<u4', header[1])
+        stream.add('<u4', *header[:2])
         stream.add_text(header[2])
 
     add_header()
     stream.add_text(namespace)
     stream.add('<i4', *what)
-    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)    # pose
-    stream.add('<f8', size, size, 0.0)                      # scale: lines use the first
-    stream.add('<f4', *LOOK.node)                         # of points without their own
+    # pose and scale, of which lines use the first
+    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, size, size, 0.0)
+    stream.add('<f4', *LOOK.node)                           # of points without their own
     stream.add('<i4', 0, 0)                                 # lifetime: forever
     stream.add('u1', 0)                                     # frame_locked
     stream.add('<u4', len(points))

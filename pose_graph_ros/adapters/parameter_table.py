@@ -56,15 +56,14 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 
 
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
-_COVARIANCE = config.CovariancePolicy()
-_RATES = GyroSource()
+_COVARIANCE, _RATES = config.CovariancePolicy(), GyroSource()
 _NODES, _NOISE = _BACKEND.nodes, _ODOMETRY.noise
 _WINDOW, _THINNING = _BACKEND.window, _BACKEND.thinning
 
 PARAMETERS: tuple[Parameter, ...] = (
-    Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources of measurements; the '
-              'parameters of each source are listed under its name. Of several odometry sources '
-              'the first one is preferred. The source `loop_closure` always exists.',
+    Parameter('sources', list(DEFAULT_SOURCES), '', 'Names of the sources of measurements; '
+              'the parameters of each source are listed under its name. Of several odometry '
+              'sources the first one is preferred. The source `loop_closure` always exists.',
               change=Change.START),
     Parameter('autostart', True, '', 'Whether the node configures and activates itself. If false, '
               'a lifecycle manager must do so.', change=Change.START),
@@ -93,10 +92,9 @@ PARAMETERS: tuple[Parameter, ...] = (
               'is optimised until convergence. If 0, it never is.', 0.0, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
-    Parameter('load_graph_on_start', False, '', 'Whether to continue with the graph in '
-              '`graph_file`, once there is one. If it cannot be loaded, the node is not '
-              'configured.',
-              change=Change.UNCONFIGURED),
+    Parameter('load_graph_on_start', False, '', 'Whether to continue with '
+              'the graph in `graph_file`, once there is one. If it cannot be loaded, the node is '
+              'not configured.', change=Change.UNCONFIGURED),
     Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
               'optionally, the angle from east to its x axis. If unset, the first fix is the '
               'origin and the x axis points east.', sizes=(0, 2, 3), change=Change.UNCONFIGURED),
@@ -131,8 +129,7 @@ PARAMETERS: tuple[Parameter, ...] = (
 OF_ALL = (
     Parameter('topic', '', '', 'Topic of the messages. By default the name of the source, unless '
               'the source is predefined.', change=Change.UNCONFIGURED),
-    Parameter('time_offset', 0.0, 's', 'Time added to the stamps of the messages.', -3600.0,
-              3600.0),
+    Parameter('time_offset', 0.0, 's', 'Time added to the stamps of the messages.', -3.6e3, 3.6e3),
     Parameter('covariance_scale', 1.0, '', 'Factor applied to all covariances.', 1e-6, 1e6))
 
 OF_WHEELS = (
@@ -164,16 +161,14 @@ OF_WHEELS = (
               'Random walk of both, per square root of an hour.', 1e-9, 10.0, sizes=(2,),
               change=Change.UNCONFIGURED))
 
-INTEGRATE = Parameter(
-    'integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` in the '
-    'messages, or their `twist`, integrated between messages.', choices=_values(Integrate),
-    change=Change.UNCONFIGURED)
+INTEGRATE = Parameter('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the '
+                      '`pose` in the messages, or their `twist`, integrated between messages.',
+                      choices=_values(Integrate), change=Change.UNCONFIGURED)
 
 OF_GYROS = (
     Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
               'With `tf` the rotation from its frame to the robot base frame is taken from '
-              '/tf_static; messages are refused until it is there.',
-              choices=('tf', 'up', 'down')),
+              '/tf_static; messages are refused until it is there.', choices=('tf', 'up', 'down')),
     Parameter('noise', _RATES.noise_from.value, '', 'Origin of the noise of the rate: `message` '
               'uses the variance in the messages, if it is positive, `model` uses `sigma_rate`.',
               choices=_values(RateNoise)),
@@ -192,13 +187,12 @@ OF_GYROS = (
               'which the rate is integrated. A longer one leaves the rotation between two hidden '
               'nodes out.', 1e-3, 10.0))
 
-HEADING = Parameter(
-    'heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the pose. '
-    'With `auto` it is used if its variance is positive and less than that of a uniform '
-    'distribution on the circle.', choices=_values(config.Heading))
-LEVER_ARM = Parameter(
-    'lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base frame, x '
-    'and y. If zero, it is taken from /tf_static if available.', -1e3, 1e3, sizes=(2,))
+HEADING = Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use the heading of the '
+                    'pose. With `auto` it is used if its variance is positive and less than that '
+                    'of a uniform distribution on the circle.', choices=_values(config.Heading))
+LEVER_ARM = Parameter('lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base '
+                      'frame, x and y. If zero, it is taken from /tf_static if available.', -1e3,
+                      1e3, sizes=(2,))
 BEACONS = Parameter(
     'beacons', [], '', 'Beacons at known places: name, x and y in the map [m] of each, such as '
     '"anchor_1 12.5 -3.0". Others are located by their ranges.', change=Change.UNCONFIGURED)

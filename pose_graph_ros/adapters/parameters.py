@@ -7,7 +7,7 @@ Check the values of parameters and their changes, say what is wrong with names, 
 """
 
 from array import array
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from itertools import pairwise
@@ -21,7 +21,7 @@ import yaml
 from pose_graph_ros.adapters import parameter_table as table, sources
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
-from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE
+from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE, Values
 from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -51,13 +51,12 @@ def source_parameters(source: str, kind: str) -> tuple[Parameter, ...]:
     of_type = type_parameter(source)
     checked_value(of_type, kind)
     _, topic = KNOWN_SOURCES.get(source, (None, source))
-    return of_type, *(
-        replace(each, name=f'{source}.{each.name}',
-                default=topic if each.name == 'topic' else each.default)
-        for each in (*OF_ALL, *KINDS[kind].parameters))
+    return of_type, *(replace(each, name=f'{source}.{each.name}', default=(
+        topic if each.name == 'topic' else each.default)) for each in (
+            *OF_ALL, *KINDS[kind].parameters))
 
 
-def listed_sources(given: Mapping[str, Any]) -> list[str]:
+def listed_sources(given: Values) -> list[str]:
     """Return the names of all sources; raises `ConfigError` for equal or bad names."""
     names: list[str] = checked_value(
         PARAMETERS[0], given.get('sources', list(table.DEFAULT_SOURCES)))
@@ -70,7 +69,7 @@ def listed_sources(given: Mapping[str, Any]) -> list[str]:
     return sources.source_names(names)
 
 
-def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
+def all_parameters(given: Values) -> tuple[Parameter, ...]:
     """Return the parameters of the node and of the sources in the given parameters."""
     parameters = list(PARAMETERS)
     for source in listed_sources(given):
@@ -79,7 +78,7 @@ def all_parameters(given: Mapping[str, Any]) -> tuple[Parameter, ...]:
     return tuple(parameters)
 
 
-def checked(given: Mapping[str, Any]) -> dict[str, Any]:
+def checked(given: Values) -> dict[str, Any]:
     """Return all parameters: the given values, after a check of type and range, or defaults."""
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}
@@ -170,9 +169,7 @@ def is_same(one: Any, other: Any) -> bool:
     return bool(one == other) and isinstance(one, bool) == isinstance(other, bool)
 
 
-def changed(
-    values: Mapping[str, Any], wanted: Mapping[str, Any], *, configured: bool,
-) -> dict[str, Any]:
+def changed(values: Values, wanted: Values, *, configured: bool) -> dict[str, Any]:
     """
     Return all parameters with some of them changed, after all checks.
 
@@ -192,17 +189,16 @@ def changed(
             raise ConfigError(f'parameter {name} is read at the start: give it in a parameter '
                               f'file or by -p {name}:=..., and start the node again')
         if parameter.change is Change.UNCONFIGURED and configured:
-            raise ConfigError(f'parameter {name} is taken when the node is configured: `ros2 '
-                              'lifecycle set` it to deactivate and cleanup, change it, and '
+            raise ConfigError(f'parameter {name} is taken when the node is configured: '
+                              '`ros2 lifecycle set` it to deactivate and cleanup, change it, and '
                               'configure it again')
         new[name] = good
-    new = checked(new)
-    require_together(new)
-    return new
+    return checked_together(new)
 
 
-def require_together(values: Mapping[str, Any]) -> None:
-    """Raise a `ConfigError` if a condition on more than one parameter is broken."""
+def checked_together(given: Values) -> dict[str, Any]:
+    """Return all parameters as `checked`, after a check of conditions on more than one."""
+    values = checked(given)
     frames = [frame(values[name]) for name in FRAMES]
     if '' in frames:
         raise ConfigError(f'parameter {FRAMES[frames.index("")]}: expected the name of a frame, '
@@ -212,6 +208,7 @@ def require_together(values: Mapping[str, Any]) -> None:
                           f'{", ".join(map(repr, frames))}')
     datum_of(values)
     sources.backend_config(values)
+    return values
 
 
 def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
@@ -256,8 +253,7 @@ def as_yaml() -> str:
              '# Generated from the tables in pose_graph_ros/adapters/parameter_table.py by',
              '# `pose-graph parameters --yaml`. pose_graph.yaml has what most robots need.',
              '/**:', '  ros__parameters:']
-    commented: set[str] = set()
-    group = ''
+    commented, group = set[str](), ''
     for parameter in PARAMETERS:
         before, (group, _, leaf) = group, parameter.name.rpartition('.')
         if group not in ('', before):
@@ -289,11 +285,10 @@ def as_markdown() -> str:
     every = [TYPE, *OF_ALL]
     for kind in KINDS.values():
         every += [each for each in kind.parameters if each not in every]
-    lines = ['| parameter | default | unit | range | changes | description |',
-             '|---|---|---|---|---|---|',
+    head = 'default | unit | range | changes | description |'
+    lines = [f'| parameter | {head}', '|---|---|---|---|---|---|',
              *(f'| `{each.name}` | {_facts(each)}' for each in PARAMETERS), '',
-             '| parameter | types | default | unit | range | changes | description |',
-             '|---|---|---|---|---|---|---|']
+             f'| parameter | types | {head}', '|---|---|---|---|---|---|---|']
     for each in every:
         kinds = [kind.name for kind in KINDS.values() if each in kind.parameters]
         lines.append(f'| `<source>.{each.name}` | {", ".join(kinds) or "all"} | {_facts(each)}')
@@ -309,9 +304,7 @@ def _facts(parameter: Parameter) -> str:
 
 
 def _range(parameter: Parameter) -> str:
-    if len(parameter.choices) > 0:
-        return ', '.join(parameter.choices)
-    return '' if parameter.smallest is None else (
+    return ', '.join(parameter.choices) if parameter.smallest is None else (
         f'{parameter.smallest:g} to {parameter.largest:g}')
 
 

@@ -13,14 +13,9 @@ import math
 from typing import Any
 
 from pose_graph_ros.adapters import conversions, parameter_table as table
+from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.parameter_table import Change, Parameter
-from pose_graph_ros.adapters.surroundings import (
-    datum_of,
-    frame,
-    Message,
-    StaticFrames,
-    Surroundings,
-)
+from pose_graph_ros.adapters.surroundings import datum_of, frame, StaticFrames, Surroundings
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError
@@ -33,8 +28,9 @@ CLOCK_JUMP_NS = NANOSECONDS
 _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 _IMU = 'sensor_msgs/msg/Imu'
 
-Settings = OdometrySource | MeasurementSource | GyroSource
 Measured = OdometrySample | Measurement
+Values = Mapping[str, Any]
+"""Checked parameters by name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +40,8 @@ class Kind:
     name: str  # value of the parameter `type`
     message_type: str
     convert: Callable[[Message, 'Source', Surroundings], Measured | Answer]
-    settings: Settings  # of a source, but for those that have parameters
+    # of a source, but for those that have parameters
+    settings: OdometrySource | MeasurementSource | GyroSource
     parameters: tuple[Parameter, ...]  # beside `OF_ALL`
     in_map: bool = False  # whether it tells where the robot is in the map
     on_earth: bool = False  # whether it tells where the map is on the Earth
@@ -65,34 +62,26 @@ class Kind:
         return not isinstance(self.settings, MeasurementSource)
 
 
-ODOMETRY = Kind(
-    'odometry', 'nav_msgs/msg/Odometry', conversions.odometry_sample, OdometrySource(),
-    (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
-GLOBAL_POSE = Kind(
-    'global_pose', _POSE, conversions.global_pose, config.POSITIONS,
-    (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
-    without_frame='it is taken for {map}, the map_frame')
-FIX = Kind(
-    'fix', 'sensor_msgs/msg/NavSatFix', conversions.fix, config.POSITIONS,
-    (*table.in_the_map(config.POSITIONS), table.LEVER_ARM), in_map=True, on_earth=True,
-    in_frames=True,
-    without_frame='its antenna is taken to be in {base}: set {name}.lever_arm')
-IMU = Kind(
-    'imu', _IMU, conversions.heading, config.HEADINGS,
-    (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
-LOOP_CLOSURE = Kind(
-    'loop_closure', _POSE, conversions.loop_closure, config.LOOP_CLOSURES,
-    table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
-TWIST = Kind(
-    'twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', conversions.twist_odometry,
-    OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
-    without_frame='it is taken for {base}, the base_link_frame')
-GYRO = Kind(
-    'gyro', _IMU, conversions.yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
-    without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
-RANGE = Kind(
-    'range', 'sensor_msgs/msg/Range', conversions.beacon_range, config.RANGES,
-    (*table.of_measurements(config.RANGES), table.LEVER_ARM, table.BEACONS), in_frames=True)
+ODOMETRY = Kind('odometry', 'nav_msgs/msg/Odometry', conversions.odometry, OdometrySource(),
+                (*table.OF_WHEELS, table.INTEGRATE), names_frames=True)
+GLOBAL_POSE = Kind('global_pose', _POSE, conversions.global_pose, config.POSITIONS,
+                   (*table.in_the_map(config.POSITIONS), table.HEADING), in_map=True,
+                   without_frame='it is taken for {map}, the map_frame')
+FIX = Kind('fix', 'sensor_msgs/msg/NavSatFix', conversions.fix, config.POSITIONS,
+           (*table.in_the_map(config.POSITIONS), table.LEVER_ARM), in_map=True, on_earth=True,
+           in_frames=True, without_frame='its antenna is taken to be in {base}: set '
+           '{name}.lever_arm')
+IMU = Kind('imu', _IMU, conversions.heading, config.HEADINGS,
+           (*table.in_the_map(config.HEADINGS), table.YAW_OFFSET), part='orientation')
+LOOP_CLOSURE = Kind('loop_closure', _POSE, conversions.loop_closure, config.LOOP_CLOSURES,
+                    table.of_measurements(config.LOOP_CLOSURES), is_rare=True)
+TWIST = Kind('twist', 'geometry_msgs/msg/TwistWithCovarianceStamped', conversions.twist,
+             OdometrySource(integrate=Integrate.TWIST), table.OF_WHEELS, in_frames=True,
+             without_frame='it is taken for {base}, the base_link_frame')
+GYRO = Kind('gyro', _IMU, conversions.yaw_rate, GyroSource(), table.OF_GYROS, in_frames=True,
+            without_frame='it is taken for {base}: set {name}.mounting', part='angular_velocity')
+RANGE = Kind('range', 'sensor_msgs/msg/Range', conversions.beacon_range, config.RANGES, (
+    *table.of_measurements(config.RANGES), table.LEVER_ARM, table.BEACONS), in_frames=True)
 KINDS = {kind.name: kind
          for kind in (ODOMETRY, GLOBAL_POSE, FIX, IMU, LOOP_CLOSURE, TWIST, GYRO, RANGE)}
 """Kinds of sources by name."""
@@ -101,10 +90,9 @@ TYPE = Parameter('type', '', '', 'Type of the source.', choices=tuple(KINDS), ch
 
 SET_POSE, JUDGE = 'set_pose', 'judge'  # names under which what a person asks for is counted
 CLOSURES = 'loop_closure'  # name of the source of loop closures that always exists
-KNOWN_SOURCES = {
-    'odom': (ODOMETRY, 'odom'), 'global_pose': (GLOBAL_POSE, 'global_pose'),
-    'fix': (FIX, 'gps/fix'), 'imu': (IMU, 'imu/data'),
-    CLOSURES: (LOOP_CLOSURE, 'loop_closure'), 'gyro': (GYRO, 'imu/data')}
+KNOWN_SOURCES = {'odom': (ODOMETRY, 'odom'), 'global_pose': (GLOBAL_POSE, 'global_pose'),
+                 'fix': (FIX, 'gps/fix'), 'imu': (IMU, 'imu/data'),
+                 CLOSURES: (LOOP_CLOSURE, 'loop_closure'), 'gyro': (GYRO, 'imu/data')}
 """Default kind and topic of the predefined sources."""
 
 
@@ -124,7 +112,7 @@ class Source:
     beacons: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
+def source_list(values: Values) -> tuple[Source, ...]:
     """Return the sources by the checked parameters, odometry in the order of preference."""
     found = []
     for name in source_names(values['sources']):
@@ -135,20 +123,17 @@ def source_list(values: Mapping[str, Any]) -> tuple[Source, ...]:
             try:
                 beacon, x, y = text.split()
                 places[beacon] = float(x), float(y)
-                good = all(abs(each) < 1e7 for each in places[beacon])
+                if not all(abs(each) < 1e7 for each in places[beacon]):
+                    raise ValueError
             except ValueError:
-                good = False
-            if not good:
                 raise ConfigError(f'parameter {name}.beacons: expected name, x and y, such as '
-                                  f'"anchor_1 12.5 -3.0", got {text!r}')
-        if 'beacons' in given:
-            given['beacons'] = places
+                                  f'"anchor_1 12.5 -3.0", got {text!r}') from None
         found.append(Source(name, KINDS[own['type']], time_offset_ns=round(
-            own['time_offset'] * NANOSECONDS), **given))
+            own['time_offset'] * NANOSECONDS), **given | {'beacons': places}))
     return tuple(found)
 
 
-def _own(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+def _own(values: Values, source: str) -> dict[str, Any]:
     """Return the parameters of a source by their names without its own."""
     return {name.removeprefix(f'{source}.'): value for name, value in values.items()
             if name.startswith(f'{source}.')}
@@ -163,7 +148,7 @@ def source_names(listed: list[str]) -> list[str]:
 _SETTINGS = {'CovariancePolicy.heading_floor': 'sigma_floor'}
 
 
-def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
+def backend_config(values: Values) -> config.BackendConfig:
     """
     Return the settings of the engine by the checked parameters.
 
@@ -209,9 +194,8 @@ def backend_config(values: Mapping[str, Any]) -> config.BackendConfig:
         nodes=config.NodePolicy(**_same(values, config.NodePolicy)),
         odometry=odometry, measurements=measurements, gyros=gyros,
         window=config.WindowConfig(
-            seconds=values['window.seconds'], metres=values['window.metres'],
-            nodes=math.ceil(values['window.nodes']),
-            prior=config.WindowPrior(values['window.prior'])),
+            values['window.seconds'], values['window.metres'], math.ceil(values['window.nodes']),
+            config.WindowPrior(values['window.prior'])),
         thinning=config.ThinningConfig(cell=values['thinning.cell']))
 
 
@@ -225,19 +209,17 @@ class MessageReader:
     """Converts the messages of all sources to measurements, by the checked parameters."""
 
     def __init__(
-        self, values: Mapping[str, Any], frames: StaticFrames | None = None,
-        keeper: TimeKeeper | None = None,
+        self, values: Values, frames: StaticFrames | None = None, keeper: TimeKeeper | None = None,
     ) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
-        self.keeper = keeper or TimeKeeper(
-            [name for name, source in self.sources.items() if source.kind.is_odometry],
-            CLOCK_JUMP_NS)
+        self.keeper = keeper or TimeKeeper([name for name, source in self.sources.items()
+                                            if source.kind.is_odometry], CLOCK_JUMP_NS)
         self.frames = StaticFrames() if frames is None else frames
         self.datum = datum_of(values)
         self.surroundings = Surroundings(
             frame(values['map_frame']), frame(values['base_link_frame']), self.datum, self.frames)
 
-    def configure(self, values: Mapping[str, Any]) -> None:
+    def configure(self, values: Values) -> None:
         """
         Use other time offsets, lever arms, yaw offsets and mountings for messages from now on.
 
@@ -248,14 +230,14 @@ class MessageReader:
             self.keeper.shift(source.name, source.time_offset_ns - before.time_offset_ns)
             self.sources[source.name] = source
 
-    def read(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+    def read(self, name: str, message: Message) -> Measured | Answer:
         """Return the measurement in a message of a source, or the reason for rejecting it."""
         measurement = self.convert(name, message)
         if isinstance(measurement, Answer):
             return measurement
         return self.keeper.judge(name, measurement).refusal or measurement
 
-    def convert(self, name: str, message: Message) -> OdometrySample | Measurement | Answer:
+    def convert(self, name: str, message: Message) -> Measured | Answer:
         """Return the same without a judgement of its stamp."""
         source = self.sources[name]
         measurement = source.kind.convert(message, source, self.surroundings)

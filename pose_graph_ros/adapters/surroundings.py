@@ -52,10 +52,9 @@ class Datum:
     def keep(self, origin: MapOrigin) -> None:
         """Use the datum of a loaded graph from now on."""
         with self._lock:
-            self.plane, self.yaw, self.altitude = (
-                TangentPlane(*origin), origin.yaw, origin.altitude)
+            self.plane, self.is_of_graph = TangentPlane(*origin), True
+            self.yaw, self.altitude = origin.yaw, origin.altitude
             self.waits = self._to_lift = False
-            self.is_of_graph = True
 
     def renew(self) -> None:
         """Make the next fix that is used the datum."""
@@ -72,15 +71,12 @@ class Datum:
             if math.isfinite(altitude):
                 self.altitude = altitude
             known = math.isfinite(self.altitude)
-            if self.plane is None:
-                self.plane = TangentPlane(
-                    latitude, longitude, self.altitude if known else 0.0, self.yaw)
+            if (plane := self.plane) is None or (self._to_lift and known):
+                where = (latitude, longitude) if plane is None else (
+                    plane.latitude, plane.longitude)
+                self.plane = plane = TangentPlane(
+                    *where, self.altitude if known else 0.0, self.yaw)
                 self._to_lift = not known
-            elif self._to_lift and known:
-                self.plane = TangentPlane(
-                    self.plane.latitude, self.plane.longitude, self.altitude, self.yaw)
-                self._to_lift = False
-            plane = self.plane
         return plane.to_map(
             latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
 

@@ -54,17 +54,14 @@ def replay(parser: argparse.ArgumentParser) -> None:
                         help='rosbag2 folder, .mcap, .db3, ROS 1 .bag; or one .g2o or .graph file')
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('replay'),
                         help='folder for the results (default: %(default)s)')
-    parser.add_argument(
-        '--export', metavar='FORMATS', type=_exports, default=Exports(),
-        help=f'more files with the path: {", ".join(FORMATS)}, separated by commas, or all; '
-             f'{", ".join(ON_EARTH)} need fixes or a datum')
-    parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag',
-                        help='new rosbag2 folder with all messages, the corrected path, odometry '
-                             'in the map and the transform from map to odom; its poses know all '
-                             'that came later')
-    parser.add_argument('--live', action='store_true',
-                        help='also write live.csv: the poses that a robot would have had at each '
-                             'moment, with their covariances')
+    parser.add_argument('--export', metavar='FORMATS', type=_exports, default=Exports(),
+                        help=f'more files with the path: {", ".join(FORMATS)}, separated by '
+                        f'commas, or all; {", ".join(ON_EARTH)} need fixes or a datum')
+    parser.add_argument('--bag', metavar='OUT', type=Path, dest='new_bag', help='new rosbag2 '
+                        'folder with all messages, the corrected path, odometry in the map and '
+                        'the transform from map to odom; its poses know all that came later')
+    parser.add_argument('--live', action='store_true', help='also write live.csv: the poses that '
+                        'a robot would have had at each moment, with their covariances')
     parser.add_argument('--json', action='store_true',
                         help='print the contents of summary.json instead of a text')
     _add_replayed(parser)
@@ -83,14 +80,13 @@ def report(parser: argparse.ArgumentParser) -> None:
       pose-graph report my_bag --odom /wheel/odometry --fix /gnss/fix --run tuesday
       pose-graph report replay --json | jq '.findings[] | select(.level == "warning")'
     """
-    parser.add_argument('runs', metavar='RUN', type=Path, nargs='+',
-                        help='folder of a replay or a demo, run.json, bags, or a .g2o or '
-                             '.graph file')
+    parser.add_argument('runs', metavar='RUN', type=Path, nargs='+', help='folder of a replay or '
+                        'a demo, run.json, bags, or a .g2o or .graph file')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path,
                         help='the page (default: report.html in the folder of the run)')
     parser.add_argument('--run', metavar='DIR', type=Path, default=Path('report'), dest='folder',
                         help='of a bag: folder for the results of the replay '
-                             '(default: %(default)s)')
+                        '(default: %(default)s)')
     parser.add_argument('--json', action='store_true',
                         help='print what was found as JSON instead of a text')
     parser.add_argument('--open', action='store_true', help='show the page in a browser')
@@ -108,11 +104,10 @@ def demo(parser: argparse.ArgumentParser) -> None:
                         help='rosbag2 folder, .mcap or .db3 (default: a simulated drive)')
     parser.add_argument('-o', '--out', metavar='DIR', type=Path, default=Path('demo'),
                         help='folder for the results (default: %(default)s)')
-    parser.add_argument('--rate', type=float, default=50.0,
-                        help='speed as a multiple of real time, 0 for as fast as the node can '
-                             '(default: %(default)s)')
+    parser.add_argument('--rate', type=float, default=50.0, help='speed as a multiple of real '
+                        'time, 0 for as fast as the node can (default: %(default)s)')
     parser.add_argument('--seed', type=int, default=1, help='seed of the simulated drive '
-                             '(default: %(default)s)')
+                        '(default: %(default)s)')
     _add_inputs(parser)
     _add_parameters(parser)
 
@@ -137,8 +132,7 @@ def tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--out', metavar='FILE', type=Path, default=Path('tuned.yaml'),
                         help='parameter file to write (default: %(default)s)')
     parser.add_argument('--folds', metavar='N', type=number(2, 50, whole=True), default=4,
-                        help='parts of the drive that are held out in turn '
-                             '(default: %(default)s)')
+                        help='parts of the drive that are held out in turn (default: %(default)s)')
     parser.add_argument('--stretch', metavar='S', type=number(1.0, 3600.0), default=None,
                         help='length of the stretches that a part has [s] (default: by how slowly '
                              'the errors change)')
@@ -187,13 +181,12 @@ def solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('graph', type=Path, nargs='?',  # in `--robust FILE` it is that of --robust
                         help='g2o, TORO or iSAM file, also compressed by gzip')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path, action='append', default=[],
-                        help='optimised g2o file, or marginals if the name ends in .csv; may be '
-                             'repeated')
-    parser.add_argument('--start', choices=STARTS, default='chordal',
-                        help='start from the constraints, from the poses in the file, from '
-                             'composed odometry, or from each, and take the lowest minimum '
-                             '(default: %(default)s); with --robust, from the poses of its '
-                             'decision')
+                        help='optimised g2o file, or marginals if the name ends in .csv; '
+                        'may be repeated')
+    parser.add_argument('--start', choices=STARTS, default='chordal', help='start from the '
+                        'constraints, from the poses in the file, from composed odometry, or from '
+                        'each, and take the lowest minimum (default: %(default)s); with --robust, '
+                        'from the poses of its decision')
     parser.add_argument('--certificate', action=argparse.BooleanOptionalAction, default=True,
                         help='prove whether the minimum is the global one (default: yes)')
     parser.add_argument('--marginals', metavar='{all,newest,IDS}',
@@ -201,17 +194,16 @@ def solve(parser: argparse.ArgumentParser) -> None:
                              'output, or -o FILE.csv (default, with such a file: all)')
     parser.add_argument('--json', action='store_true', help='print JSON (docs/tools.md)')
     parser.add_argument('--robust', nargs='?', metavar='|'.join(METHODS), const=METHODS[0],
-                        help='decide which loop closures to believe, and leave the others out, by '
-                             'comparing sets of them (selection, the default), or by graduated '
-                             'non-convexity with the surrogate for truncated least squares (gnc) '
-                             'or for Geman-McClure (gnc-gm); an edge is odometry if no id of a '
-                             'pose lies between its two; sightings of landmarks are believed')
+                        help='decide which loop closures to believe, and leave the others out, '
+                        'by comparing sets of them (selection, the default), or by graduated '
+                        'non-convexity with the surrogate for truncated least squares (gnc) or '
+                        'for Geman-McClure (gnc-gm); an edge is odometry if no id of a pose lies '
+                        'between its two; sightings of landmarks are believed')
+    usual = BELIEF.closure_floors[::2]
     parser.add_argument('--closure-sigma', nargs=2, type=number(0.0), metavar=('M', 'RAD'),
-                        default=BELIEF.closure_floors[::2],
-                        help='least standard deviations of loop closures for this decision '
-                             '(default: {} {}); the result '
-                             'has those of the file, times what the residuals show'
-                             .format(*BELIEF.closure_floors[::2]))
+                        default=usual, help='least standard deviations of loop closures for this '
+                        f'decision (default: {usual[0]} {usual[1]}); the result has those of the '
+                        'file, times what the residuals show')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file; by default both are tried')
 
@@ -250,9 +242,8 @@ def draw(parser: argparse.ArgumentParser) -> None:
                         help='draw only this node and those near it')
     parser.add_argument('--hops', metavar='K', type=int, default=2,
                         help='with --around: how many constraints away (default: %(default)s)')
-    parser.add_argument('--example', action='store_true',
-                        help='draw five states of a growing graph, with --pattern, in place of a '
-                             'file')
+    parser.add_argument('--example', action='store_true', help='draw five states of a growing '
+                        'graph, with --pattern, in place of a file')
     parser.add_argument('--json', action='store_true',
                         help='print what is drawn as JSON (docs/tools.md)')
 
@@ -270,9 +261,8 @@ def marginalize(parser: argparse.ArgumentParser) -> None:
       pose-graph marginalize graph.g2o --nodes 3,7,20:25 -o smaller.g2o
     """
     _add_graph(parser)
-    parser.add_argument('--nodes', metavar='IDS', required=True,
-                        help=f'nodes that leave, such as 3,7,20:25, or {LANDMARKS!r} for all of '
-                             'them')
+    parser.add_argument('--nodes', metavar='IDS', required=True, help='nodes that leave, such as '
+                        f'3,7,20:25, or {LANDMARKS!r} for all of them')
     parser.add_argument('-o', '--out', metavar='FILE', type=Path, required=True,
                         help='g2o file of the graph without them')
     parser.add_argument('--sparse', action='store_true',
@@ -282,9 +272,8 @@ def marginalize(parser: argparse.ArgumentParser) -> None:
 
 def _add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> None:
     """Add the arguments that give a graph."""
-    parser.add_argument('graph', type=Path, nargs=nargs,
-                        help='g2o file, or saved graph (its .json file, or the .g2o file beside '
-                             'it)')
+    parser.add_argument('graph', type=Path, nargs=nargs, help='g2o file, or saved graph (its '
+                        '.json file, or the .g2o file beside it)')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in this file (default: found out)')
 
@@ -292,9 +281,8 @@ def _add_graph(parser: argparse.ArgumentParser, *, nargs: str | None = None) -> 
 def _add_replayed(parser: argparse.ArgumentParser) -> None:
     """Add the options that say what is read of bags and of a g2o file, and how."""
     _add_span(parser)
-    parser.add_argument('--stamps', metavar='FILE', type=Path,
-                        help='text file with the stamps [s] of the vertices of a .g2o file '
-                             '(default: a second apart)')
+    parser.add_argument('--stamps', metavar='FILE', type=Path, help='text file with the stamps '
+                        '[s] of the vertices of a .g2o file (default: a second apart)')
     parser.add_argument('--edge2', choices=EDGE2_ORDERS,
                         help='format of the tag EDGE2 in a .g2o file')
     _add_inputs(parser)
@@ -311,9 +299,8 @@ def _add_span(parser: argparse.ArgumentParser) -> None:
 
 def _add_inputs(parser: argparse.ArgumentParser, *, hold_out: bool = True) -> None:
     """Add the options that choose topics and, if it is asked for, the fixes to hold out."""
-    group = parser.add_argument_group(
-        'topics in the bag',
-        'by default, the only topic of the type is used, apart from that of the truth')
+    group = parser.add_argument_group('topics in the bag', 'by default, the only topic of the '
+                                      'type is used, apart from that of the truth')
     pose = 'geometry_msgs/PoseWithCovarianceStamped'
     for option, text in (
             ('--odom', 'nav_msgs/Odometry'), ('--fix', 'sensor_msgs/NavSatFix'),

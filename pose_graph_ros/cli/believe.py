@@ -18,11 +18,10 @@ Its C is taken to be the mean of those of its closures, a little too large.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 import math
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -56,8 +55,7 @@ LEFT = float(gammainc(2.5, GATE / 2.0) + GATE / 3.0 * gammaincc(1.5, GATE / 2.0)
 TRIES = 5  # sets of closures that are tried to join parts that no odometry joins
 
 
-@dataclass(frozen=True, slots=True)
-class BelievedEdges:
+class BelievedEdges(NamedTuple):
     """Which edges of a graph are believed."""
 
     closures: IntArray  # rows of all edges that may be doubted, (M,)
@@ -112,8 +110,7 @@ def believe(
     if (problem.factorisation(np.ones(len(closures))) <= BELIEF.most_numbers * graph.n_nodes
             and optimizer.optimize_from_linear_start(copy, CONFIG).status is not Status.FAILED):
         plain = copy.poses.copy()
-    starts = [poses for poses in (plain, graph.poses.copy() if given else None)
-              if poses is not None]
+    starts = ([] if plain is None else [plain]) + ([graph.poses.copy()] if given else [])
     for start in starts:
         problem = TruncatedProblem(_filled(graph, softened), closures, start)
         choice = to_the_end(problem.near_start())
@@ -141,15 +138,15 @@ def _not_worse(
     information[closures] *= result.scale**-2.0
     scaled = edges.replaced(information=information)
     problem = TruncatedProblem(_filled(graph, scaled), closures, result.poses)
-    result = replace(result, cost=problem.cost_at(result.poses), cost_of_all=(
+    result = result._replace(cost=problem.cost_at(result.poses), cost_of_all=(
         None if plain is None else problem.cost_at(plain)))
     for start in starts:
         if problem.cost_at(start) < result.cost * (1.0 - SAME_MINIMUM):
             problem = TruncatedProblem(_filled(graph, scaled), closures, start)
             choice = to_the_end(problem.near_start())
             if choice is not None and choice.cost < result.cost:
-                result = replace(result, believed=choice.believed, poses=choice.poses,
-                                 cost=choice.cost)
+                result = result._replace(believed=choice.believed, poses=choice.poses,
+                                         cost=choice.cost)
     return result
 
 
@@ -160,8 +157,7 @@ def _filled(graph: Graph, edges: Factors) -> Graph:
 
 
 SELECTIONS: dict[str, Callable[[TruncatedProblem], Choosing]] = {
-    'selection': best,
-    'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED),
+    'selection': best, 'gnc': partial(TruncatedProblem.graduated, surrogate=Surrogate.TRUNCATED),
     'gnc-gm': partial(TruncatedProblem.graduated, surrogate=Surrogate.GEMAN_MCCLURE)}
 """The lowest truncated cost of several sets, or graduated non-convexity alone."""
 
@@ -174,8 +170,7 @@ def _joining(edges: Factors, closures: IntArray, part: IntArray, number: int) ->
     ends = np.sort(np.column_stack((part[table.i], part[table.j]))[order], axis=1)
     # of several between the same parts the first
     pairs, first = np.unique(ends, axis=0, return_index=True)
-    apart = pairs[:, 0] != pairs[:, 1]
-    size = len(part)
+    apart, size = pairs[:, 0] != pairs[:, 1], len(part)
     tree = minimum_spanning_tree(coo_array(
         (first[apart] + 1.0, tuple(pairs[apart].T)), (size, size)).tocsr())
     return closures[order[np.sort(tree.data).astype(np.int64) - 1]]

@@ -24,12 +24,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import Any
 
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
 from pose_graph_ros.adapters.bags import BagError, open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
-from pose_graph_ros.adapters.sources import backend_config, source_list
+from pose_graph_ros.adapters.sources import backend_config, source_list, Values
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.drive import drive_in
 from pose_graph_ros.cli.run import Recorder, Run, Update
@@ -39,9 +38,7 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.io.graph_files import read_graph
-from pose_graph_ros.offline.simulation.recording import course, record
-from pose_graph_ros.offline.simulation.settings import DURATIONS_S
-from pose_graph_ros.offline.simulation.worlds import WORLDS
+from pose_graph_ros.offline.simulation import recording, settings, worlds
 
 SIMULATED_TOPICS = {'odom': '/odom', 'fix': '/gps/fix', 'loop_closure': '/loop_closure'}
 GRAPH, RECORDED = 'graph.g2o', 'corrected'  # saved graph and rosbag2 of the node
@@ -49,10 +46,6 @@ DIAGNOSTICS, ODOMETRY = '/diagnostics', '/odometry/filtered'
 NO_ANSWERS = ('believed', 'believed_weakly', 'doubted', 'waiting', 'forgotten', 'left',
               'left_unused', 'without_lever_arm', 'rate_hz', 'silence_s', 'bias')
 """Ends of keys of the diagnostics that are not counts of messages by what was answered."""
-
-
-class DemoError(PoseGraphError):
-    """The node of the demo failed."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -64,8 +57,9 @@ def execute(options: argparse.Namespace) -> int:
     if bag_path is None:
         bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
         print(f'simulating a drive (seed {options.seed})')
-        write_drive(record(course(WORLDS['drive'], options.seed, DURATIONS_S['drive'])), bag_path,
-                    overwrite=True)
+        way = recording.course(
+            worlds.WORLDS['drive'], options.seed, settings.DURATIONS_S['drive'])
+        write_drive(recording.record(way), bag_path, overwrite=True)
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}
     with open_bag(bag_path) as bag:
@@ -120,16 +114,13 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
             if before[0] < count and 0 < newest_ns < last_ns and 'chi2' in values:
                 mean = (total - before[1]) / (count - before[0])
                 recorder.add_update(Update(
-                    newest_ns, int(values['hidden_nodes']),
-                    longest if longest > before[2] else max(mean, 0.0), float(values['chi2'])),
-                    count - before[0])
+                    newest_ns, int(values['hidden_nodes']), longest if longest > before[2]
+                    else max(mean, 0.0), float(values['chi2'])), count - before[0])
                 before = count, total, longest
     return values
 
 
-def _run(
-    bag: Path, inputs: Inputs, values: Mapping[str, Any], options: argparse.Namespace,
-) -> bool:
+def _run(bag: Path, inputs: Inputs, values: Values, options: argparse.Namespace) -> bool:
     """Tell whether the optimisation converged after playing the bag to the node."""
     node_command = [sys.executable, '-m', 'pose_graph_ros.ros.main',
                     *shared.ros_arguments(options),
@@ -147,13 +138,12 @@ def _run(
             try:
                 player = importlib.import_module('pose_graph_ros.ros.player')
             except ImportError as error:  # all other tools work without ROS
-                raise DemoError(f'ROS 2 is not there: {error}') from error
+                raise PoseGraphError(f'ROS 2 is not there: {error}') from error
             node = subprocess.Popen(node_command)
             try:
-                converged = player.play(
-                    bag, options.out / RECORDED, inputs,
-                    {name: values[f'{name}.topic'] for name in inputs.topics}, rate=options.rate,
-                    is_running=lambda: node.poll() is None)
+                converged = player.play(bag, options.out / RECORDED, inputs,
+                                        {name: values[f'{name}.topic'] for name in inputs.topics},
+                                        rate=options.rate, is_running=lambda: node.poll() is None)
             finally:
                 node.send_signal(signal.SIGINT)  # nothing happens if it has ended
                 try:
@@ -165,7 +155,7 @@ def _run(
             os.environ.clear()
             os.environ.update(before)
         if code != 0:
-            raise DemoError(f'the node ended with code {code}')
+            raise PoseGraphError(f'the node ended with code {code}')
         print('the node stopped cleanly')
         return bool(converged)
 

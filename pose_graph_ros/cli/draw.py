@@ -9,12 +9,11 @@ Lines and texts show on light and on dark backgrounds.
 import argparse
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 import json
 from pathlib import Path
 import sys
 import textwrap
-from typing import Any
+from typing import Any, NamedTuple
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -34,8 +33,7 @@ from pose_graph_ros.offline.pattern import elimination_order, Pattern, pattern
 N_MOST = 300  # hidden nodes in a picture; with more of them names can't be read
 INK, GREY = '#111111', '#7a828c'
 COLOURS = {     # after Okabe and Ito, but for grey; without a sort, arcs of several terms
-    None: GREY,
-    Sort.ODOMETRY: GREY, Sort.LOOP_CLOSURE: '#2F8FD0', Sort.TURN: '#B9A51C',
+    None: GREY, Sort.ODOMETRY: GREY, Sort.LOOP_CLOSURE: '#2F8FD0', Sort.TURN: '#B9A51C',
     Sort.LANDMARK: '#009E73', Sort.OBSERVED: '#E69F00', Sort.BIAS: '#B583A4',
     Sort.PRIOR: '#D55E00'}
 FILLS = {Role.POSE: '#ffffff', Role.LANDMARK: '#D9F2E6', Role.BIAS: '#F0E2EC',
@@ -47,13 +45,12 @@ BLOCK, FILL = '#4C78A8', '#E69F00'  # of the pattern of H, of the fill of its fa
 UNIT, LARGEST = 0.8, 14.0  # distance of neighbours, and most of the width and height [inch]
 DIAMETER = 0.32  # of a hidden node [inch]; less where neighbours are nearer
 SETTINGS: dict[Any, Any] = {
-    'svg.fonttype': 'none', 'svg.hashsalt': 'pose_graph_ros', 'text.color': GREY,
+    'svg.fonttype': 'none', 'svg.hashsalt': 'pose_graph_ros', 'text.color': GREY, 'font.size': 8.0,
     'axes.edgecolor': GREY, 'legend.title_fontsize': 8.0,
-    'font.family': ['DejaVu Sans', 'sans-serif'], 'font.size': 8.0}
+    'font.family': ['DejaVu Sans', 'sans-serif']}
 
 
-@dataclass(frozen=True, slots=True)
-class Panel:
+class Panel(NamedTuple):
     """A view of a graph with the places of its vertices, and the pattern of H if it is drawn."""
 
     title: str
@@ -68,8 +65,7 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError('expected a graph or --example, and not both')
     graphs = ([(title, GraphFile(rows, rows.node_ids)) for title, rows in views.five_states()]
               if options.example else [('', read(options.graph, options.edge2))])
-    notes: list[str] = []
-    panels: list[Panel] = []
+    notes, panels = list[str](), list[Panel]()
     for title, file in graphs:
         whole = views.factor_graph(file.rows, file.ids)
         shown, n_cut = views.part(whole, _chosen(options, file.ids, whole))
@@ -133,8 +129,7 @@ def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> d
     """Return what is drawn, for machines."""
     diagrams = []
     for panel in panels:
-        place = {node: n for n, node in enumerate(panel.view)}
-        vertices = []
+        place, vertices = {node: n for n, node in enumerate(panel.view)}, []
         for node, data in panel.view.nodes(data=True):
             term = data.get('term')
             vertices.append({
@@ -175,9 +170,8 @@ def _draw(panels: Sequence[Panel], path: Path, notes: Sequence[str], *, headings
                 _draw_pattern(other, panel.pattern)
         entries = {label: handle for axes in figure.axes for handle, label in zip(
             *axes.get_legend_handles_labels(), strict=True)}
-        figure.legend(
-            entries.values(), entries.keys(), loc='outside lower left', frameon=False,
-            ncols=max(int(width / 2.2), 1), title='\n'.join(text), alignment='left')
+        figure.legend(entries.values(), entries.keys(), loc='outside lower left', frameon=False,
+                      ncols=max(int(width / 2.2), 1), title='\n'.join(text), alignment='left')
         options = {'metadata': {'Date': None}} if path.suffix.lower() == '.svg' else {}
         figure.savefig(path, transparent=True, **options)
 
@@ -195,10 +189,9 @@ def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None
             looks['fixed (known): double border', _fill(data), 0.6 * area[node], role,
                   opaque].append(node)
     for (meaning, colour, size, role, opaque), nodes in looks.items():
-        nx.draw_networkx_nodes(
-            panel.view, panel.at, nodelist=nodes, ax=axes, node_color=colour, node_size=size,
-            linewidths=0.05 * diameter, edgecolors=INK, alpha=opaque,
-            node_shape='s' if role is Role.FACTOR else 'o')
+        nx.draw_networkx_nodes(panel.view, panel.at, nodelist=nodes, ax=axes, node_color=colour,
+                               node_size=size, linewidths=0.05 * diameter, edgecolors=INK,
+                               alpha=opaque, node_shape='s' if role is Role.FACTOR else 'o')
         axes.plot([], [], 's' if role is Role.FACTOR else 'o', color=colour, markeredgecolor=INK,
                   label=meaning)
     named = {data['term'].sort for data in vertices.values()
@@ -211,19 +204,18 @@ def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None
         drawn.add((start, end))
         groups[arc['sort'], bend, arc['used'], arc['directed']].add_edge(start, end)
     for (sort, bend, used, directed), alike in groups.items():
-        nx.draw_networkx_edges(
-            alike, panel.at, ax=axes, edge_color=COLOURS[sort], width=0.05 * diameter,
-            connectionstyle=f'arc3,rad={bend}', style='solid' if used else 'dashed', arrows=True,
-            arrowsize=0.45 * diameter, arrowstyle='-|>' if directed else '-',
-            nodelist=list(alike), node_size=[area[node] for node in alike])
+        nx.draw_networkx_edges(alike, panel.at, ax=axes, edge_color=COLOURS[sort],
+                               width=0.05 * diameter, connectionstyle=f'arc3,rad={bend}',
+                               style='solid' if used else 'dashed', arrows=True,
+                               arrowsize=0.45 * diameter, arrowstyle='-|>' if directed else '-',
+                               nodelist=list(alike), node_size=[area[node] for node in alike])
         if sort not in named:
             axes.plot([], [], color=COLOURS[sort],
                       label='in a term together' if sort is None else sort.value)
     longest = max((len(data['name']) for data in vertices.values()), default=1)
-    nx.draw_networkx_labels(
-        panel.view, panel.at, {node: data['name'] for node, data in vertices.items()
-                               if data['role'] not in SIZES}, ax=axes, font_color=INK,
-        font_size=min(0.42, 1.2 / longest) * diameter)
+    names = {node: data['name'] for node, data in vertices.items() if data['role'] not in SIZES}
+    nx.draw_networkx_labels(panel.view, panel.at, names, ax=axes, font_color=INK,
+                            font_size=min(0.42, 1.2 / longest) * diameter)
     if headings:
         poses = [node for node, data in vertices.items() if data['role'] is Role.POSE]
         turns = np.array([vertices[node]['pose'][2] for node in poses])
@@ -260,9 +252,8 @@ def _draw_pattern(axes: Axes, blocks: Pattern | None) -> None:
 def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
     """Return a text for Graphviz, with the places of a picture and a cluster for each view."""
     lines = ['digraph pose_graph {', '  layout=neato; overlap=true; splines=true; bgcolor=none;',
-             f'  label={json.dumps(" ".join(notes))}; fontcolor="{GREY}"; fontsize=10;',
-             f'  node [fixedsize=true, style=filled, color="{INK}", fontcolor="{INK}", '
-             'fontsize=9];']
+             f'  label={json.dumps(" ".join(notes))}; fontcolor="{GREY}"; fontsize=10;', '  node '
+             f'[fixedsize=true, style=filled, color="{INK}", fontcolor="{INK}", fontsize=9];']
     bottom = 0.0
     for n, panel in enumerate(panels):
         places = np.array(list(panel.at.values()))
@@ -274,10 +265,9 @@ def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
             shape = ('doublecircle' if data.get('fixed', False) else
                      {Role.FACTOR: 'square', Role.JOINT: 'point'}.get(data['role'], 'circle'))
             name = json.dumps('' if data['role'] in SIZES else data['name'])
-            lines.append(
-                f'  n{n}_{node} [label={name}, shape={shape}, '
-                f'width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
-                f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
+            lines.append(f'  n{n}_{node} [label={name}, '
+                         f'shape={shape}, width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
+                         f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
         for start, end, arc in panel.view.edges(data=True):
             style = ('' if arc['directed'] else ', dir=none') + (
                 '' if arc['used'] else ', style=dashed')

@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -93,8 +93,7 @@ class Drive:
         for stamps, positions in anchors:
             inside = self.odometry.covers(stamps)
             if np.any(inside):
-                odometry = self.odometry.at(stamps[inside])[:, :2]
-                pose = fit_motion(odometry, positions[inside])
+                pose = fit_motion(self.odometry.at(stamps[inside])[:, :2], positions[inside])
                 return Trajectory(self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
         return self.odometry
 
@@ -207,13 +206,11 @@ def format_table(rows: Sequence[ErrorRow]) -> str:
 def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
     """Return the figures of a drive as plain Python values, ready for JSON."""
     duration, distance = extent(drive.corrected)
-    return {
-        'duration_s': duration, 'distance_m': distance,
-        'odometry': len(drive.odometry), 'poses': len(drive.corrected),
-        **{f'fixes_{kind.replace(" ", "_")}': int(np.sum(chosen))
-           for kind, chosen in drive.fix_kinds.items()},
-        'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
-        'errors': [asdict(row) for row in drive.rows], **extra}
+    return {'duration_s': duration, 'distance_m': distance, 'odometry': len(drive.odometry),
+            'poses': len(drive.corrected), **{f'fixes_{kind.replace(" ", "_")}': int(
+                np.sum(chosen)) for kind, chosen in drive.fix_kinds.items()},
+            'loop_closures': len(drive.loop_stamps_ns), 'truth': drive.truth is not None,
+            'errors': [asdict(row) for row in drive.rows], **extra}
 
 
 class Samples:
@@ -234,16 +231,6 @@ class Samples:
             stride *= 2
         stamps, first = np.unique(np.array(self._stamps)[::stride], return_index=True)
         return Trajectory(stamps, np.array(self._poses).reshape(-1, 3)[::stride][first])
-
-
-class _Fix(NamedTuple):
-    """A measured position."""
-
-    source: str
-    stamp_ns: StampNs
-    measured: Fix | FloatArray  # a fix is not in the map yet
-    arm: FloatArray  # of the antenna, (2,) [m]
-    held_out: bool
 
 
 Measured = tuple[str, OdometrySample | Measurement, bool]
@@ -284,9 +271,8 @@ def drive_in(
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    drive = collect_drive(
-        measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-        inputs.odometry[0], refused)
+    drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
+                          inputs.odometry[0], refused)
     return place_truth(replace(
         drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
@@ -305,39 +291,39 @@ def collect_drive(
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
     corrected = estimate.path
-    odometry, fixes, loops = Samples(), list[_Fix](), list[Key]()
+    odometry, loops, sources, held = Samples(), list[Key](), list[str](), list[bool]()
+    fixes = list[Fix | kinds.GlobalPose | kinds.Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
         if not held_out:
             arrived.setdefault(source, array('q')).append(measurement.stamp_ns)
         match measurement:
-            case Fix(stamp, _, _, lever_arm):
-                fixes.append(_Fix(source, stamp, measurement, lever_arm, held_out))
-            case kinds.GlobalPose(stamp, pose, _):
-                fixes.append(_Fix(source, stamp, pose[:2], np.zeros(2), held_out))
-            case kinds.Position(stamp, position, _, lever_arm):
-                fixes.append(_Fix(source, stamp, position, lever_arm, held_out))
+            case Fix() | kinds.GlobalPose() | kinds.Position():
+                fixes.append(measurement)
+                sources.append(source)
+                held.append(held_out)
             case kinds.LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
             case OdometrySample(stamp, pose) if source == odometry_source:
                 odometry.add(stamp, pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
-    arms = np.array([each.arm for each in fixes]).reshape(-1, 2)
+    arms = np.array([np.zeros(2) if isinstance(each, kinds.GlobalPose) else each.lever_arm
+                     for each in fixes]).reshape(-1, 2)
     inside, positions = corrected.covers(stamps), np.zeros((len(fixes), 2))
     # a fix that can have been used makes the datum, if there is none
-    for k in sorted(range(len(fixes)), key=lambda k: fixes[k].held_out or not inside[k]):
-        measured = fixes[k].measured
-        positions[k] = measured.place() if isinstance(measured, Fix) else measured
+    for k in sorted(range(len(fixes)), key=lambda k: held[k] or not inside[k]):
+        each = fixes[k]
+        positions[k] = each.place() if isinstance(each, Fix) else (
+            each.pose[:2] if isinstance(each, kinds.GlobalPose) else each.position)
     if np.any(arms):  # from the antenna to the robot, with the heading of the corrected path
         turn = corrected.at(stamps[inside]) * (0.0, 0.0, 1.0)
         positions[inside] -= se2.transform(turn, arms[inside])
     known = {(each.source, each.stamp_ns, each.reference_ns): STATES.index(each.state.value)
              for each in verdicts}
     judged = {each.source for each in verdicts}
-    states = np.array([known.get((each.source, each.stamp_ns, None), BELIEVED) for each in fixes],
-                      dtype=np.int64)
-    kept_out = np.array([each.held_out for each in fixes], dtype=bool)
-    sources = [each.source for each in fixes]
+    states = np.array([known.get((source, stamp, None), BELIEVED) for source, stamp in zip(
+        sources, stamps.tolist(), strict=True)], dtype=np.int64)
+    kept_out = np.array(held, dtype=bool)
     # those that the graph has not from its begin on are refused
     lost = stamps >= int(backend.node_stamps_ns[estimate.n_frozen])
     for source, added in backend.measured().items():
@@ -345,13 +331,12 @@ def collect_drive(
             (np.array(sources, dtype=str) == source) & np.isin(stamps, added) & ~kept_out)
         # of several with one stamp the first one was added
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
+    refused = {key for key in loops if key[0] in judged} if refused is None else refused
     return Drive(
         odometry.path(), corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
-        np.array([known.get(key, REFUSED if (
-            key[0] in judged if refused is None else key in refused) else BELIEVED)
-            for key in loops], dtype=np.int64),
+        np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
         [source for source, _, _ in loops], arrived_ns=arrived)
 
 

@@ -112,8 +112,8 @@ def read_measurements(
     starts, first = np.unique(np.minimum(edges.i, edges.j)[steps], return_index=True)
     if len(starts) < n - 1:
         lone = int(np.setdiff1d(np.arange(n - 1), starts)[0])
-        raise FileFormatError(f'{path}: expected an edge from each vertex to the next, as '
-                              f'odometry; there is none from {file.ids[lone]} to '
+        raise FileFormatError(f'{path}: expected an edge from each vertex '
+                              f'to the next, as odometry; there is none from {file.ids[lone]} to '
                               f'{file.ids[lone + 1]}')
     odometry = steps[first]
     closures = np.setdiff1d(np.arange(len(edges)), odometry)
@@ -131,16 +131,13 @@ def read_measurements(
 
 def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
     """Yield composed poses at all stamps, given the edge from each vertex to the next."""
-    forward = (edges.i < edges.j)[:, None]
-    motions = np.where(forward, edges.mean, se2.inverse(edges.mean))
+    motions = np.where((edges.i < edges.j)[:, None], edges.mean, se2.inverse(edges.mean))
     variances = np.diagonal(_covariances(edges), axis1=1, axis2=2)
-    elapsed = np.diff(stamps_ns) * 1e-9
-    pose = np.zeros(3)
+    elapsed, pose = np.diff(stamps_ns) * 1e-9, np.zeros(3)
     for k, stamp_ns in enumerate(stamps_ns.tolist()):
         step = min(k, len(motions) - 1)
-        yield OdometrySample(
-            stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
-            variances[step] / elapsed[step])
+        yield OdometrySample(stamp_ns, pose, float(np.hypot(*motions[step, :2]) / elapsed[step]),
+                             variances[step] / elapsed[step])
         pose = se2.compose(pose, motions[step])
 
 

@@ -35,7 +35,6 @@ SUMMARIES = {
     'compile-kernels': 'compile the solver for later starts',
 }
 """Tools and what they do."""
-COMPILER = os.path.join('llvmlite', 'binding')
 RETRY = 0.01  # after which an interrupt is tried again [s]
 
 
@@ -101,7 +100,7 @@ def _interrupt(_: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt; later, where the compiler would swallow it."""
     while frame is not None:
         # LLVM calls Python back, and an exception there is printed and forgotten
-        if COMPILER in frame.f_code.co_filename:
+        if os.path.join('llvmlite', 'binding') in frame.f_code.co_filename:
             signal.setitimer(signal.ITIMER_REAL, RETRY)
             return
         frame = frame.f_back

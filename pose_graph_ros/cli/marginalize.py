@@ -34,10 +34,9 @@ def execute(options: argparse.Namespace) -> int:
     graph.apply(marginalize(graph, file.rows.node_ids[leaving]))
     sizes = [len(prior.nodes) for prior in graph.priors]
     if len(sizes) > 0 and not options.sparse:
-        raise ConfigError(
-            f'{options.graph}: without these nodes there are {len(sizes)} dense priors, the '
-            f'largest one on {max(sizes)} nodes, which g2o does not have; --sparse puts edges in '
-            'their place')
+        raise ConfigError(f'{options.graph}: without these nodes there are {len(sizes)} dense '
+                          f'priors, the largest one on {max(sizes)} nodes, which g2o does not '
+                          'have; --sparse puts edges in their place')
     if len(sizes) > 0:
         rows, without = graph.rows(), Graph()
         without.fill(rows._replace(priors=()))
@@ -52,10 +51,9 @@ def execute(options: argparse.Namespace) -> int:
     n_observed = graph.n_factors - n_edges
     if options.json:
         print(json.dumps({
-            'file': str(options.out), 'removed_nodes': len(leaving),
-            'hidden_nodes': graph.n_nodes, 'edges': n_edges, 'observed_nodes': n_observed,
-            'dense_priors': len(sizes), 'largest_dense_prior': max(sizes, default=0),
-            'chi2_before': before}, indent=2))
+            'file': str(options.out), 'removed_nodes': len(leaving), 'hidden_nodes': graph.n_nodes,
+            'edges': n_edges, 'observed_nodes': n_observed, 'dense_priors': len(sizes),
+            'largest_dense_prior': max(sizes, default=0), 'chi2_before': before}, indent=2))
     else:
         print(f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {n_edges} '
               f'edges and {n_observed} observed nodes')

@@ -6,7 +6,6 @@ Draw a drive: a map of all paths, and below it (or beside a tall one) their erro
 A simulated one has the truth in place of a corrected path.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -38,9 +37,9 @@ USED_FIXES: dict[str, Any] = {
     'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
     'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
-HELD_OUT_FIXES: dict[str, Any] = {
-    'color': 'none', 'marker': 'D', 'linestyle': 'none', 'markersize': 4.5,
-    'markeredgecolor': VERMILION, 'markeredgewidth': 0.9}
+HELD_OUT_FIXES: dict[str, Any] = {'color': 'none', 'marker': 'D', 'linestyle': 'none',
+                                  'markersize': 4.5, 'markeredgecolor': VERMILION,
+                                  'markeredgewidth': 0.9}
 STYLE: Any = {
     'font.size': 12, 'text.color': INK, 'axes.labelcolor': INK, 'axes.edgecolor': GREY,
     'xtick.color': GREY, 'ytick.color': GREY, 'grid.color': GRID, 'axes.grid': True,
@@ -55,9 +54,7 @@ SIMULATED = {'doubted fixes, not used': 'fixes moved by a jump',
 """Names in the legend of what was simulated, by those of a drive."""
 
 
-def draw_drive(
-    drive: Drive, file: Path, title: str, names: Mapping[str, str] | None = None,
-) -> None:
+def draw_drive(drive: Drive, file: Path, title: str, names: dict[str, str] | None = None) -> None:
     """
     Draw a drive as a picture with a width of 1600 pixels, and write it to a file.
 
@@ -149,11 +146,12 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
                   linestyle=(0, (6, 4)), zorder=4, label='truth')
     axes.plot(*thinned(drive.placed_odometry.poses[:, :2]).T, color=PURPLE, linewidth=1.3,
               zorder=1, label=label('odometry alone'))
-    for chosen, style, name in zip(
-            drive.fix_kinds.values(), ({**USED_FIXES, 'markersize': 4.5}, DOUBTED_FIXES,
-                                       HELD_OUT_FIXES),
-            (label('fixes'), label('doubted fixes').replace(
-                'doubted fixes', 'doubted fixes, not used'), 'fixes held out'), strict=False):
+    kinds = drive.fix_kinds
+    for chosen, style, name in (
+            (kinds['used'], {**USED_FIXES, 'markersize': 4.5}, label('fixes')),
+            (kinds['doubted'], DOUBTED_FIXES, label('doubted fixes').replace(
+                'doubted fixes', 'doubted fixes, not used')),
+            (kinds['held out'], HELD_OUT_FIXES, 'fixes held out')):
         if np.any(chosen):
             axes.plot(*thinned(drive.fix_positions[chosen]).T, **style, zorder=2, label=name)
     inside = np.all(path.covers(drive.loop_stamps_ns), axis=1)
@@ -169,10 +167,9 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
                                         'os', (1, -1), strict=False):
         axes.plot(*pose[:2], marker, color='white', markeredgecolor=INK, markersize=10,
                   markeredgewidth=2.0, zorder=6)
-        axes.annotate(
-            name, pose[:2], (0, 12 * side), textcoords='offset points', ha='center',
-            va='bottom' if side > 0 else 'top', fontsize=13, fontweight='bold', zorder=7,
-            path_effects=[withStroke(linewidth=3.5, foreground='white')])
+        axes.annotate(name, pose[:2], (0, 12 * side), textcoords='offset points', ha='center',
+                      va='bottom' if side > 0 else 'top', fontsize=13, fontweight='bold', zorder=7,
+                      path_effects=[withStroke(linewidth=3.5, foreground='white')])
     axes.set(xlabel=f'{drive.map_axes[0]} [m]', ylabel=f'{drive.map_axes[1]} [m]')
 
 
@@ -252,6 +249,5 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
     nothing = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
     fix_states, loop_states = (np.where(false, drives.DOUBTED, drives.BELIEVED)
                                for false in (wrong, group >= 0))
-    draw_drive(Drive(
-        odometry, nothing, truth, stamps, measured, fix_states, [''] * len(stamps), ends,
-        loop_states, [''] * len(ends)), file, title, SIMULATED)
+    draw_drive(Drive(odometry, nothing, truth, stamps, measured, fix_states, [''] * len(
+        stamps), ends, loop_states, [''] * len(ends)), file, title, SIMULATED)

@@ -24,7 +24,7 @@ from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, open_bag, Span
 from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, MessageReader
+from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, MessageReader, Values
 from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, ON_EARTH
@@ -32,17 +32,17 @@ from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
 from pose_graph_ros.cli.run import Recorder, Run, Update
 from pose_graph_ros.cli.run.document import write_results
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, Pose
+from pose_graph_ros.core.geometry.se2 import between_one, compose_one, Pose
 from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection, Trajectory
 from pose_graph_ros.core.io import path_files
 from pose_graph_ros.core.io.g2o import write_g2o
 from pose_graph_ros.core.judgement.texts import Key
-from pose_graph_ros.core.measurements import Measurement, OdometrySample
+from pose_graph_ros.core.measurements import OdometrySample
 
 UPDATE_EVERY = 10  # new hidden nodes after which the graph is updated, to stay near the optimum
 LINES = {'geojson': path_files.geojson_lines, 'kml': path_files.kml_lines,
@@ -117,11 +117,9 @@ class LivePoses:
         self._period_ns = round(1e9 / frequency)
         self._estimate: Estimate | None = None
         self._next_ns = self._newest_ns = 0
-        self._stamps: list[int] = []
-        self._poses: list[FloatArray] = []
-        self._covariances: list[FloatArray] = []
+        self._found: list[tuple[int, Prediction]] = []
 
-    def is_due(self, sample: OdometrySample | Measurement, n_nodes: int) -> bool:
+    def is_due(self, sample: Measured, n_nodes: int) -> bool:
         """Return whether the graph is to be updated with a measurement."""
         return (isinstance(sample, OdometrySample) and n_nodes > 0
                 and sample.stamp_ns >= self._next_ns)
@@ -132,24 +130,21 @@ class LivePoses:
         if self._estimate is not None:
             self._next_ns = self._estimate.stamp_ns + self._period_ns
 
-    def add(self, sample: OdometrySample | Measurement, source: str) -> None:
+    def add(self, sample: Measured, source: str) -> None:
         """Add the pose at a sample of the primary odometry, unless it is late."""
         estimate = self._estimate
         if not isinstance(sample, OdometrySample) or estimate is None or (
                 estimate.primary != source or sample.stamp_ns <= self._newest_ns):
             return
         self._newest_ns = sample.stamp_ns
-        found = predict(estimate, sample)
-        self._stamps.append(sample.stamp_ns)
-        self._poses.append(found.T_map_base)
-        self._covariances.append(found.covariance)
+        self._found.append((sample.stamp_ns, predict(estimate, sample)))
 
     def lines(self) -> Iterator[str]:
         """Yield the lines of a table, as that of the path."""
-        return path_files.csv_lines(
-            Trajectory(np.array(self._stamps, dtype=np.int64),
-                       np.array(self._poses).reshape(-1, 3)),
-            np.array(self._covariances).reshape(-1, 3, 3))
+        stamps = np.array([stamp for stamp, _ in self._found], dtype=np.int64)
+        poses = np.array([each.T_map_base for _, each in self._found]).reshape(-1, 3)
+        return path_files.csv_lines(Trajectory(stamps, poses), np.array(
+            [each.covariance for _, each in self._found]).reshape(-1, 3, 3))
 
 
 class _Corrector:
@@ -196,9 +191,8 @@ class _Corrector:
         if (self._has_poses and stamp_ns > self._newest_ns
                 and frame(source.header.frame_id) == self.odom_frame):
             self._newest_ns = stamp_ns
-            yield TF, output_cdr.transform_cdr(
-                stamp_ns, np.array(compose_one(pose, between_one(odometry, (0.0, 0.0, 0.0)))),
-                self.map_frame, self.odom_frame)
+            yield TF, output_cdr.transform_cdr(stamp_ns, np.array(compose_one(
+                pose, between_one(odometry, (0.0, 0.0, 0.0)))), self.map_frame, self.odom_frame)
 
 
 def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> dict[str, int]:
@@ -214,10 +208,9 @@ def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> di
     """
     corrector, path = _Corrector(bag, inputs, run), run.estimate.path
     begin_ns, step = inputs.span.begin_ns, -(-len(path) // MOST_POSES)
-    writer.write(
-        PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
-        output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]),
-                            int(path.stamps_ns[-1]), corrector.map_frame))
+    writer.write(PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
+                 output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]), int(
+                     path.stamps_ns[-1]), corrector.map_frame))
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
@@ -239,9 +232,8 @@ def _copy(writer: BagWriter, message: BagMessage, ours: _Corrector) -> bool:
         if message.topic == TF and all(
                 name.encode() in message.raw for name in (ours.map_frame, ours.odom_frame)):
             transforms = message.decode().transforms
-            kept = [each for each in transforms if (
-                frame(each.header.frame_id), frame(each.child_frame_id)) != (
-                    ours.map_frame, ours.odom_frame)]
+            kept = [each for each in transforms if (frame(each.header.frame_id), frame(
+                each.child_frame_id)) != (ours.map_frame, ours.odom_frame)]
             if len(kept) < len(transforms):
                 if len(kept) > 0:
                     writer.write(TF, TYPES[TF], message.recorded_ns, MESSAGES[TYPES[TF]](kept))
@@ -266,7 +258,7 @@ class Replayed(NamedTuple):
     report: UpdateReport  # of the final optimisation
     counts: Counter[tuple[str, str]]  # messages by source and answer
     recorder: Recorder
-    datum: Datum | None = None  # of the map; None for a g2o file
+    seconds: float  # that it took
 
     @property
     def refused(self) -> set[Key]:
@@ -275,32 +267,11 @@ class Replayed(NamedTuple):
 
 
 def run(
-    bag: Bag, inputs: Inputs, values: Mapping[str, Any], live: LivePoses | None = None,
+    measurements: Iterable[tuple[str, Measured]], values: Values, live: LivePoses | None = None,
 ) -> Replayed:
-    """Return a new engine after adding all messages of a bag and a full optimisation."""
-    reader, recorder = reader_of(bag, values), Recorder()
-    refused: Counter[tuple[str, str]] = Counter()
-    backend, report = run_measurements(
-        measurements_of(bag, inputs, reader, refused), values, recorder, live)
-    return Replayed(backend, report, backend.counts + refused, recorder, reader.datum)
-
-
-def measurements_of(
-    bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
-) -> Iterator[tuple[str, OdometrySample | Measurement]]:
-    """Yield the valid measurements of a bag that are not held out, and their sources."""
-    for source, measurement, _ in measured_in(bag, inputs, reader, refused, held_out=False):
-        yield source, measurement
-
-
-def run_measurements(
-    measurements: Iterable[tuple[str, OdometrySample | Measurement]], values: Mapping[str, Any],
-    recorder: Recorder | None = None, live: LivePoses | None = None,
-) -> tuple[PoseGraphBackend, UpdateReport]:
-    """Return a new engine after adding measurements, and the report of the full optimisation."""
-    backend = PoseGraphBackend(sources.backend_config(values))
-    recorder = Recorder() if recorder is None else recorder
-    next_update = UPDATE_EVERY
+    """Return a new engine after adding measurements and a full optimisation."""
+    start, next_update = time.monotonic(), UPDATE_EVERY
+    backend, recorder = PoseGraphBackend(sources.backend_config(values)), Recorder()
     for source, measurement in measurements:
         if isinstance(measurement, OdometrySample):
             backend.add_odometry(measurement, source)
@@ -310,15 +281,15 @@ def run_measurements(
                 measurement, backend.graph.n_nodes):
             begin = time.thread_time()  # of this process, however busy the machine is
             report = backend.update()
-            recorder.add_update(Update(
-                int(backend.node_stamps_ns[-1]), len(backend.node_stamps_ns),
-                1e3 * (time.thread_time() - begin), report.chi2))
+            recorder.add_update(Update(int(backend.node_stamps_ns[-1]), len(
+                backend.node_stamps_ns), 1e3 * (time.thread_time() - begin), report.chi2))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
             if live is not None:
                 live.updated(backend)
         if live is not None:
             live.add(measurement, source)
-    return backend, backend.optimize()
+    report = backend.optimize()
+    return Replayed(backend, report, backend.counts, recorder, time.monotonic() - start)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -338,26 +309,29 @@ def _execute_bags(options: argparse.Namespace) -> int:
             BagWriter(options.new_bag, latched=LATCHED))
         if not options.json:
             print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
-        start = time.monotonic()
+        reader, refused = reader_of(bag, values), Counter[tuple[str, str]]()
         live = LivePoses(values['frequency']) if options.live else None
-        result = run(shared.watched_bag(bag, 'optimising'), inputs, values, live)
-        seconds = time.monotonic() - start
+        result = run((each[:2] for each in measured_in(
+            shared.watched_bag(bag, 'optimising'), inputs, reader, refused, held_out=False)),
+            values, live)
+        result = result._replace(counts=result.counts + refused)
         if len(result.backend.node_stamps_ns) == 0:
             names = inputs.odometry
             topics = ' or '.join(inputs.topics[name] for name in names)
             why = ', '.join(f'{answer} {count}' for (source, answer), count
                             in sorted(result.counts.items()) if source in names)
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
-        plane = None if result.datum is None else result.datum.plane
+        plane = reader.datum.plane
         done = _run_of(options, result, drive_in(
             shared.watched_bag(bag, 'comparing'), inputs, values, result.backend, options.truth,
             origin=None if plane is None else plane.origin, refused=result.refused),
-            values=values, kinds=inputs.kinds, seconds=seconds)
-        facts: dict[str, Any] = {'bags': [str(path) for path in options.bags], 'seconds': seconds}
+            values, inputs.kinds)
+        facts: dict[str, Any] = {
+            'bags': [str(path) for path in options.bags], 'seconds': result.seconds}
         if writer is not None:
             facts['new_bag'] = write_corrected(
                 writer, shared.watched_bag(bag, 'writing the bag'), inputs, done)
-    return _report(options, done, facts, result.datum, live)
+    return _report(options, done, facts, reader.datum, live)
 
 
 def _execute_g2o(options: argparse.Namespace) -> int:
@@ -368,27 +342,23 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     require_datum(options.export, known=False)
     values = shared.parameter_values(options, {'odom.noise': 'twist'})
     odometry = next(each.name for each in sources.source_list(values) if each.kind.is_odometry)
-    measurements = [
-        (odometry if isinstance(each, OdometrySample) else CLOSURES, each)
-        for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
-    start, recorder = time.monotonic(), Recorder()
-    backend, report = run_measurements(measurements, values, recorder)
-    result, seconds = Replayed(backend, report, backend.counts, recorder), time.monotonic() - start
+    measurements = [(odometry if isinstance(each, OdometrySample) else CLOSURES, each)
+                    for each in read_measurements(options.bags[0], options.stamps, options.edge2)]
+    result = run(measurements, values)
     drive = collect_drive(
-        ((*each, False) for each in measurements), backend, odometry, result.refused)
-    return _report(options, _run_of(
-        options, result, drive, values=values,
-        kinds={odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}, seconds=seconds),
-        {'seconds': seconds})
+        ((*each, False) for each in measurements), result.backend, odometry, result.refused)
+    kinds = {odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}
+    return _report(options, _run_of(options, result, drive, values, kinds),
+                   {'seconds': result.seconds})
 
 
 def _run_of(
-    options: argparse.Namespace, result: Replayed, drive: Drive, *, values: Mapping[str, Any],
-    kinds: Mapping[str, Kind], seconds: float,
+    options: argparse.Namespace, result: Replayed, drive: Drive, values: Values,
+    kinds: Mapping[str, Kind],
 ) -> Run:
-    return Run(
-        options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}', drive,
-        result.backend, result.recorder, values, kinds, result.counts, result.report, seconds)
+    return Run(options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}',
+               drive, result.backend, result.recorder, values, kinds, result.counts,
+               result.report, result.seconds)
 
 
 def _report(
@@ -402,8 +372,7 @@ def _report(
     if live is not None:
         exported.append(options.out / 'live.csv')
         write_lines(exported[-1], live.lines())
-    names = ['drive.png', 'summary.json', 'run.json', 'graph.g2o',
-             *(path.name for path in exported)]
+    names = 'drive.png', 'summary.json', 'run.json', 'graph.g2o', *(each.name for each in exported)
     if options.json:
         print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
     else:

@@ -27,8 +27,7 @@ import re
 from typing import Any
 import webbrowser
 
-from pose_graph_ros.adapters.bag_inputs import OPTIONS
-from pose_graph_ros.adapters.bags import BagError
+from pose_graph_ros.adapters import bag_inputs, bags
 from pose_graph_ros.cli import replay
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.run.document import FILE, read_document
@@ -36,8 +35,8 @@ from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
            'springs')  # keys of run.json that --json prints
-OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth', *OPTIONS, 'param',
-             'hold_out')  # of bags alone
+OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth', *bag_inputs.OPTIONS,
+             'param', 'hold_out')  # of bags alone
 PAGES = ('.html', '.htm')
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')
 
@@ -49,7 +48,7 @@ def execute(options: argparse.Namespace) -> int:
     code, file = 0, _file(options)
     if file is None:
         if (options.folder / 'metadata.yaml').is_file():
-            raise BagError(f'--run {options.folder}: this is a bag; name another folder')
+            raise bags.BagError(f'--run {options.folder}: this is a bag; name another folder')
         file, words = options.folder / FILE, argparse.Namespace(**vars(options) | {
             'bags': options.runs, 'out': options.folder, 'json': False, 'export': Exports(),
             'new_bag': None, 'live': False})

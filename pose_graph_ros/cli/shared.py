@@ -8,7 +8,6 @@ from copy import copy
 import math
 from pathlib import Path
 import sys
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
@@ -16,7 +15,7 @@ import yaml
 from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, OPTIONS
 from pose_graph_ros.adapters.bags import Bag, BagError, one_line, Span
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import source_list
+from pose_graph_ros.adapters.sources import source_list, Values
 from pose_graph_ros.core.exceptions import ConfigError
 
 DELAY = 0.5  # after which a bar appears [s]
@@ -28,11 +27,9 @@ def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
     return {source: getattr(options, source) for source in OPTIONS}
 
 
-def parameter_values(
-    options: argparse.Namespace, usual: Mapping[str, Any] = MappingProxyType({}),
-) -> dict[str, Any]:
+def parameter_values(options: argparse.Namespace, usual: Values | None = None) -> dict[str, Any]:
     """Return all parameters by the options, as the node reads them; raises `ConfigError`."""
-    given = {**usual, **_read_file(options.params_file)}
+    given = {**(usual or {}), **_read_file(options.params_file)}
     for text in options.param:
         name, separator, value = text.partition(':=')
         if separator == '':
@@ -84,9 +81,7 @@ def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None
             flat[prefix + name] = value
 
 
-def inputs_of(
-    bag: Bag, options: argparse.Namespace, values: Mapping[str, Any], hold_out: int = 0,
-) -> Inputs:
+def inputs_of(bag: Bag, options: argparse.Namespace, values: Values, hold_out: int = 0) -> Inputs:
     """Return what is read of a bag by the options; raises `BagError` if that is nothing."""
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]

@@ -24,9 +24,7 @@ from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
 from pose_graph_ros.core.geometry.se2 import Covariance, FloatArray, IntArray, Poses
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.atomic_files import write_files
-from pose_graph_ros.core.io.g2o import g2o_text
-from pose_graph_ros.core.io.path_files import tum_text
+from pose_graph_ros.core.io import atomic_files, g2o, path_files
 from pose_graph_ros.core.quantities import Metres, StampsNs
 from pose_graph_ros.offline.simulation import recording, settings
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
@@ -38,10 +36,8 @@ ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)  # constant, as many driv
 Message = tuple[str, str, int, Any]
 """Topic, type, time of recording [ns] and message; recorded at its stamp, if made here."""
 _TYPES = message_types()
-_ODOMETRY = 'nav_msgs/msg/Odometry'
-_FIX = 'sensor_msgs/msg/NavSatFix'
-_IMU = 'sensor_msgs/msg/Imu'
-_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+_ODOMETRY, _FIX = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/NavSatFix'
+_IMU, _POSE = 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -55,17 +51,15 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError(f'--node-distance: only a graph has nodes, but {options.out} is a bag; '
                           f'expected a name that ends in {GRAPH_SUFFIX}')
     name = options.out.stem if is_graph else options.out.name
-    beside = {kind: options.out.with_name(f'{name}_truth.{kind}')
-              for kind in ('json', *(['tum'] if options.tum else []),
-                           *(['g2o'] if is_graph else []))}
+    beside = {kind: options.out.with_name(f'{name}_truth.{kind}') for kind in (
+        'json', *(['tum'] if options.tum else []), *(['g2o'] if is_graph else []))}
     written = [options.out, *beside.values()]
     for path in written:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
-    way = recording.course(
-        WORLDS[options.world], options.seed,
-        options.duration or settings.DURATIONS_S[options.world],
-        lambda usual: changed(usual, options))
+    duration = options.duration or settings.DURATIONS_S[options.world]
+    way = recording.course(WORLDS[options.world], options.seed, duration,
+                           lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.truth.stamps_ns[-1] - settings.START_NS) / 1e9}
     files = dict[Path, bytes]()
@@ -87,27 +81,23 @@ def execute(options: argparse.Namespace) -> int:
             **_disturbances(way.setup)}
         for path, poses in ((options.out, simulated.start),
                             (beside['g2o'], simulated.truth.poses)):
-            files[path] = g2o_text(simulated.graph(poses).rows()).encode()
+            files[path] = g2o.g2o_text(simulated.graph(poses).rows()).encode()
     else:
         simulated = recording.record(way)
         about |= write_drive(simulated, options.out)
     text = json.dumps(about, indent=2)
     files[beside['json']] = f'{text}\n'.encode()
     if options.tum:
-        files[beside['tum']] = tum_text(simulated.truth).encode()
-    write_files(files)
+        files[beside['tum']] = path_files.tum_text(simulated.truth).encode()
+    atomic_files.write_files(files)
     if options.plot is not None:
         # matplotlib takes half a second to load
         from pose_graph_ros.cli.picture import draw_simulated  # noqa: PLC0415
 
         draw_simulated(simulated, options.plot, next(_lines(about)))
         written.append(options.plot)
-    if options.json:
-        print(text)
-        return 0
-    for line in _lines(about):
-        print(line)
-    print('written: ' + ', '.join(map(str, written)))
+    print(text if options.json else '\n'.join(
+        [*_lines(about), f'written: {", ".join(map(str, written))}']))
     return 0
 
 
@@ -121,8 +111,8 @@ def _lines(about: Mapping[str, Any]) -> Iterator[str]:
         yield (f'  {about["nodes"]} nodes, {about["edges"]} edges, {about["observed_nodes"]} '
                f'observed nodes; chi2 of the truth {about["chi2_of_the_truth"]:.6g}, of '
                f'{about["measured_numbers"]} numbers')
-    false = len(about['false_closures'])
-    yield f'  {about["true_closures"]} true and {false} false loop closures'
+    yield (f'  {about["true_closures"]} true and {len(about["false_closures"])} false loop '
+           'closures')
     if about['missing_groups'] > 0:
         yield (f'  warning: {about["missing_groups"]} false closures or groups of them found no '
                'places that are apart and driven in the same direction')
@@ -208,9 +198,8 @@ def _delivered(
 def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:
     false = np.flatnonzero(group >= 0)
     return {'true_closures': int(np.sum(group < 0)),
-            'false_closures': [{what: pair, 'group': number} for pair, number in zip(
-                ends[false].tolist(), group[false].tolist(), strict=True)],
-            'missing_groups': missing}
+            'false_closures': [{what: pair, 'group': number} for pair, number in zip(ends[
+                false].tolist(), group[false].tolist(), strict=True)], 'missing_groups': missing}
 
 
 def _disturbances(setup: settings.Setup) -> dict[str, Any]:
@@ -222,9 +211,8 @@ def _disturbances(setup: settings.Setup) -> dict[str, Any]:
         'start_ns': settings.START_NS,
         'outages': [{'topic': each.topic, 'begin_ns': stamp(each.begin_s),
                      'end_ns': stamp(each.end_s)} for each in setup.outages],
-        'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s),
-                   'end_ns': stamp(each.at_s + each.seconds), 'step': each.step}
-                  for each in setup.jumps],
+        'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s), 'end_ns': stamp(
+            each.at_s + each.seconds), 'step': each.step} for each in setup.jumps],
         **{name: [asdict(each) for each in found] for name, found in (
             ('delays', setup.delays), ('clock_offsets', setup.offsets),
             ('duplicates', setup.duplicates), ('claimed_sigmas', setup.claims))}}
@@ -253,8 +241,7 @@ def odometry_messages(
             path.stamps_ns.tolist(), path.poses.tolist(), rates.tolist(), strict=True):
         twist = _of('Twist', _of('Vector3', vx, 0.0, 0.0), _of('Vector3', 0.0, 0.0, yaw_rate))
         yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
-            _header(stamp, frame), 'base_link',
-            _of('PoseWithCovariance', _pose(pose), covariance),
+            _header(stamp, frame), 'base_link', _of('PoseWithCovariance', _pose(pose), covariance),
             _of('TwistWithCovariance', twist, covariance))
 
 

@@ -21,24 +21,21 @@ from pose_graph_ros.offline.simulation.settings import DURATIONS_S, Jump, Odomet
 PICTURES = ('.png', '.pdf', '.svg')
 FALSE_SIZE = 4  # closures of a group of false ones
 # Options of what a graph does not have, and where their values are.
-ONLY_IN_BAGS = {
-    '--odometry': 'wheels.errors', '--wheel-scale': 'wheels.scale',
-    '--slip': 'wheels.slip_events_per_s', '--heading-drift': 'wheels.heading_drift',
-    '--gyro': 'gyro', '--gyro-noise': 'gyro.sigma,bias,bias_walk', '--delay': 'delay',
-    '--duplicate': 'duplicate', '--clock-offset': 'clock_offset'}
-SENSORS: dict[str, Any] = {
-    'wheels': settings.Wheels, 'gyro': settings.Gyro, 'fixes': settings.Fixes,
-    'poses': settings.GlobalPoses, 'closures': settings.Closures}
+ONLY_IN_BAGS = {'--odometry': 'wheels.errors', '--wheel-scale': 'wheels.scale',
+                '--slip': 'wheels.slip_events_per_s', '--heading-drift': 'wheels.heading_drift',
+                '--gyro': 'gyro', '--gyro-noise': 'gyro.sigma,bias,bias_walk', '--delay': 'delay',
+                '--duplicate': 'duplicate', '--clock-offset': 'clock_offset'}
+SENSORS: dict[str, Any] = {'wheels': settings.Wheels, 'gyro': settings.Gyro,
+                           'fixes': settings.Fixes, 'poses': settings.GlobalPoses,
+                           'closures': settings.Closures}
 # Grammar, class, name in the setup and help of each disturbance, by its option.
 DISTURBANCES: dict[str, tuple[str, Callable[..., Any], str, str]] = {
     'outage': ('TOPIC:FROM:TO', settings.Outage, 'outages', 'nothing is measured in between'),
-    'jump': ('TOPIC:AT:DX,DY[,RAD][:FOR]', Jump, 'jumps',
-             'step of odometry in the frame of the robot; or step of fixes or global poses, east '
-             'and north, for so many seconds; /odom:AT:reset: odometry begins again at its '
-             'origin'),
-    'delay': ('TOPIC:S[:JITTER]', settings.Delay, 'delays',
-              'recorded so long after the stamp, plus 0 to JITTER at random, which shuffles '
-              'messages'),
+    'jump': ('TOPIC:AT:DX,DY[,RAD][:FOR]', Jump, 'jumps', 'step of odometry in the frame of '
+             'the robot; or step of fixes or global poses, east and north, for so many seconds; '
+             '/odom:AT:reset: odometry begins again at its origin'),
+    'delay': ('TOPIC:S[:JITTER]', settings.Delay, 'delays', 'recorded so long after the stamp, '
+              'plus 0 to JITTER at random, which shuffles messages'),
     'duplicate': ('TOPIC:SHARE', settings.Duplicates, 'duplicates',
                   'share of the messages that come again within a second'),
     'clock_offset': ('TOPIC:S', settings.ClockOffset, 'offsets',
@@ -88,15 +85,13 @@ def simulate(parser: argparse.ArgumentParser) -> None:
         group.add_argument(f'--{option.replace("_", "-")}', metavar=grammar, action='append',
                            type=_disturbance(grammar, kind), default=[], help=text)
     out = parser.add_argument_group('output')
-    out.add_argument('--node-distance', metavar='M', type=number(0.01),
-                     help='distance of the nodes of a graph [m] '
-                          f'(default: {_by_world(settings.NODE_DISTANCES)})')
+    out.add_argument('--node-distance', metavar='M', type=number(0.01), help='distance of the '
+                     f'nodes of a graph [m] (default: {_by_world(settings.NODE_DISTANCES)})')
     out.add_argument('--tum', action='store_true', help='also write the truth as OUT_truth.tum')
     out.add_argument('--plot', metavar='FILE', type=Path,
                      help=f'draw a map; the name ends in {", ".join(PICTURES)}')
-    out.add_argument('--json', action='store_true',
-                     help='print what was simulated, the content of OUT_truth.json, as JSON '
-                          '(docs/tools.md)')
+    out.add_argument('--json', action='store_true', help='print what was simulated, the content '
+                     'of OUT_truth.json, as JSON (docs/tools.md)')
 
 
 def _by_world(values: dict[str, float]) -> str:
@@ -106,27 +101,25 @@ def _by_world(values: dict[str, float]) -> str:
 def _add_sensors(parser: argparse.ArgumentParser) -> None:
     """Add the options on sensors; `dest` is the sensor, with the fields of it that are set."""
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
-    wheels.add_argument('--odometry', dest='wheels.errors',
-                        choices=[each.value for each in OdometryErrors],
+    wheels.add_argument('--odometry',
+                        dest='wheels.errors', choices=[each.value for each in OdometryErrors],
                         type=lambda text: next((e for e in OdometryErrors if e == text), text),
                         help='errors of two wheels, or a random walk as the node assumes it '
-                             '(default: wheels; a graph always has the latter)')
-    wheels.add_argument('--wheel-scale', dest='wheels.scale', metavar='LEFT,RIGHT',
-                        type=_numbers(0, 1),
-                        help='ratio of measured to true distance (default: 1.0068,1.0070)')
+                        '(default: wheels; a graph always has the latter)')
+    wheels.add_argument('--wheel-scale', dest='wheels.scale', metavar='LEFT,RIGHT', type=_numbers(
+        0, 1), help='ratio of measured to true distance (default: 1.0068,1.0070)')
     wheels.add_argument('--slip', dest='wheels.slip_events_per_s', metavar='PER_MINUTE',
-                        type=number(0.0, factor=1.0 / 60.0),
-                        help='events of slip of each wheel, which then measures 1 cm too much at '
-                             '1 m/s (default: 1; hall: 0.5)')
+                        type=number(0.0, factor=1.0 / 60.0), help='events of slip of each wheel, '
+                        'which then measures 1 cm too much at 1 m/s (default: 1; hall: 0.5)')
     wheels.add_argument('--heading-drift', dest='wheels.heading_drift', metavar='RAD_PER_M',
-                        type=number(),
-                        help='drift of the heading by the wheels [rad/m] (default: 0)')
+                        type=number(), help='drift of the heading by the wheels '
+                        '[rad/m] (default: 0)')
     gyro = parser.add_argument_group('gyroscope on /imu/data, 100 Hz')
     gyro.add_argument('--gyro', action='store_true', help='with a gyroscope')
-    gyro.add_argument('--gyro-noise', dest='gyro.sigma,bias,bias_walk',
-                      metavar='WHITE,BIAS,WALK', type=_numbers(0, 1, 2),
-                      help='white noise [rad/sqrt(s)], bias at the start [rad/s] and its walk '
-                           '[rad/s/sqrt(s)]; implies --gyro (default: 5e-4,0.01,2e-5)')
+    gyro.add_argument('--gyro-noise', dest='gyro.sigma,bias,bias_walk', metavar='WHITE,BIAS,WALK',
+                      type=_numbers(0, 1, 2), help='white noise [rad/sqrt(s)], bias at the '
+                      'start [rad/s] and its walk [rad/s/sqrt(s)]; implies --gyro (default: '
+                      '5e-4,0.01,2e-5)')
     fixes = parser.add_argument_group('GNSS on /gps/fix')
     fixes.add_argument('--fix', action=argparse.BooleanOptionalAction,
                        help='with fixes (default: in the drive; the options below imply it)')
@@ -135,26 +128,21 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
     fixes.add_argument('--fix-sigma', dest='fixes.white', metavar='M', type=number(0.0),
                        help='white error of a coordinate (default: 0.4)')
     fixes.add_argument('--fix-correlated', dest='fixes.correlated,correlation_s', metavar='M,S',
-                       type=_numbers(0, 1),
-                       help='standard deviation and time constant of the correlated '
-                            '(Gauss-Markov) error of a coordinate; 0,1 for none '
-                            '(default: 1.2,60)')
+                       type=_numbers(0, 1), help='standard deviation and time constant '
+                       'of the correlated (Gauss-Markov) error of a coordinate; 0,1 for none '
+                       '(default: 1.2,60)')
     poses = parser.add_argument_group('global poses on /global_pose')
-    poses.add_argument('--global-pose', dest='poses.period_s', metavar='PERIOD',
-                       type=number(0.01),
+    poses.add_argument('--global-pose', dest='poses.period_s', metavar='PERIOD', type=number(0.01),
                        help='a pose in the map every so many seconds (default: there are none)')
-    poses.add_argument('--global-pose-sigma', dest='poses.sigmas', metavar='M,RAD',
-                       type=_numbers(0, 0, 1),
-                       help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
+    poses.add_argument('--global-pose-sigma', dest='poses.sigmas', metavar='M,RAD', type=_numbers(
+        0, 0, 1), help='white errors; implies --global-pose 1 (default: 0.1,0.02)')
     loops = parser.add_argument_group('loop closures on /loop_closure')
-    loops.add_argument('--closures', dest='closures.rate', metavar='RATE',
-                       type=number(0.0, 1.0),
-                       help='share of the stretches driven before in which a closure is found, '
-                            '0 to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
-                            '(default: 1; grid: 0.5)')
-    loops.add_argument('--closure-sigma', dest='closures.sigmas', metavar='M,RAD',
-                       type=_numbers(0, 0, 1),
-                       help='(default: 0.1,0.0175; hall: 0.05,0.01; grid: 0.1,0.02)')
+    loops.add_argument('--closures', dest='closures.rate', metavar='RATE', type=number(0.0, 1.0),
+                       help='share of the stretches driven before in which a closure is found, 0 '
+                       'to 1; stretches are of 25 m (drive), 5 m (hall), 1 m (grid) '
+                       '(default: 1; grid: 0.5)')
+    loops.add_argument('--closure-sigma', dest='closures.sigmas', metavar='M,RAD', type=_numbers(
+        0, 0, 1), help='(default: 0.1,0.0175; hall: 0.05,0.01; grid: 0.1,0.02)')
     loops.add_argument('--false-rate', metavar='SHARE', type=number(0.0),
                        help='share of all closures that tie two different places '
                             '(default: 0; drive: 4 single ones and a group of 4)')
@@ -176,28 +164,24 @@ def changed(usual: Setup, options: argparse.Namespace) -> Setup:
     given.setdefault('closures', {})
     if options.false_rate is not None or options.false_groups is not None:
         groups, size = options.false_groups or (0, FALSE_SIZE)
-        given['closures']['false'] = replace(
-            (usual.closures or SENSORS['closures']()).false, share=options.false_rate, singles=0,
-            groups=groups, size=size, loose=False)
+        given['closures']['false'] = replace((usual.closures or SENSORS['closures']()).false,
+                                             share=options.false_rate, singles=0, groups=groups,
+                                             size=size, loose=False)
     if options.fix is False and 'fixes' in given:
         raise ConfigError('--no-fix: expected no other option on fixes, but there is one')
     values: dict[str, Any] = {sensor: replace(getattr(usual, sensor) or SENSORS[sensor](), **of)
                               for sensor, of in given.items()}
     if options.fix is False:
         values['fixes'] = None
-    setup = replace(usual, **values)
-    present = setup.sensors
+    present = replace(usual, **values).sensors
     for option, (_, _, name, _) in DISTURBANCES.items():
         found: Sequence[Change] = getattr(options, option)
         replaced = {topic for topic, _ in found}
         for topic in replaced - present.keys():
-            raise ConfigError(
-                f'--{option.replace("_", "-")} {topic}: nothing is simulated there, expected '
-                f'one of {", ".join(present)}')
-        values[name] = (
-            *(each for each in getattr(usual, name)
-              if each.topic not in replaced and each.topic in present),
-            *(each for _, each in found if each is not None))
+            raise ConfigError(f'--{option.replace("_", "-")} {topic}: nothing is simulated there, '
+                              f'expected one of {", ".join(present)}')
+        kept = (each for each in getattr(usual, name) if each.topic in present.keys() - replaced)
+        values[name] = (*kept, *(each for _, each in found if each is not None))
     return replace(usual, **values)
 
 

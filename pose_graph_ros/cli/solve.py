@@ -10,17 +10,17 @@ better one. What takes long to load, such as compiled kernels, is imported where
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import json
-import math
 from pathlib import Path
 import re
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
+from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
@@ -45,8 +45,7 @@ CONFIG = SolverConfig(max_iterations=200)
 MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
+class Solution(NamedTuple):
     """A graph at the lowest minimum that was found."""
 
     result: BatchResult
@@ -107,7 +106,7 @@ def solve(problem: Problem, start: str) -> Solution:
         each[0].result.status is Status.FAILED, each[0].result.chi2))
     if best is not found[-1][0]:
         best = resumed(problem, best, poses)
-    return replace(best, tried=tuple((each.start, each.result) for each, _ in found))
+    return best._replace(tried=tuple((each.start, each.result) for each, _ in found))
 
 
 def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
@@ -116,8 +115,8 @@ def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
     """
     again = _solve_from(problem, 'present', poses)
     if again.result.status is not Status.CONVERGED:
-        return replace(again, start=solution.start)
-    return replace(solution, result=replace(solution.result, chi2=again.result.chi2))
+        return again._replace(start=solution.start)
+    return solution._replace(result=replace(solution.result, chi2=again.result.chi2))
 
 
 def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
@@ -170,8 +169,7 @@ def _held_weakly(
     weak = 1e-7 * np.median(typical[typical > 0.0]) * (
         np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
     copy.apply(GraphUpdate(factors=Factors.on(
-        np.arange(n), None, graph.poses.copy(), weak,
-        [FactorKind.GLOBAL_POSE] * n)))
+        np.arange(n), None, graph.poses.copy(), weak, [FactorKind.GLOBAL_POSE] * n)))
     other = optimize(copy, CONFIG)
     if other.status is Status.FAILED:
         return result, False
@@ -180,8 +178,7 @@ def _held_weakly(
                    reason=f'{result.reason}; it is held near its start'), False
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(NamedTuple):
     """What the certificate says of a solution."""
 
     certificate: Certificate | None
@@ -197,9 +194,8 @@ class Report:
         return {
             'verdict': (Verdict.NOT_ATTEMPTED if made is None else made.verdict).value,
             'reason': self.reason, 'seconds': self.seconds,
-            **{key: None if made is None else getattr(made, name) for key, name in (
-                ('chi2', 'chi2'), ('gap', 'gap'), ('relative_gap', 'relative_gap'),
-                ('lambda_min', 'smallest'), ('rank', 'rank'))},
+            **{key: getattr(made, {'lambda_min': 'smallest'}.get(key, key), None) for key in (
+                'chi2', 'gap', 'relative_gap', 'lambda_min', 'rank')},
             'lower_minimum': made is not None and made.is_lower,
             'chi2_from_it': self.chi2_from_it, 'chi2_bound': bound,
             'chi2_gap': None if bound is None else max(self.chi2 - bound, 0.0)}
@@ -216,7 +212,7 @@ class Report:
         else:
             lines = [f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
                      f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum '
-                     f'found']
+                     'found']
         if made.is_lower:
             lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
         if self.chi2_from_it is not None:
@@ -256,14 +252,11 @@ def with_certificate(
         graph.set_poses(made.poses)
         other = solve(problem, 'present')
         found = other.result.chi2
-        if other.result.is_better_than(solution.result):
-            solution = Solution(other.result, 'minimum of the chordal objective',
-                                other.determined, solution.tried)
-        else:
-            solution = resumed(problem, solution, poses)
+        solution = Solution(
+            other.result, 'minimum of the chordal objective', other.determined, solution.tried,
+        ) if other.result.is_better_than(solution.result) else resumed(problem, solution, poses)
     bound = max(made.bound, 0.0) if formulation.below_chi2 else None
-    return solution, Report(
-        made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
+    return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
 
 
 # --- the tool
@@ -330,7 +323,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     if options.json:
         graph, result = problem.graph, solution.result
         edges = graph.factors_at(doubted)
-        print(json.dumps(_finite({
+        print(json.dumps(finite({
             'hidden_nodes': graph.n_nodes, 'edges': len(graph.factors.edges),
             'observed_nodes': len(graph.factors.observed), 'chi2': result.chi2,
             'iterations': result.iterations, 'status': result.status.value,
@@ -340,8 +333,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             'held': file.ids[held].tolist(),
             'doubted': np.stack((problem.ids[edges.i], problem.ids[edges.j]), axis=1).tolist(),
             'chi2_start': before, 'seconds': seconds, 'edge2': file.edge2_order,
-            'robust': decision,
-            'certificate': None if certificate is None else certificate.values(),
+            'robust': decision, 'certificate': certificate and certificate.values(),
             **({} if rows is None else {'marginals_relative_error': error}),
             **({} if rows is None or len(tables) > 0 else {'marginals': table})}),
             indent=2, allow_nan=False))
@@ -360,21 +352,12 @@ def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArr
         *(f'  from the {name}: chi2 {each.chi2:.9g}, {each.status.value} after '
           f'{each.iterations} iterations' for name, each in solution.tried),
         f'chi2 {result.chi2:.9g}, {result.status.value} after {result.iterations} iterations '
-        f'from the {solution.start}, {seconds:.3f} s'
-        f'{": " if result.reason else ""}{result.reason}',
+        f'from the {solution.start}, {seconds:.3f} s{": " if result.reason else ""}'
+        f'{result.reason}',
         *(f'  edge {ids[factors.i[k]]} -> {ids[factors.j[k]]}: energy {energies[k]:.4g}'
           for k in order[is_edge & ~np.isin(order, doubted)][:N_LARGEST]),
         *(f'  observed node on {ids[factors.i[k]]}: energy {energies[k]:.4g}'
           for k in order[~is_edge][:N_LARGEST])]
-
-
-def _finite(value: Any) -> Any:
-    """Return values for JSON, which has no infinity: None in its place."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _marginals(

@@ -12,8 +12,7 @@ part in these.
 
 import argparse
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Sequence
 from enum import Enum
 from itertools import islice
 import json
@@ -21,17 +20,17 @@ import math
 import os
 import sys
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import backend_config, IMU
-from pose_graph_ros.cli import shared, tuned_parameters
-from pose_graph_ros.cli.drive import distances, read_truth
-from pose_graph_ros.cli.replay import measurements_of, run_measurements
+from pose_graph_ros.adapters.sources import backend_config, IMU, Values
+from pose_graph_ros.cli import finite, shared, tuned_parameters
+from pose_graph_ros.cli.drive import distances, measured_in, read_truth
+from pose_graph_ros.cli.replay import run
 from pose_graph_ros.cli.tuned_parameters import changed, Claims, interval, Tuned
 from pose_graph_ros.core import measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
@@ -42,11 +41,10 @@ from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.judgement.verdicts import State
 from pose_graph_ros.core.measurements import Absolute, HeadingOnly, LoopClosure, OdometrySample
 from pose_graph_ros.core.quantities import Metres, Seconds, StampNs
-from pose_graph_ros.core.sources.kinds import validate
-from pose_graph_ros.core.sources.validation import Validated
+from pose_graph_ros.core.sources import kinds, validation
 from pose_graph_ros.offline import noise
 from pose_graph_ros.offline.noise import Errors, Found, Noise, Summary
-from pose_graph_ros.offline.source_residuals import RowFit, ScaleFit
+from pose_graph_ros.offline.source_residuals import ScaleFit
 from pose_graph_ros.offline.variance_components import analyse
 
 Key = tuple[str, StampNs]  # source and stamp of a measurement
@@ -64,8 +62,7 @@ class Verdict(Enum):
     WORSE = 'held-out errors are not lower after tuning'
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(NamedTuple):
     """Result of a tuning."""
 
     tuned: Sequence[Tuned]
@@ -82,47 +79,45 @@ class Outcome:
 class Tuning:
     """Tunes with the measurements of a bag, the first million, all fixes in the same map."""
 
-    def __init__(self, bag: Bag, inputs: Inputs, values: Mapping[str, Any]) -> None:
+    def __init__(self, bag: Bag, inputs: Inputs, values: Values) -> None:
         self._inputs, self._values = inputs, values
         self._step, self._steps = 0, 0
         self._path = bag.path
-        stream = measurements_of(bag, inputs, reader_of(bag, values), Counter())
-        self._measurements = list(islice(stream, IN_MEMORY))
+        stream = measured_in(bag, inputs, reader_of(bag, values), Counter(), held_out=False)
+        self._measurements = [each[:2] for each in islice(stream, IN_MEMORY)]
         self.is_cut = next(stream, None) is not None  # whether the bag has more
-        start = min((each.stamp_ns for _, each in self._measurements
-                     if isinstance(each, OdometrySample)), default=0)
+        moves = [(name, each.stamp_ns) for name, each in self._measurements
+                 if isinstance(each, OdometrySample)]
+        start = min((stamp_ns for _, stamp_ns in moves), default=0)
         # the first fix that odometry covers is placed first
         for k in sorted(range(len(self._measurements)),
                         key=lambda k: self._measurements[k][1].stamp_ns < start):
             name, fix = self._measurements[k]
             if isinstance(fix, measurements.Fix):
                 self._measurements[k] = name, fix.placed()
-        counts = Counter(name for name, each in self._measurements
-                         if isinstance(each, OdometrySample))
+        counts = Counter(name for name, _ in moves)
         self._odometries = [name for name in inputs.odometry if counts[name] > 1]
         if len(self._odometries) == 0:
             topics = ' or '.join(inputs.topics[name] for name in inputs.odometry)
             raise BagError(f'{self._path}: no usable odometry on {topics}')
-        stamps = [each.stamp_ns for name, each in self._measurements
-                  if name == self._odometries[0]]
+        stamps = [stamp_ns for name, stamp_ns in moves if name == self._odometries[0]]
         self._start_ns, self._duration = min(stamps), (max(stamps) - min(stamps)) * 1e-9
-        self._sources = {name: some for name, some in self._valid(values).items()
-                         if len(some) >= LEAST}
+        valid = self._valid(values)
+        self._repaired = {name for name, _, is_repaired in valid if is_repaired}
+        every = {name: [each for of, each, _ in valid if of == name]
+                 for name in inputs.of(lambda kind: kind.in_map or kind is IMU)}
+        self._sources = {name: some for name, some in every.items() if len(some) >= LEAST}
         self._closures: list[tuple[str, LoopClosure]] = []
         if all(isinstance(each, HeadingOnly) for some in self._sources.values() for each in some):
-            self._sources, self._closures = {}, [
-                (name, each) for name, each in self._measurements
-                if isinstance(each, LoopClosure)]
+            self._sources, self._closures = {}, [(name, each) for name, each in self._measurements
+                                                 if isinstance(each, LoopClosure)]
             if len(self._closures) < LEAST:
                 topics = ', '.join(f'{topic} ({source})'
                                    for source, topic in inputs.topics.items())
-                raise BagError(
-                    f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, global '
-                    f'poses or loop closures are needed; used are {topics}')
+                raise BagError(f'{self._path}: nothing to tune by: at least {LEAST} valid fixes, '
+                               f'global poses or loop closures are needed; used are {topics}')
 
-    def tune(
-        self, folds: int, truth: Trajectory | None, stretch: Seconds | None = None,
-    ) -> Outcome:
+    def tune(self, folds: int, truth: Trajectory | None, stretch: Seconds | None) -> Outcome:
         """Return the parameters that are the most likely, and how well these do."""
         if stretch is not None and stretch > self._duration / folds:
             raise BagError(
@@ -139,9 +134,8 @@ class Tuning:
         tuned, tau = self._estimate(runs, frozenset())
         after = self._run(checked({**self._values, **changed(tuned)}),
                           'all, with the settings after')
-        doubted = frozenset(
-            (one.source, one.stamp_ns) for one in after.verdicts()
-            if one.state is State.DOUBTED and one.reference_ns is None)
+        doubted = frozenset((one.source, one.stamp_ns) for one in after.verdicts()
+                            if one.state is State.DOUBTED and one.reference_ns is None)
         if len(doubted) > 0:
             tuned, tau = self._estimate(runs, doubted)
         period = max((float(np.median(np.diff([each.stamp_ns for each in some]))) * 1e-9
@@ -151,10 +145,8 @@ class Tuning:
         tried = [self._fold(k, folds, stretch, doubted, truth) for k in range(folds)]
         one, other = noise.comparable(*zip(*(
             pair for errors, _ in tried for pair in errors), strict=True))
-        verdict = Verdict.SAME
-        if len(changed(tuned)) > 0:
-            verdict = Verdict.BETTER if noise.is_better(
-                one, other, self._start_ns, stretch) else Verdict.WORSE
+        verdict = Verdict.SAME if len(changed(tuned)) == 0 else Verdict.BETTER if noise.is_better(
+            one, other, self._start_ns, stretch) else Verdict.WORSE
         errors = [] if truth is None else np.sqrt(np.mean(np.square(
             [to_truth for _, to_truth in tried]), axis=0)).tolist()
         measured = [f'{len(some)} of {name}' for name, some in self._sources.items()] or [
@@ -163,48 +155,43 @@ class Tuning:
                        errors, folds, stretch,
                        f'{self._duration:.0f} s of odometry, {", ".join(measured)}', len(doubted))
 
-    def _valid(self, values: Mapping[str, Any]) -> dict[str, list[Absolute]]:
-        """Return the valid measurements in the map of each source by stamp, by some parameters."""
-        config, found = backend_config(values), {}
-        for name in self._inputs.of(lambda kind: kind.in_map or kind is IMU):
-            valid = []
-            for of, each in self._measurements:
-                if of == name and isinstance(each, Absolute):
-                    one = validate(each, config.measurement_source(name, type(each)).covariance)
-                    if isinstance(one, Validated) and isinstance(one.measurement, Absolute):
-                        valid.append(one.measurement)
-            found[name] = sorted(valid, key=lambda each: each.stamp_ns)
+    def _valid(self, values: Values) -> list[tuple[str, Absolute, bool]]:
+        """Return source, valid measurement in the map, and whether it was repaired, by stamp."""
+        config, found = backend_config(values), []
+        for name, each in sorted(self._measurements, key=lambda each: each[1].stamp_ns):
+            if isinstance(each, Absolute):
+                one = kinds.validate(each, config.measurement_source(name, type(each)).covariance)
+                if isinstance(one, validation.Validated) and isinstance(one.measurement, Absolute):
+                    found.append((name, one.measurement, len(one.repairs) > 0))
         return found
 
     def _run(
-        self, values: Mapping[str, Any], text: str, without: Collection[Key] = (),
+        self, values: Values, text: str, without: Collection[Key] = (),
         odometry: str = '',
     ) -> PoseGraphBackend:
         """Run the engine, as a step that is shown, without some measurements or other odometry."""
         self._step += 1
         _show(f'step {self._step} of {self._steps}: {text}')
-        backend, _ = run_measurements((
-            (name, each) for name, each in self._measurements
-            if odometry in ('', name) or not isinstance(each, OdometrySample)
-            if isinstance(each, OdometrySample) or (name, each.stamp_ns) not in without), values)
-        return backend
+        return run((
+            (name, each) for name, each in self._measurements if (
+                odometry in ('', name) if isinstance(each, OdometrySample)
+                else (name, each.stamp_ns) not in without)), values).backend
 
     def _runs(
         self, text: str, left_out: Collection[Key] = (),
     ) -> tuple[PoseGraphBackend, list[PoseGraphBackend]]:
         """Return a run with the settings before, and those that show the noise of odometries."""
         before = self._run(self._values, f'{text}, with the settings before', left_out)
-        return before, [before] if self._is_shown_before else [
-            self._run(self._looking, f'{text}, by {name}', left_out, name)
-            for name in self._odometries]
+        return before, [before] if self._is_shown_before else [self._run(
+            self._looking, f'{text}, by {name}', left_out, name) for name in self._odometries]
 
     def _estimate(
         self, runs: Sequence[PoseGraphBackend], without: Collection[Key],
     ) -> tuple[list[Tuned], Seconds]:
         """Return what runs show, but for some measurements, and the longest time constant."""
         tuned, longest = list[Tuned](), 0.0
-        for name, run in zip(self._odometries, runs, strict=True):
-            parts, by_residuals = run.parts, dict[str, ScaleFit]()
+        for name, engine in zip(self._odometries, runs, strict=True):
+            parts, by_residuals = engine.parts, dict[str, ScaleFit]()
             if len(self._closures) > 0 or any(
                     len(_heading_variances(some)) > 0 for some in self._sources.values()):
                 by_residuals |= analyse(parts).fits
@@ -220,42 +207,36 @@ class Tuning:
                 way, turn = noise.proven_odometry(found.values())
             else:
                 way, turn = (NOT_SHOWN if one is None else one.proven(one.high) for one in (
-                    _of_residuals(by_residuals.get(name), axis) for axis in (0, 2)))
+                    _shown(by_residuals.get(name), axis) for axis in (0, 2)))
             tuned += tuned_parameters.odometry_parameters(name, way, turn, self._values)
-            if run is not runs[0]:
+            if engine is not runs[0]:
                 continue
             longest = max((0.0 if each.tau is None else each.tau.value
                            for each in found.values()), default=0.0)
             for source, some in self._sources.items():
                 tuned += tuned_parameters.source_parameters(
                     source, self._claims(source, some), self._values, size=proven.get(source),
-                    heading=_of_residuals(by_residuals.get(source), 2))
+                    heading=_shown(by_residuals.get(source), 2))
             for source in dict.fromkeys(of for of, _ in self._closures):
-                size = None if source not in by_residuals else _found(by_residuals[source])
-                if size is not None:
+                if (size := _shown(by_residuals.get(source))) is not None:
                     # their constraints share noise of odometry up to the hidden nodes
                     tuned += tuned_parameters.source_parameters(
-                        source, OF_CLOSURES, self._values,
-                        size=size.written(max(size.value, 1.0)))
+                        source, OF_CLOSURES, self._values, size=size.written(max(size.value, 1.0)))
         return tuned, longest
 
     def _claims(self, name: str, some: Sequence[Absolute]) -> Claims:
         policy = backend_config(self._values).measurement_source(name, type(some[0])).covariance
-        repaired = any(isinstance(one := validate(each, policy), Validated)
-                       and len(one.repairs) > 0 for of, each in self._measurements
-                       if of == name and isinstance(each, Absolute))
         positions = np.array([0.5 * np.trace(each.covariance[:2, :2]) for each in some
                               if not isinstance(each, HeadingOnly)])
         headings = _heading_variances(some)
-        inside = len(positions) == 0 or bool(
-            np.min(positions) > 1.01 * policy.position_floor**2
-            and np.max(positions) < 0.99 * policy.position_ceiling**2)
+        inside = len(positions) == 0 or bool(np.min(positions) > 1.01 * policy.position_floor**2
+                                             and np.max(positions) < 0.99
+                                             * policy.position_ceiling**2)
+        both = positions, headings
         return Claims(
-            all(np.ptp(each) < 0.05 * np.min(each) for each in (positions, headings)
-                if len(each) > 0),
-            inside and not repaired and len(policy.override) == 0,
-            *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0
-              for each in (positions, headings)))
+            all(np.ptp(each) < 0.05 * np.min(each) for each in both if len(each) > 0),
+            inside and name not in self._repaired and len(policy.override) == 0,
+            *(float(np.sqrt(np.median(each))) if len(each) > 0 else 0.0 for each in both))
 
     def _fold(
         self, k: int, folds: int, stretch: Seconds, doubted: frozenset[Key],
@@ -282,9 +263,8 @@ class Tuning:
             common = np.intersect1d(*(each.stamps_ns for each in errors))
             one, other = (each.rows(np.isin(each.stamps_ns, common)) for each in errors)
             pairs.append((one, other))
-        return pairs, [] if truth is None else [
-            float(np.sqrt(np.mean(np.square(distances(
-                self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
+        return pairs, [] if truth is None else [float(np.sqrt(np.mean(np.square(
+            distances(self._path_of(backend)[0], truth.stamps_ns, truth.poses[:, :2])[1]))))
             for _, backend in tried]
 
     def _path_of(self, backend: PoseGraphBackend) -> tuple[Trajectory, Covariances]:
@@ -294,7 +274,7 @@ class Tuning:
         return estimate.path, backend.path_covariances(estimate)
 
     def _errors(
-        self, values: Mapping[str, Any], backend: PoseGraphBackend, held: Collection[Key],
+        self, values: Values, backend: PoseGraphBackend, held: Collection[Key],
     ) -> list[Errors]:
         """Return the errors of a path at what was held out of each source, and at closures."""
         reports, valid, (path, covariances) = (
@@ -304,7 +284,7 @@ class Tuning:
             in_use = reports[name].in_use if name in reports else None
             found.append(noise.errors_at(
                 path, covariances,
-                [each for each in valid[name] if (name, each.stamp_ns) in held
+                [each for of, each, _ in valid if of == name and (name, each.stamp_ns) in held
                  and not isinstance(each, HeadingOnly)],
                 1.0 if in_use is None else in_use.correlated + in_use.white))
         closures = [each for name, each in self._closures
@@ -324,24 +304,19 @@ def _heading_variances(some: Sequence[Absolute]) -> FloatArray:
                      for each in some if isinstance(each, HeadingOnly | measurements.GlobalPose)])
 
 
-def _of_residuals(found: ScaleFit | None, axis: int) -> Found | None:
-    """Return the noise of a coordinate that residuals show; None if they show nothing."""
-    rows = [] if found is None else [row for row in found.rows if row.coordinate == axis]
-    return _found(rows[0]) if len(rows) > 0 else None
-
-
-def _found(of: RowFit | ScaleFit) -> Found | None:
-    if math.isnan(of.ratio):
-        return None
-    return Found(of.ratio**2, of.low**2, of.high**2, kept=of.low <= 1.0 <= of.high)
+def _shown(fit: ScaleFit | None, axis: int | None = None) -> Found | None:
+    """Return the noise, or that of a coordinate, by residuals; None if they show nothing."""
+    of = fit if fit is None or axis is None else next(
+        (row for row in fit.rows if row.coordinate == axis), None)
+    return None if of is None or math.isnan(of.ratio) else Found(
+        of.ratio**2, of.low**2, of.high**2, kept=of.low <= 1.0 <= of.high)
 
 
 # --- the tool
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    start = time.monotonic()
-    values = shared.parameter_values(options)
+    start, values = time.monotonic(), shared.parameter_values(options)
     if options.out.is_dir():
         raise BagError(f'{options.out}: is a folder; expected a file to write')
     if not options.out.resolve().parent.is_dir():
@@ -364,17 +339,15 @@ def execute(options: argparse.Namespace) -> int:
         options.out.write_text(
             tuned_parameters.yaml_text(outcome.tuned, headline), encoding='utf-8')
     if options.json:
-        print(json.dumps({
+        print(json.dumps(finite({
             'bags': [str(each) for each in options.bags],
             'file': str(options.out) if is_better else None,
             'verdict': outcome.verdict.name.lower(), 'reason': outcome.verdict.value,
-            'parameters': [_plain(asdict(each)) | {'changed': each.changes}
-                           for each in outcome.tuned],
-            'before': _plain(outcome.before._asdict()), 'after': _plain(outcome.after._asdict()),
-            'to_truth': _plain(dict(zip(
-                ('before', 'after'), outcome.to_truth, strict=False))) or None,
+            'parameters': [each._asdict() | {'changed': each.changes} for each in outcome.tuned],
+            'before': outcome.before._asdict(), 'after': outcome.after._asdict(),
+            'to_truth': dict(zip(('before', 'after'), outcome.to_truth, strict=False)) or None,
             'folds': outcome.folds, 'stretch_s': outcome.stretch, 'doubted': outcome.n_doubted,
-            'is_cut': tuning.is_cut, 'seconds': time.monotonic() - start}, indent=2))
+            'is_cut': tuning.is_cut, 'seconds': time.monotonic() - start}), indent=2))
     else:
         print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         print('\n'.join(_lines(outcome, tuning)))
@@ -411,9 +384,8 @@ def _lines(outcome: Outcome, tuning: Tuning) -> list[str]:
     lines += ['', f'{"held out":<22}{"rms":>9}{"median":>9}{"NEES":>9}{"NLPD":>9}'
                   f'{"correlation":>13}{"count":>8}']
     for name, of in (('before', outcome.before), ('after', outcome.after)):
-        lines.append(
-            f'{name:<22}{of.rms:>7.3f} m{of.median:>7.3f} m{of.nees:>9.3g}{of.nlpd:>9.3f}'
-            f'{of.correlation_time:>11.3g} s{of.n:>8}')
+        lines.append(f'{name:<22}{of.rms:>7.3f} m{of.median:>7.3f} m{of.nees:>9.3g}'
+                     f'{of.nlpd:>9.3f}{of.correlation_time:>11.3g} s{of.n:>8}')
     for name, error in zip(('before, to truth', 'after, to truth'), outcome.to_truth,
                            strict=False):
         lines.append(f'{name:<22}{error:>7.3f} m')
@@ -427,7 +399,3 @@ def _value(value: Any) -> str:
     return f'{value:.4g}' if isinstance(value, int | float) else str(value)
 
 
-def _plain(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return facts with null for what is not a finite number, which JSON does not know."""
-    return {name: None if isinstance(value, float) and not abs(value) < float('inf') else value
-            for name, value in facts.items()}

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """From estimated noise to parameters of the node, and their file with a reason for each."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
 import math
 from typing import Any, NamedTuple
 
+from pose_graph_ros.adapters.sources import Values
 from pose_graph_ros.core.quantities import Metres, Radians
 from pose_graph_ros.offline.noise import Found
 
@@ -16,8 +16,7 @@ ODOMETRY = {'sigma_distance': False, 'sigma_lateral': False, 'sigma_heading_dist
 LARGEST_SIGMA = 10.0  # of odometry, by the range of its parameters
 
 
-@dataclass(frozen=True, slots=True)
-class Tuned:
+class Tuned(NamedTuple):
     """One parameter of the node, before and after."""
 
     name: str
@@ -33,9 +32,7 @@ class Tuned:
         return bool(self.after != self.before)
 
 
-def odometry_parameters(
-    source: str, way: Found, turn: Found, values: Mapping[str, Any],
-) -> Iterator[Tuned]:
+def odometry_parameters(source: str, way: Found, turn: Found, values: Values) -> Iterator[Tuned]:
     """Yield the parameters of a source of odometry by the noise of the way and of turns."""
     if values[f'{source}.noise'] == 'twist':
         yield _one(f'{source}.covariance_scale', max(way, turn), values, 1.0)
@@ -57,7 +54,7 @@ class Claims(NamedTuple):
 
 
 def source_parameters(
-    source: str, claims: Claims, values: Mapping[str, Any], *, size: Found | None,
+    source: str, claims: Claims, values: Values, *, size: Found | None,
     heading: Found | None = None,
 ) -> Iterator[Tuned]:
     """Yield the parameters of a source by the size of its errors, of positions and headings."""
@@ -71,11 +68,11 @@ def source_parameters(
     if claims.is_scalable and not apart:
         one = _one(scale, leading, values, 1.0)
         if claims.is_constant and claims.sigma > 0.0 and one.changes:
-            one = replace(one, note=f'{one.note}; sigma {_number(claims.sigma)} m claimed, '
-                          f'{_number(claims.sigma * math.sqrt(leading.value))} m found')
+            one = one._replace(note=f'{one.note}; sigma {_number(claims.sigma)} m claimed, '
+                               f'{_number(claims.sigma * math.sqrt(leading.value))} m found')
         if one.changes and size is not None and heading is not None:
-            one = replace(one, note=f'{one.note}; of headings by themselves it would be '
-                          f'{_number(values[scale] * heading.value)}')
+            one = one._replace(note=f'{one.note}; of headings by themselves it would be '
+                               f'{_number(values[scale] * heading.value)}')
         yield one
     else:
         sigmas = [claims.sigma * math.sqrt(size.value)] if size is not None else [1.0]
@@ -94,7 +91,7 @@ def source_parameters(
 
 
 def _one(
-    name: str, found: Found, values: Mapping[str, Any], power: float, largest: float = math.inf,
+    name: str, found: Found, values: Values, power: float, largest: float = math.inf,
 ) -> Tuned:
     """Return a parameter by the factor on the variances, of which it is a power."""
     before = values[name]
@@ -119,25 +116,22 @@ def yaml_text(tuned: Sequence[Tuned], headline: Sequence[str]) -> str:
     lines = [*(f'# {line}'.rstrip() for line in headline), '/**:', '  ros__parameters:']
     for source in dict.fromkeys(each.name.partition('.')[0] for each in tuned):
         own = [each for each in tuned if each.name.startswith(f'{source}.')]
-        if not any(each.changes for each in own):
-            lines += [f'    # {each.name}: {_text(each.before)}, {_why(each)}' for each in own]
-            continue
-        lines.append(f'    {source}:')
+        some_change = any(each.changes for each in own)
+        lines += [f'    {source}:'] if some_change else []
         for each in own:
             leaf = each.name.partition('.')[2]
             if each.changes:
                 lines += [f'      # {_text(each.before)} before; {_why(each)}',
                           f'      {leaf}: {_text(each.after)}']
             else:
-                lines.append(f'      # {leaf}: {_text(each.before)}, {_why(each)}')
+                name = f'      # {leaf}' if some_change else f'    # {each.name}'
+                lines.append(f'{name}: {_text(each.before)}, {_why(each)}')
     return '\n'.join(lines) + '\n'
 
 
 def interval(tuned: Tuned) -> str:
     """Return the interval of a parameter; empty if it has none."""
-    if math.isnan(tuned.low):
-        return ''
-    return f'{_number(tuned.low)} to {_number(tuned.high)}'
+    return '' if math.isnan(tuned.low) else f'{_number(tuned.low)} to {_number(tuned.high)}'
 
 
 def _why(tuned: Tuned) -> str:

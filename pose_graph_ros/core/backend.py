@@ -14,12 +14,13 @@ from pose_graph_ros.core import (
     newest_estimate,
     transaction as tr,
 )
-from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
+from pose_graph_ros.core.alignment import Alignment
 from pose_graph_ros.core.batch import final_optimization
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, CovariancePolicy
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
+from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.forgetting import Forgetting
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
@@ -85,7 +86,7 @@ class PoseGraphBackend:
         self.counts = self._pipeline.counts  # of answers by source and 'accepted' or the reason
         self.refusals = self._pipeline.refusals  # details of the newest ones by source and reason
         self._quarantine: list[Queued] = []
-        self._alignment = AlignmentMonitor(self._config)
+        self._alignment = Alignment(self._nodes, self._judge.fixes)
         self.parts = Parts(  # what it is made of, for tools
             self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
             self._pipeline, self._quarantine, self._judge, self._smoother)
@@ -99,7 +100,6 @@ class PoseGraphBackend:
         self._nodes.configure(config)
         self._pipeline.configure(config)
         self._factors.config = config
-        self._alignment.configure(config)
 
     @property
     def refused_closures(self) -> list[tuple[str, int, int | None]]:
@@ -229,7 +229,6 @@ class PoseGraphBackend:
         if isinstance(moved, ms.Answer):
             return self._pipeline.count(source, moved)
         self._collect()
-        self._alignment.stop_rechecking()
         self._pipeline.attach_to_node(moved, source, int(self._nodes.ids[-1]))
         return self._pipeline.count(source, ms.ACCEPTED)
 
@@ -287,7 +286,7 @@ class PoseGraphBackend:
         T_map_graph, graph = None, self.graph
         with tr.Transaction() as transaction:
             transaction.keep(self._alignment, 'state', 'sigma')
-            T_map_graph = self._alignment.find(graph, self._pipeline.queue, self._nodes)
+            T_map_graph = self._alignment.find(graph, self._pipeline.queue)
             queue = self._pipeline.take_ready(aligned=self._alignment.is_aligned)
             if len(queue) == 0 and self._settled:
                 return UpdateReport(Status.CONVERGED, chi2=self._chi2), []
@@ -316,7 +315,6 @@ class PoseGraphBackend:
             self._nodes.move_frozen(T_map_graph)
         self._factors.commit()
         self._judge.commit()
-        self._alignment.add(queue)
         self._refiner.restart()
         result, self._settled = self._refiner.reweight(result)
         # in a larger graph an update does not change all weights of odometry
@@ -348,16 +346,17 @@ class PoseGraphBackend:
 
     def _recheck_alignment(self) -> None:
         """Rotate and optimise the graph anew if the angle between odometry and map is wrong."""
-        poses = self._alignment.recheck(self.graph, self._nodes)
+        poses = self._alignment.check(self.graph)
         if poses is None:
             return
         graph = self.graph
         oldest = int(graph.node_ids[np.argmax(graph.is_pose)])  # that thinning has left
-        left = graph.poses_of(oldest)
+        left, chi2 = graph.poses_of(oldest), self._smoother.chi2()
         with tr.Transaction() as transaction:
             transaction.callback(graph.set_poses, graph.poses.copy())
             graph.set_poses(poses)
-            tr.checked(self._optimize_whole())
+            if tr.checked(self._optimize_whole()).chi2 >= chi2:
+                raise LinearSolveError('the graph lies better as it was')
         if transaction.failure != '':
             self._settle()  # eliminates everything again
             return

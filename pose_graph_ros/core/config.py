@@ -297,18 +297,6 @@ class NodePolicy:
 
 
 @dataclass(frozen=True, slots=True)
-class AlignmentPolicy:
-    """When the angle between odometry and map, computed from positions, counts as known."""
-
-    sigma_heading: float = 0.15  # maximum sigma of the angle [rad]
-    minimum_baseline: float = 1.0  # minimum extent of the positions [m]
-    baseline_in_sigmas: float = 5.0  # minimum extent of the positions, in sigmas of a position
-
-    def __post_init__(self) -> None:
-        check(self, 'sigma_heading', 'minimum_baseline', 'baseline_in_sigmas')
-
-
-@dataclass(frozen=True, slots=True)
 class SolverConfig:
     """Settings of Gauss-Newton with Levenberg-Marquardt damping, for a whole graph."""
 
@@ -374,7 +362,6 @@ class BackendConfig:
     """Settings of `PoseGraphBackend`."""
 
     nodes: NodePolicy = field(default_factory=NodePolicy)
-    alignment: AlignmentPolicy = field(default_factory=AlignmentPolicy)
     # of the update at each tick of the timer
     smoother: SmootherConfig = field(default_factory=SmootherConfig)
     # of the full optimisation at the end of a stream; after outages it can converge slowly

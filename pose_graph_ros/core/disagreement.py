@@ -131,10 +131,9 @@ def _solved_without(graph: Graph, parts: Mapping[str, _Part], source: str) -> Gr
     # what nothing else holds is held where the first node is
     first = np.flatnonzero(graph.is_pose)[:0 if 'map' in kinds else 1]
     information = np.tile(np.diag((1.0, 1.0, float('heading' not in kinds))), (len(first), 1, 1))
-    copy.apply(GraphUpdate(
-        weigh=dict.fromkeys(part.factors.tolist(), 0.0),
-        factors=Factors.on(graph.node_ids[first], None, graph.poses[first],
-                               information, [FactorKind.GLOBAL_POSE] * len(first))))
+    copy.apply(GraphUpdate(weigh=dict.fromkeys(part.factors.tolist(), 0.0), factors=Factors.on(
+        graph.node_ids[first], None, graph.poses[first], information,
+        [FactorKind.GLOBAL_POSE] * len(first))))
     result = optimize_from_two_starts(copy, SolverConfig())
     return None if result.status is Status.FAILED else copy
 

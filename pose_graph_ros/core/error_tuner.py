@@ -27,19 +27,9 @@ from pose_graph_ros.core.graph.graph_update import Measured
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.motion import (
-    AS_CLAIMED,
-    changed,
-    OdometryErrors,
-)
+from pose_graph_ros.core.odometry.motion import AS_CLAIMED, changed, OdometryErrors
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.bias import (
-    Additions,
-    BiasChain,
-    CorrelatedErrors,
-    held_by_bias,
-    Process,
-)
+from pose_graph_ros.core.sources import bias as bs
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder, SourceState
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.transaction import succeeds
@@ -55,10 +45,10 @@ class _Change:
     """A change of the error model of a source that is under way."""
 
     source: str
-    errors: CorrelatedErrors | None  # the new ones; None for white errors
+    errors: bs.CorrelatedErrors | None  # the new ones; None for white errors
     remaining: IntArray  # numbers of the measurements to be moved, the next ones last
     before: IntArray  # id of the edge that held each measurement at the beginning, or -1
-    bias: BiasChain = field(default_factory=BiasChain)  # what is in the graph for it
+    bias: bs.BiasChain = field(default_factory=bs.BiasChain)  # what is in the graph for it
     undoing: bool = False
 
 
@@ -76,7 +66,7 @@ class ErrorTuner:
         self._odometry = AS_CLAIMED  # errors of odometry that were learnt
         self._next = BANK.first_learnt  # number of measurements at which it is learnt next
         # sources whose errors are to change, one after the other
-        self._waiting: dict[str, CorrelatedErrors | None] = {}
+        self._waiting: dict[str, bs.CorrelatedErrors | None] = {}
         self._change: _Change | None = None
         self.n_failures = 0  # number of changes that were undone because the solver failed
         self._failed: OdometryErrors | None = None  # of odometry, with which the solver failed
@@ -260,7 +250,7 @@ class ErrorTuner:
                 return True
         return False
 
-    def _begin(self, source: str, errors: CorrelatedErrors | None) -> None:
+    def _begin(self, source: str, errors: bs.CorrelatedErrors | None) -> None:
         """Begin to change the error model of a source."""
         constraints = self._factors.sources[source]
         self._change = _Change(
@@ -299,7 +289,7 @@ class ErrorTuner:
         graph, bias = self._smoother.graph, change.bias
         held = constraints.held(some)
         weights = graph.weights[graph.factor_rows(held)]
-        additions, rows = Additions(graph.next_ids), constraints.measured.values[some]
+        additions, rows = bs.Additions(graph.next_ids), constraints.measured.values[some]
         new = change.before[some] if change.undoing else np.full(len(some), -1)
         wanted = dict.fromkeys(held.tolist(), 0.0)
         if change.errors is None:
@@ -308,9 +298,9 @@ class ErrorTuner:
         else:
             table = graph.factors_at(rows['id'])
             bias = bias.with_bins(
-                rows['stamp_ns'], Process.correlated(change.errors), additions, np.zeros(3))
+                rows['stamp_ns'], bs.Process.correlated(change.errors), additions, np.zeros(3))
             new = additions.add(Factors.joined([
-                held_by_bias(
+                bs.held_by_bias(
                     Queued(change.source, table.rows(slice(k, k + 1)), int(row['stamp_ns']),
                            noise=row['noise']), bias, change.errors)
                 for k, row in enumerate(rows)]).replaced(weight=weights))

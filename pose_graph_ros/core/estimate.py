@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE

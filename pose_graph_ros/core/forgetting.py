@@ -245,7 +245,7 @@ class Forgetting:
         nodes.forget(poses[:n])
         if not parts.alignment.is_aligned:
             self._joint = se2.between(poses[n - 1], poses[n])
-        parts.alignment.forget(int(nodes.ids[first]))
+        parts.alignment.forget()
         parts.pipeline.seen.forget(nodes.last_frozen_ns)
         # constraints that were to be added to nodes that have left
         left = {*leaving.tolist()}

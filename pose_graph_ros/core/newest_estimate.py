@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.alignment import estimator
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState, guess
 from pose_graph_ros.core.batch.truncated import LIMITS
 from pose_graph_ros.core.config import Loss, OdometrySource, Robust
 from pose_graph_ros.core.estimate import Estimate
@@ -55,7 +54,7 @@ def estimate(
         waiting = [each.factor for each in (*parts.pipeline.queue, *parts.quarantine)
                    if each.is_placed]
         if len(waiting) > 0:
-            shift, cov = estimator.guess(
+            shift, cov = guess(
                 graph.poses, newest, Factors.joined(waiting).renumbered(graph.node_rows))
             newest = newest + shift
         else:

@@ -10,7 +10,7 @@ saving. Measurements that wait for odometry are not saved; they can be sent agai
 
 from typing import NamedTuple
 
-from pose_graph_ros.core.alignment.monitor import AlignmentMonitor
+from pose_graph_ros.core.alignment import Alignment
 from pose_graph_ros.core.exceptions import FileFormatError, NothingToSaveError
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -38,7 +38,7 @@ class Parts(NamedTuple):
     nodes: HiddenNodes
     factors: FactorBuilder
     reweighting: Reweighting
-    alignment: AlignmentMonitor
+    alignment: Alignment
     pipeline: MeasurementPipeline
     quarantine: list[Queued]
     """Constraints that were set aside after a failed update."""

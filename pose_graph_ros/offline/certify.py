@@ -36,7 +36,6 @@ is the projection of Q - L. All rows may be turned by one unitary matrix, so row
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -47,13 +46,11 @@ from pose_graph_ros.core.geometry.se2 import ComplexArray, FloatArray, IntArray,
 from pose_graph_ros.core.sparse import BlockFactors
 from pose_graph_ros.offline.chordal_objective import Formulation, QuadraticForm
 
-Operator = Callable[[ComplexArray], ComplexArray]
 Preconditioner = Callable[[ComplexArray, ComplexArray], ComplexArray]
 """From headings, and derivatives by them, to a change that is nearly a step of Newton."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tuning:
+class Tuning(NamedTuple):
     """Numbers of the certificate; fractions of f are those of at least 1."""
 
     max_rank: int = 6  # numbers for each heading at most
@@ -74,8 +71,7 @@ class Verdict(Enum):
     NOT_ATTEMPTED = 'not attempted'
 
 
-@dataclass(frozen=True, slots=True)
-class Certificate:
+class Certificate(NamedTuple):
     """What was found of the minimum near given poses, and of the best one."""
 
     verdict: Verdict  # of the best minimum that was found
@@ -104,8 +100,7 @@ class Certificate:
         return self.chi2 < self.near - TUNING.lower * max(self.near, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Spectrum:
+class Spectrum(NamedTuple):
     """What is known of the certificate matrix of some headings."""
 
     positive: bool  # whether S plus the shift was shown to be positive definite
@@ -168,9 +163,9 @@ def certify(
             bound = max(bound, spectrum.bound)
     gap = max(cost - bound, 0.0)
     certified = gap <= TUNING.gap * max(cost, 1.0)
-    return Certificate(
-        Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED, cost, near, gap,
-        spectrum.smallest, y.shape[1], formulation.poses(form.positions(z)[:, 0], z[:, 0]))
+    return Certificate(Verdict.CERTIFIED if certified else Verdict.NOT_CERTIFIED,
+                       cost, near, gap, spectrum.smallest, y.shape[1],
+                       formulation.poses(form.positions(z)[:, 0], z[:, 0]))
 
 
 def _escaped(form: QuadraticForm, y: ComplexArray, direction: ComplexArray) -> ComplexArray:
@@ -244,8 +239,7 @@ def _smallest(
     basis = np.zeros((n, 0), dtype=np.complex128) if known is None else np.linalg.qr(known)[0]
 
     def inverse(v: ComplexArray) -> ComplexArray:
-        right = _without(basis, v.ravel())[:, None]
-        return _without(basis, form.inverse(factors, right)[:, 0])
+        return _without(basis, form.inverse(factors, _without(basis, v.ravel())[:, None])[:, 0])
 
     # takes 0.1 s to load
     import scipy.sparse.linalg  # noqa: PLC0415
@@ -330,7 +324,7 @@ def minimized(
     return y
 
 
-def _projection(y: ComplexArray) -> Operator:
+def _projection(y: ComplexArray) -> Callable[[ComplexArray], ComplexArray]:
     """Return the projection to the tangent space at Y, with row 0 at rest."""
     def tangent(v: ComplexArray) -> ComplexArray:
         v = v - multipliers(y, v)[:, None] * y

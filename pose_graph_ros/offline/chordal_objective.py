@@ -31,7 +31,8 @@ for each node. Headings may also be rows of r complex numbers each (`certify`): 
 columns as well.
 """
 
-from dataclasses import dataclass
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,8 +47,7 @@ class NotCoveredError(PoseGraphError):
     """The objective does not cover a graph; the message is the reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class Formulation:
+class Formulation(NamedTuple):
     """Terms of the objective, M of them; unknown 0 is the map."""
 
     i: IntArray
@@ -71,8 +71,7 @@ class Formulation:
 
     def headings(self, poses: FloatArray) -> ComplexArray:
         """Return z, shape (n_unknowns,), of poses of all hidden nodes, shape (N, 3)."""
-        z = np.ones(self.n_unknowns, dtype=np.complex128)
-        free = self.number > 0
+        z, free = np.ones(self.n_unknowns, dtype=np.complex128), self.number > 0
         z[self.number[free]] = np.exp(1j * poses[free, 2])
         return z
 
@@ -129,9 +128,8 @@ def formulate(graph: Constrained) -> Formulation:
         arm_i, arm_j, kappa, tau, number[:-1], poses.copy(), is_below, origin)
     part = components(form.i[tau > 0.0], form.j[tau > 0.0], form.n_unknowns)
     if np.any(part != 0):
-        raise NotCoveredError(
-            f'constraints on positions join {int(np.sum(part != 0))} nodes to nothing fixed '
-            f'and nothing observed')
+        raise NotCoveredError(f'constraints on positions join {int(np.sum(part != 0))} nodes to '
+                              'nothing fixed and nothing observed')
     return form
 
 

@@ -258,9 +258,8 @@ def map_places(view: Any, *, spring: bool = False) -> tuple[dict[int, FloatArray
     turns = 2.4 * np.arange(len(nodes))
     aside = np.column_stack((np.cos(turns), np.sin(turns)))
     if spring:
-        start = {node: place + 0.01 * way
-                 for node, place, way in zip(in_map, _to_unit(at, in_map, lines), aside,
-                                             strict=False)}
+        start = {node: place + 0.01 * way for node, place, way in zip(
+            in_map, _to_unit(at, in_map, lines), aside, strict=False)}
         found = nx.spring_layout(lines, pos=start, iterations=200, seed=0)
         at = np.array([found[node] for node in in_map]).reshape(-1, 2)
     at = _to_unit(at, in_map, lines)
@@ -340,12 +339,9 @@ def five_states() -> list[tuple[str, GraphRows]]:
         poses, graph = np.zeros((n, 3)), Graph()
         poses[:, 0] = 2.0 * np.arange(n)
         i, eyes = np.arange(n - 1), np.tile(np.eye(3), (5, 1, 1))
-        graph.apply(GraphUpdate(
-            hidden=poses, factors=Factors.joined([
-                Factors(i, i + 1, np.diff(poses, axis=0), eyes[:n - 1],
-                        [FactorKind.ODOMETRY] * (n - 1)),
-                Factors.on(observed, mean=np.zeros((len(observed), 3)),
-                           information=eyes[:len(observed)],
-                           kind=[FactorKind.GLOBAL_POSE] * len(observed))])))
+        m, odometry = len(observed), [FactorKind.ODOMETRY] * (n - 1)
+        graph.apply(GraphUpdate(hidden=poses, factors=Factors.joined([
+            Factors(i, i + 1, np.diff(poses, axis=0), eyes[:n - 1], odometry), Factors.on(
+                observed, None, np.zeros((m, 3)), eyes[:m], [FactorKind.GLOBAL_POSE] * m)])))
         states.append((title, graph.rows()))
     return states

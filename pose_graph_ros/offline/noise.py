@@ -112,11 +112,6 @@ class Noise(NamedTuple):
             return self.size.written(1.0)
         return self.size.written(max(self.size.value, min(max(self.size.high, self.shown), 1.0)))
 
-    @property
-    def excess(self) -> float:
-        """By what the variance that is proven is larger than that which was found."""
-        return max(self.proven.value / self.size.value, 1.0)
-
 
 def noise_of(parts: Parts, source: str, without: Collection[StampNs] = ()) -> Noise | None:
     """
@@ -214,8 +209,7 @@ def _shown(rows: Records, seconds: float) -> float:
     here += (rows['offset'][:, 0] + 1j * rows['offset'][:, 1]) * np.exp(1j * headings)
     there = rows['mean'][:, 0] + 1j * rows['mean'][:, 1]
     here, there = here - np.mean(here), there - np.mean(there)
-    turn = np.angle(np.sum(np.conj(here) * there))
-    errors = np.abs(there - here * np.exp(1j * turn))**2
+    errors = np.abs(there - here * np.exp(1j * np.angle(np.sum(np.conj(here) * there))))**2
     # two coordinates, without the three numbers by which odometry was laid there
     degrees = 2.0 * seconds / CHANGE - 3.0
     quantile = 2.0 * float(gammaincinv(0.5 * max(degrees, 0.0), TAIL))
@@ -226,7 +220,8 @@ def _shown(rows: Records, seconds: float) -> float:
 
 def proven_odometry(found: Collection[Noise]) -> tuple[Found, Found]:
     """Return the proven noise of odometry, of way and turn, as most of the drive shows it."""
-    excess = max(each.excess for each in found)
+    # by what the variances of sources that are proven are larger than those that were found
+    excess = max(1.0, *(each.proven.value / each.size.value for each in found))
     most = max(found, key=lambda each: each.seconds)
     return most.way.proven(excess * most.way.high), most.turn.proven(excess * most.turn.high)
 
@@ -264,9 +259,6 @@ class Errors(NamedTuple):
         """Return some of them."""
         columns: Any = (column[which] for column in self)
         return Errors(*columns)
-
-
-NO_ERRORS = Errors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
 
 
 class Summary(NamedTuple):
@@ -316,13 +308,11 @@ def errors_at(
     those of what was held out are multiplied by a factor.
     """
     stamps = np.array([each.stamp_ns for each in held_out], dtype=np.int64)
-    chosen = [held_out[k] for k in np.flatnonzero(path.covers(stamps)).tolist()]
-    if len(chosen) == 0:
-        return NO_ERRORS
-    stamps = np.array([each.stamp_ns for each in chosen], dtype=np.int64)
-    positions, levers = (np.array(column) for column in zip(*(
+    inside = np.flatnonzero(path.covers(stamps))
+    stamps, chosen = stamps[inside], [held_out[k] for k in inside.tolist()]
+    positions, levers = np.array([
         (each.position, each.lever_arm) if isinstance(each, Position)
-        else (each.pose[:2], np.zeros(2)) for each in chosen), strict=True))
+        else (each.pose[:2], np.zeros(2)) for each in chosen]).reshape(-1, 2, 2).swapaxes(0, 1)
     poses = path.at(stamps)
     arms = se2.transform(poses, levers) - poses[:, :2]
     after = np.clip(np.searchsorted(path.stamps_ns, stamps), 1, max(len(path) - 1, 1))
@@ -331,7 +321,7 @@ def errors_at(
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -arms[:, 1], arms[:, 0]
     spread = jacobian @ covariances[np.minimum(after, len(path) - 1)] @ np.swapaxes(jacobian, 1, 2)
-    own = factor * np.array([each.covariance[:2, :2] for each in chosen])
+    own = factor * np.array([each.covariance[:2, :2] for each in chosen]).reshape(-1, 2, 2)
     return Errors(stamps, positions - poses[:, :2] - arms, spread + own)
 
 
@@ -370,9 +360,8 @@ def error_summary(of: Errors) -> Summary:
         nees = float(np.mean(_sigmas(errors, covariances))) / 2.0
         nlpd = float(np.mean(_surprises(of)[usable]))
     distinct = np.diff(of.stamps_ns, prepend=-1) > 0
-    return Summary(
-        len(squared), float(np.sqrt(np.mean(squared))), float(np.median(of.distances)), nees,
-        nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
+    return Summary(len(squared), float(np.sqrt(np.mean(squared))), float(np.median(of.distances)),
+                   nees, nlpd, estimate(of.stamps_ns[distinct], of.errors[distinct]).tau)
 
 
 def _sigmas(errors: FloatArray, covariances: FloatArray) -> FloatArray:

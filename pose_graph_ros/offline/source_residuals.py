@@ -65,6 +65,8 @@ LEAST_INDEPENDENT = 10.0
 # Probability of the interval of the factor.
 INTERVAL = 0.95
 _COORDINATES = 3
+# A ratio with its interval, where residuals do not show it.
+UNKNOWN: dict[str, Any] = {'ratio': math.nan, 'low': math.nan, 'high': math.nan}
 
 
 class SourceResiduals(NamedTuple):
@@ -140,9 +142,8 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
         errors = factors.errors_in_use(source)
         # the variance of correlated errors, in units of the claimed one
         total = 1.0 if errors is None else errors.correlated + errors.white
-        found[source] = residuals._replace(
-            taken=J @ covariances[rows] @ np.swapaxes(J, 1, 2),
-            scale=np.where(table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
+        found[source] = residuals._replace(taken=J @ covariances[rows] @ np.swapaxes(
+            J, 1, 2), scale=np.where(table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
     for name, ids in edges_by_source(graph, nodes, factors).items():
         if name[0] not in found:
             edges = graph.factors_at(ids)
@@ -176,9 +177,8 @@ def _residuals(
     of_state = table.constants[biased][:, [2, 2, 3]] * measured[biased]
     errors[biased] -= of_state * graph.poses_of(table.j[biased])
     claimed[biased] += (of_state / (1.0, 1.0, STRETCH))[:, :, None]**2 * np.eye(3)
-    return SourceResiduals(
-        *name, stamps_ns, errors, measured, claimed * scale[:, None, None]**2,
-        np.full((len(ids), 3, 3), np.nan), table.weight > 0.0, scale, ids)
+    return SourceResiduals(*name, stamps_ns, errors, measured, claimed * scale[:, None, None]**2,
+                           np.full((len(ids), 3, 3), np.nan), table.weight > 0.0, scale, ids)
 
 
 def spread(n: int, most: int) -> IntArray:
@@ -230,10 +230,8 @@ class ScaleFit(NamedTuple):
     @property
     def unknown(self) -> 'ScaleFit':
         """The same, without saying how large sigmas are."""
-        rows = tuple(row._replace(ratio=math.nan, low=math.nan, high=math.nan)
-                     for row in self.rows)
-        return self._replace(
-            rows=rows, ratio=math.nan, low=math.nan, high=math.nan, independent=0.0)
+        return self._replace(rows=tuple(row._replace(**UNKNOWN) for row in self.rows),
+                             independent=0.0, **UNKNOWN)
 
 
 def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> ScaleFit:
@@ -243,7 +241,7 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
     known = used.rows(np.all(np.isfinite(used.taken), axis=(1, 2)))
     n = len(used.ids)
     if len(known.ids) == 0:
-        return ScaleFit(n, (), 0.0, 0.0, 1.0, 0.0, 0.0, math.nan, math.nan, math.nan)
+        return ScaleFit(n, (), 0.0, 0.0, 1.0, 0.0, 0.0, **UNKNOWN)
     rows = tuple(_row(used, known, row, errors)
                  for row in np.flatnonzero(np.any(known.measured, axis=0)).tolist())
     freedom, energies = np.sum(used.measured, axis=1), used.energies
@@ -251,10 +249,9 @@ def fit(residuals: SourceResiduals, errors: CorrelatedErrors | None = None) -> S
     redundancy, scale = expected / float(np.mean(freedom)), float(np.median(used.scale))
     independent = sum(row.independent for row in rows)
     ratio, low, high = _ratio(energies, freedom, redundancy, independent)
-    return ScaleFit(
-        n, rows, expected, float(np.mean(energies)),
-        float(np.mean(energies <= _quantiles(freedom, INTERVAL))), redundancy, independent,
-        scale * ratio, scale * low, scale * high)
+    return ScaleFit(n, rows, expected, float(np.mean(energies)),
+                    float(np.mean(energies <= _quantiles(freedom, INTERVAL))), redundancy,
+                    independent, scale * ratio, scale * low, scale * high)
 
 
 def _row(
@@ -263,17 +260,15 @@ def _row(
     """Return the fit of one coordinate."""
     measured = used.measured[:, row]
     sigma = used.sigmas[measured, row]
-    values = used.errors[measured, row] / sigma
-    there = known.measured[:, row]
+    values, there = used.errors[measured, row] / sigma, known.measured[:, row]
     claimed, taken = (each[there, row, row] for each in (known.covariances, known.taken))
     # variances of residuals in units of those of measurements; with a diagonal R these shares add
     # up to the redundancy
     left = float(np.mean(np.clip(1.0 - taken / np.where(claimed > 0.0, claimed, 1.0), 0.0, 1.0)))
     independent = _independent(values, left, used.stamps_ns[measured], errors)
-    return RowFit(
-        row, len(values), float(np.sqrt(np.mean(sigma**2))), math.sqrt(left),
-        float(np.sqrt(np.mean(values**2))), independent,
-        *_ratio(values**2, np.ones(len(values)), left, independent))
+    return RowFit(row, len(values), float(np.sqrt(np.mean(sigma**2))),
+                  math.sqrt(left), float(np.sqrt(np.mean(values**2))), independent,
+                  *_ratio(values**2, np.ones(len(values)), left, independent))
 
 
 def _ratio(
@@ -320,18 +315,14 @@ def _independent(
 
 def squared_correlations(values: FloatArray) -> float:
     """Return the sum of the squared autocorrelations of a series, up to where they fade."""
-    n = len(values)
-    power = float(np.sum(values**2))
-    longest = n // 4
-    if longest < 1 or power <= 0.0:
+    n, power = len(values), float(np.sum(values**2))
+    if n < 4 or power <= 0.0:
         return 0.0
     size = 1 << int(2 * n - 1).bit_length()
-    spectrum = np.fft.rfft(values, size)
-    correlation = np.fft.irfft(np.abs(spectrum)**2, size)[1:longest + 1] / power
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(values, size))**2, size)[1:n // 4 + 1] / power
     # into the standard deviations of white residuals
     faded = np.flatnonzero(np.abs(correlation) < 2.0 / math.sqrt(n))
-    end = int(faded[0]) if len(faded) > 0 else longest
-    return float(np.sum(correlation[:end]**2))
+    return float(np.sum(correlation[:int(faded[0]) if len(faded) > 0 else None]**2))
 
 
 class Whiteness(NamedTuple):

@@ -38,7 +38,7 @@ from pose_graph_ros.core.measurements import Answer
 from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.sources.kinds import attach, closure_covariance
 from pose_graph_ros.offline import source_residuals
-from pose_graph_ros.offline.source_residuals import inverse, ScaleFit, SourceResiduals
+from pose_graph_ros.offline.source_residuals import inverse, ScaleFit, SourceResiduals, UNKNOWN
 
 # Random signs for each trace: its error is half of that of the squares that it is compared to.
 PROBES = 4
@@ -66,19 +66,20 @@ class Found(NamedTuple):
     redundancies: FloatArray
     covariance: FloatArray  # of the logarithms of the ratios, shape (K, K)
 
-    def of(self, which: Sequence[int]) -> tuple[float, float, float, float]:
-        """Return factor, ends of its interval, and independent residuals of some together."""
+    def of(self, which: Sequence[int]) -> dict[str, Any]:
+        """Return factor with its interval, and independent residuals, of some together."""
         k = list(which)
         share = np.maximum(self.redundancies[k], 0.0) * self.ratios[k]**2
         total, count = float(np.sum(share)), float(np.sum(self.redundancies[k]))
         if not (total > 0.0 and count > 0.0):
-            return math.nan, math.nan, math.nan, 0.0
+            return {**UNKNOWN, 'independent': 0.0}
         variance = float(share @ self.covariance[np.ix_(k, k)] @ share) / total**2
         independent = 0.5 / variance
         if independent < source_residuals.LEAST_INDEPENDENT:
-            return math.nan, math.nan, math.nan, independent
+            return {**UNKNOWN, 'independent': independent}
         ratio, width = math.sqrt(total / count), math.exp(1.96 * math.sqrt(variance))
-        return ratio, ratio / width, ratio * width, independent
+        return {'ratio': ratio, 'low': ratio / width, 'high': ratio * width,
+                'independent': independent}
 
 
 def split(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
@@ -91,8 +92,7 @@ def split(covariances: Covariances) -> tuple[FloatArray, FloatArray]:
 
 def constraints(graph: Graph) -> Constraints:
     """Return the constraints of a graph with a weight above 0, linear at its estimate."""
-    poses = graph.poses
-    used = np.flatnonzero(graph.weights > 0.0)
+    poses, used = graph.poses, np.flatnonzero(graph.weights > 0.0)
     factors = graph.factors_by_row.rows(used)
     error = errors(poses, factors)
     # derivatives by the nodes of the ends, and their columns
@@ -119,9 +119,9 @@ def constraints(graph: Graph) -> Constraints:
         priors = priors + csr_array((prior.information.ravel(), (row.ravel(), column.ravel())),
                                     shape=(size, size))
     free = np.repeat(~graph.fixed, 3) & (abs(jacobian).sum(axis=0) > 0.0)
-    return Constraints(
-        error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0, factors.information,
-        factors.weight, jacobian[:, free], priors[free][:, free], used)
+    return Constraints(error, np.diagonal(factors.information, axis1=1, axis2=2) > 0.0,
+                       factors.information, factors.weight, jacobian[:, free],
+                       priors[free][:, free], used)
 
 
 def restricted_likelihood(
@@ -209,7 +209,7 @@ def _statistics(
 class Analysis(NamedTuple):
     """The residuals of each source, and how large its true sigmas are."""
 
-    residuals: Mapping[str, SourceResiduals]  # at the estimate
+    residuals: dict[str, SourceResiduals]  # at the estimate
     fits: Mapping[str, ScaleFit]  # how large they are, with the factors of all in one estimate
     # Sources with correlated errors that the graph takes for independent: the residuals do not
     # show how large these are, and what those of other sources show may be because of them.
@@ -232,9 +232,8 @@ def analyse(parts: Parts) -> Analysis:
             for source, each in residuals.items()}
     white = {source: each for source, each in residuals.items()
              if each.kind != 'map' or np.all(parts.graph.factors_at(each.ids).j < 0)}
-    correlated = frozenset(
-        source for source, each in white.items() if each.kind == 'map'
-        and (found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
+    correlated = frozenset(source for source, each in white.items() if each.kind == 'map' and (
+        found := source_residuals.whiteness(each)) is not None and found.tau > 0.0)
     if len(correlated) == 0:
         fits |= _together(parts, fits, white)
     return Analysis(residuals, fits, correlated)
@@ -277,27 +276,17 @@ def _together(
     found = restricted_likelihood(data, np.array(list(components.values())), fixed)
     if found is None:
         return {source: at_estimate[source].unknown for source in sources}
-    return {source: _with_factors(
-        at_estimate[source], own[at], found,
-        {kind: k for k, (name, kind) in enumerate(components) if name == source},
-        in_use=nodes.errors.mean_sigma if source == nodes.primary else 1.0)
-        for source, at in rows.items() if len(at) > 0}
-
-
-def _with_factors(
-    present: ScaleFit, claimed: Covariances, found: Found, parts: Mapping[int, int], *,
-    in_use: float,
-) -> ScaleFit:
-    """Return a fit with other factors, in place of those that its source alone shows."""
-    sigmas = np.sqrt(np.mean(np.diagonal(claimed, axis1=1, axis2=2), axis=0)) / in_use
-    rows = []
-    for row in present.rows:
-        part = parts.get(row.coordinate // 2)
-        ratio, low, high, _ = found.of([] if part is None else [part])
-        rows.append(row._replace(
-            sigma=float(sigmas[row.coordinate]), ratio=in_use * ratio, low=in_use * low,
-            high=in_use * high))
-    ratio, low, high, independent = found.of(list(parts.values()))
-    return present._replace(
-        rows=tuple(rows), ratio=in_use * ratio, low=in_use * low, high=in_use * high,
-        independent=independent)
+    # the factors of all in place of those that each source alone shows
+    fits = {}
+    for source, at in rows.items():
+        if len(at) == 0:
+            continue
+        in_use = nodes.errors.mean_sigma if source == nodes.primary else 1.0
+        sigmas = np.sqrt(np.mean(np.diagonal(own[at], axis1=1, axis2=2), axis=0)) / in_use
+        scaled = found._replace(ratios=in_use * found.ratios)
+        numbers = {kind: k for k, (name, kind) in enumerate(components) if name == source}
+        fits[source] = at_estimate[source]._replace(rows=tuple(row._replace(
+            **scaled.of([k for kind, k in numbers.items() if kind == row.coordinate // 2]) | {
+                'sigma': float(sigmas[row.coordinate]), 'independent': row.independent})
+            for row in at_estimate[source].rows), **scaled.of([*numbers.values()]))
+    return fits

@@ -22,7 +22,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from pose_graph_ros.adapters.conversions import frame
 from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
 from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.disagreement import Disagreement
@@ -45,14 +45,12 @@ def values(session: 'Session') -> dict[str, object]:
     status, estimate = worker.status, worker.estimate
     found: dict[str, object] = {
         'received': sum(each.count for each in session.input.arrivals.values()),
-        'processed': status.processed + sum(rejected.values()),
-        'pending': status.pending, 'quarantined': status.quarantined,
-        'updates': status.updates, 'prepared': int(worker.prepared),
-        'active': int(session.active), 'paused': int(session.input.paused),
-        'resets': session.n_resets,
+        'processed': status.processed + sum(rejected.values()), 'pending': status.pending,
+        'quarantined': status.quarantined, 'updates': status.updates,
+        'prepared': int(worker.prepared), 'active': int(session.active),
+        'paused': int(session.input.paused), 'resets': session.n_resets,
         'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
-        'solve_max_ms': f'{1e3 * status.solve_max:.3f}',
-        'memory_mb': f'{memory() / 1e6:.0f}'}
+        'solve_max_ms': f'{1e3 * status.solve_max:.3f}', 'memory_mb': f'{memory() / 1e6:.0f}'}
     if session.reset_reason != '':
         found['reset_reason'] = session.reset_reason
     found |= {f'{source}.{answer}': count
@@ -66,14 +64,13 @@ def values(session: 'Session') -> dict[str, object]:
         for source, each in status.differences.items()}
     found |= {f'quarantined.{rank}': name for rank, name in enumerate(status.set_aside, 1)}
     if estimate is not None:
-        found.update({
-            'odometry': estimate.primary, 'alignment': estimate.alignment.value,
-            'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
-            'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
-            'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
-            'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
-            'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
-            'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
+        found.update({'odometry': estimate.primary, 'alignment': estimate.alignment.value,
+                      'alignment_yaw_deg': f'{math.degrees(estimate.T_map_odom[2]):.3f}',
+                      'alignment_sigma_deg': f'{math.degrees(estimate.alignment_sigma):.3f}',
+                      'hidden_nodes': estimate.n_hidden, 'frozen_nodes': estimate.n_frozen,
+                      'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
+                      'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
+                      'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
         if (errors := estimate.odometry_errors) != AS_CLAIMED:
             # never a whole number: those are counts
             found |= {f'{estimate.primary}.errors_{name}': f'{value:.6f}'
@@ -170,11 +167,6 @@ class Concern(NamedTuple):
     text: str
     logged: bool = False  # whether the log has it, too, when it begins and when it is over
 
-    @property
-    def sentence(self) -> str:
-        """The text as a sentence."""
-        return f'{self.text[0].upper()}{self.text[1:]}.'
-
 
 ERROR, WARN, GOOD = DiagnosticStatus.ERROR, DiagnosticStatus.WARN, DiagnosticStatus.OK
 
@@ -232,8 +224,8 @@ def _missing_input(session: 'Session') -> Iterator[Concern]:
             f'a graph of {estimate.n_hidden} hidden nodes is loaded and waits for odometry')
         yield Concern(WARN, f'{state}: {why}')
     if received.quiet > 0.0:
-        yield Concern(WARN, f'nothing has been received for {received.quiet:.0f} s: the drivers '
-                      'have stopped, or a bag has ended'
+        yield Concern(WARN, 'nothing has been received for '
+                      f'{received.quiet:.0f} s: the drivers have stopped, or a bag has ended'
                       + ('; the graph has been optimised' if session.worker.is_optimal else ''),
                       logged=True)
     if len(refused) > 0:

@@ -19,10 +19,10 @@ import time
 from typing import Any, NamedTuple
 
 from pose_graph_ros.adapters.conversions import Message
-from pose_graph_ros.adapters.sources import MessageReader
+from pose_graph_ros.adapters.sources import Measured, MessageReader
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.se2 import between_one
-from pose_graph_ros.core.measurements import Answer, Measurement, OdometrySample, rejected
+from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
 from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS, TimeKeeper
 from pose_graph_ros.core.quantities import Seconds, StampNs
@@ -30,8 +30,7 @@ from pose_graph_ros.core.quantities import Seconds, StampNs
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Expectations:
+class Expectations(NamedTuple):
     """When sources are missed [s], and from when on it is said that they are refused."""
 
     # A source is silent after the longest of this time, this many of its median gaps between two
@@ -49,6 +48,9 @@ class Expectations:
 
 
 EXPECTED = Expectations()
+Counts = Counter[tuple[str, str]]
+Details = Mapping[tuple[str, str], str]
+"""Of messages by source and 'accepted' or a reason, and details of the newest refusals."""
 INTENDED = ('paused', 'thinned')  # reasons that the user has asked for
 
 
@@ -124,15 +126,11 @@ class Arrivals:
         if self.n_apart >= EVIDENCE and clock_ns - self.apart_since_ns >= EVIDENCE_NS:
             way = 'ahead of' if late_ns < 0 else 'behind'
             waits = ', for which its measurements wait' if may_be_late else ''
-            self.wrong = (
-                f'the stamps of {self.source} are {abs(self.delay):.1f} s {way} those of '
-                f'{odometry}{waits}: mend the clock of its driver (GPS time is 18 s ahead of '
-                f'UTC), or set {self.source}.time_offset')
+            self.wrong = (f'the stamps of {self.source} are {abs(self.delay):.1f} s {way} those '
+                          f'of {odometry}{waits}: mend the clock of its driver (GPS time is 18 s '
+                          f'ahead of UTC), or set {self.source}.time_offset')
 
-    def refusal(
-        self, counts: Counter[tuple[str, str]], details: Mapping[tuple[str, str], str],
-        now: Seconds,
-    ) -> str:
+    def refusal(self, counts: Counts, details: Details, now: Seconds) -> str:
         """Return what to say if its newest messages were all refused, else an empty text."""
         refused = Counter({reason: counts[name, reason] for name, reason in details
                            if name == self.source and reason not in INTENDED})
@@ -146,9 +144,9 @@ class Arrivals:
             return ''
         begin = f'{count} of {self.count}' if accepted == 0 else f'the newest {count}'
         # all reasons with the newest detail of each, the most frequent first
-        reasons = '; '.join(
-            (f'{n} times ' if len(newest) > 1 else '') + f'{reason} '
-            f'({details[self.source, reason]})' for reason, n in newest.most_common())
+        reasons = '; '.join((f'{n} times ' if len(newest) > 1 else '')
+                            + f'{reason} ({details[self.source, reason]})'
+                            for reason, n in newest.most_common())
         return f'{begin} messages of {self.source} were refused: {reasons}'
 
 
@@ -179,7 +177,7 @@ class ReceivedMessage(NamedTuple):
 
     source: str
     message: Message
-    measurement: OdometrySample | Measurement
+    measurement: Measured
     refusal: Answer | None = None  # why it is not used, by its stamp
 
 
@@ -273,10 +271,9 @@ class Input:
         self._clear()
 
     def _clear(self) -> None:
-        self.arrivals = {
-            name: Arrivals(name, is_rare=source.kind.is_rare)
-            for name, source in self.reader.sources.items()}
-        self.rejected: Counter[tuple[str, str]] = Counter()  # number by source and reason
+        self.arrivals = {name: Arrivals(name, is_rare=source.kind.is_rare)
+                         for name, source in self.reader.sources.items()}
+        self.rejected: Counts = Counter()  # number by source and reason
         self._details: dict[tuple[str, str], str] = {}  # of the newest by source and reason
         self.posted = 0  # number of measurements that were handed to the engine
         self.silent: list[str] = []  # sources that are silent while others are not
@@ -312,7 +309,7 @@ class Input:
         overdue = time.monotonic() - self._odometry_at > LONGEST_DOUBT
         return self.time_jumps.release() if overdue else []
 
-    def read(self, source: str, message: Message) -> OdometrySample | Measurement | None:
+    def read(self, source: str, message: Message) -> Measured | None:
         """Return the measurement of a message; None if it cannot be used, whatever its stamp."""
         try:
             measurement = self.reader.convert(source, message)
@@ -325,10 +322,7 @@ class Input:
             message.header.frame_id, getattr(message, 'child_frame_id', ''))
         return measurement
 
-    def post(
-        self, received: ReceivedMessage,
-        post: Callable[[str, OdometrySample | Measurement], bool],
-    ) -> None:
+    def post(self, received: ReceivedMessage, post: Callable[[str, Measured], bool]) -> None:
         """Hand a measurement to the engine, unless its stamp is refused or the input is paused."""
         source, _, measurement, refusal = received
         if refusal is not None:
@@ -341,10 +335,7 @@ class Input:
             self.posted += 1
             self.posted_at, self.is_streaming = time.monotonic(), True
 
-    def watch(
-        self, counts: Counter[tuple[str, str]], details: Mapping[tuple[str, str], str], *,
-        active: bool,
-    ) -> None:
+    def watch(self, counts: Counts, details: Details, *, active: bool) -> None:
         """
         Find the sources that are silent or refused, and log each reason once.
 
@@ -360,9 +351,8 @@ class Input:
         for (source, reason), detail in details.items():
             if source in self.reader.sources and (source, reason) not in self._told:
                 self._told.add((source, reason))
-                logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
-                           '%s: %s: %s (logged once, counted in diagnostics)',
-                           source, reason, detail)
+                logger.log(logging.INFO if reason in INTENDED else logging.WARNING, '%s: %s: %s '
+                           '(logged once, counted in diagnostics)', source, reason, detail)
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used."""
@@ -385,8 +375,7 @@ class PoseContinuity:
 
     def __init__(self, maximum_speed: float, *, resumes: bool = False) -> None:
         self.maximum_speed = maximum_speed  # may be changed at any time
-        self._resumes = resumes
-        self._stamp_ns = 0
+        self._resumes, self._stamp_ns = resumes, 0
         self._pose = (0.0, 0.0, 0.0)
         self._window = SpeedWindow(UNKNOWN, 0, self._pose)
         self._jump_ns = 0
@@ -400,11 +389,9 @@ class PoseContinuity:
             motion = between_one(self._pose, (x, y, theta))
             step = math.hypot(motion[0], motion[1]), abs(motion[2])
             begins = self._stamp_ns == 0 or elapsed_ns < 0
-            if begins:
-                jumped = self._stamp_ns == 0 and self._resumes
-            else:
-                jumped = elapsed_ns > FAR_NS or is_jump(
-                    self._window.speeds, step, elapsed_ns * 1e-9, sample.speed, self.maximum_speed)
+            jumped = (self._stamp_ns == 0 and self._resumes) if begins else (
+                elapsed_ns > FAR_NS or is_jump(self._window.speeds, step, elapsed_ns * 1e-9,
+                                               sample.speed, self.maximum_speed))
             self._stamp_ns, self._pose = sample.stamp_ns, (x, y, theta)
             if begins or jumped:
                 self._window = SpeedWindow(self._window.speeds, sample.stamp_ns, self._pose)

@@ -8,7 +8,7 @@ an error with each message, is left out and counted.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
 import logging
 import math
 import re
@@ -98,9 +98,7 @@ class NodeLog(logging.Handler):
         super().close()
 
 
-def verdict_lines(
-    changes: Sequence[Change], doubted: Collection[str],
-) -> Iterator[tuple[int, str, object]]:
+def verdict_lines(changes: list[Change], doubted: set[str]) -> Iterator[tuple[int, str, object]]:
     """
     Yield level, text and way of each way in which the states of constraints have changed.
 

@@ -119,8 +119,7 @@ class PoseGraphNode(LifecycleNode):
         return self._session
 
     def _configure(self) -> None:
-        values = rules.checked(self._given)
-        rules.require_together(values)
+        values = rules.checked_together(self._given)
         check_topics(self, values, self._overrides)
         self._session = Session(self, values)
         self._offered = Services(self, self._session)

@@ -10,10 +10,10 @@ and to save its graph.
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 import time
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
@@ -28,10 +28,8 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from pose_graph_ros.adapters import bag_inputs
-from pose_graph_ros.adapters.bag_writer import BagWriter
+from pose_graph_ros.adapters import bag_inputs, bag_writer, parameter_table
 from pose_graph_ros.adapters.bags import MessageError, open_bag
-from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros.topics import message_class, TF_TYPE, TFMessage
@@ -45,8 +43,7 @@ LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
-@dataclass(frozen=True, slots=True)
-class Patience:
+class Patience(NamedTuple):
     """Longest waits for the node [s], and how far it may fall behind."""
 
     appear: float = 30.0
@@ -58,10 +55,6 @@ class Patience:
 
 
 PATIENCE = Patience()
-
-
-class PlayError(PoseGraphError):
-    """The node did not respond as expected; the message says how."""
 
 
 class Player(Node):
@@ -84,8 +77,7 @@ class Player(Node):
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
         self.diagnostics: dict[str, str] = {}  # the newest values of the node's diagnostics
-        self.n_poses = 0  # of the newest path
-        outputs = {name: OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
+        outputs = {name: parameter_table.OUTPUTS[name][:2] for name in (*RECORDED, *KEPT)}
         if TFMessage is not None:
             outputs['tf'] = '/tf', TF_TYPE
         for name, (relative, type_name) in outputs.items():
@@ -93,9 +85,8 @@ class Player(Node):
             self.create_subscription(
                 message_class(type_name), topic, partial(self._record, name, topic, type_name),
                 LATCHED if name in KEPT else RELIABLE, raw=True)
-        self._optimize, self._save = (
-            self.create_client(Trigger, f'{NODE_NAME}/{name}')
-            for name in ('optimize', 'save_graph'))
+        self._optimize, self._save = (self.create_client(Trigger, f'{NODE_NAME}/{name}')
+                                      for name in ('optimize', 'save_graph'))
 
     def _record(self, output: str, topic: str, type_name: str, raw: bytes) -> None:
         received = topic, type_name, time.time_ns(), raw
@@ -120,9 +111,9 @@ class Player(Node):
         end = time.monotonic() + timeout
         while not done():
             if not self._is_running():
-                raise PlayError('the node ended early')
+                raise PoseGraphError('the node ended early')
             if time.monotonic() > end:
-                raise PlayError(f'{failure} (waited {timeout:g} s)')
+                raise PoseGraphError(f'{failure} (waited {timeout:g} s)')
             self._executor.spin_once(timeout_sec=0.05)
 
     def play(self, bag: Path, rate: float) -> Counter[str]:
@@ -136,10 +127,9 @@ class Player(Node):
         self._spin_until(
             lambda: all(writer.get_subscription_count() > 0 for writer in self._writers.values())
             and len(self.diagnostics) > 0 and self._optimize.service_is_ready()
-            and self._save.service_is_ready(), PATIENCE.appear,
-            'the node does not subscribe')
+            and self._save.service_is_ready(), PATIENCE.appear, 'the node does not subscribe')
         self._spin_until(lambda: self.diagnostics.get('prepared') != '0', PATIENCE.prepare,
-                        'the node is still compiling')
+                         'the node is still compiling')
         sent = self.processed
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
@@ -205,17 +195,21 @@ class Player(Node):
         self._spin_until(asked.done, PATIENCE.answer, f'no answer to {what}')
         return asked.result()
 
-    def write(self, folder: Path) -> None:
-        """Have the node save its graph, and write a rosbag2 of all that it has published."""
+    def write(self, folder: Path) -> int:
+        """
+        Have the node save its graph, and write a rosbag2 of all that it has published.
+
+        Return the number of poses of the newest path.
+        """
         answer = self._call(self._save, 'saving the graph')
         if not answer.success:
-            raise PlayError(f'~/save_graph: {answer.message}')
-        path = deserialize_message(self._newest['path'][-1], PathMessage)
-        self.n_poses = len(path.poses)
+            raise PoseGraphError(f'~/save_graph: {answer.message}')
         newest = list(self._newest.values())
-        with BagWriter(folder, overwrite=True, latched=[each[0] for each in newest]) as writer:
+        latched = [each[0] for each in newest]
+        with bag_writer.BagWriter(folder, overwrite=True, latched=latched) as writer:
             for message in (*self._recorded, *newest):
                 writer.write(*message)
+        return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
 
 
 def play(
@@ -233,10 +227,10 @@ def play(
         player = Player(inputs, topics, context, is_running)
         published = player.play(bag, rate)
         success, answer = player.request_final_optimization()
-        player.write(out)
+        n_poses = player.write(out)
         print('published: ' + ', '.join(f'{key} {count}' for key, count in published.items()))
         print(f'the node: processed {player.processed}; optimisation {answer}; '
-              f'path of {player.n_poses} poses')
+              f'path of {n_poses} poses')
     finally:
         rclpy.try_shutdown(context=context)
     return success

@@ -9,7 +9,6 @@ but the transform and the diagnostics are made only while there is a subscriber.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 import math
 import threading
 import time
@@ -22,19 +21,15 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.adapters import output_cdr
+from pose_graph_ros.adapters import output_cdr, parameter_table, parameters
 from pose_graph_ros.adapters.conversions import frame, Message
-from pose_graph_ros.adapters.output_cdr import UNKNOWN_VARIANCE
-from pose_graph_ros.adapters.parameter_table import OUTPUTS
-from pose_graph_ros.adapters.parameters import FRAMES
 from pose_graph_ros.adapters.sources import JUDGE, source_list
 from pose_graph_ros.adapters.surroundings import Datum
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict
 from pose_graph_ros.core.geometry import covariance as cov
@@ -54,7 +49,7 @@ LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 
 LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
-UNPLACED = np.diag((UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
+UNPLACED = np.diag((*2 * [output_cdr.UNKNOWN_VARIANCE], UNKNOWN_HEADING_VARIANCE))
 LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
           State.DOUBTED: DiagnosticStatus.WARN, State.WAITING: DiagnosticStatus.STALE}
 
@@ -73,8 +68,7 @@ class View:
 
     def is_due(self, state: object, period: Seconds) -> bool:
         """Tell whether to publish what is new, if a state is given, wanted, and not too soon."""
-        return ((state is None or state != self.shown)
-                and time.monotonic() - self.at >= period
+        return ((state is None or state != self.shown) and time.monotonic() - self.at >= period
                 and bool(self.publisher.get_subscription_count() > 0))
 
 
@@ -83,12 +77,12 @@ class Publishers:
 
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self._node = node
-        self.frames = tuple(frame(values[name]) for name in FRAMES)
+        self.frames = tuple(frame(values[name]) for name in parameters.FRAMES)
         self.map_frame, self.odom_frame, self.base_frame = self.frames
-        self._publishers = {
-            name: self._publisher(type_name, values[f'outputs.{name}'],
-                                  LATCHED_QOS if name in LATCHED else OUTPUT_QOS)
-            for name, (_, type_name, _) in OUTPUTS.items()}
+        self._publishers = {name: node.create_publisher(
+            topics.message_class(type_name), values[f'outputs.{name}'],
+            **topics.overridable(LATCHED_QOS if name in LATCHED else OUTPUT_QOS))
+            for name, (_, type_name, _) in parameter_table.OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
             self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))
         self.path, self.markers, self.verdicts = (View(self._publishers[name]) for name in LATCHED)
@@ -103,20 +97,14 @@ class Publishers:
         self._lock = threading.Lock()
         self.configure(values)
 
-    def _publisher(self, type_name: str, topic: str, qos: QoSProfile) -> Publisher:
-        return self._node.create_publisher(
-            topics.message_class(type_name), topic,
-            copy(qos),  # rclpy writes the overrides into it
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-
     def configure(self, values: Mapping[str, Any]) -> None:
         """Set the parameters that can change while the node runs."""
         if values['publish_tf'] and TFMessage is None:
-            self._node.get_logger().warning(
-                'tf2_msgs is not installed: the transform from map to odom is not published',
-                once=True)
+            self._node.get_logger().warning('tf2_msgs is not installed: the transform from map to '
+                                            'odom is not published', once=True)
         elif values['publish_tf'] and self.transforms is None:
-            publisher = self._publisher(topics.TF_TYPE, topics.TOPIC, topics.TF_QOS)
+            publisher = self._node.create_publisher(
+                TFMessage, topics.TOPIC, **topics.overridable(topics.TF_QOS))
             self.transforms = TransformPublisher(
                 self._node, publisher, self.map_frame, self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:
@@ -163,7 +151,7 @@ class Publishers:
             latitude, longitude, _ = plane.to_geodetic(
                 prediction.T_map_base[:2], altitude if math.isfinite(altitude) else plane.altitude)
             # in east and north
-            covariance = np.diag((0.0, 0.0, UNKNOWN_VARIANCE))
+            covariance = np.diag((0.0, 0.0, output_cdr.UNKNOWN_VARIANCE))
             turned = cov.turned(prediction.covariance[:2, :2], -plane.yaw)
             covariance[:2, :2] = 0.5 * (turned + turned.T)
             self._fix.publish(NavSatFix(
@@ -227,20 +215,19 @@ class Publishers:
             self.transforms.forget()
         with self._lock:
             self.graph += 1
-            for view, empty in (
-                    (self.path, lambda header: Path(header=header)),
-                    (self.markers, lambda header: MarkerArray(
-                        markers=[Marker(header=header, action=Marker.DELETEALL)])),
-                    (self.verdicts, lambda header: verdicts_message([], {}, header))):
+            for view, empty in ((self.path, lambda header: Path(header=header)),
+                                (self.markers, lambda header: MarkerArray(
+                                    markers=[Marker(header=header, action=Marker.DELETEALL)])),
+                                (self.verdicts, lambda header: verdicts_message([], {}, header))):
                 if view.stamp_ns > 0:
                     view.publisher.publish(empty(_header(view.stamp_ns + 1, self.map_frame)))
                 view.forget()
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
-        status = DiagnosticStatus(
-            level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph', message=text,
-            hardware_id='pose_graph', values=_key_values(values))
+        status = DiagnosticStatus(level=level, name=f'{self._node.get_fully_qualified_name()}: '
+                                  'pose graph', message=text, hardware_id='pose_graph',
+                                  values=_key_values(values))
         self._publishers['diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
 
@@ -261,10 +248,10 @@ def verdicts_message(
     n_all = sum(sum(each.counts.values()) for each in totals.values())
     of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
     doubting = any(each.doubting for each in totals.values())
-    summary = DiagnosticStatus(
-        level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK, name='summary',
-        message=f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}',
-        values=_key_values(total_values(totals)))
+    summary = DiagnosticStatus(level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK,
+                               name='summary', message=f'{len(verdicts)} '
+                               f'of {n_all} are listed; {of_sources or "nothing is judged yet"}',
+                               values=_key_values(total_values(totals)))
     return DiagnosticArray(header=header, status=[summary, *(DiagnosticStatus(
         level=LEVELS[each.state], name=each.id, message=sentence(each), hardware_id=each.source,
         values=_key_values(details(each))) for each in verdicts)])

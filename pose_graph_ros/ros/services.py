@@ -32,8 +32,7 @@ logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
 CLOSED = 'the node was cleaned up meanwhile'
-SERVICE_THREAD = 'pose graph services'
-HIDDEN_NODE = '_services'
+SERVICE_THREAD, HIDDEN_NODE = 'pose graph services', '_services'
 Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
 
@@ -114,19 +113,17 @@ class Services:
         estimate = self._session.worker.estimate
         self._session.reset()
         plane = self._session.input.reader.datum.plane
-        return True, (
-            f'{0 if estimate is None else estimate.n_hidden} hidden nodes are gone; '
-            + ('the next good fix will be the datum' if plane is None else
-               f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]'))
+        return True, (f'{0 if estimate is None else estimate.n_hidden} hidden nodes are gone; ' + (
+            'the next good fix will be the datum' if plane is None else 'the datum is still '
+            f'[{plane.latitude:.9f}, {plane.longitude:.9f}]'))
 
     def _pause(self, request: SetBool.Request) -> Answer:
         received = self._session.input
         if received.paused == request.data:
             return True, 'paused already' if request.data else 'was not paused'
         received.paused = request.data
-        return True, (
-            'paused: measurements are counted but not used; poses still follow the odometry'
-            if request.data else 'resumed')
+        return True, ('paused: measurements are counted but not used; poses still '
+                      'follow the odometry' if request.data else 'resumed')
 
     def _set_datum(self, _: Trigger.Request) -> Answer:
         """Let the next good fix be the datum, unless the graph refers to the present one."""

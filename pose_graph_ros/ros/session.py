@@ -9,7 +9,6 @@ the newest estimate, propagated by it, is published; path and markers are after 
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from copy import copy
 from functools import partial
 import logging
 import math
@@ -20,7 +19,6 @@ from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
@@ -31,20 +29,11 @@ from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS
-from pose_graph_ros.ros import diagnostics
+from pose_graph_ros.ros import diagnostics, publishers, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
-from pose_graph_ros.ros.publishers import Publishers
 from pose_graph_ros.ros.requests import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.topics import (
-    CLOSURE_QOS,
-    INPUTS,
-    JUDGE_TOPIC,
-    message_class,
-    SENSOR_QOS,
-    STATIC_TOPIC,
-)
 from pose_graph_ros.ros.worker import Worker
 
 logger = logging.getLogger(__name__)
@@ -58,8 +47,8 @@ class Session:
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
-        initial = initial_graph(values)
-        self.input, self.out = Input(values), Publishers(node, values)
+        path, datum = initial_graph(values) or (None, None)
+        self.input, self.out = Input(values), publishers.Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
         self.n_resets, self.reset_reason = 0, ''
@@ -71,7 +60,6 @@ class Session:
         self._jump_handle: JumpHandle | None = None
         # a clock that is set back, or a bag that starts again, must not stall a timer
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        path, datum = initial or (None, None)
 
         def prepare(stopped: Callable[[], bool]) -> PoseGraphBackend | None:
             self._warm_up(stopped)
@@ -87,9 +75,8 @@ class Session:
         resumes: bool,
     ) -> None:
         """Start the thread that owns a graph, which may resume a drive."""
-        self._continuity = {
-            name: PoseContinuity(source.maximum_speed, resumes=resumes)
-            for name, source in self._config.odometry.items()}
+        self._continuity = {name: PoseContinuity(source.maximum_speed, resumes=resumes)
+                            for name, source in self._config.odometry.items()}
         self.is_loaded = resumes  # whether the graph began as one that was loaded
         # of this graph, so that the answer of an earlier worker is nobody's
         self.searches = diagnostics.Searches()
@@ -122,20 +109,19 @@ class Session:
         sources = self.input.reader.sources.values()
         callbacks: dict[str, Callable[[Any], None]] = {
             'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
-            JUDGE_TOPIC: lambda message: decide(message, self.worker),
-            STATIC_TOPIC: self.input.reader.frames.receive}
+            topics.JUDGE_TOPIC: lambda message: decide(message, self.worker),
+            topics.STATIC_TOPIC: self.input.reader.frames.receive}
         in_frames = any(source.kind.in_frames for source in sources)
         wanted: list[tuple[str, str, QoSProfile, Callable[[Any], None]]] = [
-            (topic, *given, callbacks[topic]) for topic, given in INPUTS.items()
-            if topic != STATIC_TOPIC or in_frames]
+            (topic, *given, callbacks[topic]) for topic, given in topics.INPUTS.items()
+            if topic != topics.STATIC_TOPIC or in_frames]
         wanted += [(source.topic, source.kind.message_type,
-                    CLOSURE_QOS if source.kind.is_rare else SENSOR_QOS,
+                    topics.CLOSURE_QOS if source.kind.is_rare else topics.SENSOR_QOS,
                     partial(self._on_message, source)) for source in sources]
         for topic, kind, qos, callback in wanted:
             self._subscriptions.append(self.node.create_subscription(
-                message_class(kind), topic, guarded(callback, lambda: self.active),
-                copy(qos),  # rclpy writes the overrides into it
-                qos_overriding_options=QoSOverridingOptions.with_default_policies()))
+                topics.message_class(kind), topic, guarded(callback, lambda: self.active),
+                **topics.overridable(qos)))
         self._watch_time()
         self.active, self.activated_at = True, time.monotonic()
         for arrivals in self.input.arrivals.values():
@@ -328,7 +314,8 @@ class Session:
         self.searches.update(self.worker)
         # in this order: the sentence is then at least as new as the values beside it
         values, found = diagnostics.values(self), [*diagnostics.concerns(self)]
-        self.out.publish_diagnostics(found[0].level, found[0].sentence, values)
+        level, text, _ = found[0]
+        self.out.publish_diagnostics(level, f'{text[0].upper()}{text[1:]}.', values)
         if self.active:
             present = {NUMBER.sub('', each.text): each.text for each in found if each.logged}
             for key in present.keys() - self._told.keys():

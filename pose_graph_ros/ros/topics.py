@@ -10,6 +10,7 @@ and others that publish it.
 
 from collections import Counter, deque
 from collections.abc import Mapping
+from copy import copy
 from importlib import import_module
 import math
 import time
@@ -19,6 +20,7 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
@@ -26,7 +28,7 @@ from pose_graph_ros.adapters import output_cdr
 from pose_graph_ros.adapters.conversions import frame, stamp_ns
 from pose_graph_ros.adapters.parameter_table import OUTPUTS
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, source_list
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
@@ -54,6 +56,12 @@ TOPIC, STATIC_TOPIC = '/tf', '/tf_static'
 LISTENING, PAUSE = 2.0, 30.0
 
 
+def overridable(profile: QoSProfile) -> dict[str, Any]:
+    """Return the arguments of a publisher or subscription whose parameters override a profile."""
+    return {'qos_profile': copy(profile),  # rclpy writes the overrides into it
+            'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
+
+
 def other_publishers(node: Node, topic: str) -> list[str]:
     """Return the full names of the other nodes that publish a topic, which may be like its own."""
     names = Counter(
@@ -70,10 +78,9 @@ def other_publishers(node: Node, topic: str) -> list[str]:
 SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100)     # a loop closure is rare and must not get lost
 JUDGE_TOPIC = '~/judge'
-INPUTS = {
-    'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
-    'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
-    JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
+INPUTS = {'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+          'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
+          JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
 """Messages and quality of service by topic, but for the sources."""
 if TFMessage is not None:   # late subscribers receive the newest message of every broadcaster
     INPUTS[STATIC_TOPIC] = TF_TYPE, QoSProfile(
@@ -109,9 +116,8 @@ def check_topics(node: Node, values: Mapping[str, Any], overrides: Mapping[str, 
                               f'has with {other}')
         if published != '' and output == '':
             hint = f': move that {moved(node, published)}, instead of a remap, which moves both'
-            raise ConfigError(
-                f'{user}: expected a topic that the node does not publish, got {topic}, which is '
-                f'{first}{hint if published in OUTPUTS else ""}')
+            raise ConfigError(f'{user}: expected a topic that the node does not publish, got '
+                              f'{topic}, which is {first}{hint if published in OUTPUTS else ""}')
     for name, value in sorted(overrides.items()):
         topic, _, rest = name.removeprefix(OVERRIDES).partition('.')
         entity, _, policy = rest.partition('.')
@@ -203,20 +209,18 @@ class TransformPublisher:
         if self._odom_frame.encode() not in data or self.other != '':
             return
         for transform in deserialize_message(data, TFMessage).transforms:
-            parent = frame(transform.header.frame_id)
-            t = transform.transform
+            parent, t = frame(transform.header.frame_id), transform.transform
             if frame(transform.child_frame_id) != self._odom_frame or (
                     stamp_ns(transform), t.translation.x, t.rotation.z) in self._own:
                 continue
             names = ' or '.join(other_publishers(self._node, TOPIC))
             names = names and f', by {names}'
             wrong = '' if parent == self._map_frame else ', so that it has two parents'
-            self.other = (
-                f'another node publishes {parent} -> {self._odom_frame} on '
-                f'{self._node.resolve_topic_name(TOPIC)}{names}{wrong}: set publish_tf of one of '
-                'the two to false; if it is that of another robot, give each a namespace and its '
-                'own tf, with remap_tf:=true of the launch file or -r /tf:=tf '
-                '-r /tf_static:=tf_static')
+            self.other = (f'another node publishes {parent} -> {self._odom_frame} on '
+                          f'{self._node.resolve_topic_name(TOPIC)}{names}{wrong}: set publish_tf '
+                          'of one of the two to false; if it is that of another robot, give each '
+                          'a namespace and its own tf, with remap_tf:=true of the launch file or '
+                          '-r /tf:=tf -r /tf_static:=tf_static')
             return
 
 
@@ -244,8 +248,7 @@ class Slew:
         if self._last is not None and (linear > 0.0 or angular > 0.0):
             elapsed = (stamp_ns - self._stamp_ns) * 1e-9
             shown = se2.compose(self._last, T_odom_base)
-            wanted = se2.compose(T_map_odom, T_odom_base)
-            step = wanted - shown
+            step = se2.compose(T_map_odom, T_odom_base) - shown
             step[2] = se2.wrap(step[2])
             distance, turn = math.hypot(step[0], step[1]), abs(float(step[2]))
             if 0.0 < linear * elapsed < distance:

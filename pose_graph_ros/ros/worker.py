@@ -17,12 +17,13 @@ import threading
 import time
 from typing import TypeVar
 
+from pose_graph_ros.adapters.sources import Measured
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
-from pose_graph_ros.core.measurements import Measurement, OdometrySample
+from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.odometry.gyro import Difference
 from pose_graph_ros.core.sources.bias import Calibration
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -79,7 +80,7 @@ class Worker:
         self._backend, self._on_estimate, self._prepare = backend, on_estimate, prepare
         self.prepared = False  # whether the preparation has ended
         self.is_optimal = False  # whether the whole graph was optimised since the last update
-        self._inbox: deque[tuple[str, OdometrySample | Measurement]] = deque()
+        self._inbox: deque[tuple[str, Measured]] = deque()
         self._update_wanted = False
         self._jobs: list[tuple[str, Job[object], Future[object]]] = []
         self._stopping = False
@@ -101,7 +102,7 @@ class Worker:
         self.thread.join(timeout)
         return not self.thread.is_alive()
 
-    def post(self, source: str, measurement: OdometrySample | Measurement) -> bool:
+    def post(self, source: str, measurement: Measured) -> bool:
         """Return whether a measurement was handed over: not if the inbox is full."""
         with self._condition:
             if len(self._inbox) >= 100_000:
@@ -172,9 +173,7 @@ class Worker:
         """Tell whether more is asked for than to add measurements."""
         return self._stopping or self._update_wanted or len(self._jobs) > 0
 
-    def _process(
-        self, batch: Collection[tuple[str, OdometrySample | Measurement]], *, wanted: bool,
-    ) -> None:
+    def _process(self, batch: Collection[tuple[str, Measured]], *, wanted: bool) -> None:
         """Add measurements, and update the graph if that is wanted."""
         for source, measurement in batch:
             if self._stopping:
@@ -276,10 +275,9 @@ class Worker:
         count, total, longest = self._durations
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
-            refusals=dict(backend.refusals),
-            pending=backend.n_waiting, quarantined=backend.n_quarantined,
-            set_aside=backend.set_aside(3), updates=count, solve_mean=total / max(count, 1),
-            solve_max=longest,
+            refusals=dict(backend.refusals), pending=backend.n_waiting,
+            quarantined=backend.n_quarantined, set_aside=backend.set_aside(3), updates=count,
+            solve_mean=total / max(count, 1), solve_max=longest,
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
             biases=backend.gyro_biases(backend.graph), calibrations=backend.calibrations(),

@@ -11,7 +11,7 @@ from sensor_msgs.msg import Range as RangeMessage
 from tf2_msgs.msg import TFMessage
 
 from pose_graph_ros.adapters import conversions
-from pose_graph_ros.adapters.parameters import checked, require_together
+from pose_graph_ros.adapters.parameters import checked, checked_together
 from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY, Source
 from pose_graph_ros.adapters.surroundings import Datum, StaticFrames, Surroundings
 from pose_graph_ros.core.exceptions import ConfigError
@@ -31,7 +31,7 @@ def test_odometry_is_read_whatever_the_length_of_its_quaternion() -> None:
     message = odometry(12.5, 1.0, -2.0, 2.5)
     message.pose.pose.orientation.z *= 3.0
     message.pose.pose.orientation.w *= 3.0
-    sample = conversions.odometry_sample(message, SOURCE, BY)
+    sample = conversions.odometry(message, SOURCE, BY)
     assert sample.stamp_ns == 12_500_000_000
     assert sample.pose == pytest.approx([1.0, -2.0, 2.5])
 
@@ -63,10 +63,10 @@ def test_any_other_frame_of_a_loop_closure_is_refused(frame: str) -> None:
 def test_the_twist_of_odometry_tells_speed_and_noise() -> None:
     message = odometry(1.0, 0.0, 0.0, 0.0, speed=-3.0)
     message.twist.twist.linear.y = 4.0
-    assert conversions.odometry_sample(message, SOURCE, BY).speed == pytest.approx(5.0)
-    assert conversions.odometry_sample(message, SOURCE, BY).twist_variance is None
+    assert conversions.odometry(message, SOURCE, BY).speed == pytest.approx(5.0)
+    assert conversions.odometry(message, SOURCE, BY).twist_variance is None
     message.twist.covariance[0], message.twist.covariance[35] = 0.01, 0.02
-    sample = conversions.odometry_sample(message, SOURCE, BY)
+    sample = conversions.odometry(message, SOURCE, BY)
     assert sample.twist_variance.tolist() == [0.01, 0.0, 0.02]
 
 
@@ -74,7 +74,7 @@ def test_the_twist_of_odometry_tells_speed_and_noise() -> None:
 def test_a_twist_that_says_nothing_is_left_out(number: float) -> None:
     message = odometry(1.0, 0.0, 0.0, 0.0, speed=number)
     message.twist.covariance[0], message.twist.covariance[7] = 1.0, number
-    sample = conversions.odometry_sample(message, SOURCE, BY)
+    sample = conversions.odometry(message, SOURCE, BY)
     assert isinstance(sample, OdometrySample)
     assert math.isfinite(sample.speed)
     assert sample.twist_variance is None
@@ -127,8 +127,8 @@ def test_the_frame_of_a_range_names_the_beacon_and_perhaps_the_antenna() -> None
 @pytest.mark.parametrize('text', ['door', 'door 1', 'door 1 x', 'door 1 nan', 'door 1 2 3', ''])
 def test_a_beacon_without_name_and_place_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match=r'tags\.beacons: expected name, x and y'):
-        require_together(checked({
-            'sources': ['odom', 'tags'], 'tags.type': 'range', 'tags.beacons': [text]}))
+        checked_together({
+            'sources': ['odom', 'tags'], 'tags.type': 'range', 'tags.beacons': [text]})
 
 
 def reader(**values: object) -> MessageReader:

@@ -21,9 +21,9 @@ from pose_graph_ros.adapters.parameters import (
     as_yaml,
     changed,
     checked,
+    checked_together,
     explanation,
     is_own,
-    require_together,
 )
 from pose_graph_ros.adapters.sources import (
     backend_config,
@@ -79,7 +79,7 @@ def test_the_short_yaml_file_changes_nothing_whatever_in_it_is_put_to_use() -> N
     examples = re.sub(r'(?m)^( +)# (\w+: \[)', r'\1\2', text)
     more = flat(yaml.safe_load(examples)['/**']['ros__parameters'])
     assert set(more) - set(given) == {'datum', 'fix.covariance_override'}
-    require_together(checked(more))
+    checked_together(more)
 
 
 def test_the_yaml_file_holds_every_default() -> None:
@@ -158,7 +158,7 @@ def test_a_wrong_name_or_type_is_refused(values: dict[str, object]) -> None:
     ({'map_frame': '/odom'}, 'map_frame, .* expected three different names')])
 def test_values_that_do_not_go_together_are_refused(values: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
-        require_together(checked(values))
+        checked_together(values)
 
 
 def test_every_setting_of_a_source_reaches_the_engine() -> None:
@@ -310,7 +310,7 @@ def test_whatever_is_wanted_is_taken_whole_or_refused(
         new = changed(PRESENT, wanted, configured=configured)
         # what has been taken would be taken at the start, too, and nothing else has changed
         assert checked(new) == new
-        require_together(new)
+        checked_together(new)
         assert {name for name in new if new[name] != before[name]} <= set(wanted)
         for name in new:
             if new[name] != before[name]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from circle_bag import circle, fixes, odometry
+from circle_bag import circle, fixes, odometry, replayed_bag
 import numpy as np
 import pytest
 from run_schema import problems
@@ -155,7 +155,7 @@ def test_a_loop_closure_to_a_node_that_has_left_is_not_drawn_as_used(tmp_path) -
     values = checked({'window.nodes': 8})
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
-        result = replay.run(bag, inputs, values)
+        result = replayed_bag(bag, inputs, values)
         drive = drive_in(bag, inputs, values, result.backend, None, origin=None,
                          refused=result.refused)
     assert result.backend.counts['loop_closure', 'before_window'] == 1
@@ -169,7 +169,7 @@ def test_the_axes_of_the_map_are_east_and_north_unless_it_is_turned(datum, axes,
     values = checked({'datum': datum})
     with open_bag(tmp_path / 'bag') as bag:
         inputs = choose_inputs(bag, source_list(values), {})
-        drive = drive_in(bag, inputs, values, replay.run(bag, inputs, values).backend, None,
+        drive = drive_in(bag, inputs, values, replayed_bag(bag, inputs, values).backend, None,
                          origin=None)
     assert drive.map_axes == axes
     assert drive.truth is None
@@ -208,7 +208,7 @@ def test_the_exit_code_says_whether_the_optimisation_converged(tmp_path, monkeyp
     write_bag(tmp_path / 'bag', odometry())
     with open_bag(tmp_path / 'bag') as bag:
         values = checked({})
-        done = replay.run(bag, choose_inputs(bag, source_list(values), {}), values)
+        done = replayed_bag(bag, choose_inputs(bag, source_list(values), {}), values)
     assert done.report.status is Status.CONVERGED
     for status, code in ((Status.CONVERGED, 0), (Status.MAX_ITERATIONS, 1), (Status.FAILED, 1)):
         report = UpdateReport(status, '', 0, 0, 0.0)

@@ -5,7 +5,15 @@
 from pathlib import Path
 import sys
 
-from circle_bag import circle, fixes, NOETIC, odometry, write_compressed, write_ros1
+from circle_bag import (
+    circle,
+    fixes,
+    NOETIC,
+    odometry,
+    replayed_bag,
+    write_compressed,
+    write_ros1,
+)
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -17,7 +25,6 @@ from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.replay import run
 from pose_graph_ros.cli.shared import watched_bag
 from pose_graph_ros.cli.simulate import Message, write_bag
 
@@ -48,8 +55,8 @@ def path_of(*bags: Path) -> list[bytes]:
     """Return stamps and poses of the path of the engine that a replay fills."""
     values = checked({})
     with open_bag(*bags) as bag:
-        estimate = run(
-            bag, choose_inputs(bag, source_list(values), {}), values).backend.estimate()
+        inputs = choose_inputs(bag, source_list(values), {})
+        estimate = replayed_bag(bag, inputs, values).backend.estimate()
     assert estimate is not None
     assert len(estimate.path) == 81
     return [estimate.path.stamps_ns.tobytes(), estimate.path.poses.tobytes()]

@@ -15,7 +15,7 @@ from run_schema import problems
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, GYRO, LOOP_CLOSURE, ODOMETRY
 from pose_graph_ros.cli.drive import collect_drive, place_truth
-from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.replay import run
 from pose_graph_ros.cli.run import MOST_UPDATES, Recorder, Run, thinned, Update
 from pose_graph_ros.cli.run.document import document
 from pose_graph_ros.cli.run.findings import MOST_SILENCES, silences, silent
@@ -28,8 +28,8 @@ SECOND = 10**9
 def run_of(*settings: tuple[str, Any], **of_drive: Any) -> dict[str, Any]:
     """Return run.json of a drive of which all is known."""
     drive = HonestDrive(**{'seed': 1, 'seconds': 240.0, 'closures': 20} | of_drive)
-    values, recorder = checked(dict(settings)), Recorder()
-    backend, report = run_measurements(drive.measurements(), values, recorder)
+    values = checked(dict(settings))
+    backend, report, _, recorder, _ = run(drive.measurements(), values)
     compared = place_truth(replace(collect_drive(
         ((*each, False) for each in drive.measurements()), backend, 'odom', ()),
         truth=drive.truth))

@@ -16,7 +16,7 @@ from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, Fixes, G
 from pose_graph_ros.offline.simulation.worlds import WORLDS
 
 OLD = Path(__file__).parents[1] / 'data' / 'drive_2.npz'
-FIX_SIGMA = Fixes().sigma
+FIX_SIGMA = Fixes().sigmas[0]
 
 
 def test_the_drive_is_the_one_of_the_first_version() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.config import (
-    AlignmentPolicy,
     BackendConfig,
     CovariancePolicy,
     Loss,
@@ -22,7 +21,7 @@ from pose_graph_ros.core.exceptions import ConfigError
 
 NUMBERS = [(kind, item.name)
            for kind in (NodePolicy, OdometryNoise, OdometrySource, CovariancePolicy,
-                        MeasurementSource, AlignmentPolicy, SolverConfig, BackendConfig)
+                        MeasurementSource, SolverConfig, BackendConfig)
            for item in fields(kind) if isinstance(getattr(kind(), item.name), float)]
 
 

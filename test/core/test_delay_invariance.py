@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource

@@ -13,7 +13,7 @@ from random_graphs import snapshot
 from saved_graphs import assert_same_value
 
 from pose_graph_ros.core import transaction
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource

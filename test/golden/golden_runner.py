@@ -28,8 +28,8 @@ from pose_graph_ros.adapters.bag_inputs import choose_inputs, reader_of
 from pose_graph_ros.adapters.bags import Bag, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, source_list
+from pose_graph_ros.cli.drive import measured_in
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.replay import measurements_of
 from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
@@ -132,8 +132,9 @@ def driven(drive: Drive, path: Path, truth: Trajectory | None) -> Record:
     with open_bag(path) as bag:
         inputs = choose_inputs(bag, source_list(values), {}, truth='/ground_truth')
         digest = input_hash(bag, list(inputs.topics.values()))
-        for source, each in drive.stream(
-                measurements_of(bag, inputs, reader_of(bag, values), refused := Counter())):
+        every = measured_in(
+            bag, inputs, reader_of(bag, values), refused := Counter(), held_out=False)
+        for source, each in drive.stream(each[:2] for each in every):
             if not isinstance(each, OdometrySample):
                 backend.add_measurement(each, source)
                 continue

@@ -2,14 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of a drive along a circle, with odometry that is too long and exact fixes."""
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
+from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
+from pose_graph_ros.adapters.bags import Bag
+from pose_graph_ros.cli.drive import measured_in
+from pose_graph_ros.cli.replay import Replayed, run
 from pose_graph_ros.cli.simulate import fix_messages, Message, odometry_messages
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
@@ -77,3 +83,9 @@ def write_compressed(path: Path, messages: Iterable[Message], mode: CompressionM
                 connections[topic] = writer.add_connection(topic, kind, typestore=JAZZY)
             writer.write(connections[topic], stamp, JAZZY.serialize_cdr(message, kind))
     return path
+
+
+def replayed_bag(bag: Bag, inputs: Inputs, values: dict[str, Any]) -> Replayed:
+    """What `pose-graph replay` makes of a bag."""
+    measurements = measured_in(bag, inputs, reader_of(bag, values), Counter(), held_out=False)
+    return run((each[:2] for each in measurements), values)

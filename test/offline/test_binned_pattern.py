@@ -6,15 +6,15 @@ from honest_drive import HonestDrive
 import numpy as np
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.replay import run
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.offline.pattern import BinnedPattern, factor, filled, hessian
 
 
 def graph_of(correlation_time: float) -> Graph:
     drive = HonestDrive(1, seconds=120.0, closures=8, tau=correlation_time)
-    return run_measurements(drive.measurements(), checked(
-        {'global_pose.correlation_time': correlation_time}))[0].graph
+    return run(drive.measurements(), checked(
+        {'global_pose.correlation_time': correlation_time})).backend.graph
 
 
 def blocks_of(graph: Graph) -> np.ndarray:

@@ -79,9 +79,10 @@ def test_a_minute_of_smooth_fixes_does_not_prove_millimetres(fixes: dict[str, fl
 
 def test_a_source_that_keeps_more_than_was_found_is_not_outweighed_by_odometry() -> None:
     likely = found(*made(3, 60, GOOD, white=0.003))
-    assert likely.excess > 10.0
+    excess = likely.proven.value / likely.size.value
+    assert excess > 10.0
     for written, each in zip(proven_odometry([likely]), (likely.way, likely.turn), strict=True):
-        assert written.value >= min(1.0, each.value * likely.excess)
+        assert written.value >= min(1.0, each.value * excess)
 
 
 def test_good_odometry_proves_in_a_long_drive_that_fixes_claim_too_much() -> None:

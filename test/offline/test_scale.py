@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.replay import run
 from pose_graph_ros.offline.source_residuals import fit, SourceResiduals, whiteness
 from pose_graph_ros.offline.variance_components import analyse, Analysis
 
@@ -91,7 +91,7 @@ def test_whiteness_tells_the_correlation_time_of_correlated_errors_alone() -> No
 
 def analysed(settings: dict[str, float], **drive: float) -> Analysis:
     measurements = HonestDrive(2, **drive).measurements()  # type: ignore[arg-type]
-    return analyse(run_measurements(measurements, checked(settings))[0].parts)
+    return analyse(run(measurements, checked(settings)).backend.parts)
 
 
 @pytest.mark.parametrize(('wrong', 'ratio'), [('times', 3.0), ('odometry_times', 3.0)])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.cli.replay import run_measurements
+from pose_graph_ros.cli.replay import run
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -19,7 +19,7 @@ STEP = 1e-6
 
 def engine(correlation_time: float, seed: int = 1, **settings: float) -> PoseGraphBackend:
     drive = HonestDrive(seed, seconds=60.0, closures=4, fix_period=2.0, **settings)
-    backend, report = run_measurements(drive.measurements(), checked(
+    backend, report, *_ = run(drive.measurements(), checked(
         {'global_pose.correlation_time': correlation_time, 'global_pose.robust_loss': 'none'}))
     assert report.status.value == 'converged'
     return backend

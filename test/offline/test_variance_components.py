@@ -48,7 +48,7 @@ def test_the_intervals_hold_the_true_factors_in_95_percent_of_all_runs() -> None
             claimed * mask[:, None, None] for mask in (~closure, closure)]), 0.0 * claimed)
         assert found is not None
         for k, true in enumerate(times):
-            ratio, low, high, independent = found.of([k])
+            ratio, low, high, independent = found.of([k]).values()
             assert low < ratio < high < 2.0 * low
             assert independent < 3.0 * np.sum(closure if k else ~closure)
             inside[k] += low < true < high

@@ -55,7 +55,7 @@ def test_launch_makes_the_node_and_rviz_only_if_it_is_there(
     specification = importlib.util.spec_from_file_location('pose_graph_launch', LAUNCH)
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
-    monkeypatch.setattr(module, 'get_package_share_directory', lambda _: str(TREE))
+    monkeypatch.setattr(module.packages, 'get_package_share_directory', lambda _: str(TREE))
     *declared, started = module.generate_launch_description().entities
     assert [entity.name for entity in declared] == list(ARGUMENTS)
     context = launch.LaunchContext()

@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.surroundings import Datum
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2

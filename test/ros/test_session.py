@@ -32,7 +32,7 @@ from visualization_msgs.msg import MarkerArray
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport
@@ -49,7 +49,7 @@ PERIODS = {'diagnostics_period': 0.02, 'frequency': 50.0, 'path_period': 0.0}
 def health(session: object) -> tuple[bytes, str]:
     """Return the level of the diagnostics and their message."""
     first = next(concerns(session))
-    return first.level, first.sentence
+    return first.level, f'{first.text[0].upper()}{first.text[1:]}.'
 
 
 class Robot(Driver):

@@ -32,10 +32,6 @@ from pose_graph_ros.core.quantities import Seconds, StampNs
 MOST_UPDATES = 2000  # in run.json
 
 
-class NoCovariancesError(PoseGraphError):
-    """The solver failed, so that the path has no covariances."""
-
-
 class Update(NamedTuple):
     """An update, or the worst of several."""
 
@@ -111,19 +107,17 @@ class Run:
 
     @cached_property
     def covariances(self) -> Covariances:
-        """Those of the path; raises `NoCovariancesError` if the solver failed."""
+        """Those of the path; raises `PoseGraphError` if the solver failed."""
         try:
             return self.backend.path_covariances(self.estimate)
         except ValueError as error:
-            raise NoCovariancesError(f'there are no covariances: {error}') from error
+            raise PoseGraphError(f'there are no covariances: {error}') from error
 
 
 def rounded(values: npt.ArrayLike, digits: int = 3) -> list[Any]:
     """Return values as a list for JSON, None for those that are not finite."""
     array = np.round(np.asarray(values, dtype=np.float64), digits) + 0.0
-    as_objects = array.astype(object)
-    as_objects[~np.isfinite(array)] = None
-    return list(as_objects.tolist())
+    return [value if math.isfinite(value) else None for value in array.tolist()]
 
 
 def number(value: float | None, digits: int = 4) -> float | None:

@@ -36,12 +36,10 @@ from pose_graph_ros.offline.source_residuals import spread
 REFUSED_SOMEHOW = 'Refused; the counts of its source say why.'
 MOST_POSES = 10_000  # of a path
 MOST_OF_SOURCE = 20_000  # fixes or loop closures; half are kept for those not believed
-VERSION = 1
-FILE = 'run.json'
-KEYS = (
-    'title', 'subtitle', 'start', 'start_ns', 'duration', 'axes', 'offset', 'facts', 'findings',
-    'lines', 'ellipses', 'fixes', 'closures', 'states', 'errors', 'error_table', 'sources',
-    'springs', 'updates', 'sparsity', 'texts')
+VERSION, FILE = 1, 'run.json'
+KEYS = ('title', 'subtitle', 'start', 'start_ns', 'duration', 'axes', 'offset', 'facts',
+        'findings', 'lines', 'ellipses', 'fixes', 'closures', 'states', 'errors', 'error_table',
+        'sources', 'springs', 'updates', 'sparsity', 'texts')
 
 
 def read_document(path: Path) -> dict[str, Any]:
@@ -159,12 +157,11 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
     nees = {} if drive.truth is None or report.status is Status.FAILED else drives.consistency(
         drive, run.covariances)
     # counts of each source, and all closures and all that is not believed
-    judged = {
-        'sources': {source: {
-            'states': {state.value: each.counts.get(state, 0) for state in texts.ORDER},
-            'forgotten': each.n_forgotten} for source, each in totals.items()},
-        'constraints': [texts.as_json(each) for each in run.verdicts
-                        if each.kind is Judged.LOOP_CLOSURE or texts.is_notable(each)]}
+    judged = {'sources': {source: {
+        'states': {state.value: each.counts.get(state, 0) for state in texts.ORDER},
+        'forgotten': each.n_forgotten} for source, each in totals.items()}, 'constraints': [
+            texts.as_json(each) for each in run.verdicts if each.kind is Judged.LOOP_CLOSURE
+            or texts.is_notable(each)]}
     text = json.dumps(drives.summary(drive, {
         **facts, **{f'nees_{name}': each for name, each in nees.items()},
         **({'calibrations': calibrations} if len(calibrations) > 0 else {}),
@@ -198,12 +195,12 @@ def write_results(run: Run, folder: Path, facts: Mapping[str, Any]) -> list[str]
         lines.append('new bag: {original} messages copied, {left_out} left out, {corrected} poses '
                      'of odometry corrected'.format(**facts['new_bag']))
     return [*lines, 'counts: ' + ', '.join(f'{name} {count}' for name, count in counts.items()),
-            '', drives.format_table(drive.rows), *(
-                f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
-                    f'{each["mean"]:.4g}, expected {each["expected"]}, '
-                    f'{each["interval"][0]:.4f} to {each["interval"][1]:.4f} if errors were '
-                    f'independent; {100.0 * each["within"]:.1f} % below the 95 % quantile'))
-                for name, each in nees.items()), '']
+            '', drives.format_table(drive.rows),
+            *(f'NEES of the {name}: ' + ('no valid covariance' if each is None else (
+                f'{each["mean"]:.4g}, expected {each["expected"]}, {each["interval"][0]:.4f} '
+                f'to {each["interval"][1]:.4f} if '
+                f'errors were independent; {100.0 * each["within"]:.1f} % below '
+                'the 95 % quantile')) for name, each in nees.items()), '']
 
 
 # --- the map
@@ -216,9 +213,9 @@ def _lines(drive: Drive, frame: Frame) -> tuple[dict[str, Any], IntArray]:
 
     path = drive.corrected
     some = spread(len(path), MOST_POSES)
-    return {'corrected': {'t': frame.seconds(path.stamps_ns[some]), **(places(path) or {}),
-                          'theta': rounded(path.poses[some, 2])},
-            'odometry': places(drive.placed_odometry),
+    corrected = {'t': frame.seconds(path.stamps_ns[some]), **(places(path) or {}),
+                 'theta': rounded(path.poses[some, 2])}
+    return {'corrected': corrected, 'odometry': places(drive.placed_odometry),
             'truth': places(drive.truth)}, path.stamps_ns[some]
 
 
@@ -252,8 +249,7 @@ def _judged(
     reasons: Mapping[Key, str], frame: Frame,
 ) -> dict[str, Any]:
     """Return the columns of what is believed, and why not."""
-    found = [verdicts.get(key) for key in keys]
-    whys = []
+    found, whys = [verdicts.get(key) for key in keys], []
     for key, state, each in zip(keys, states.tolist(), found, strict=True):
         # of fixes nearly all are believed, for the same reason
         silent = state == HELD_OUT or (state == BELIEVED and key[2] is None)
@@ -280,9 +276,8 @@ def _fixes(
         nearer = np.abs(at_ns[before] - stamps) < np.abs(at_ns[after] - stamps)
         inside = (stamps >= at_ns[0] - 1_000_000) & (stamps <= at_ns[-1] + 1_000_000)
         nearest = np.where(inside, np.where(nearer, before, after), -1)
-        found.append({
-            'source': source, 'left_out': len(every) - len(rows), 't': frame.seconds(stamps),
-            'x': x, 'y': y, 'at': nearest.tolist(), **_judged(
+        found.append({'source': source, 'left_out': len(every) - len(
+            rows), 't': frame.seconds(stamps), 'x': x, 'y': y, 'at': nearest.tolist(), **_judged(
                 [(source, stamp, None) for stamp in stamps.tolist()], drive.fix_states[rows],
                 verdicts, {}, frame)})
     return found
@@ -299,12 +294,11 @@ def _closures(
         ends = np.sort(stamps, axis=1)
         places = path.at(np.clip(ends, *path.stamps_ns[[0, -1]]))[:, :, :2]
         (x0, y0), (x1, y1) = frame.places(places[:, 0]), frame.places(places[:, 1])
-        found.append({
-            'source': source, 'left_out': len(every) - len(rows),
-            't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
-            'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, **_judged(
-                [(source, later, earlier) for earlier, later in stamps.tolist()],
-                drive.loop_states[rows], verdicts, reasons, frame)})
+        found.append({'source': source, 'left_out': len(every) - len(rows),
+                      't0': frame.seconds(ends[:, 0]), 't1': frame.seconds(ends[:, 1]),
+                      'x0': x0, 'y0': y0, 'x1': x1, 'y1': y1, **_judged(
+                          [(source, later, earlier) for earlier, later in stamps.tolist()],
+                          drive.loop_states[rows], verdicts, reasons, frame)})
     return found
 
 

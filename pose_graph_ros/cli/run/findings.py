@@ -8,7 +8,6 @@ is as it should be. Covariances count as wrong if the interval of the factor on 
 beyond 1.5; where the engine has found so by itself and allows for it, that is a notice.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 import math
 from typing import Any, NamedTuple
@@ -18,7 +17,7 @@ import numpy as np
 from pose_graph_ros.adapters.sources import Kind
 from pose_graph_ros.cli.run import Run
 from pose_graph_ros.cli.run.sources import SourceAnalysis, verdict
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import number_of, sentence, short
@@ -65,14 +64,12 @@ def _whole(run: Run) -> Iterator[Finding]:
         yield Finding('warning', f'the final optimisation did not converge ({report.status.value}'
                                  f'{reason}): the path is not at the minimum', 'updates')
     if estimate.alignment is AlignmentState.UNALIGNED:
-        yield Finding(
-            'warning', 'the angle between odometry and map is unknown, as fixes are too few or '
-            'from too short a path: drive farther', 'map')
+        yield Finding('warning', 'the angle between odometry and map is unknown, as fixes are too '
+                      'few or from too short a path: drive farther', 'map')
     elif estimate.alignment is AlignmentState.LOCAL:
         others = '' if len(run.backend.parts.pipeline.beacons.ids) == 0 else ' and beacons'
-        yield Finding(
-            'notice', 'nothing was measured in the map, so the path begins at its origin, and '
-            f'nothing but loop closures{others} bounds its drift', 'map')
+        yield Finding('notice', 'nothing was measured in the map, so the path begins at its '
+                      f'origin, and nothing but loop closures{others} bounds its drift', 'map')
     for source, each in run.backend.calibrations().items():
         yield Finding(
             'good', f'{source}: its yaw rate is corrected by {short(each.rate, 3)} rad/s (sigma '
@@ -172,16 +169,14 @@ def _stretches(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[F
         begin, end = (1e-9 * (every[k].stamp_ns - run.start_ns) for k in (part[0], part[-1]))
         far = [float(np.hypot(*every[k].residual[:2])) for k in part]
         size = f', {short(np.nanmedian(far))} m from the path' if np.any(np.isfinite(far)) else ''
-        yield Finding(
-            'warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} s to '
-            f'{end:.1f} s contradict the path and are not used{size}: look for reflections, '
-            f'or a jump of the receiver', 'map')
+        yield Finding('warning', f'{source}: {number_of(len(part), Judged.FIX)} from {begin:.1f} '
+                      f's to {end:.1f} s contradict the path and are not used{size}: look for '
+                      'reflections, or a jump of the receiver', 'map')
     rest = len(at) - sum(map(len, long[:MOST_TOLD]))
     if rest > 0:
         more = ' more' if len(long) > 0 else ''
-        yield Finding(
-            'notice', f'{source}: {rest}{more} of {number_of(len(every), Judged.FIX)} '
-            f'contradict the path, alone or in other stretches, and are not used', 'map')
+        yield Finding('notice', f'{source}: {rest}{more} of {number_of(len(every), Judged.FIX)} '
+                      'contradict the path, alone or in other stretches, and are not used', 'map')
 
 
 def _closures(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Finding]:
@@ -217,9 +212,9 @@ def _odometry(run: Run, source: str, verdicts: Sequence[Verdict]) -> Iterator[Fi
                                  'more places', 'map')
     jumps = run.counts.get((source, 'jump'), 0)
     if jumps > 0:
-        yield Finding('warning', f'{source}: odometry jumped {jumps} times by more than '
-                                 f'{source}.maximum_speed allows; the motion there is taken as '
-                                 'unknown', 'map')
+        yield Finding('warning', f'{source}: odometry jumped {jumps} times by more '
+                      f'than {source}.maximum_speed allows; the motion there is taken as unknown',
+                      'map')
 
 
 def silent(stamps_ns: Sequence[StampNs], least_s: Seconds) -> FloatArray:
@@ -264,16 +259,12 @@ def silences(
                 'the motion there is that of other odometry, as far as it goes on' if others else
                 'the motion there is not known')
         longest = float(np.max(lengths))
-        yield Finding('warning' if longest > 20.0 else 'notice',
-                      f'{source}: no messages from {where}{more} ({short(longest, 3)} s at most); '
-                      f'{what}', f'source-{source}')
+        yield Finding('warning' if longest > 20.0 else 'notice', f'{source}: no messages from '
+                      f'{where}{more} ({short(longest, 3)} s at most); {what}', f'source-{source}')
 
 
 def _refusals(run: Run) -> Iterator[Finding]:
     """Yield how many messages were refused, by source and reason."""
-    totals: Counter[str] = Counter()
-    for (source, _), count in run.counts.items():
-        totals[source] += count
     invalid = []
     for (source, reason), count in sorted(run.counts.items()):
         if reason == 'default_covariance' or reason.startswith('repaired'):
@@ -283,8 +274,8 @@ def _refusals(run: Run) -> Iterator[Finding]:
         elif source not in ('solver', 'alignment') and reason not in (
                 'accepted', 'pending', 'sorted', 'thinned', 'rotations', 'done_over', 'jump'):
             detail = run.backend.refusals.get((source, reason), '')
-            yield Finding(
-                'warning' if count > 0.05 * totals[source] else 'notice',
-                f'{source}: {count} of {totals[source]} messages are not used: {reason}'
-                + (f', the last: {detail}' if detail else ''), f'source-{source}')
+            total = sum(n for (of, _), n in run.counts.items() if of == source)
+            yield Finding('warning' if count > 0.05 * total else 'notice',
+                          f'{source}: {count} of {total} messages are not used: {reason}'
+                          + (f', the last: {detail}' if detail else ''), f'source-{source}')
     yield from invalid

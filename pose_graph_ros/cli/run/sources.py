@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The sources of a run in run.json: residuals, expected against found, with a verdict in words."""
 
-from collections.abc import Mapping, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -20,7 +19,6 @@ from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, W
 from pose_graph_ros.offline.variance_components import Analysis
 
 WRONG = 1.5  # ratio of true to claimed sigmas, or its reciprocal, beyond which they are wrong
-_NAMES = {'map': ('x', 'y', 'heading'), 'edge': ('along', 'across', 'heading')}
 
 
 class SourceAnalysis(NamedTuple):
@@ -54,10 +52,10 @@ def analyse(run: Run, analysis: Analysis) -> dict[str, SourceAnalysis]:
         if source != run.estimate.primary:
             factor = fit.ratio**2 * float(run.values.get(f'{source}.covariance_scale', 1.0))
             advice = f'{source}.covariance_scale to {short(factor)}'
-        found[source] = SourceAnalysis(
-            each, run.kinds.get(source, guesses[each.kind]), fit,
-            source_residuals.whiteness(each), None if report is None else report.in_use,
-            source in analysis.correlated, tuple(sorted(analysis.correlated - {source})), advice)
+        found[source] = SourceAnalysis(each, run.kinds.get(source, guesses[each.kind]), fit,
+                                       source_residuals.whiteness(each), None if report is None
+                                       else report.in_use, source in analysis.correlated,
+                                       tuple(sorted(analysis.correlated - {source})), advice)
     return found
 
 
@@ -72,26 +70,26 @@ def source_entry(analysis: SourceAnalysis, frame: Frame) -> dict[str, Any]:
     for row, size in expected.items():
         here = used.measured[:, row] & (size > 0.0)
         normalised[here, row] = used.errors[here, row] / (used.sigmas[here, row] * size)
-    names = _NAMES['map' if residuals.kind == 'map' else 'edge']
+    names = (*('xy' if residuals.kind == 'map' else ('along', 'across')), 'heading')
     some = source_residuals.spread(len(used.ids), 2000)
     edges = np.linspace(-5.0, 5.0, 41)  # those beyond count in the outermost bins
-    values = normalised[np.isfinite(normalised)]
-    white = analysis.whiteness
+    values, white = normalised[np.isfinite(normalised)], analysis.whiteness
+    def numbers(of: Any, *fields: str) -> dict[str, float | None]:
+        return {field: number(getattr(of, field)) for field in fields}
+
     return {
         'name': residuals.source, 'kind': analysis.kind.name,
         'count': len(residuals.ids), 'used': len(used.ids),
-        'rows': [{'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
-                  'count': row.n, **{name: number(getattr(row, name)) for name in (
-                      'sigma', 'expected', 'found', 'ratio', 'low', 'high')}}
-                 for row in found.rows],
-        'energy': {'expected': number(found.energy_expected),
-                   'found': number(found.energy_found),
+        'rows': [{
+            'name': names[row.coordinate], 'unit': 'rad' if row.coordinate == 2 else 'm',
+            'count': row.n, **numbers(row, 'sigma', 'expected', 'found', 'ratio', 'low', 'high')}
+            for row in found.rows],
+        'energy': {'expected': number(found.energy_expected), 'found': number(found.energy_found),
                    'quantile95_share': number(found.within)},
-        **{name: number(getattr(found, name)) for name in (
-            'ratio', 'low', 'high', 'redundancy', 'independent')},
-        'verdict': verdict(analysis)[1],
-        'unused': {'count': len(unused.ids),
-                   'median_distance': number(float(np.median(far))) if len(far) > 0 else None},
+        **numbers(found, 'ratio', 'low', 'high', 'redundancy', 'independent'),
+        'verdict': verdict(analysis)[1], 'unused': {
+            'count': len(unused.ids), 'median_distance': number(
+                float(np.median(far)) if len(far) > 0 else None)},
         'histogram': None if len(values) == 0 or found.says_nothing else {
             'edges': rounded(edges), 'count': np.histogram(
                 np.clip(values, edges[0] + 1e-9, edges[-1] - 1e-9), edges)[0].tolist()},
@@ -111,11 +109,11 @@ def verdict(analysis: SourceAnalysis) -> tuple[str, str]:
     if fit.n_used == 0:
         return '', 'nothing of it is used'
     if fit.says_nothing:
-        return '', ('its covariances cannot be checked: the path follows it, so that its '
-                    f'residuals are {short(100.0 * fit.redundancy)} % of what its errors are'
-                    if fit.redundancy < 0.1 else
-                    f'its covariances cannot be checked: {fit.n_used} measurements are as few as '
-                    f'{short(fit.independent)} independent ones')
+        return '', ('its covariances cannot be checked: the path follows '
+                    f'it, so that its residuals are {short(100.0 * fit.redundancy)} % of what '
+                    'its errors are' if fit.redundancy < 0.1 else 'its covariances cannot be '
+                    f'checked: {fit.n_used} measurements are as few as {short(fit.independent)} '
+                    'independent ones')
     share = f'{short(fit.ratio)} times' if fit.ratio > 1.0 else f'{short(100.0 * fit.ratio)} % of'
     positions = [row for row in fit.rows if row.coordinate < 2]
     rows, unit = (positions, 'm') if len(positions) > 0 else (list(fit.rows), 'deg')
@@ -154,9 +152,7 @@ def _wrong(analysis: SourceAnalysis) -> tuple[str, str]:
                       f'for less than it could; {advice} would be right')
 
 
-def springs(
-    run: Run, residuals: Mapping[str, SourceResiduals], frame: Frame,
-) -> list[dict[str, Any]]:
+def springs(run: Run, residuals: dict[str, SourceResiduals], frame: Frame) -> list[dict[str, Any]]:
     """Return the constraints with the largest weighted energies, in descending order."""
     names = {each.number: each.id for each in run.verdicts}
     stamps, path, found = run.backend.node_stamps_ns, run.drive.corrected, []
@@ -189,24 +185,19 @@ def springs(
             name = f'{what} at {seconds:.1f} s{rest.partition(" s")[2]}'
         found.append({
             'rank': rank, 'source': each.source, 'kind': each.kind.replace('_', ' '),
-            'name': names.get(each.number, name),
-            'energy': number(each.energy), 'expected': number(
-                expected if math.isfinite(expected) else float(each.freedom)),
+            'name': names.get(each.number, name), 'energy': number(each.energy),
+            'expected': number(expected if math.isfinite(expected) else float(each.freedom)),
             'from': ends[0] if len(ends) > 0 else None, 'to': ends[1] if len(ends) > 1 else None,
             'text': _text(each, here if len(each.nodes) < 2 else ends, residual)})
     return found
 
 
-def _text(
-    each: ConstraintEnergy, ends: Sequence[Mapping[str, Any]], residual: FloatArray | None,
-) -> str:
+def _text(each: ConstraintEnergy, ends: list[dict[str, Any]], residual: FloatArray | None) -> str:
     """Return what a constraint is and how far it is off; the residual is None if unknown."""
     times = ' to '.join(f'{end["t"]:.1f}' for end in sorted(ends, key=lambda end: end['t']))
     at = f' at {times} s' if len(ends) > 0 else ''
     if each.kind == 'bias':
         return f'error of {each.source}{at}: it changes faster than its correlation time says'
-    off = '' if residual is None else (
-        f': {short(np.hypot(*residual[:2]))} m' + ('' if residual[2] == 0.0 else
-                                                f' and {short(abs(residual[2]))} rad') + ' off')
-    name = each.name.partition(' at ')[0] if len(ends) > 0 else each.name
-    return f'{name}{at}{off}'
+    off = '' if residual is None else (f': {short(np.hypot(*residual[:2]))} m' + (
+        '' if residual[2] == 0.0 else f' and {short(abs(residual[2]))} rad') + ' off')
+    return f'{each.name.partition(" at ")[0] if len(ends) > 0 else each.name}{at}{off}'

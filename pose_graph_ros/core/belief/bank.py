@@ -8,6 +8,7 @@ does not depend on the order of arrival.
 """
 
 from copy import copy
+import math
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -191,6 +192,14 @@ class Bank:
     def evidence(self) -> float:
         """Logarithm of the probability density of all measurements."""
         return float(np.logaddexp.reduce(self._bank['weight'][:self._n]))
+
+    @property
+    def heading_sigma(self) -> float:
+        """Sigma of the heading at the newest row, by all that may have happened [rad]."""
+        some = self._bank[:self._n]
+        likely = np.exp(some['weight'] - np.max(some['weight']))
+        off = se2.wrap(some['state'][:, 2] - some['state'][np.argmax(likely), 2])
+        return math.sqrt(np.average(some['covariance'][:, 2, 2] + off**2, weights=likely))
 
     def _note_spread(self) -> None:
         """Note how far what else may have happened is from the best, at the newest row."""

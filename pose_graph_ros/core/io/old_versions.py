@@ -8,7 +8,8 @@ version 3 the ids of hidden nodes are `rows`. In version 4 loop closures may hav
 Up to version 5 closures and fixes have columns of their own in judgements, samples that wait are
 columns as well, and edges and observed nodes have ids of their own; those of observed nodes follow
 here on those of the edges. Up to version 6 biases of gyroscopes and of other sources are chains of
-two kinds, and what waits and what may align the graph are columns with other names.
+two kinds, and what waits is in columns with other names. Some files of version 7 hold, as all
+before, measurements for the next check of the alignment.
 """
 
 from collections import defaultdict
@@ -30,7 +31,7 @@ OBSERVED = ('global_pose', 'position', 'heading')
 NUMBERED = {
     ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
-    ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES, ('alignment', 'kind'): OBSERVED}
+    ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES}
 TURN = ('source', 'i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate',
         'rest_variance')
 _EDGES_IN_G2O = ('odometry', 'loop_closure', 'prior')
@@ -71,7 +72,12 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
                 gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
     if version < 6:
         members = _with_one_table(members, judged=version >= 3)
-    return _with_states(members) if version < 7 else members
+    if version < 7:
+        members = _with_states(members)
+    # measurements for the next check of the alignment, which the judge's bank has now
+    members['alignment'] = {name: members['alignment'][name]
+                            for name in ('state', 'sigma', 'next_verdict')}
+    return members
 
 
 def _list_samples(stream: dict[str, Any]) -> None:
@@ -208,12 +214,6 @@ def _with_states(members: dict[str, Any]) -> dict[str, Any]:
             old['i'], old['j'], *_measured(old)))
     members['waiting'] = encoded(SavedQueue.of([*members['waiting'].queue(), *rotations]))
     members['set_aside'] = encoded(members['set_aside'])
-    old = members['alignment']
-    evidence = _queue([old['sources'][k] for k in old['source']],
-                      [[stamp_ns, -1] for stamp_ns in old['stamps_ns']], Factors.on(
-                          old['node'], np.reshape(old['offset'], (-1, 3)), *_measured(old)))
-    members['alignment'] = {'evidence': encoded(evidence), **{
-        name: old[name] for name in ('state', 'sigma', 'next_verdict')}}
     return {**members, 'seen': {name: {
         'stamps_ns': each['seen_ns'], 'references': each['seen_references']}
         for name, each in sources.items()}, 'sources': {

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pose_graph_ros.core.alignment.monitor import AlignmentState, SavedAlignment
+from pose_graph_ros.core.alignment import AlignmentState, SavedAlignment
 from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray, wrap
 from pose_graph_ros.core.graph.graph import GraphRows

@@ -23,18 +23,8 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.judgement import verdicts as vd
+from pose_graph_ros.core.judgement import closures as cl, verdicts as vd
 from pose_graph_ros.core.judgement.closure_search import decide, Redecision
-from pose_graph_ros.core.judgement.closures import (
-    ANYTHING,
-    as_edges,
-    chances,
-    claims,
-    ClosureTable,
-    GATE,
-    NEVER,
-    squares,
-)
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS, NEW, SavedVerdicts
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
@@ -48,7 +38,7 @@ class ClosureJudge:
         self, smoother: IncrementalSmoother, reweighting: Reweighting, chain: OdometryChain,
     ) -> None:
         self._smoother, self._reweighting, self._chain = smoother, reweighting, chain
-        self.states = ClosureTable(chain)
+        self.states = cl.ClosureTable(chain)
         self.redecision = Redecision(smoother)
         # increases when more or less is believed, so that those that wait are tested again
         self._round = 0
@@ -65,7 +55,7 @@ class ClosureJudge:
         self._chain.extend(self._smoother.graph)
         for one in new:
             self.states.append(one, now_ns, vd.WAITING)
-        self.states.measure(begin, claims(edges))
+        self.states.measure(begin, cl.claims(edges))
         numbers = np.arange(begin, begin + n)
         if not self._smoother.graph.has_touched and not self._is_large:
             for number, state in self._tested(numbers[:self._most]).items():
@@ -77,7 +67,7 @@ class ClosureJudge:
         numbers = np.arange(len(self.states) - self._n_staged, len(self.states))
         if not np.any(self.states.in_graph[numbers]):
             return None
-        self.states.state[numbers], self.states.round[numbers] = vd.WAITING, NEVER
+        self.states.state[numbers], self.states.round[numbers] = vd.WAITING, cl.NEVER
         return self.states.in_graph[numbers].astype(np.float64)
 
     def rollback(self) -> None:
@@ -109,19 +99,19 @@ class ClosureJudge:
     def _tested(self, numbers: IntArray) -> dict[int, vd.State]:
         """Test closures that are not in the graph; return the states of those to believe."""
         some, states = self.states.rows(numbers), self.states
-        errors, spread = self._smoother.innovations(as_edges(some))
-        distance = squares(errors, spread + some.noise)
+        errors, spread = self._smoother.innovations(cl.as_edges(some))
+        distance = cl.squares(errors, spread + some.noise)
         states.spread[numbers] = spread
         before = states.state[numbers].copy()
         states.distance[numbers] = np.sqrt(distance)
         states.round[numbers] = self._round
-        states.state[numbers] = np.where(distance < GATE, vd.WAITING, vd.DOUBTED)
-        chance = chances(spread + some.noise, self._smoother.graph.extent)
+        states.state[numbers] = np.where(distance < cl.GATE, vd.WAITING, vd.DOUBTED)
+        chance = cl.chances(spread + some.noise, self._smoother.graph.extent)
         chosen = dict[int, vd.State]()
         for k, number in enumerate(numbers.tolist()):
             if number < len(states) - self._n_staged:
                 states.announce(number, int(before[k]), self._now_ns)
-            if distance[k] < GATE:
+            if distance[k] < cl.GATE:
                 # how many of the source are or were used, and doubted
                 counts = states.counts(int(states.source[number]))
                 alone = (counts[vd.DOUBTED] + 1.0) * chance[k] < BELIEF.wrong_odds * (
@@ -155,9 +145,9 @@ class ClosureJudge:
             return False
         some = states.rows(waiting)
         # covariances shrink while more is believed, so this is about the least that it can be
-        least = squares(self._smoother.graph.errors(as_edges(some)),
+        least = cl.squares(self._smoother.graph.errors(cl.as_edges(some)),
                         states.spread[waiting] + some.noise)
-        hopeless = ~(least < GATE)
+        hopeless = ~(least < cl.GATE)
         states.round[waiting[hopeless]] = self._round
         rest = waiting[~hopeless][np.argsort(least[~hopeless], kind='stable')]
         return self._change(self._tested(rest[:self._most])) or len(rest) > self._most
@@ -178,9 +168,9 @@ class ClosureJudge:
         inside = inside[states.judged[inside] & ~self._rest(inside)]
         # the smoother knows the energies; raised covariances make the residuals only smaller
         rows, factors = graph.factor_rows(states.held[inside]), graph.factor_records
-        inside = inside[factors['energy'][rows] > 0.5 * GATE * factors['weight'][rows]]
+        inside = inside[factors['energy'][rows] > 0.5 * cl.GATE * factors['weight'][rows]]
         some = states.rows(inside)
-        bad = inside[squares(graph.errors(as_edges(some)), some.noise) > GATE]
+        bad = inside[cl.squares(graph.errors(cl.as_edges(some)), some.noise) > cl.GATE]
         thrown_out = self._change(dict.fromkeys(bad.tolist(), vd.State.DOUBTED))
         # those that contradict one another would take turns in the graph for ever
         self._let_rest(bad)
@@ -212,7 +202,7 @@ class ClosureJudge:
         result = self._smoother.update(GraphUpdate(weigh=weights), fall_back=at_once)
         if result.status is Status.FAILED:
             numbers = np.array([*changes])
-            self.states.round[numbers] = NEVER
+            self.states.round[numbers] = cl.NEVER
             self._let_rest(numbers)
             return False
         self._note(changes)
@@ -227,7 +217,7 @@ class ClosureJudge:
         self._set_base_weights(np.array(sorted(changes), dtype=np.int64))
         self._round += 1
         if not all(state.in_graph for state in changes.values()):
-            self.states.spread[:] = ANYTHING * np.eye(3)     # without them it is less certain
+            self.states.spread[:] = cl.ANYTHING * np.eye(3)     # without them it is less certain
 
     def _changes_to(self, decided: IntArray, believed: IntArray) -> dict[int, vd.State]:
         """Return the states of closures with a set of believed ones, both by the ids of edges."""
@@ -327,7 +317,7 @@ class ClosureJudge:
         self._now_ns = now_ns
         self._chain.extend(self._smoother.graph)
         self.states.restore(saved)
-        self.states.measure(0, claims(self._smoother.graph.factors_at(saved.held)))
+        self.states.measure(0, cl.claims(self._smoother.graph.factors_at(saved.held)))
 
     def decide(self, number: int, decision: vd.Decision) -> bool:
         """

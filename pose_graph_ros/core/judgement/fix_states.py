@@ -20,7 +20,6 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judgements import Column, Judgements
 from pose_graph_ros.core.judgement.settings import BELIEF
@@ -52,9 +51,7 @@ class FixStates(Judgements):
         free = self.decision[which] == vd.AUTO
         self.state[which[free]] = np.where(believed[free], vd.BELIEVED, vd.DOUBTED)
 
-    def weights(
-        self, before: IntArray, reweighting: Reweighting, *, base: bool = False,
-    ) -> dict[int, float]:
+    def weights(self, before: IntArray, *, base: bool = False) -> dict[int, float]:
         """Return weights that change, or `base` weights, by the ids of factors."""
         changed, later = self.changed(before), np.empty(0, dtype=np.int64)
         doubted = np.flatnonzero(~self.believed[len(before):]) + len(before)
@@ -62,29 +59,13 @@ class FixStates(Judgements):
         if not base and len(again) > 0:
             # losses have lowered the weights of the believed ones since one that returns
             later = np.flatnonzero((self.stamps_ns[:, 0] >= np.min(again)) & self.believed)
-        return {
-            int(self.held[number]): self._base_weight(number, changed, reweighting)
-            if self.state[number] == vd.BELIEVED else 0.0
-            for number in (*doubted.tolist(), *later.tolist(), *changed.tolist())}
+        which = np.concatenate((doubted, later, changed))
+        return dict(zip(self.held[which].tolist(), self.believed[which].astype(float).tolist(),
+                        strict=True))
 
     def changed(self, before: IntArray) -> IntArray:
         """Return the numbers of records that had another state, given all that there were."""
         return np.flatnonzero(self.state[:len(before)] != before)
-
-    def _base_weight(self, number: int, changed: IntArray, reweighting: Reweighting) -> float:
-        """Return the base weight of a believed record, or else that of one next to it."""
-        held, source = self.records[number][['held', 'source']].tolist()
-        own = reweighting.base_weight(held)
-        if own:
-            return own
-        first = max(number - BELIEF.records_near, 0)
-        near = slice(first, number + BELIEF.records_near)
-        alike = first + np.flatnonzero(self.believed[near] & (self.source[near] == source))
-        alike = np.setdiff1d(alike, changed)
-        if len(alike) == 0:
-            return 1.0
-        nearest = int(alike[np.argmin(np.abs(alike - number))])
-        return reweighting.base_weight(int(self.held[nearest])) or 1.0
 
     def moved(self, before: IntArray, after: IntArray) -> None:
         """Have records follow measurements that other factors hold now; by ids."""

@@ -115,6 +115,10 @@ class FixJudge:
             return True
         return False if settings.finds_correlation else None
 
+    def trusts(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool:
+        """Tell whether a source is believed whatever speaks against it."""
+        return self._factors.config.measurement_source(source, kind).robust is Robust.NONE
+
     def _number(self, source: str) -> int:
         """Return the number of the errors of a source, which is told to the bank if it is new."""
         if source not in self._sources:
@@ -140,9 +144,10 @@ class FixJudge:
 
     def _insert(self, rows: Records) -> None:
         for bank in self._banks():
-            bank.insert(rows, self._odometry())
+            bank.insert(rows, self.odometry())
 
-    def _odometry(self) -> Odometry:
+    def odometry(self) -> Odometry:
+        """Return the chain of odometry, with the errors that it knows of."""
         chain = self._chain
         return Odometry(
             chain.nodes, chain.poses, chain.sums,
@@ -160,7 +165,7 @@ class FixJudge:
         rows, bank = self._records(source, 0.0), Bank()
         rows = rows[~np.isin(rows['stamp_ns'], np.array([*without], dtype=np.int64))]
         if len(rows) > 0:
-            bank.insert(rows, self._odometry())
+            bank.insert(rows, self.odometry())
         return bank.rows
 
     def prepare(self) -> None:
@@ -175,14 +180,15 @@ class FixJudge:
                 rows['source'], rows['judged'] = self._number(source), judged
                 self._insert(rows)
 
-    def known(self) -> Known:
-        """Return which noise is given, and which is to be found."""
-        n, finding = min(len(self._sources), BANK.sources), self._factors.finding()
+    def known(self, sources: Sequence[str] | None = None) -> Known:
+        """Return which noise is given, and which is to be found, also of some other sources."""
+        sources = self._sources if sources is None else sources
+        n, finding = min(len(sources), BANK.sources), self._factors.finding()
         point, scale = [*claimed(n)], self._factors.config.odometry_scale
         if scale > 0.0:
             point[WAY] = point[TURN] = 2.0 * math.log2(scale)
         free = list[int]()
-        for number, source in enumerate(self._sources[:n]):
+        for number, source in enumerate(sources[:n]):
             given = None if source in finding else self._errors_in_use(source)
             if given is not None:
                 for axis, value in zip(axes_of(number), given[::-1], strict=True):
@@ -262,7 +268,7 @@ class FixJudge:
 
     def _with_weights(self, change: GraphUpdate, before: _Decided) -> GraphUpdate:
         """Return an update with the weights of new records and of those that have changed."""
-        weights, loosened = self.states.weights(before.state, self._reweighting), before.loosened
+        weights, loosened = self.states.weights(before.state), before.loosened
         for edge in () if loosened is self.loosened else {*loosened, *self.loosened}:
             if loosened.get(edge) != self.loosened.get(edge):
                 weights[edge] = self.loosened.get(edge, 1.0)
@@ -278,8 +284,7 @@ class FixJudge:
         if self._before is None:
             return
         states = self.states
-        for held, weight in states.weights(
-                self._before.state, self._reweighting, base=True).items():
+        for held, weight in states.weights(self._before.state, base=True).items():
             self._reweighting.set_base_weight(held, weight)
         before = np.append(self._before.state, np.full(len(states) - len(self._before.state), NEW))
         for number in np.flatnonzero(states.state != before).tolist():
@@ -328,7 +333,7 @@ class FixJudge:
         gone = {*factors.tolist()}
         if not gone.isdisjoint(self.loosened):
             self.loosened = {edge: weight for edge, weight in self.loosened.items()
-                              if edge not in gone}
+                             if edge not in gone}
 
     def decide(self, number: int, decision: Decision) -> bool:
         """Apply a person's decision on a measurement; return whether the solver succeeded."""

@@ -15,17 +15,11 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
+from pose_graph_ros.core import saved_columns as sc
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.saved_columns import (
-    Choices,
-    Column as SavedColumn,
-    Integers,
-    Numbers,
-    Pairs,
-)
 from pose_graph_ros.core.sources.factor_builder import NewConstraint
 
 # State of a constraint before it came.
@@ -53,18 +47,18 @@ class SavedVerdicts:
     """The columns of a table, and its sources."""
 
     sources: tuple[str, ...]
-    scales: Numbers  # of each source, 1: older versions had a factor on its sigmas
+    scales: sc.Numbers  # of each source, 1: older versions had a factor on its sigmas
     # of each source, how many have left the graph, by their states then
-    left: Annotated[IntArray, SavedColumn(int, (len(vd.State),))]
-    held: Integers
-    added: Integers
-    source: Integers
-    number: Integers
-    stamps_ns: Pairs
-    state: Annotated[IntArray, Choices(vd.State)]
-    since_ns: Integers
-    decision: Annotated[IntArray, Choices(vd.Decision)]
-    distance: Numbers  # -1 if it was not judged
+    left: Annotated[IntArray, sc.Column(int, (len(vd.State),))]
+    held: sc.Integers
+    added: sc.Integers
+    source: sc.Integers
+    number: sc.Integers
+    stamps_ns: sc.Pairs
+    state: Annotated[IntArray, sc.Choices(vd.State)]
+    since_ns: sc.Integers
+    decision: Annotated[IntArray, sc.Choices(vd.Decision)]
+    distance: sc.Numbers  # -1 if it was not judged
 
 
 class Column:

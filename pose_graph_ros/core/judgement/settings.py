@@ -60,7 +60,6 @@ class BeliefSettings:
 
     # --- measurements in the map
     newest: int = 3  # measurements of a source that tell whether it is doubted
-    records_near: int = 100  # measurements around one among which one alike is looked for
 
     # squared distance from which on a measurement contradicts others: 99.9 % of chi2
     event: float = 13.8

@@ -185,7 +185,7 @@ def as_observed(prior: Prior) -> Factors:
     # without information on the heading the error is in map axes, as that of a position
     mean[2] = se2.wrap(mean[2]) if np.any(information[2]) else 0.0
     return Factors.on(prior.nodes, mean=mean[None], kind=[FactorKind.NODE_PRIOR],
-                         information=turned(information[None], mean[2:]))
+                      information=turned(information[None], mean[2:]))
 
 
 def _checked(graph: Graph, nodes: Collection[int]) -> IntArray:

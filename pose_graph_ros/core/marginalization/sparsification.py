@@ -301,7 +301,7 @@ def edges_between(
     mean[:, :2] += np.einsum('mji,mj->mi', se2.rotation(turn), moved[:, :2])
     mean[:, 2] = se2.wrap(mean[:, 2] + moved[:, 2])
     return Factors(nodes[start], nodes[end], mean, turned(in_map, turn + mean[:, 2]),
-                 np.full(len(start), FactorKind.PRIOR, dtype=np.uint8))
+                   np.full(len(start), FactorKind.PRIOR, dtype=np.uint8))
 
 
 def turned(information: FloatArray, theta: FloatArray) -> FloatArray:

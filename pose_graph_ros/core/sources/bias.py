@@ -281,7 +281,7 @@ def biased_constraint(
     if kind != FactorKind.POSITION:
         mean[2] = se2.wrap(mean[2] - offset[2])
     return Factors([observed.i[0]], [bias], [mean], [information], [FactorKind.BIAS],
-                 weight=observed.weight, constants=[(offset[0], offset[1], *factors)])
+                   weight=observed.weight, constants=[(offset[0], offset[1], *factors)])
 
 
 def held_by_bias(

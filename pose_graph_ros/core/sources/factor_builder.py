@@ -230,8 +230,8 @@ class FactorBuilder:
 
     def errors_in_use(self, source: str) -> bs.CorrelatedErrors | None:
         """Return the statistics of the errors of a source in use; None for white errors."""
-        state = self._state(source)
-        if state.bias is None or state.errors is not None:
+        state = self.sources.get(source)
+        if state is not None and (state.bias is None or state.errors is not None):
             return state.errors
         return _given(self._settings(source))
 

@@ -68,8 +68,8 @@ def validate(
         return ms.rejected(defect, f'{name}: {numbers.tolist()}')
     stamps = measurement.stamp_ns, kind.key(measurement)
     if stamps[0] <= 0 or any(abs(stamp) > ms.LARGEST_STAMP for stamp in stamps):
-        return ms.rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
-                        f'{name}: expected stamps above 0, got {stamps} ns')
+        return ms.rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp', f'{name}: expected '
+                           f'stamps above 0, got {stamps} ns')
     return kind.check(measurement, policy)
 
 
@@ -90,7 +90,7 @@ def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | ms.Answer:
     first_ns = int(nodes.stamps_ns[0])
     if stamp_ns < first_ns:
         return ms.rejected('before_odometry', f'stamp {1e-9 * stamp_ns:.3f} s, odometry begins at '
-                                           f'{1e-9 * first_ns:.3f} s')
+                           f'{1e-9 * first_ns:.3f} s')
     if stamp_ns < nodes.last_frozen_ns:
         return _before_window(stamp_ns, nodes)
     attachment = nodes.attach(stamp_ns)
@@ -102,7 +102,7 @@ def attach(nodes: HiddenNodes, stamp_ns: int) -> Attachment | ms.Answer:
 
 def _before_window(stamp_ns: int, nodes: HiddenNodes) -> ms.Answer:
     return ms.rejected('before_window', f'stamp {1e-9 * stamp_ns:.3f} s, the graph begins at '
-                                     f'{1e-9 * nodes.last_frozen_ns:.3f} s')
+                       f'{1e-9 * nodes.last_frozen_ns:.3f} s')
 
 
 def _observe(given: ms.Absolute, source: str, at: Attachment, to: Target) -> ms.Answer:

@@ -46,7 +46,8 @@ class Queued(NamedTuple):
     @property
     def is_in_map(self) -> bool:
         """Whether it is a measurement relative to the map."""
-        return int(self.factor.kind[0]) >= FactorKind.GLOBAL_POSE and len(self.nodes) == 1
+        factor = self.factor
+        return bool(factor.kind[0] >= FactorKind.GLOBAL_POSE and factor.j[0] < 0 <= factor.i[0])
 
     @property
     def is_placed(self) -> bool:

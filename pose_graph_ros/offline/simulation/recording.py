@@ -15,9 +15,11 @@ freedom as there are measured numbers.
 
 from collections.abc import Callable, Iterable, Mapping
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.geometry import se2
@@ -38,8 +40,7 @@ STREAMS = ('world', 'gyro', 'odometry', 'fixes', 'poses', 'closures', 'rate', 'j
 """Who draws random numbers of its own; the place in this list is a part of its seed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
+class Recording(NamedTuple):
     """Measurements and true poses of a simulated drive; all stamps as the messages have them."""
 
     setup: Setup
@@ -66,13 +67,12 @@ class Recording:
         return Trajectory(stamps_ns, values[:, :3])
 
 
-@dataclass(frozen=True, slots=True)
-class Course:
+class Course(NamedTuple):
     """A motion through a world, what is simulated there, and random numbers for it."""
 
     motion: Motion
     setup: Setup
-    streams: Mapping[str, np.random.Generator]
+    streams: Mapping[str, Generator]
 
 
 def course(
@@ -89,9 +89,7 @@ def course(
     return Course(motion, change(usual), streams)
 
 
-def _states(
-    generator: np.random.Generator, motion: Motion, usual: Setup,
-) -> dict[str, np.random.Generator]:
+def _states(generator: Generator, motion: Motion, usual: Setup) -> dict[str, Generator]:
     """
     Return the states of a generator from which the usual sensors draw one after the other.
 
@@ -101,9 +99,9 @@ def _states(
     assert usual.fixes is not None
     assert usual.closures is not None
     truth, closures = motion.truth, usual.closures
-    states: dict[str, np.random.Generator] = {}
+    states: dict[str, Generator] = {}
 
-    def state(name: str) -> np.random.Generator:
+    def state(name: str) -> Generator:
         states[name] = copy.deepcopy(generator)
         return generator
 
@@ -146,10 +144,10 @@ def record(way: Course) -> Recording:
         found = streams['rate'].random(len(ends)) < setup.closures.rate
         closures, missing = sensors.with_false(
             streams['false'], way.motion, setup.closures, ends[found], measured[found])
-    every = {
-        ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
-        settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
-        FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)), CLOSURES: closures}
+    every = {ODOMETRY: Measured(odometry.stamps_ns, path, np.full(len(path), -1)),
+             settings.GYRO: Measured(truth.stamps_ns[:len(rates)], rates, np.full(len(rates), -1)),
+             FIXES: fixes, POSES: poses._replace(values=se2.wrapped(poses.values)),
+             CLOSURES: closures}
     kept = {topic: each.rows(sensors.heard(each.later_ns, topic, setup.outages))
             for topic, each in every.items()}
     arrivals = {topic: sensors.arrivals(streams[topic], topic, each.later_ns, setup)
@@ -157,14 +155,13 @@ def record(way: Course) -> Recording:
     stamps = sensors.jittered_stamps(streams['truth'], truth, sensors.ODOMETRY_PERIOD_S)
     arrivals[settings.TRUTH] = sensors.arrivals(
         np.random.default_rng(0), settings.TRUTH, stamps, setup)
-    ahead = {topic: sum(round(each.seconds * 1e9) for each in setup.offsets
-                        if each.topic == topic) for topic in settings.TOPICS}
-    return Recording(
-        setup, float(way.motion.distance[-1]), Trajectory(stamps, to_map(truth.at(stamps))),
-        {topic: each._replace(stamps_ns=each.stamps_ns + ahead[topic])
-         for topic, each in kept.items()}, arrivals,
-        tuple(int(np.sum(~sensors.heard(every[each.topic].later_ns, each.topic, [each])))
-              for each in setup.outages), missing)
+    for offset in setup.offsets:
+        own = kept[offset.topic]
+        kept[offset.topic] = own._replace(stamps_ns=own.stamps_ns + round(offset.seconds * 1e9))
+    silenced = tuple(int(np.sum(~sensors.heard(every[each.topic].later_ns, each.topic, [each])))
+                     for each in setup.outages)
+    return Recording(setup, float(way.motion.distance[-1]), Trajectory(
+        stamps, to_map(truth.at(stamps))), kept, arrivals, silenced, missing)
 
 
 def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
@@ -183,7 +180,7 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
 
 
 def _true_closures(
-    generator: np.random.Generator, path: Motion, closures: settings.Closures,
+    generator: Generator, path: Motion, closures: settings.Closures,
 ) -> tuple[IntArray, FloatArray]:
     """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
     stamps = path.truth.stamps_ns
@@ -203,8 +200,7 @@ def _true_closures(
 
 # --- a graph
 
-@dataclass(frozen=True, slots=True)
-class SimulatedGraph:
+class SimulatedGraph(NamedTuple):
     """A graph of N nodes, whose numbers are 0 to N - 1, and the truth."""
 
     truth: Trajectory
@@ -261,7 +257,7 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
 
 
 def odometry_edges(
-    generator: np.random.Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
+    generator: Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
 ) -> Factors:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
@@ -277,7 +273,7 @@ def odometry_edges(
     information = np.zeros((n, 3, 3))
     information[:, range(3), range(3)] = 1.0 / variances
     return Factors(np.arange(n), np.arange(1, n + 1), mean, information,
-                 np.full(n, FactorKind.ODOMETRY))
+                   np.full(n, FactorKind.ODOMETRY))
 
 
 def _loop_edges(way: Course, path: Motion, node_distance: float) -> tuple[Factors, IntArray, int]:

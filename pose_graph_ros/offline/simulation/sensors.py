@@ -15,6 +15,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
@@ -57,9 +58,7 @@ class Measured(NamedTuple):
         return Measured(self.stamps_ns[which], self.values[which], self.wrong[which])
 
 
-def jittered_stamps(
-    generator: np.random.Generator, truth: Trajectory, period_s: float,
-) -> IntArray:
+def jittered_stamps(generator: Generator, truth: Trajectory, period_s: float) -> IntArray:
     """
     Return stamps of a sensor during the truth, with random phase and jitter, shape (M,) [ns].
     """
@@ -69,11 +68,10 @@ def jittered_stamps(
     return np.asarray(truth.stamps_ns[0] + np.round(ticks * period_s * 1e9).astype(np.int64))
 
 
-def odometry(generator: np.random.Generator, truth: Trajectory, wheels: Wheels) -> Trajectory:
+def odometry(generator: Generator, truth: Trajectory, wheels: Wheels) -> Trajectory:
     """Return `T_odom_base` by odometry."""
-    steps = se2.between(truth.poses[:-1], truth.poses[1:])
     measured = (_by_wheels if wheels.errors is settings.OdometryErrors.WHEELS else _by_model)(
-        generator, steps, wheels)
+        generator, se2.between(truth.poses[:-1], truth.poses[1:]), wheels)
     x, y, turned = (0.0, 0.0, -truth.poses[0, 2]) if wheels.start is None else wheels.start
     heading = se2.wrap(truth.poses[0, 2] + turned) + np.concatenate((
         [0.0], np.cumsum(measured[:, 2])))
@@ -86,7 +84,7 @@ def odometry(generator: np.random.Generator, truth: Trajectory, wheels: Wheels) 
     return Trajectory(stamps, dense.at(stamps))
 
 
-def _by_wheels(generator: np.random.Generator, steps: FloatArray, wheels: Wheels) -> FloatArray:
+def _by_wheels(generator: Generator, steps: FloatArray, wheels: Wheels) -> FloatArray:
     """Return the motions that the wheels measure, ahead, sideways and turned, shape (N, 3)."""
     forward, turn = np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2]
     left = wheels.scale[0] * (forward - 0.5 * wheels.track_width * turn)
@@ -108,12 +106,11 @@ def _by_wheels(generator: np.random.Generator, steps: FloatArray, wheels: Wheels
     return np.column_stack((forward, np.zeros(len(steps)), turn))
 
 
-def _by_model(generator: np.random.Generator, steps: FloatArray, wheels: Wheels) -> FloatArray:
+def _by_model(generator: Generator, steps: FloatArray, wheels: Wheels) -> FloatArray:
     """Return the motions with the noise that the node assumes, shape (N, 3)."""
     variances = model_variances(steps)
     cells = (PERIOD_S / CELL_S * np.arange(len(steps))).astype(np.int64)
-    n_cells = int(cells[-1]) + 1
-    noise = np.empty_like(steps)
+    n_cells, noise = int(cells[-1]) + 1, np.empty_like(steps)
     for axis in range(3):
         whole = np.bincount(cells, variances[:, axis], n_cells)
         drawn = generator.standard_normal(n_cells) * np.sqrt(whole)
@@ -129,9 +126,9 @@ def model_variances(steps: FloatArray, model: OdometryNoise = MODEL) -> FloatArr
     In: motions of the robot, shape (N, 3). Out: variances in its frame, shape (N, 3).
     """
     distance, turn = np.hypot(steps[:, 0], steps[:, 1]), np.abs(steps[:, 2])
-    return np.column_stack((
-        model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,
-        model.sigma_heading_distance**2 * distance + model.sigma_heading_turn**2 * turn))
+    return np.column_stack((model.sigma_distance**2 * distance, model.sigma_lateral**2 * distance,
+                            model.sigma_heading_distance**2 * distance
+                            + model.sigma_heading_turn**2 * turn))
 
 
 def velocities(path: Trajectory) -> FloatArray:
@@ -141,9 +138,7 @@ def velocities(path: Trajectory) -> FloatArray:
     return np.concatenate((rates[:1], rates))
 
 
-def yaw_rates(
-    generator: np.random.Generator, heading: FloatArray, gyro: settings.Gyro,
-) -> FloatArray:
+def yaw_rates(generator: Generator, heading: FloatArray, gyro: settings.Gyro) -> FloatArray:
     """Return yaw rates, (R,) [rad/s], given true headings every `PERIOD_S`, not wrapped [rad]."""
     n = len(heading)
     walk = np.cumsum(generator.normal(0.0, gyro.bias_walk * np.sqrt(PERIOD_S), n))
@@ -153,7 +148,7 @@ def yaw_rates(
 
 
 def positions(
-    generator: np.random.Generator, truth: Trajectory, fixes: settings.Fixes,
+    generator: Generator, truth: Trajectory, fixes: settings.Fixes,
 ) -> tuple[IntArray, FloatArray]:
     """Return the stamps of fixes, shape (M,), and their positions, shape (M, 2) [m]."""
     stamps = jittered_stamps(generator, truth, fixes.period_s)
@@ -165,7 +160,7 @@ def positions(
 
 
 def revisits(
-    generator: np.random.Generator, path: Motion, places: IntArray, closures: Closures,
+    generator: Generator, path: Motion, places: IntArray, closures: Closures,
 ) -> tuple[IntArray, IntArray]:
     """
     Return the earlier and the later pose of true closures, shape (L,) each, as numbers of places.
@@ -173,10 +168,9 @@ def revisits(
     poses, stamps = path.truth.poses[places], path.truth.stamps_ns[places]
     pairs = KDTree(poses[:, :2]).query_pairs(closures.radius, output_type='ndarray')
     old, new = np.sort(pairs, axis=1).T
-    good = (
-        (stamps[new] - stamps[old] > closures.min_time_s * 1e9)
-        & (path.distance[places[new]] - path.distance[places[old]] > closures.min_distance)
-        & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < closures.angle))
+    good = ((stamps[new] - stamps[old] > closures.min_time_s * 1e9)
+            & (path.distance[places[new]] - path.distance[places[old]] > closures.min_distance)
+            & (np.abs(se2.wrap(poses[new, 2] - poses[old, 2])) < closures.angle))
     old, new = old[good], new[good]
     # one random pair of each stretch of the path
     order = generator.permutation(len(new))
@@ -185,7 +179,7 @@ def revisits(
 
 
 def with_false(
-    generator: np.random.Generator, path: Motion, closures: Closures, ends: IntArray,
+    generator: Generator, path: Motion, closures: Closures, ends: IntArray,
     poses: FloatArray,
 ) -> tuple[Measured, int]:
     """
@@ -250,7 +244,7 @@ def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
 
 
 def moved(
-    generator: np.random.Generator, stamps_ns: IntArray, values: FloatArray,
+    generator: Generator, stamps_ns: IntArray, values: FloatArray,
     jumps: list[settings.Jump],
 ) -> Measured:
     """Return fixes or global poses, shape (M, 2 or 3), with jumps."""
@@ -276,7 +270,7 @@ def heard(stamps_ns: IntArray, topic: str, outages: Iterable[settings.Outage]) -
 
 
 def arrivals(
-    generator: np.random.Generator, topic: str, stamps_ns: IntArray, setup: Setup,
+    generator: Generator, topic: str, stamps_ns: IntArray, setup: Setup,
 ) -> tuple[IntArray, IntArray]:
     """
     Return which messages of a topic are recorded, and when [ns], shape (K,) each, by that time.

@@ -26,8 +26,6 @@ LATENCY_S = {ODOMETRY: 0.004, GYRO: 0.002, FIXES: 0.13, POSES: 0.05, CLOSURES: 0
 """Usual time from the stamp of a measurement to its recording, by topic."""
 TOPICS = (ODOMETRY, GYRO, FIXES, POSES, CLOSURES)
 """What can be disturbed."""
-CLAIMING = (GYRO, FIXES, POSES, CLOSURES)
-"""What comes with a covariance that can be wrong."""
 
 
 def _known(topic: str, known: tuple[str, ...] = TOPICS, what: str = '') -> None:
@@ -114,14 +112,9 @@ class Fixes:
             raise ConfigError('fixes: expected a white or a correlated error above 0, got 0 and 0')
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation of a coordinate, of both errors together [m]."""
-        return math.hypot(self.correlated, self.white)
-
-    @property
     def sigmas(self) -> tuple[float, float]:
-        """Those of both coordinates [m]."""
-        return self.sigma, self.sigma
+        """Standard deviations of the coordinates, of both errors together [m]."""
+        return (math.hypot(self.correlated, self.white),) * 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,9 +166,8 @@ class FalseClosures:
             return [self.size] * self.groups + [1] * self.singles
         total = round(self.share / (1.0 - self.share) * true)
         if grouped > total:
-            raise ConfigError(
-                f'{self.groups} groups of {self.size} false closures are {grouped}, but a share '
-                f'of {self.share:g} beside {true} true ones is {total}')
+            raise ConfigError(f'{self.groups} groups of {self.size} false closures are {grouped}, '
+                              f'but a share of {self.share:g} beside {true} true ones is {total}')
         return [self.size] * self.groups + [1] * (total - grouped)
 
 
@@ -253,10 +245,9 @@ class Jump:
         if self.step is not None and self.topic == FIXES and self.step[2] != 0.0:
             raise ConfigError(f'jump of {FIXES}: expected DX,DY, got a heading of {self.step[2]}')
         if not self.seconds > 0.0 or (self.topic == ODOMETRY and self.seconds != math.inf):
-            raise ConfigError(f'jump of {self.topic}: expected '
-                              + ('no length of time, as odometry never comes back, '
-                                 if self.topic == ODOMETRY else 'a positive length of time, ')
-                              + f'got {self.seconds:g} s')
+            raise ConfigError(f'jump of {self.topic}: expected ' + (
+                'no length of time, as odometry never comes back, ' if self.topic == ODOMETRY
+                else 'a positive length of time, ') + f'got {self.seconds:g} s')
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +298,8 @@ class ClaimedSigma:
     factor: float
 
     def __post_init__(self) -> None:
-        _known(self.topic, CLAIMING, 'claimed sigma: ')
+        # odometry comes without a covariance that can be wrong
+        _known(self.topic, TOPICS[1:], 'claimed sigma: ')
         require(self, 'factor', positive=True)
 
 

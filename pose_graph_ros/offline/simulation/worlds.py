@@ -17,10 +17,11 @@ which headings turn, has a derivative that does.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.ndimage import gaussian_filter1d
 
 from pose_graph_ros.core.geometry import se2
@@ -37,8 +38,7 @@ DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 TURN_POINTS = 1000  # at which a turn is tabulated
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(NamedTuple):
     """True poses of a vehicle in the frame of the world, and how far it has driven."""
 
     truth: Trajectory  # headings need not be wrapped
@@ -46,8 +46,7 @@ class Motion:
     lap_time: float = np.inf  # when the second lap begins [s]; never if there are no laps
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(NamedTuple):
     """What the vehicle can do."""
 
     speed: float  # [m/s]
@@ -95,9 +94,7 @@ def path_length(path: FloatArray) -> FloatArray:
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))))
 
 
-def wandering(
-    generator: np.random.Generator, points: Points, step: Metres, sigma: Metres,
-) -> FloatArray:
+def wandering(generator: Generator, points: Points, step: Metres, sigma: Metres) -> FloatArray:
     """Return poses along a line, which wander slowly to its sides, shape (P, 3), not wrapped."""
     direction = np.gradient(points, axis=0) / step
     normal = np.column_stack((-direction[:, 1], direction[:, 0]))
@@ -113,9 +110,7 @@ def ramp(u: FloatArray) -> FloatArray:
     return u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
 
 
-def gauss_markov(
-    generator: np.random.Generator, count: int, sigma: float, step: float,
-) -> FloatArray:
+def gauss_markov(generator: Generator, count: int, sigma: float, step: float) -> FloatArray:
     """
     Return samples of a stationary first-order Gauss-Markov process, shape (count,).
 
@@ -128,7 +123,7 @@ def gauss_markov(
 
 
 def street_corners(
-    rng: np.random.Generator, length: float, spacing: FloatArray, *, fresh: float,
+    rng: Generator, length: float, spacing: FloatArray, *, fresh: float,
 ) -> FloatArray:
     """
     Return the crossings of a random drive through a grid of streets, shape (K, 2) [m].
@@ -195,8 +190,7 @@ def rounded(corners: FloatArray, turn: float, step: float) -> tuple[FloatArray, 
     # from the middle of line k to that of line k + 1
     rest = s - begins[line]
     start, after = half[line] - reach, np.minimum(line + 1, len(ways) - 1)
-    bend = np.clip(rest - start, 0.0, turn)
-    straight = np.minimum(rest, start)
+    bend, straight = np.clip(rest - start, 0.0, turn), np.minimum(rest, start)
     beyond = np.maximum(rest - start - turn, 0.0)
     forward = (straight + np.interp(bend, along, ahead))[:, None]
     sideways = (np.interp(bend, along, left) + beyond)[:, None]
@@ -228,11 +222,10 @@ OUTAGE_S = (-40.0, 30.0)
 REFLECTED = settings.Jump(FIXES, 150.0, (14.0, -9.0, 0.0), 25.0, 1.5)
 
 
-@dataclass(frozen=True, slots=True)
-class World:
+class World(NamedTuple):
     """A place, and what moves there."""
 
-    drive: Callable[[np.random.Generator, float], Motion]
+    drive: Callable[[Generator, float], Motion]
     """Return the motion of some length [s]."""
     setup: Callable[[Motion], Setup]
     """Return the usual sensors and disturbances."""
@@ -240,21 +233,20 @@ class World:
     """Whether its usual sensors draw from one stream of random numbers, one after the other."""
 
 
-def drive_circuit(generator: np.random.Generator, duration_s: float) -> Motion:
+def drive_circuit(generator: Generator, duration_s: float) -> Motion:
     """Return a drive along the circuit, at random within the lane, with random waits at lights."""
     heading, stops, lap_length = _circuit(duration_s)
     # on straight streets, and then along bent ones
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = CIRCUIT_STEP * np.column_stack((np.cos(middle), np.sin(middle)))
     grid = np.concatenate(([[0.0, 0.0]], np.cumsum(steps, axis=0)))
-    bent = grid + np.column_stack((
-        7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
-        9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
+    bent = grid + np.column_stack((7.0 * np.sin(2.0 * np.pi * grid[:, 1] / 310.0),
+                                   9.0 * np.sin(2.0 * np.pi * grid[:, 0] / 360.0 + 0.6)))
     path = wandering(generator, bent @ se2.rotation(STREET_BEARING).T, CIRCUIT_STEP, LANE_SIGMA)
     waits = np.append(3.0, generator.uniform(8.0, 20.0, len(stops)))
     motion, arrival = follow(path, stops, waits, CAR, duration_s)
     lap = round(lap_length / CIRCUIT_STEP)
-    return replace(motion, lap_time=float(arrival[lap]) if lap < len(arrival) else np.inf)
+    return motion._replace(lap_time=float(arrival[lap]) if lap < len(arrival) else np.inf)
 
 
 def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
@@ -265,13 +257,11 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     outgoing = np.roll(incoming, -1, axis=0)
     right = np.array([[0.0, -1.0], [1.0, 0.0]])
     lane = corners + LANE_OFFSET * (incoming + outgoing) @ right
-    turns = np.arctan2(
-        incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
-        np.sum(incoming * outgoing, axis=1))
+    turns = np.arctan2(incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0],
+                       np.sum(incoming * outgoing, axis=1))
 
     # distance from the corner to the ends of a turn: the integral of the cosine of its heading
-    turn = (np.arange(1000) + 0.5) / 1000
-    reach = TURN_LENGTH * np.mean(np.cos(0.5 * np.pi * ramp(turn)))
+    reach = TURN_LENGTH * np.mean(np.cos(0.5 * np.pi * ramp((np.arange(1000) + 0.5) / 1000)))
     straights = np.linalg.norm(lane - np.roll(lane, 1, axis=0), axis=1) - 2.0 * reach
     begins = np.cumsum(straights + TURN_LENGTH) - TURN_LENGTH
     lap_length = float(begins[-1] + TURN_LENGTH)
@@ -291,14 +281,13 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
 
 def _drive_setup(motion: Motion) -> Setup:
     outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
-    return Setup(
-        wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
-        closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
-        outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time) else (),
-        jumps=(REFLECTED,))
+    return Setup(wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
+                 closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
+                 outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time)
+                 else (), jumps=(REFLECTED,))
 
 
-def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
+def _hall(generator: Generator, duration_s: float) -> Motion:
     """
     Return a drive through the aisles of a hall in random order.
 
@@ -323,7 +312,7 @@ def _hall(generator: np.random.Generator, duration_s: float) -> Motion:
     return follow(path, stops, waits, FORKLIFT, duration_s)[0]
 
 
-def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
+def _grid(generator: Generator, duration_s: float) -> Motion:
     length = (duration_s + MARGIN_S) * CART.speed
     corners = street_corners(
         generator, length + 2.0 * BLOCK * BLOCKS, np.full(BLOCKS, BLOCK), fresh=1.0)
@@ -331,8 +320,7 @@ def _grid(generator: np.random.Generator, duration_s: float) -> Motion:
     path = wandering(generator, points, PATH_STEP, ASIDE)
     path[:, :2] = path[:, :2] @ se2.rotation(STREET_BEARING).T
     path[:, 2] += STREET_BEARING
-    stops = np.empty(0, dtype=np.int64)
-    return follow(path, stops, np.array([REST_S]), CART, duration_s)[0]
+    return follow(path, np.empty(0, dtype=np.int64), np.array([REST_S]), CART, duration_s)[0]
 
 
 WORLDS = {

@@ -12,7 +12,7 @@ from test_thinning_backend import driven, settings
 from test_window import drive, Event, run, WINDOW
 from tum_files import read_tum
 
-from pose_graph_ros.core.alignment.monitor import AlignmentState
+from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, OdometrySource, POSITIONS

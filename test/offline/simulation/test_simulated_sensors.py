@@ -119,7 +119,7 @@ def test_fixes_have_the_white_and_the_correlated_errors_that_were_asked_for() ->
     assert np.max(np.abs(found - expected)) < 0.12 * 1.5**2
     white = found[0] - np.exp(np.polyfit(lags[1:15], np.log(found[1:15]), 1)[1])
     assert white == pytest.approx(0.25, abs=0.05)
-    assert np.std(errors) == pytest.approx(settings.sigma, rel=0.06)
+    assert np.std(errors) == pytest.approx(settings.sigmas[0], rel=0.06)
     assert np.corrcoef(errors.T)[0, 1] == pytest.approx(0.0, abs=0.12)
 
 
