@@ -10,7 +10,6 @@ poses, with which the incremental smoother can continue.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -164,7 +163,7 @@ def _is_observed(graph: Graph) -> bool:
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     if start is Start.CHORDAL:
-        return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory))
+        return linear_starts.chordal(graph)
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT and not _is_observed(graph):
