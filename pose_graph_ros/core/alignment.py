@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pose_graph_ros.core.belief import learning
 from pose_graph_ros.core.belief.bank import Bank, is_believed, Odometry
-from pose_graph_ros.core.belief.learning import Known, log_prior, noise_at, TURN, WAY
 from pose_graph_ros.core.belief.rows import measured, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.geometry import se2
@@ -39,10 +39,11 @@ KNOWN, MEASURED_ALONE = 0.2, 0.5
 # The graph is aligned anew if its heading is off by more than both [sigma, rad]; the solver
 # corrects smaller differences.
 OFF_SIGMAS, OFF = 4.0, 0.3
-# Exponents of 2 of the variances of odometry that are tried, in units of those that are claimed or
-# given: with noise that is far too large the heading is forgotten before it is known, and with
-# noise that is too small, or a scale that is off by a fifth, odometry contradicts all fixes.
-ODOMETRY = 0.0, -6.0, 6.0
+# Exponents of 2 of the variances of odometry and of sources that are tried, in units of those that
+# are claimed or given. With noise of odometry that is far too large the heading is forgotten
+# before it is known; with noise that is too small, or a scale that is off by a fifth, odometry
+# and fixes contradict one another.
+NOISES = (0.0, 0.0), (-6.0, 0.0), (6.0, 0.0), (0.0, 6.0)
 # Number of measurements at which that is checked first.
 FIRST_CHECK = 8
 
@@ -74,7 +75,7 @@ class _Assumed(NamedTuple):
     """What a bank on all that waits takes to be so."""
 
     mirrored: bool  # the y axis of odometry points to the wrong side
-    more: float  # how much noisier odometry is than it says, as in `ODOMETRY`
+    noise: tuple[float, float]  # one of `NOISES`
     prior: float  # logarithm of the probability of the noise
 
 
@@ -124,10 +125,13 @@ class Alignment:
         if sources != self._sources:
             self.forget()
             self._sources, given = sources, self._fixes.known(sources).point
-            for mirrored, more in product((False, True), ODOMETRY):
-                prior = log_prior((more, more), Known((), odometry=True, sources=()))
-                self._banks[_Assumed(mirrored, more, prior)] = Bank(noise_at(
-                    (given[WAY] + more, given[TURN] + more, *given[2:])))
+            of_all = learning.Known((), odometry=True, sources=tuple(range((len(given) - 2) // 3)))
+            white = [learning.axes_of(source)[0] for source in of_all.sources]
+            for mirrored, noise in product((False, True), NOISES):
+                more = {learning.WAY: noise[0], learning.TURN: noise[0]} | dict.fromkeys(white, noise[1])
+                prior = learning.log_prior(learning.moved(learning.claimed(len(white)), more), of_all)
+                self._banks[_Assumed(mirrored, noise, prior)] = Bank(learning.noise_at(tuple(
+                    exponent + more.get(axis, 0.0) for axis, exponent in enumerate(given))))
         new = [each for each in waiting if (each.source, each.stamp_ns) not in self._seen]
         self._seen = {(each.source, each.stamp_ns) for each in waiting}
         rows = measured(Factors.joined([each.factor for each in new]),

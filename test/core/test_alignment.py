@@ -310,6 +310,14 @@ def test_odometry_with_a_wrong_scale_aligns(scale: float, sigma: float) -> None:
         assert abs(off) < max(0.2, 5.0 * driven.alignment.sigma)
 
 
+def test_fixes_with_errors_eight_times_as_large_as_claimed_align() -> None:
+    for seed in range(3):
+        some = replace(drive(seed, 100, 2.0, sigma=4.0), sigma=0.5)
+        result = found(some)
+        assert result.motion is not None
+        assert result.error < max(0.2, 5.0 * result.sigma)
+
+
 # --- Headings --------------------------------------------------------------------------------
 
 def test_one_global_pose_gives_the_angle_unless_its_heading_is_poor() -> None:
