@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief import learning
+from pose_graph_ros.core.belief import learning as ln
 from pose_graph_ros.core.belief.bank import Bank, is_believed, Odometry
 from pose_graph_ros.core.belief.rows import measured, Records
 from pose_graph_ros.core.belief.settings import BANK
@@ -125,12 +125,12 @@ class Alignment:
         if sources != self._sources:
             self.forget()
             self._sources, given = sources, self._fixes.known(sources).point
-            of_all = learning.Known((), odometry=True, sources=tuple(range((len(given) - 2) // 3)))
-            white = [learning.axes_of(source)[0] for source in of_all.sources]
+            of_all = ln.Known((), odometry=True, sources=tuple(range((len(given) - 2) // 3)))
+            white = [ln.axes_of(source)[0] for source in of_all.sources]
             for mirrored, noise in product((False, True), NOISES):
-                more = {learning.WAY: noise[0], learning.TURN: noise[0]} | dict.fromkeys(white, noise[1])
-                prior = learning.log_prior(learning.moved(learning.claimed(len(white)), more), of_all)
-                self._banks[_Assumed(mirrored, noise, prior)] = Bank(learning.noise_at(tuple(
+                more = {ln.WAY: noise[0], ln.TURN: noise[0]} | dict.fromkeys(white, noise[1])
+                prior = ln.log_prior(ln.moved(ln.claimed(len(white)), more), of_all)
+                self._banks[_Assumed(mirrored, noise, prior)] = Bank(ln.noise_at(tuple(
                     exponent + more.get(axis, 0.0) for axis, exponent in enumerate(given))))
         new = [each for each in waiting if (each.source, each.stamp_ns) not in self._seen]
         self._seen = {(each.source, each.stamp_ns) for each in waiting}
