@@ -351,8 +351,9 @@ class Input:
         for (source, reason), detail in details.items():
             if source in self.reader.sources and (source, reason) not in self._told:
                 self._told.add((source, reason))
-                logger.log(logging.INFO if reason in INTENDED else logging.WARNING, '%s: %s: %s '
-                           '(logged once, counted in diagnostics)', source, reason, detail)
+                logger.log(logging.INFO if reason in INTENDED else logging.WARNING,
+                           '%s: %s: %s (logged once, counted in diagnostics)',
+                           source, reason, detail)
 
     def reject(self, source: str, answer: Answer) -> None:
         """Count a message that cannot be used."""

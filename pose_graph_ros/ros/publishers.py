@@ -49,7 +49,8 @@ LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 
 LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
-UNPLACED = np.diag((*2 * [output_cdr.UNKNOWN_VARIANCE], UNKNOWN_HEADING_VARIANCE))
+UNPLACED = np.diag((
+    output_cdr.UNKNOWN_VARIANCE, output_cdr.UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
 LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
           State.DOUBTED: DiagnosticStatus.WARN, State.WAITING: DiagnosticStatus.STALE}
 
@@ -225,8 +226,8 @@ class Publishers:
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
-        status = DiagnosticStatus(level=level, name=f'{self._node.get_fully_qualified_name()}: '
-                                  'pose graph', message=text, hardware_id='pose_graph',
+        name = f'{self._node.get_fully_qualified_name()}: pose graph'
+        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id='pose_graph',
                                   values=_key_values(values))
         self._publishers['diagnostics'].publish(DiagnosticArray(
             header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
@@ -248,9 +249,9 @@ def verdicts_message(
     n_all = sum(sum(each.counts.values()) for each in totals.values())
     of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
     doubting = any(each.doubting for each in totals.values())
+    text = f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}'
     summary = DiagnosticStatus(level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK,
-                               name='summary', message=f'{len(verdicts)} '
-                               f'of {n_all} are listed; {of_sources or "nothing is judged yet"}',
+                               name='summary', message=text,
                                values=_key_values(total_values(totals)))
     return DiagnosticArray(header=header, status=[summary, *(DiagnosticStatus(
         level=LEVELS[each.state], name=each.id, message=sentence(each), hardware_id=each.source,

@@ -113,9 +113,10 @@ class Services:
         estimate = self._session.worker.estimate
         self._session.reset()
         plane = self._session.input.reader.datum.plane
-        return True, (f'{0 if estimate is None else estimate.n_hidden} hidden nodes are gone; ' + (
-            'the next good fix will be the datum' if plane is None else 'the datum is still '
-            f'[{plane.latitude:.9f}, {plane.longitude:.9f}]'))
+        datum = ('the next good fix will be the datum' if plane is None else
+                 f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]')
+        n = 0 if estimate is None else estimate.n_hidden
+        return True, f'{n} hidden nodes are gone; {datum}'
 
     def _pause(self, request: SetBool.Request) -> Answer:
         received = self._session.input
