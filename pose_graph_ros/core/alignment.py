@@ -35,7 +35,7 @@ from pose_graph_ros.core.sources.settings import SOURCES
 
 # Sigma of the heading by which the graph is aligned, and of a measured one that does it alone: the
 # user may set a pose, or a compass be all that there is [rad].
-KNOWN, MEASURED_ALONE = 0.2, 0.5
+KNOWN, MEASURED_ALONE = 0.3, 0.5
 # The graph is aligned anew if its heading is off by more than both [sigma, rad]; the solver
 # corrects smaller differences.
 OFF_SIGMAS, OFF = 4.0, 0.3
