@@ -8,11 +8,14 @@ the package in the ament index, its executables in lib/pose_graph_ros, its files
 """
 
 from dataclasses import dataclass
+import functools
+import json
 import os
 from pathlib import Path
 import shutil
 import subprocess
 import sys
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -33,20 +36,18 @@ LEFT_OUT = shutil.ignore_patterns(
     '.*', '*.egg-info', '__pycache__', 'build', 'install', 'log', 'demo', 'docs', 'test')
 DEADLINE = 240.0    # [s] of any one command, below the time limit of a test
 
-LOCATE = f"""
+ASK = f"""
+from importlib.metadata import distribution
+import json
 from ament_index_python import get_package_prefix, get_package_share_directory
 import {PACKAGE}
-print(get_package_prefix('{PACKAGE}'), get_package_share_directory('{PACKAGE}'),
-      {PACKAGE}.__file__, {PACKAGE}.__version__, sep='\\n')
-"""
-LOAD_ENTRY_POINTS = f"""
-from importlib.metadata import distribution
-points = distribution('{PACKAGE}').entry_points.select(group='console_scripts')
-print(*sorted(point.name for point in points if callable(point.load())))
-"""
-RENDER = f"""
 from {PACKAGE}.cli.report import render
-print(render({{}}))
+points = distribution('{PACKAGE}').entry_points.select(group='console_scripts')
+print(json.dumps({{
+    'prefix': get_package_prefix('{PACKAGE}'), 'module': {PACKAGE}.__file__,
+    'share': get_package_share_directory('{PACKAGE}'), 'version': {PACKAGE}.__version__,
+    'commands': sorted(point.name for point in points if callable(point.load())),
+    'page': render({{}})}}))
 """
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -63,6 +64,13 @@ class Installation:
     python: Path
     environment: dict[str, str]
     """As after `source install/setup.bash`, or in the activated virtual environment."""
+
+    @functools.cached_property
+    def answers(self) -> dict[str, Any]:
+        """What a program finds there."""
+        found: dict[str, Any] = json.loads(run(
+            self.python, '-c', ASK, env=self.environment, cwd=Path('/')))
+        return found
 
 
 def run(*command: str | Path, env: dict[str, str], cwd: Path | None = None) -> str:
@@ -166,12 +174,11 @@ def installation(
 
 
 def test_ament_index_leads_to_the_installation(installation):
-    located = run(installation.python, '-c', LOCATE, env=installation.environment, cwd=Path('/'))
-    prefix, share, module, version = located.splitlines()
-    assert Path(prefix) == installation.prefix
-    assert Path(share) == installation.prefix / 'share' / PACKAGE
-    assert Path(module).is_relative_to(installation.modules)
-    assert version == pose_graph_ros.__version__
+    found = installation.answers
+    assert Path(found['prefix']) == installation.prefix
+    assert Path(found['share']) == installation.prefix / 'share' / PACKAGE
+    assert Path(found['module']).is_relative_to(installation.modules)
+    assert found['version'] == pose_graph_ros.__version__
 
 
 def test_shared_files_are_those_of_the_tree(installation):
@@ -193,9 +200,7 @@ def test_executable_starts(installation):
 
 
 def test_no_common_word_is_put_on_the_path(installation):
-    names = run(
-        installation.python, '-c', LOAD_ENTRY_POINTS, env=installation.environment, cwd=Path('/'))
-    assert names.split() == ['pose-graph', 'pose_graph_node']
+    assert installation.answers['commands'] == ['pose-graph', 'pose_graph_node']
 
 
 def test_the_page_of_reports_is_installed_with_its_parts(installation):
@@ -203,10 +208,8 @@ def test_the_page_of_reports_is_installed_with_its_parts(installation):
     expected = {path.relative_to(TREE / folder) for path in (TREE / folder).rglob('*.*')
                 if path.suffix in {'.html', '.css', '.js'} or path.parent.name == 'vendor'}
     assert len(expected) > 10
-    page = run(installation.python, '-c', RENDER, env=installation.environment, cwd=Path('/'))
-    assert page.rstrip().endswith('</html>')
-    where = Path(run(installation.python, '-c', f'import {PACKAGE} as p; print(p.__file__)',
-                     env=installation.environment, cwd=Path('/')).strip()).parent
+    assert installation.answers['page'].rstrip().endswith('</html>')
+    where = Path(installation.answers['module']).parent
     assert all((where / 'cli' / 'page' / path).is_file() for path in expected)
 
 
