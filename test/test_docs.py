@@ -16,8 +16,7 @@ from pose_graph_ros import core
 
 PACKAGE = Path(pose_graph_ros.__file__).parent
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [page for page in (
-    *ROOT.glob('*.md'), *ROOT.glob('docs/*.md')) if page.name != 'LICENSE']
+PAGES = [page for page in (*ROOT.glob('*.md'), *ROOT.glob('docs/*.md')) if page.name != 'LICENSE']
 README_LINES = 110
 
 

@@ -266,9 +266,7 @@ def test_the_writer_refuses_what_it_cannot_write(tmp_path: Path) -> None:
             bag.write('/a', POINT, 1, TYPES[STRING]('hello'))
 
 
-def test_missing_messages_are_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_missing_messages_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     metadata = write_points(tmp_path / 'bag') / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace('message_count: 5', 'message_count: 9'))
     with open_bag(tmp_path / 'bag') as bag, caplog.at_level(logging.WARNING):

@@ -99,8 +99,7 @@ def test_the_tables_of_the_documentation_are_made_from_the_tables() -> None:
 
 def test_defaults_make_the_default_engine_with_a_loss_for_what_is_in_the_map() -> None:
     config = backend_config(checked({}))
-    robust = MeasurementSource(
-        robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
+    robust = MeasurementSource(robust=Robust.JUDGED, loss=Loss.HUBER, correlation_time=FOUND)
     assert config == BackendConfig(
         odometry={'odom': OdometrySource()},
         measurements={SET_POSE: SET_POSES, 'global_pose': robust, 'fix': robust,

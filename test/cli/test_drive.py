@@ -121,8 +121,7 @@ def test_odometry_is_laid_over_the_truth_or_else_the_fixes_or_else_the_result() 
         drive.fix_positions[inside].mean(axis=0))
     result = without_fixes(without_truth(drive)).placed_odometry
     np.testing.assert_allclose(result.poses, straight(0.5).poses, atol=1e-9)
-    nothing = replace(
-        without_fixes(without_truth(drive)), corrected=NOTHING)
+    nothing = replace(without_fixes(without_truth(drive)), corrected=NOTHING)
     assert nothing.placed_odometry is drive.odometry
 
 

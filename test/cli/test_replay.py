@@ -212,8 +212,7 @@ def test_the_exit_code_says_whether_the_optimisation_converged(tmp_path, monkeyp
     assert done.report.status is Status.CONVERGED
     for status, code in ((Status.CONVERGED, 0), (Status.MAX_ITERATIONS, 1), (Status.FAILED, 1)):
         report = UpdateReport(status, '', 0, 0, 0.0)
-        monkeypatch.setattr(
-            replay, 'run', lambda *_, report=report: done._replace(report=report))
+        monkeypatch.setattr(replay, 'run', lambda *_, report=report: done._replace(report=report))
         assert run(tmp_path / 'bag', '-o', tmp_path / 'out') == code
 
 

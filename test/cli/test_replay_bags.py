@@ -5,15 +5,7 @@
 from pathlib import Path
 import sys
 
-from circle_bag import (
-    circle,
-    fixes,
-    NOETIC,
-    odometry,
-    replayed_bag,
-    write_compressed,
-    write_ros1,
-)
+from circle_bag import circle, fixes, NOETIC, odometry, replayed_bag, write_compressed, write_ros1
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Rosbag1Writer
@@ -144,8 +136,7 @@ def test_live_poses_do_not_know_what_came_later(tmp_path) -> None:
 
 @pytest.mark.parametrize('named', ['wheel/odometry', '/wheel/odometry'])
 def test_topics_of_ros_1_without_a_slash_can_be_named(named, tmp_path) -> None:
-    messages = [(topic, *rest) for topic in ('wheel/odometry', 'other')
-                for _, *rest in odometry()]
+    messages = [(topic, *rest) for topic in ('wheel/odometry', 'other') for _, *rest in odometry()]
     bag = write_ros1(tmp_path / 'bag.bag', messages)
     by_option = replayed(tmp_path / 'option', bag, '--odom', named)
     by_parameter = replayed(tmp_path / 'parameter', bag, '-p', f'odom.topic:={named}')

@@ -221,9 +221,7 @@ def wrong(kind: str, some: Drive, rng: np.random.Generator, m: int) -> Drive:
     (20, 8, 1.0, {'sigma': 0.02}),
     (20, 8, 30.0, {'speed': 30.0, 'sigma': 2.0, 'curvature': 0.002}),
 ], ids=['4', '8', '10', '30', '100', 'rtk', 'car'])
-def test_two_fifths_may_be_wrong(
-    kind: str, n: int, m: int, gap: float, arguments: dict,
-) -> None:
+def test_two_fifths_may_be_wrong(kind: str, n: int, m: int, gap: float, arguments: dict) -> None:
     aligned = 0
     for seed in range(6):
         result = found(wrong(kind, drive(seed, n, gap, **arguments),

@@ -82,9 +82,7 @@ def through_files(backend: PoseGraphBackend, config: BackendConfig, path: Path) 
 
 @given(st.integers(0, 2**32 - 1), configs(), st.sampled_from((0.0, 1.0, 30.0)))
 @settings(max_examples=5, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_drive_ends(
-    tmp_path: Path, seed: int, config: BackendConfig, delay: float,
-) -> None:
+def test_no_drive_ends(tmp_path: Path, seed: int, config: BackendConfig, delay: float) -> None:
     rng, backend, stamp = np.random.default_rng(seed), PoseGraphBackend(config), 0
     for source, event in disturbed(rng, delay):
         add(backend, (source, event))

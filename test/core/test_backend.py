@@ -14,12 +14,7 @@ from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    MeasurementSource,
-    OdometrySource,
-    POSITIONS,
-)
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource, POSITIONS
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
@@ -116,9 +111,7 @@ def in_order(*sources: Sequence[Event]) -> list[Event]:
                   key=lambda event: event.stamp_ns)
 
 
-def run(
-    events: Sequence[Event], update_every: int = 0, **arguments: object,
-) -> PoseGraphBackend:
+def run(events: Sequence[Event], update_every: int = 0, **arguments: object) -> PoseGraphBackend:
     backend = PoseGraphBackend(**arguments)
     for k, event in enumerate(events, 1):
         feed(backend, event)
@@ -301,9 +294,7 @@ def long_drive(backend: PoseGraphBackend, n: int, *, closures: bool) -> list[Upd
 # Of an update when the graph has six times the nodes; rounds on top of each other make the tree of
 # cliques a little deeper.
 @pytest.mark.parametrize(('closures', 'growth'), [(False, 1.1), (True, 2.0)])
-def test_the_work_of_an_update_does_not_grow_with_the_graph(
-    closures: bool, growth: float,
-) -> None:
+def test_the_work_of_an_update_does_not_grow_with_the_graph(closures: bool, growth: float) -> None:
     # with odometry that is better than it says, late poses would be found to be correlated
     white = replace(POSITIONS, correlation_time=0.0)
     backend = PoseGraphBackend(prompt(measurements={'fix': white, 'late': white}))

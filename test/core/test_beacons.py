@@ -108,8 +108,7 @@ def test_the_order_of_arrival_does_not_matter() -> None:
     late = [(stamp if source == 'odom' else stamp + int(rng.integers(20 * SECOND)), source, each)
             for stamp, source, each in events]
     one, other = run(events), run(sorted(late, key=lambda event: event[0]))
-    np.testing.assert_allclose(
-        one.estimate().path.poses, other.estimate().path.poses, atol=1e-6)
+    np.testing.assert_allclose(one.estimate().path.poses, other.estimate().path.poses, atol=1e-6)
 
 
 def test_beacons_at_known_places_hold_the_path_in_the_map() -> None:

@@ -104,8 +104,7 @@ def simulated(seed: int, *, outliers: bool) -> tuple[list[Event], list[Event]]:
             stamp_of(t), truth(t) + rng.normal(0.0, [0.2, 0.3, 0.05]),
             np.diag([0.04, 0.09, 0.0025])))
     for t in times(0.5, 2.0):
-        add('compass', HeadingOnly(
-            stamp_of(t), float(truth(t)[2] + rng.normal(0.0, 0.1)), 0.01))
+        add('compass', HeadingOnly(stamp_of(t), float(truth(t)[2] + rng.normal(0.0, 0.1)), 0.01))
     for t in times(31.0, 1.0):
         z = se2.between(truth(t - 30.0), truth(t)) + rng.normal(0.0, [0.05, 0.05, 0.01])
         if rng.random() < 0.2 and outliers:

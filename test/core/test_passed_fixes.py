@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    Loss,
-    MeasurementSource,
-    Robust,
-)
+from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, Robust
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -68,9 +63,7 @@ def newest(backend: PoseGraphBackend) -> Estimate:
     return estimate
 
 
-SOURCES = {
-    'white': JUDGED,
-    'correlated': MeasurementSource(correlation_time=20.0)}
+SOURCES = {'white': JUDGED, 'correlated': MeasurementSource(correlation_time=20.0)}
 MEASUREMENTS: dict[str, tuple[str, Measurement]] = {
     'position': ('fix', fix(LAST - 2.4, (1.5, -1.0))),
     'pose': ('pose', GlobalPose(stamp(LAST - 3), TRUTH[LAST - 3] + (0.5, 0.8, 0.05),

@@ -49,9 +49,7 @@ def estimate_of(backend: PoseGraphBackend) -> Estimate:
     return estimate
 
 
-def test_later_odometry_is_appended_as_the_next_estimate_would(
-    backend: PoseGraphBackend,
-) -> None:
+def test_later_odometry_is_appended_as_the_next_estimate_would(backend: PoseGraphBackend) -> None:
     estimate = estimate_of(backend)
     ahead = predict(estimate, sample(22))
     np.testing.assert_allclose(

@@ -18,12 +18,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind
-from pose_graph_ros.core.measurements import (
-    AnswerStatus,
-    LoopClosure,
-    OdometrySample,
-    Position,
-)
+from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample, Position
 
 PER_LAP, LAPS = 40, 6
 SIGMA = np.array((0.02, 0.02, 0.005))

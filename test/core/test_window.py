@@ -10,21 +10,11 @@ import pytest
 from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    MeasurementSource,
-    WindowConfig,
-    WindowPrior,
-)
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, WindowConfig, WindowPrior
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.measurements import (
-    LoopClosure,
-    Measurement,
-    OdometrySample,
-    Position,
-)
+from pose_graph_ros.core.measurements import LoopClosure, Measurement, OdometrySample, Position
 
 SECOND = 1_000_000_000
 RATE = 5

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The drive of the tests with the real node: a circle, with exact odometry and fixes."""
 
-from collections.abc import Sequence
 import math
 
 from harness import Client, fix, odometry, stamp_ns
@@ -36,13 +35,10 @@ def odometry_at(seconds: float) -> Odometry:
     return odometry(START + seconds, *odometry_pose(seconds).tolist(), speed=2.0)
 
 
-def fix_at(
-    seconds: float, lever_arm: Sequence[float] = (0.0, 0.0), sigma: float = 0.5,
-) -> NavSatFix:
-    """The exact fix of an antenna that is there on the robot."""
-    antenna = se2.transform(true_pose(seconds), np.array(lever_arm))
-    latitude, longitude, _ = PLANE.to_geodetic(antenna, PLANE.altitude)
-    return fix(START + seconds, latitude, longitude, sigma)
+def fix_at(seconds: float) -> NavSatFix:
+    """The exact fix of an antenna at the robot."""
+    latitude, longitude, _ = PLANE.to_geodetic(true_pose(seconds)[:2], PLANE.altitude)
+    return fix(START + seconds, latitude, longitude)
 
 
 def drive(

@@ -7,12 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    GyroSource,
-    MeasurementSource,
-    OdometrySource,
-)
+from pose_graph_ros.core.config import BackendConfig, GyroSource, MeasurementSource, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import Measurement, OdometrySample, Position, YawRate

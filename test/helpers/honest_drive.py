@@ -10,12 +10,7 @@ import numpy as np
 from pose_graph_ros.core.config import OdometryNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.measurements import (
-    LoopClosure,
-    Measurement,
-    OdometrySample,
-    Position,
-)
+from pose_graph_ros.core.measurements import LoopClosure, Measurement, OdometrySample, Position
 
 SECOND = 10**9
 START_NS = 1_700_000_000 * SECOND
@@ -70,17 +65,14 @@ class HonestDrive:
         if self.tau > 0.0:
             phi = np.exp(-np.diff(t[self.fix_at]) / self.tau)
             for k in range(1, len(errors)):
-                errors[k] = phi[k - 1] * errors[k - 1] + np.sqrt(
-                    1.0 - phi[k - 1]**2) * errors[k]
-        self.positions = (self.truth.poses[self.fix_at, :2]
-                          + self.times * self.sigma * errors)
+                errors[k] = phi[k - 1] * errors[k - 1] + np.sqrt(1.0 - phi[k - 1]**2) * errors[k]
+        self.positions = (self.truth.poses[self.fix_at, :2] + self.times * self.sigma * errors)
         later = np.sort(rng.choice(np.arange(n // 2, n), self.closures, replace=False))
         lap = round(2.0 * (2.0 * np.pi / 0.15) / PERIOD)
         self.closure_at = np.column_stack((np.maximum(later - lap, 3), later))
         exact = se2.between(*(self.truth.poses[self.closure_at[:, k]] for k in (0, 1)))
         # errors are in the axes of the reference
-        self.relative = exact + self.closure_times * CLOSURE_SIGMAS * rng.normal(
-            size=exact.shape)
+        self.relative = exact + self.closure_times * CLOSURE_SIGMAS * rng.normal(size=exact.shape)
         self.is_false = np.zeros(self.closures, dtype=bool)
         self.is_false[rng.permutation(self.closures)[:self.false_closures]] = True
         self.relative[self.is_false, :2] += rng.choice((-1.0, 1.0), (self.false_closures, 2)) * (

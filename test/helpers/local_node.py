@@ -37,9 +37,7 @@ class LocalNode:
 
     """
 
-    def __init__(
-        self, log: Path, make_node: Callable[[Context], Node] | None = None,
-    ) -> None:
+    def __init__(self, log: Path, make_node: Callable[[Context], Node] | None = None) -> None:
         self.context = Context()
         self._stack = ExitStack()
         env = self._stack.enter_context(isolated_environment(log))
@@ -61,9 +59,7 @@ class LocalNode:
         rclpy.shutdown(context=self.context)
         self._stack.close()
 
-    def spin_until(
-        self, done: Callable[[], bool], what: str, patience: float = PATIENCE,
-    ) -> None:
+    def spin_until(self, done: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:
         """Serve callbacks of both nodes until a condition holds."""
         end = time.monotonic() + patience
         while not done():

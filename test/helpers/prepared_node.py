@@ -36,9 +36,7 @@ class PreparedNode:
 
     """
 
-    def __init__(
-        self, arguments: Sequence[str], env: Mapping[str, str], stderr: Path,
-    ) -> None:
+    def __init__(self, arguments: Sequence[str], env: Mapping[str, str], stderr: Path) -> None:
         self._process = _server().Process(
             target=_run, args=(list(arguments), dict(env), str(stderr)), daemon=True)
         self._process.start()

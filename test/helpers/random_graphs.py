@@ -17,8 +17,7 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
 def random_poses(rng: np.random.Generator, n: int, spread: float = 5.0) -> FloatArray:
     """Return poses, shape (n, 3), with positions in a square and any heading."""
-    return np.column_stack((
-        rng.uniform(-spread, spread, (n, 2)), rng.uniform(-np.pi, np.pi, n)))
+    return np.column_stack((rng.uniform(-spread, spread, (n, 2)), rng.uniform(-np.pi, np.pi, n)))
 
 
 def random_information(rng: np.random.Generator, n: int) -> FloatArray:
@@ -33,9 +32,7 @@ def random_edges(rng: np.random.Generator, i: list[int], j: list[int]) -> Factor
                  [FactorKind.LOOP_CLOSURE] * len(i))
 
 
-def random_observed(
-    rng: np.random.Generator, node: list[int], *, offset: bool = True,
-) -> Factors:
+def random_observed(rng: np.random.Generator, node: list[int], *, offset: bool = True) -> Factors:
     """Return observed nodes with random means; every third has no information on the heading."""
     information = random_information(rng, len(node))
     mean = random_poses(rng, len(node))
@@ -237,6 +234,5 @@ def corridor_graph(seed: int, sigma: float, length: int = 150, width: int = 3) -
     information = np.tile(np.diag(sigmas**-2), (len(i), 1, 1))
     kind = np.where(j - i == 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     graph = Graph()
-    graph.apply(GraphUpdate(
-        hidden=truth, factors=Factors(i, j, mean, information, kind), fix=[0]))
+    graph.apply(GraphUpdate(hidden=truth, factors=Factors(i, j, mean, information, kind), fix=[0]))
     return graph

@@ -30,8 +30,7 @@ def feed_all(backend: PoseGraphBackend, events: Iterable[Event]) -> None:
 
 
 def line_sample(time: float, at: float | None = None) -> OdometrySample:
-    return OdometrySample(
-        round(time * SECOND), np.array([time if at is None else at, 0.0, 0.0]))
+    return OdometrySample(round(time * SECOND), np.array([time if at is None else at, 0.0, 0.0]))
 
 
 def straight_line(config: BackendConfig = LINE_ODOMETRY) -> PoseGraphBackend:

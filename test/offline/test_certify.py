@@ -94,8 +94,7 @@ def dense(form: Formulation) -> ComplexArray:
         for row, weight in ((place, form.tau[k]), (turn, form.kappa[k])):
             matrix += weight * np.outer(row.conj(), row)
     t, z = slice(1, n), slice(n, 2 * n)
-    return np.asarray(
-        matrix[z, z] - matrix[z, t] @ np.linalg.solve(matrix[t, t], matrix[t, z]))
+    return np.asarray(matrix[z, z] - matrix[z, t] @ np.linalg.solve(matrix[t, t], matrix[t, z]))
 
 
 seeds = st.integers(0, 10_000)
@@ -212,8 +211,7 @@ def test_the_objective_is_nowhere_above_chi2_if_it_says_so(seed: int) -> None:
     assert form.below_chi2
     quadratic = QuadraticForm(form)
     for _ in range(5):
-        poses = np.column_stack((
-            rng.uniform(-5.0, 5.0, (12, 2)), rng.uniform(-np.pi, np.pi, 12)))
+        poses = np.column_stack((rng.uniform(-5.0, 5.0, (12, 2)), rng.uniform(-np.pi, np.pi, 12)))
         poses[isotropic.fixed] = isotropic.poses[isotropic.fixed]
         assert quadratic.cost(form.headings(poses)[:, None]) <= isotropic.energies(poses).chi2
 

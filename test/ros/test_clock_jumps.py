@@ -83,8 +83,7 @@ def test_after_a_jump_of_the_clock_queued_messages_of_the_old_time_are_old(back:
     results = [time_jumps.receive(received) for received in (
         odometry(160.0), fix(159.8), odometry(100.0), fix(159.9), odometry(100.1), fix(100.1),
         fix(165.0))]
-    assert [result.is_old for result in results] == [
-        True, True, False, True, False, False, False]
+    assert [result.is_old for result in results] == [True, True, False, True, False, False, False]
     assert all(result.jump_ns == 0 for result in results)
 
 

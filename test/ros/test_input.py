@@ -165,9 +165,7 @@ def test_messages_that_are_held_back_are_released_after_a_while(clock: Clock) ->
     assert given.input.release_overdue() == []
 
 
-def test_a_new_graph_forgets_all_but_what_is_held_back(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_new_graph_forgets_all_but_what_is_held_back(caplog: pytest.LogCaptureFixture) -> None:
     given = Given()
     for step in range(20):
         given.use('odom', odometry(100.0 + 0.1 * step))
@@ -178,8 +176,7 @@ def test_a_new_graph_forgets_all_but_what_is_held_back(
     given.input.watch(Counter(), {}, active=True)
     given.input.start_new_graph(checked(given.values))
     assert given.input.rejected == {}
-    assert all(each == Arrivals(name, each.is_rare)
-               for name, each in given.input.arrivals.items())
+    assert all(each == Arrivals(name, each.is_rare) for name, each in given.input.arrivals.items())
     assert (given.input.posted, given.input.is_streaming) == (0, False)
     assert given.input.reader.datum.plane is None
     assert given.input.reader.frames is frames

@@ -195,8 +195,7 @@ def test_a_bad_argument_is_one_sentence_and_no_traceback(tmp_path: Path) -> None
         nodes = []
         for k, (arguments, _) in enumerate(BAD):
             (tmp_path / str(k)).mkdir()
-            nodes.append(stack.enter_context(NodeProcess(
-                tmp_path / str(k), arguments.split())))
+            nodes.append(stack.enter_context(NodeProcess(tmp_path / str(k), arguments.split())))
         assert [node.process.wait(PATIENCE) for node in nodes] == [2] * len(nodes)
         for node, (_, expected) in zip(nodes, BAD, strict=True):
             assert 'Traceback' not in node.stderr()

@@ -165,8 +165,7 @@ def test_what_was_dumped_can_be_loaded_and_given_as_a_file(
         results = node.set_parameters([Parameter.from_parameter_msg(
             ParameterMessage(name=name, value=get_parameter_value(text)))
             for name, text in texts.items()])
-        return {name for name, result in zip(texts, results, strict=True)
-                if not result.successful}
+        return {name for name, result in zip(texts, results, strict=True) if not result.successful}
 
     dumped = values()
     assert dumped['datum'] is dumped['fix.covariance_override'] is None
@@ -246,9 +245,7 @@ def test_mistakes_around_the_node_are_logged_when_they_begin_and_end(
 @pytest.mark.parametrize('managed', [{
     'sources': ['odom', 'fix', 'tags'], 'tags.type': 'range', 'tags.beacons': ['door 3 4']}],
     indirect=True)
-def test_a_range_to_a_beacon_of_the_map_waits_until_the_graph_lies_there(
-    managed: Managed,
-) -> None:
+def test_a_range_to_a_beacon_of_the_map_waits_until_the_graph_lies_there(managed: Managed) -> None:
     managed.start()
     managed.publishers['tags'] = managed.local.advertise(Range, 'tags')
     managed.drive(4.0, fixes=False)

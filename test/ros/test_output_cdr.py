@@ -38,8 +38,7 @@ def planar(pose: np.ndarray) -> list[float]:
 
 def check_header(message: object, stamp_ns: int, frame: str) -> None:
     stamp = message.header.stamp
-    assert (stamp.sec, stamp.nanosec, message.header.frame_id) == (
-        *divmod(stamp_ns, 10**9), frame)
+    assert (stamp.sec, stamp.nanosec, message.header.frame_id) == (*divmod(stamp_ns, 10**9), frame)
 
 
 def read(data: bytes, kind: type) -> object:

@@ -27,13 +27,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph.graph_view import GraphView, Lines
 from pose_graph_ros.core.judgement.texts import details, sentence
-from pose_graph_ros.core.judgement.verdicts import (
-    Decision,
-    Judged,
-    SourceVerdicts,
-    State,
-    Verdict,
-)
+from pose_graph_ros.core.judgement.verdicts import Decision, Judged, SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.ros import publishers
 from pose_graph_ros.ros.publishers import Publishers, thinned, verdicts_message

@@ -93,9 +93,7 @@ def active(robot: Robot) -> Robot:
     return robot
 
 
-def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(
-    active: Robot,
-) -> None:
+def test_the_path_follows_an_optimisation_and_diagnostics_are_as_documented(active: Robot) -> None:
     paths = active.local.subscribe(PathMessage, 'path', LATCHED)
     active.drive(10.0)
     active.wait(lambda: len(paths) > 0, 'a path comes')

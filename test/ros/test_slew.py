@@ -23,8 +23,7 @@ def test_the_robot_is_moved_no_faster_than_asked(
     slew = Slew()
     slew.limited(SECOND, before, then, linear, angular)
     shown = se2.compose(before, now)
-    moved = se2.compose(
-        slew.limited(SECOND + SECOND // 10, after, now, linear, angular), now)
+    moved = se2.compose(slew.limited(SECOND + SECOND // 10, after, now, linear, angular), now)
     wanted = se2.compose(after, now)
     step, whole = moved - shown, wanted - shown
     distance, turn = np.hypot(*whole[:2]), abs(se2.wrap(whole[2]))

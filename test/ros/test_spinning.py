@@ -69,9 +69,7 @@ def test_it_stops_at_once_though_no_callback_is_due(spun: Spun) -> None:
     spun.stop()
 
 
-def test_no_exception_of_a_callback_ends_it(
-    spun: Spun, caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_no_exception_of_a_callback_ends_it(spun: Spun, caplog: pytest.LogCaptureFixture) -> None:
     heard: list[str] = []
 
     def hear(message: Any) -> None:

@@ -116,8 +116,7 @@ def test_a_job_that_fails_is_answered_logged_and_counted(
     assert isinstance(broken.exception(PATIENCE), ZeroDivisionError)
     assert isinstance(refused.exception(PATIENCE), FileFormatError)
     wait_until(lambda: len(worker.status.counts) == 2)
-    assert worker.status.counts == {
-        ('worker', 'internal_error'): 1, ('worker', 'refused_job'): 1}
+    assert worker.status.counts == {('worker', 'internal_error'): 1, ('worker', 'refused_job'): 1}
     first, second = caplog.records
     assert first.getMessage() == 'the markers failed'
     assert first.exc_info is not None

@@ -59,8 +59,7 @@ def a_drive(
     the way for `longer`, and turns by `rate` [rad/s] more.
     """
     rng = np.random.default_rng(seed)
-    steps = np.column_stack((
-        np.full(n, speed * period), np.zeros(n), 0.1 * np.sin(np.arange(n))))
+    steps = np.column_stack((np.full(n, speed * period), np.zeros(n), 0.1 * np.sin(np.arange(n))))
     cov = speed * period * np.diag((0.0025, 0.0009, 1e-4))
     slips = drift * rng.standard_normal((n, 3)) * np.sqrt(np.diagonal(cov)) * (1.0, 1.0, turns)
     told = steps * (1.0 + longer, 1.0, 1.0) + (0.0, 0.0, rate * period)

@@ -45,9 +45,7 @@ def assert_same(pose: FloatArray, expected: FloatArray, tolerance: float = ROUND
 # --- wrap ------------------------------------------------------------------------------------
 
 @given(st.one_of(angles, st.floats(-1e6, 1e6)))
-def test_wrapped_angles_are_in_the_half_open_interval_and_the_same_direction(
-    angle: float,
-) -> None:
+def test_wrapped_angles_are_in_the_half_open_interval_and_the_same_direction(angle: float) -> None:
     wrapped = float(se2.wrap(angle))
     assert -np.pi <= wrapped < np.pi
     rounding = 1e-15 * (10.0 + abs(angle))
@@ -138,7 +136,6 @@ def test_interpolation_is_linear_with_the_shortest_turn(
     np.testing.assert_allclose(
         between[:2], (1.0 - fraction) * a[:2] + fraction * b[:2], atol=ROUNDING)
     whole = float(se2.wrap(b[2] - a[2]))
-    assert_same(np.array([0.0, 0.0, between[2]]),
-                np.array([0.0, 0.0, a[2] + fraction * whole]))
+    assert_same(np.array([0.0, 0.0, between[2]]), np.array([0.0, 0.0, a[2] + fraction * whole]))
     assert_same(se2.interpolate(a, b, 0.0), a)
     assert_same(se2.interpolate(a, b, 1.0), b)

@@ -45,8 +45,7 @@ def test_interpolation_is_that_of_a_slow_search(stamps: list[int], data: st.Data
 
 def test_nothing_is_extrapolated() -> None:
     trajectory = Trajectory([10, 20], np.zeros((2, 3)))
-    np.testing.assert_array_equal(
-        trajectory.covers([9, 10, 20, 21]), [False, True, True, False])
+    np.testing.assert_array_equal(trajectory.covers([9, 10, 20, 21]), [False, True, True, False])
     with pytest.raises(ValueError, match=r'2 of 3 .*\[10, 20\]'):
         trajectory.at([9, 15, 21])
     empty = Trajectory([], np.empty((0, 3)))
@@ -93,8 +92,7 @@ def test_it_recovers_any_rigid_motion(source: np.ndarray, pose: np.ndarray) -> N
     fitted = fit_motion(source, target)
     np.testing.assert_allclose(se2.transform(fitted, source), target, atol=1e-6)
     if np.ptp(source, axis=0).max() > 1.0:
-        np.testing.assert_allclose(
-            se2.between(fitted, se2.wrapped(pose)), 0.0, atol=1e-6)
+        np.testing.assert_allclose(se2.between(fitted, se2.wrapped(pose)), 0.0, atol=1e-6)
 
 
 @settings(max_examples=30)

@@ -24,11 +24,7 @@ from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import (
-    FactorKind,
-    FACTORS,
-    Factors,
-)
+from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 
@@ -100,8 +96,7 @@ def drive(rng: np.random.Generator, noise: float) -> list[GraphUpdate]:
         node = k if k < 2 else k + 4 + (k > 4) + (k > 5)
         update = GraphUpdate(hidden=se2.wrapped(truth[k:k + 1] + noise * rng.normal(size=3)))
         if k == 0:
-            updates.append(update._replace(
-                fix=[0], hidden=truth[:1]))
+            updates.append(update._replace(fix=[0], hidden=truth[:1]))
             names = [0]
             continue
         parts = []

@@ -6,13 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from random_graphs import (
-    random_edges,
-    random_graph,
-    random_observed,
-    random_poses,
-    snapshot,
-)
+from random_graphs import random_edges, random_graph, random_observed, random_poses, snapshot
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.graph import editing
@@ -127,8 +121,7 @@ def test_whatever_the_arrays_are_like_the_rows_are_the_same(
     usual, other = Graph(), Graph()
     usual.apply(GraphUpdate(hidden=hidden, factors=factors))
     signatures = len(editing.add_rows.signatures)
-    other.apply(GraphUpdate(
-        hidden=odd(hidden), factors=Factors(*map(odd, factors.columns))))
+    other.apply(GraphUpdate(hidden=odd(hidden), factors=Factors(*map(odd, factors.columns))))
     assert snapshot(other) == snapshot(usual)
     assert len(editing.add_rows.signatures) == signatures
 

@@ -80,10 +80,8 @@ def test_what_is_not_simply_believed_is_drawn_apart_though_its_weight_is_0() -> 
     positions = np.flatnonzero((edges.j < 0) & (edges.information[:, 0, 0] > 0.0))[:2].tolist()
     weak, waiting, doubted = closures
     whole = graph_view.view(graph)
-    graph.apply(GraphUpdate(
-        weigh=dict.fromkeys((waiting, doubted, *positions), 0.0)))
-    view = graph_view.view(
-        graph, DrawnRows([weak], [waiting], [doubted], unused=positions))
+    graph.apply(GraphUpdate(weigh=dict.fromkeys((waiting, doubted, *positions), 0.0)))
+    view = graph_view.view(graph, DrawnRows([weak], [waiting], [doubted], unused=positions))
     assert whole is not None
     assert view is not None
     assert len(view.loop_closures.ends) == len(whole.loop_closures.ends) - 3

@@ -178,8 +178,7 @@ def test_a_prior_alone_holds_its_nodes() -> None:
     poses[:, 0] = range(3)
     prior = random_prior(rng, [0, 1, 2], poses, anchored=True)
     smoother = IncrementalSmoother(EXACT)
-    assert smoother.update(
-        GraphUpdate(hidden=poses, priors=[prior])).status is Status.CONVERGED
+    assert smoother.update(GraphUpdate(hidden=poses, priors=[prior])).status is Status.CONVERGED
     information = model(prior, smoother.poses, np.ones(3, np.bool_)).information
     np.testing.assert_allclose(
         smoother.covariance(2), np.linalg.inv(information)[6:, 6:], rtol=1e-4)

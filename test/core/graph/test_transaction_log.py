@@ -59,9 +59,7 @@ def assert_pools_are_whole(graph: Graph) -> None:
 
 @given(seeds, st.integers(1, 30))
 @settings(max_examples=40)
-def test_every_number_of_the_pools_belongs_to_one_clique_or_to_none(
-    seed: int, steps: int,
-) -> None:
+def test_every_number_of_the_pools_belongs_to_one_clique_or_to_none(seed: int, steps: int) -> None:
     simulation, smoother, slow = begun(seed)
     for _ in range(steps):
         update = simulation.mixture(slow)

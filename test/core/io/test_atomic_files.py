@@ -70,9 +70,7 @@ def test_if_a_file_cannot_be_renamed_all_are_unchanged(
 
 @pytest.mark.parametrize('share', [0.0, 0.5, 0.9])
 @pytest.mark.parametrize('name', NAMES)
-def test_a_disk_that_is_full_leaves_the_old_files(
-    tmp_path: Path, name: str, share: float,
-) -> None:
+def test_a_disk_that_is_full_leaves_the_old_files(tmp_path: Path, name: str, share: float) -> None:
     """Those before the largest one are whole by then."""
     write(tmp_path, OLD)
     new = {**NEW, name: 3 * NEW[name]}

@@ -175,8 +175,7 @@ def test_missing_vertices_are_composed_from_edges(folder: Path, seed: int) -> No
     file = read(folder, '\n'.join([*lines, f'VERTEX_SE2 {10 * known} {start}']))
     assert not file.has_start
     np.testing.assert_allclose(file.graph.poses[:, :2], truth[:, :2], atol=1e-12)
-    np.testing.assert_allclose(
-        se2.wrap(file.graph.poses[:, 2] - truth[:, 2]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(se2.wrap(file.graph.poses[:, 2] - truth[:, 2]), 0.0, atol=1e-12)
     # without any vertex the first node is at the origin
     file = read(folder, '\n'.join(lines))
     np.testing.assert_array_equal(file.graph.poses[0], 0.0)
@@ -217,8 +216,7 @@ def test_edge2_means_what_it_is_said_to_mean(folder: Path, seed: int) -> None:
     for order, numbers in (('toro', toro), ('isam', isam)):
         text = ' '.join(repr(float(number)) for number in numbers)
         graph = read(folder, f'VERTEX2 0 1 2 3\nEDGE2 0 1 1 0 0 {text}', order).graph
-        np.testing.assert_allclose(
-            graph.factors.information[0], information, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(graph.factors.information[0], information, rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(graph.poses[0], [1.0, 2.0, 3.0])
 
 
@@ -307,9 +305,7 @@ def plausible_lines(draw: st.DrawFn) -> str:
     st.text(), st.lists(st.lists(words).map(' '.join)).map('\n'.join),
     st.lists(st.one_of(plausible_lines(), st.lists(words).map(' '.join))).map('\n'.join)),
     st.sampled_from((None, 'toro', 'isam')))
-def test_any_text_is_read_or_refused(
-    folder: Path, text: str, edge2_order: str | None,
-) -> None:
+def test_any_text_is_read_or_refused(folder: Path, text: str, edge2_order: str | None) -> None:
     path = folder / 'fuzz.g2o'
     path.write_bytes(text.encode('utf-8', 'surrogatepass'))
     try:

@@ -15,13 +15,7 @@ from typing import Any
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
-from saved_graphs import (
-    assert_same_value,
-    feed_all,
-    LINE_ODOMETRY,
-    line_sample,
-    straight_line,
-)
+from saved_graphs import assert_same_value, feed_all, LINE_ODOMETRY, line_sample, straight_line
 from test_delay_invariance import CORRELATED, DRIVES
 from tum_files import read_tum
 
@@ -209,8 +203,7 @@ def test_a_file_of_version_1_is_read() -> None:
     """It was written by 0.1.0, with numbers for losses and kinds."""
     saved = read_graph(DATA / 'version_1.g2o')
     assert [tuple(Loss)[k] for k in saved.losses.losses] == 3 * [Loss.HUBER] + 2 * [Loss.CAUCHY]
-    assert np.flatnonzero(saved.rows.factors.kind == FactorKind.BIAS).tolist() == [
-        5, 6, 7, 11, 12]
+    assert np.flatnonzero(saved.rows.factors.kind == FactorKind.BIAS).tolist() == [5, 6, 7, 11, 12]
     assert saved.rows.factors.observed.kind.tolist() == [
         FactorKind.GLOBAL_POSE, FactorKind.POSITION, FactorKind.HEADING,
         FactorKind.POSITION]

@@ -29,8 +29,7 @@ LAP = 60  # duration of a round [s]
 def true_pose(seconds: float) -> np.ndarray:
     """A circle of 20 m radius."""
     angle = 2.0 * math.pi * seconds / LAP
-    return se2.wrapped(np.array(
-        [20.0 * math.sin(angle), 20.0 * (1.0 - math.cos(angle)), angle]))
+    return se2.wrapped(np.array([20.0 * math.sin(angle), 20.0 * (1.0 - math.cos(angle)), angle]))
 
 
 def driven(*wrong: float, last: int = LAP + 20) -> PoseGraphBackend:
@@ -157,8 +156,7 @@ def test_a_source_that_is_no_longer_judged_keeps_the_verdicts_so_far(robust: Rob
 def test_of_many_hopeless_closures_the_oldest_are_forgotten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(
-        closures, 'BELIEF', replace(BELIEF, most_waiting=6))
+    monkeypatch.setattr(closures, 'BELIEF', replace(BELIEF, most_waiting=6))
     # each is so far off that none agrees with another one
     backend = driven(*(12.0 * (-1.0) ** k * (k + 2) for k in range(9)), 0.0, 0.0, 0.0, 0.0)
     total = backend.verdict_totals()['loop']

@@ -9,21 +9,12 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    MeasurementSource,
-    NodePolicy,
-    Robust,
-)
+from pose_graph_ros.core.config import BackendConfig, MeasurementSource, NodePolicy, Robust
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.io.graph_files import read_graph, write_graph
 from pose_graph_ros.core.judgement.verdicts import Decision, State
-from pose_graph_ros.core.measurements import (
-    GlobalPose,
-    LoopClosure,
-    OdometrySample,
-)
+from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, OdometrySample
 
 SECOND = 10**9
 LAP, LAPS = 80, 3
@@ -38,8 +29,7 @@ def drive(seed: int) -> tuple[FloatArray, FloatArray]:
     step = np.array([1.0, 0.0, 2.0 * np.pi / LAP])
     for k in range(1, len(truth)):
         truth[k] = se2.compose(truth[k - 1], step)
-        odometry[k] = se2.compose(
-            odometry[k - 1], step + rng.normal(0.0, (0.03, 0.02, 0.006)))
+        odometry[k] = se2.compose(odometry[k - 1], step + rng.normal(0.0, (0.03, 0.02, 0.006)))
     return truth, odometry
 
 
@@ -156,8 +146,7 @@ def test_right_closures_that_agree_all_the_way_are_believed_beside_wrong_groups(
         wrong += [closure(begin + k, end + k, se2.compose(
             se2.inverse(se2.between(TRUTH[begin], TRUTH[begin + k])), se2.compose(
                 z, se2.between(TRUTH[end], TRUTH[end + k])))) for k in range(0, 8, 2)]
-    wrong = [each for each in wrong
-             if each.stamp_ns not in {other.stamp_ns for other in right}]
+    wrong = [each for each in wrong if each.stamp_ns not in {other.stamp_ns for other in right}]
     backend = run([*right, *wrong])
     backend.optimize()
     found = {k for k, state in states(backend).items() if state.in_graph}

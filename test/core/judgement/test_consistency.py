@@ -60,8 +60,7 @@ class Drive:
         """Return closures that all begin in one half of the drive and end in the other."""
         n = len(self.rows)
         i, j = self.rng.integers(0, n // 2, m), self.rng.integers(n // 2, n, m)
-        mean = np.array([self.composed(a, b, np.zeros((n, 3)))
-                         for a, b in zip(i, j, strict=True)])
+        mean = np.array([self.composed(a, b, np.zeros((n, 3))) for a, b in zip(i, j, strict=True)])
         mean += self.rng.normal(size=(m, 3)) * (0.5, 0.5, 0.2)
         return Closures(i, j, mean, np.array(
             [covariance(self.rng, (0.3, 0.2, 0.1)) for _ in range(m)]))
@@ -183,6 +182,5 @@ def test_a_chain_goes_on_over_nodes_that_have_left() -> None:
                 whole.between(left[[begin]], left[[end]]), strict=True):
             np.testing.assert_allclose(actual, expected, atol=1e-12)
     motion, noise = chain.between(left[[2]], left[[3]])
-    np.testing.assert_allclose(
-        motion[0], se2.between(*graph.poses_of(left[[2, 3]])), atol=1e-12)
+    np.testing.assert_allclose(motion[0], se2.between(*graph.poses_of(left[[2, 3]])), atol=1e-12)
     assert np.all(np.linalg.eigvalsh(noise[0]) > 0.0)

@@ -70,9 +70,7 @@ def source_of(what: Measurement) -> str:
     return 'scan' if isinstance(what, LoopClosure) else 'fix'
 
 
-def run(
-    events: Sequence[OdometrySample | Measurement], every: int = 5,
-) -> PoseGraphBackend:
+def run(events: Sequence[OdometrySample | Measurement], every: int = 5) -> PoseGraphBackend:
     backend = PoseGraphBackend(CONFIG)
     for k, event in enumerate(events):
         if isinstance(event, OdometrySample):

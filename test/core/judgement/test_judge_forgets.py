@@ -46,8 +46,7 @@ def test_the_motion_between_nodes_that_stay_is_known_as_before(seed: int) -> Non
 
 def added(states: ClosureTable, edges: range) -> None:
     for edge in edges:
-        states.append(
-            NewConstraint(edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
+        states.append(NewConstraint(edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
 
 
 def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:

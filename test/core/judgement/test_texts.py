@@ -10,17 +10,8 @@ import math
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.judgement.texts import (
-    as_json,
-    sentence,
-    short,
-)
-from pose_graph_ros.core.judgement.verdicts import (
-    Decision,
-    Judged,
-    State,
-    Verdict,
-)
+from pose_graph_ros.core.judgement.texts import as_json, sentence, short
+from pose_graph_ros.core.judgement.verdicts import Decision, Judged, State, Verdict
 
 CLOSURE = Verdict(
     'loop_closure/17', Judged.LOOP_CLOSURE, 'loop_closure', 1_695_250_000_000,

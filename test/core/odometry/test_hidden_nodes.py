@@ -330,8 +330,7 @@ def test_without_the_samples_behind_thinned_nodes_motions_are_interpolated_betwe
     before = [nodes.attach(stamp_ns) for stamp_ns in instants]
     nodes.drop_samples(5)   # nothing was thinned out
     assert len(nodes.streams['wheel'].timeline) > 1000
-    nodes.thin(nodes.ids[[4]], nodes.ids[[3]], np.array([[2.0, 0.0, 0.0]]),
-                     0.01 * np.eye(3)[None])
+    nodes.thin(nodes.ids[[4]], nodes.ids[[3]], np.array([[2.0, 0.0, 0.0]]), 0.01 * np.eye(3)[None])
     nodes.drop_samples(5)
     timeline = nodes.streams['wheel'].timeline
     assert len(timeline) < 6 * 50

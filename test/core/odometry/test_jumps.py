@@ -115,8 +115,7 @@ def timeline(speed: float, turn_rate: float = 0.0) -> OdometryTimeline:
     one = OdometryTimeline()
     for k in range(51):
         time = max(0.1 * k - 4.0, 0.0)
-        one.append(next_row(
-            one._last, k * SECOND // 10, (speed * time, 0.0, turn_rate * time)))
+        one.append(next_row(one._last, k * SECOND // 10, (speed * time, 0.0, turn_rate * time)))
     return one
 
 
@@ -124,8 +123,7 @@ def timeline(speed: float, turn_rate: float = 0.0) -> OdometryTimeline:
 def test_the_robot_keeps_the_speed_that_it_had_before_a_gap(gap: float) -> None:
     mean, noise = gap_motion(timeline(3.0), END, END + round(gap * 1e9), -1)
     np.testing.assert_allclose(mean, [3.0 * gap, 0.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(noise)), np.add([3.0 * gap, 3.0 * gap, 0.0], SIGMA))
+    np.testing.assert_allclose(np.sqrt(np.diag(noise)), np.add([3.0 * gap, 3.0 * gap, 0.0], SIGMA))
     assert np.count_nonzero(noise - np.diag(np.diag(noise))) == 0
 
 

@@ -78,8 +78,7 @@ def test_other_errors_can_be_put_in_and_taken_out(
     first = changed(means, np.linalg.inv(noise), seconds, AS_CLAIMED, one)
     np.testing.assert_allclose(np.linalg.inv(first[1]), one.covariances(noise), rtol=1e-7)
     directly = changed(means, np.linalg.inv(noise), seconds, AS_CLAIMED, other)
-    for found, expected in zip(
-            changed(*first, seconds, one, other), directly, strict=True):
+    for found, expected in zip(changed(*first, seconds, one, other), directly, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
 
 

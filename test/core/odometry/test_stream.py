@@ -157,12 +157,10 @@ def jumps(samples: list[OdometrySample]) -> int:
     return settled(samples).n_jumps
 
 
-def reset(samples: list[OdometrySample], at: int, *, yaw: bool = False) -> list[OdometrySample]:
-    """Let odometry begin anew at a sample, in place and heading or, with `yaw`, heading alone."""
-    origin = samples[at].pose * [not yaw, not yaw, 1.0]
-    return samples[:at] + [
-        OdometrySample(one.stamp_ns, np.append(one.pose[:2], one.pose[2] - origin[2]) if yaw
-                       else se2.between(origin, one.pose)) for one in samples[at:]]
+def reset(samples: list[OdometrySample], at: int) -> list[OdometrySample]:
+    """Let odometry begin anew at a sample."""
+    return samples[:at] + [OdometrySample(one.stamp_ns, se2.between(samples[at].pose, one.pose))
+                           for one in samples[at:]]
 
 
 RATES = [5, 10, 50, 200]

@@ -32,8 +32,7 @@ seeds, flags = st.integers(0, 2**32 - 1), st.booleans()
 def at_rest(seed: int) -> tuple[IncrementalSmoother, World]:
     """Return a smoother at the minimum of a world with closures, fixes, biases and doubts."""
     smoother, _, here = driven(seed, 11)
-    smoother.update(here.joined(
-        here.new_nodes(2), factors=here.observed([0, 1], position=True)))
+    smoother.update(here.joined(here.new_nodes(2), factors=here.observed([0, 1], position=True)))
     return smoother, here
 
 
@@ -214,8 +213,7 @@ def _laps_with_a_window(seed: int, n: int, *, per_lap: int, lag: int) -> float:
     rng = np.random.default_rng(seed)
     sigma, turn = np.array((0.05, 0.05, 0.02)), 2.0 * np.pi / per_lap
     smoother, whole, oldest = IncrementalSmoother(), Graph(), 0
-    held = Factors.on(
-        [0], None, [[0.0, 0.0, 0.0]], [1e10 * np.eye(3)], [FactorKind.GLOBAL_POSE])
+    held = Factors.on([0], None, [[0.0, 0.0, 0.0]], [1e10 * np.eye(3)], [FactorKind.GLOBAL_POSE])
     smoother.update(GraphUpdate(hidden=np.zeros((1, 3)), factors=held))
     updates = [GraphUpdate(hidden=np.zeros((1, 3)), factors=held)]
     for k in range(1, n):

@@ -60,9 +60,7 @@ def test_a_tail_moves_rigidly_when_the_ring_is_closed() -> None:
 
 
 @pytest.mark.parametrize('config', [LINEAR, EXACT], ids=['default', 'exact'])
-def test_small_moves_do_not_get_lost(
-    config: SmootherConfig,
-) -> None:
+def test_small_moves_do_not_get_lost(config: SmootherConfig) -> None:
     """A closure that gets stronger in many small steps bends the ring a little in each."""
     smoother, exact = ring_with_a_tail(config), ring_with_a_tail(EXACT)
     for engine in (smoother, exact):

@@ -41,8 +41,7 @@ class Twins:
         idle.weight[:] = 0.0
         at = self.full.graph.n_factors
         self.idle += range(at, at + len(idle))
-        actual = self.full.update(update._replace(
-            factors=Factors.joined([idle, update.factors])))
+        actual = self.full.update(update._replace(factors=Factors.joined([idle, update.factors])))
         assert actual == expected
 
     def drive(self, steps: int) -> None:

@@ -70,16 +70,14 @@ def test_every_constraint_has_the_name_of_its_source_and_of_its_ends() -> None:
     energies = backend.graph.energies()
     assert len(found) == np.count_nonzero(energies.factors > 0.0)
     assert sum(each.energy for each in found) == pytest.approx(energies.chi2)
-    assert [each.energy for each in found] == sorted(
-        (each.energy for each in found), reverse=True)
+    assert [each.energy for each in found] == sorted((each.energy for each in found), reverse=True)
     names = [each.name for each in found]
     assert len(set(names)) == len(names)
     n = len(backend.node_stamps_ns)
     for source in ('wheels', 'visual'):
         ours = [each for each in found if each.source == source]
         assert {each.kind for each in ours} == {'odometry'}
-        assert {each.name for each in ours} == {
-            f'{source} x{k} - x{k + 1}' for k in range(n - 1)}
+        assert {each.name for each in ours} == {f'{source} x{k} - x{k + 1}' for k in range(n - 1)}
     stamps = backend.node_stamps_ns
 
     def node(seconds: float) -> int:
@@ -91,8 +89,7 @@ def test_every_constraint_has_the_name_of_its_source_and_of_its_ends() -> None:
         name: {k for k in range(6, 121, 4) if k // 4 % 3 == number}
         for number, name in enumerate(('wander', 'plain', 'robust'))}
     for source, instants in expected.items():
-        ours = {each.name for each in found
-                if each.source == source and each.kind != 'bias'}
+        ours = {each.name for each in found if each.source == source and each.kind != 'bias'}
         assert ours == {f'{source} at {k - 0.25:.3f} s near x{node(k - 0.25)}' for k in instants}
     kinds = {each.source: each.kind for each in found if each.kind != 'bias'}
     assert kinds == {

@@ -13,11 +13,7 @@ from pose_graph_ros.core.config import (
     OdometryNoise,
     OdometrySource,
 )
-from pose_graph_ros.core.measurements import (
-    GlobalPose,
-    OdometrySample,
-    Position,
-)
+from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Position
 from pose_graph_ros.core.sources.settings import SOURCES
 
 SECOND = 1_000_000_000

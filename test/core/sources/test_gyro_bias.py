@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.config import (
-    BackendConfig,
-    OdometryNoise,
-    OdometrySource,
-    WindowConfig,
-)
+from pose_graph_ros.core.config import BackendConfig, OdometryNoise, OdometrySource, WindowConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -149,8 +144,7 @@ def test_no_rotation_spans_the_step_to_a_pose_that_is_set(short: Drive) -> None:
     backend.update()
     before = backend.graph.n_nodes
     turned = backend.estimate().path.poses[-1] + (0.0, 0.0, 1.5)
-    answer = backend.set_pose(
-        GlobalPose(half, turned, np.diag((0.01, 0.01, 1e-4))), 'set_pose')
+    answer = backend.set_pose(GlobalPose(half, turned, np.diag((0.01, 0.01, 1e-4))), 'set_pose')
     assert answer.status is AnswerStatus.ACCEPTED
     feed(backend, [each for each in short.events if half < each[1].stamp_ns <= half + 2 * SECOND
                    and each[0] != 'fix'])
@@ -165,9 +159,7 @@ def test_no_rotation_spans_the_step_to_a_pose_that_is_set(short: Drive) -> None:
     assert abs(se2.wrap(pose[2] - turned[2])) < 0.01
 
 
-def test_with_another_period_the_chain_of_the_bias_goes_on(
-    short: Drive, tmp_path: Path,
-) -> None:
+def test_with_another_period_the_chain_of_the_bias_goes_on(short: Drive, tmp_path: Path) -> None:
     half = len(short.events) // 2
     saved = feed(PoseGraphBackend(settings()), short.events[:half]).saved()
     n_before = np.count_nonzero(saved.rows.is_bias)

@@ -8,12 +8,7 @@ from test_gauss_markov import SECOND, TAU
 
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import NextIds
-from pose_graph_ros.core.sources.bias import (
-    Additions,
-    BiasChain,
-    CorrelatedErrors,
-    Process,
-)
+from pose_graph_ros.core.sources.bias import Additions, BiasChain, CorrelatedErrors, Process
 
 PROCESS = Process.correlated(CorrelatedErrors(TAU, 1.0, 0.05))
 
@@ -86,8 +81,7 @@ def test_a_bias_of_which_old_states_have_left_stays_the_same_process(
         if oldest % 3 == 0:
             chain.forget(end)
         bins, cov = chain.covariance()
-        np.testing.assert_allclose(
-            cov, np.exp(-np.abs(bins[:, None] - bins) / TAU), atol=1e-9)
+        np.testing.assert_allclose(cov, np.exp(-np.abs(bins[:, None] - bins) / TAU), atol=1e-9)
         assert chain.bias.nodes.tolist() == sorted(chain.bins, key=chain.bins.__getitem__)
     assert chain.bias.nodes[-1] not in chain.bias.leaving(None)
 

@@ -274,8 +274,7 @@ def test_when_the_heading_of_a_pose_is_used(
         np.testing.assert_array_equal(answer.measurement.lever_arm, 0.0)
     else:
         assert isinstance(answer.measurement, GlobalPose)
-        np.testing.assert_allclose(
-            answer.measurement.covariance, np.diag([0.04, 0.09, left]))
+        np.testing.assert_allclose(answer.measurement.covariance, np.diag([0.04, 0.09, left]))
 
 
 @pytest.mark.parametrize(('variance', 'said'), [
@@ -287,8 +286,7 @@ def test_the_variance_of_a_heading(variance: float, said: float | str) -> None:
     if said == 'no_information':
         assert answer.reason == refused.reason == said
     elif said == 'default':
-        assert answer == Validated(
-            HeadingOnly(SECOND, 1.0, 0.3**2), ('default_covariance',))
+        assert answer == Validated(HeadingOnly(SECOND, 1.0, 0.3**2), ('default_covariance',))
         assert refused.reason == 'covariance_not_positive'
     else:
         assert answer.measurement.variance == refused.measurement.variance == pytest.approx(said)

@@ -157,8 +157,7 @@ def test_where_a_chain_is_cut_no_covariance_becomes_smaller(
         cuts, _ = cut_chains(graph, biases)
         assert len(cuts) == 1
         leaving = leaving[np.isin(leaving, segment.poses)]
-        update = sparse_removal(
-            graph, np.sort(np.append(leaving, biases)), segment.factors)
+        update = sparse_removal(graph, np.sort(np.append(leaving, biases)), segment.factors)
         assert update is not None
         smoother.update(update)
         bias = bias.without(biases)

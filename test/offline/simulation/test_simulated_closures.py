@@ -58,8 +58,7 @@ def test_the_share_and_the_groups_of_false_closures_are_as_asked(
 
 def test_true_closures_have_their_sigmas_and_the_rate_that_was_asked_for() -> None:
     drive = with_closures('hall', 3600.0)
-    whole, part = (each.measured[CLOSURES] for each in (drive, with_closures(
-        'hall', 3600.0, 0.3)))
+    whole, part = (each.measured[CLOSURES] for each in (drive, with_closures('hall', 3600.0, 0.3)))
     assert np.all(whole.wrong == -1)
     assert len(part.values) == pytest.approx(
         0.3 * len(whole.values), abs=4.0 * np.sqrt(0.21 * len(whole.values)))

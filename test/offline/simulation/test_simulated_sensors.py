@@ -94,8 +94,7 @@ def test_disturbances_change_only_what_they_name(world: str) -> None:
     np.testing.assert_array_equal(before.stamps_ns[kept], after.stamps_ns)
     moved = (time >= 100.0) & (time < 120.0)
     np.testing.assert_array_equal(after.wrong >= 0, moved[kept])
-    np.testing.assert_array_equal(
-        before.values[kept & ~moved], after.values[after.wrong == -1])
+    np.testing.assert_array_equal(before.values[kept & ~moved], after.values[after.wrong == -1])
     assert other.silenced == (int(np.sum(~kept)),)
 
 

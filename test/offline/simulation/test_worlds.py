@@ -57,8 +57,7 @@ def test_the_robot_stays_in_the_aisles_of_the_hall_for_hours() -> None:
     assert x.max() < (AISLES - 1) * AISLE_SPACING + 0.6
     # each aisle again and again, in both directions
     middle = np.abs(y - 0.5 * AISLE_DEPTH) < 1.0
-    visits = np.round(x[middle] / AISLE_SPACING).astype(int) * 2 + (
-        np.sin(heading[middle]) > 0.0)
+    visits = np.round(x[middle] / AISLE_SPACING).astype(int) * 2 + (np.sin(heading[middle]) > 0.0)
     assert np.bincount(visits, minlength=2 * AISLES).min() > 10
     assert np.mean(np.diff(motion.distance) < 1e-6) > 0.1    # it stops to pick up
 
