@@ -126,10 +126,6 @@ class OdometryNoise:
     def __post_init__(self) -> None:
         check(self, 'sigma_floor_position', 'sigma_floor_heading')
 
-    def scaled(self, factor: float) -> 'OdometryNoise':
-        """Return the noise with all sigmas times a factor."""
-        return OdometryNoise(*(factor * getattr(self, each.name) for each in fields(self)))
-
 
 @dataclass(frozen=True, slots=True)
 class OdometrySource:

@@ -16,10 +16,11 @@ import math
 
 import numpy as np
 
-from pose_graph_ros.core.compiled.jit import FLAG, kernel, NUMBER, ROWS
-from pose_graph_ros.core.elimination.assembly import eliminate_clique
+from pose_graph_ros.core.compiled.jit import FLAG, INTEGER, kernel, NUMBER, ROWS
+from pose_graph_ros.core.elimination import assembly
 from pose_graph_ros.core.elimination.fronts import backward_rows, forward_rows
-from pose_graph_ros.core.geometry.se2 import Poses
+from pose_graph_ros.core.exceptions import LinearSolveError
+from pose_graph_ros.core.geometry.se2 import ComplexArray, Poses
 from pose_graph_ros.core.graph import factors, normal_equations, prior_rows, tables as tb
 
 
@@ -31,24 +32,25 @@ def put_poses(memory: tb.Memory, poses: Poses) -> None:
         rows[field] = 0.0
 
 
-@kernel(signature=(tb.HEAD, NUMBER))
-def eliminate(head, damping):  # type: ignore[no-untyped-def]
+@kernel(signature=(tb.HEAD, NUMBER, INTEGER))
+def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     """
     Eliminate all cliques with a damping lambda, which is 0 for a Gauss-Newton step.
 
-    The poses become the references, and all factors are linearized there. Return False if a node
-    is not determined, which is `BAD_NODE` of the head.
+    `terms` says what constraints add; see `assembly`. For LINEARIZED the poses become the
+    references, and all factors are linearized there. Return False if a node is not determined,
+    which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)[0]
-    for v in range(head[tb.N_NODES]):
+    for v in range(head[tb.N_NODES] if terms == assembly.LINEARIZED else 0):
         factors.refer_to_pose(tb.nodes(head)[v])
-    for e in range(head[tb.N_FACTORS]):
+    for e in range(head[tb.N_FACTORS] if terms == assembly.LINEARIZED else 0):
         if tb.factors(head)[e].weight > 0.0:
             factors.linearize(head, e)
     scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
-        bad = eliminate_clique(head, c, False)
+        bad = assembly.eliminate_clique(head, c, terms)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             break
@@ -93,8 +95,9 @@ def step(head, right, chord):  # type: ignore[no-untyped-def]
         for k in range(n_frontal):
             v = members[k]
             f = tb.nodes(head)[v]
-            if f.fixed != 0:
-                right[v, :] = 0.0
+            if f.fixed != 0:    # known, and zero but in a linear start
+                for m in range(3):
+                    right[v, m] = f.delta[m]
                 continue
             for m in range(3):
                 right[v, m] = x[3 * k + m]
@@ -199,7 +202,27 @@ class CompiledSystem:
     def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
         if chord:
             return float(step(self._head, self._right, True)), 0.0
-        if not eliminate(self._head, damping):
+        if not eliminate(self._head, damping, assembly.LINEARIZED):
             return math.inf, 0.0
         length = float(step(self._head, np.zeros_like(self._right), False))
         return length, float(np.sum(self._right * self._rows['delta']))
+
+
+def solve_chordal(
+    memory: tb.Memory, known: ComplexArray, headings: ComplexArray | None,
+) -> ComplexArray:
+    """Solve as a `ChordalSolve` of `linear_starts` over planted cliques; changes the poses."""
+    rows = memory['nodes'][:memory.head[tb.N_NODES]]
+    fixed = rows['fixed'] != 0
+    if headings is not None:
+        rows['pose'][~fixed, 2] = np.angle(headings[:-1])[~fixed]
+    # the unknowns are the solutions of the nodes
+    delta = rows['delta']
+    for field in ('reference', 'delta', 'seen', 'checked_turn'):
+        rows[field] = 0.0
+    delta[fixed, 0], delta[fixed, 1] = known.real[:-1][fixed], known.imag[:-1][fixed]
+    terms = assembly.HEADINGS if headings is None else assembly.POSITIONS
+    if not eliminate(memory.head, 0.0, terms):
+        raise LinearSolveError('chordal start: singular')
+    step(memory.head, np.zeros((len(rows), 3)), False)
+    return np.append(delta[:, 0] + 1j * delta[:, 1], known[-1])

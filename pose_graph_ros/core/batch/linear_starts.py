@@ -14,7 +14,8 @@ condition |u| = 1 both equations are linear.
   from odometry.
 - `joint` solves for both together, which needs no measured heading.
 
-Nothing in here is compiled.
+Nothing in here is compiled. `gauss_newton.solve_chordal` solves the systems of `chordal` over
+the cliques of a graph.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +37,12 @@ if TYPE_CHECKING:
 
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
 Ends = Sequence[Blocks]   # one for each end of a constraint
+ChordalSolve = Callable[[ComplexArray, ComplexArray | None], ComplexArray]
+"""
+Solves for all positions of a graph, given headings u with |u| = 1, or for u if none are given.
+
+What is known of fixed nodes, and what is returned, are complex numbers, the last that of the map.
+"""
 
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
@@ -172,11 +179,29 @@ class NodeSystem:
         return solve
 
 
-def chordal(graph: Constrained, nodes: NodeSystem | None = None) -> Poses:
+def sparse_chordal(graph: Constrained, nodes: NodeSystem | None = None) -> ChordalSolve:
+    """Return the `ChordalSolve` that is not compiled; `nodes` is that of the edges."""
+    terms = Terms.of_factors(graph.factors_by_row, len(graph.poses)).informative()
+    system = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
+
+    def solve(known: ComplexArray, headings: ComplexArray | None) -> ComplexArray:
+        if headings is None:
+            root = np.sqrt(terms.kappa)[:, None, None]
+            by = -root * terms.turn[:, None, None], root + 0j
+            right = np.zeros(len(root), complex)
+        else:
+            root = np.sqrt(terms.tau)[:, None, None]
+            by = -root, root
+            right = root[:, 0, 0] * (
+                headings[terms.i] * terms.arm_i - headings[terms.j] * terms.arm_j)
+        return system.solver(by, right[:, None], known[:, None])()[:, 0]
+    return solve
+
+
+def chordal(graph: Constrained, solve: ChordalSolve | None = None) -> Poses:
     """
     Return initial poses from the constraints and the poses of fixed nodes: headings come first.
 
-    `nodes` is the system of the edges; without it one is made.
     Raises LinearSolveError if headings or positions are not determined, for example if only
     positions are observed, or if the graph has priors or nodes that are no poses.
     """
@@ -184,20 +209,15 @@ def chordal(graph: Constrained, nodes: NodeSystem | None = None) -> Poses:
         raise LinearSolveError('chordal start: a bias or a landmark has no heading')
     if graph.n_priors > 0:
         raise LinearSolveError('chordal start: a prior has no term for a heading alone')
-    terms = Terms.of_factors(graph.factors_by_row, len(graph.poses)).informative()
-    system = nodes or NodeSystem(terms.i, terms.j, ~graph.fixed)
+    solve = solve or sparse_chordal(graph)
     t, u = _known(graph.poses)
-    root = np.sqrt(terms.kappa)[:, None, None]
-    by = -root * terms.turn[:, None, None], root + 0j
-    u = system.solver(by, np.zeros((len(root), 1), complex), u[:, None])()[:, 0]
+    u = solve(u, None)
     length = np.abs(u)
     # what remains of u where measured headings cancel often leads to another minimum
     if np.any(length < 1e-6):
         raise LinearSolveError('chordal start: the measured headings cancel each other out')
     u /= length
-    root = np.sqrt(terms.tau)[:, None, None]
-    right = root[:, :, 0] * (u[terms.i] * terms.arm_i - u[terms.j] * terms.arm_j)[:, None]
-    return _poses(graph, system.solver((-root, root), right, t[:, None])()[:, 0], u)
+    return _poses(graph, solve(t, u), u)
 
 
 def joint(graph: 'Graph', *, unit: bool = False) -> Poses:

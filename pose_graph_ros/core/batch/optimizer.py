@@ -10,6 +10,7 @@ poses, with which the incremental smoother can continue.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -163,7 +164,7 @@ def _is_observed(graph: Graph) -> bool:
 def _start(graph: Graph, start: Start) -> FloatArray:
     """Return the poses of a start, or raise LinearSolveError if there are none."""
     if start is Start.CHORDAL:
-        return linear_starts.chordal(graph)
+        return linear_starts.chordal(graph, partial(gauss_newton.solve_chordal, graph.memory))
     if start is Start.PRESENT:
         return graph.poses.copy()
     if start is Start.JOINT and not _is_observed(graph):

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.batch import levenberg_marquardt as lm
-from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem
+from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, sparse_chordal
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
@@ -131,7 +131,7 @@ class PlainOptimizer:
                 first = chi2 = self.evaluate()[0]
                 if start is lm.Start.CHORDAL and first < np.inf:
                     steps = min(steps, lm.TRUSTED_ITERATIONS)
-                    graph.poses = chordal(graph, self._nodes)
+                    graph.poses = chordal(graph, sparse_chordal(graph, self._nodes))
                     chi2 = self.evaluate()[0]
                 if chi2 < np.inf:
                     result = lm.to_the_end(lm.minimize(

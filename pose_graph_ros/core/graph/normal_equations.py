@@ -7,6 +7,8 @@ Symbols are those of `factors`. With G the two columns of a third node, a factor
 `J^T W J` and `-J^T W h`, with J = (-T, F, G) in map axes.
 """
 
+import math
+
 from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.graph import factors as fc, tables as tb
 
@@ -150,6 +152,52 @@ def add(head, e, at, front, ld):  # type: ignore[no-untyped-def]
     if k >= 0:
         reference = fc.by_state(f, nodes[k].reference[0], nodes[k].reference[1])
     _add(f, kind, nodes[i], nodes[j], reference, at, front, ld)
+
+
+@kernel
+def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-def]
+    """
+    Add an equation of a linear start to a front, as `add` does: of headings, or of positions.
+
+    It is `v_j - f v_i = s`, or `v_i = s` where a node is observed, of complex numbers: v is u or t
+    of `batch.linear_starts`. The third unknown of each node is 0.
+    """
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    i = f.ends[0]
+    kappa = weight = f.weight * f.information[5]
+    fx, fy, sx, sy = 1.0, 0.0, 0.0, 0.0
+    if headings:
+        if b >= 0:
+            fx, fy = math.cos(f.mean[2]), math.sin(f.mean[2])
+        else:
+            th = f.mean[2] - f.constants[2]
+            sx, sy = math.cos(th), math.sin(th)
+    else:
+        weight = 0.5 * f.weight * (f.information[0] + f.information[3])
+        c, s = math.cos(nodes[i].pose[2]), math.sin(nodes[i].pose[2])
+        x, y = (f.mean[0], f.mean[1]) if b >= 0 else (f.constants[0], f.constants[1])
+        sx, sy = c * x - s * y, s * x + c * y
+        if b < 0:
+            sx, sy = f.mean[0] - sx, f.mean[1] - sy
+    for at in (a, b):
+        if at >= 0:
+            front[at * (ld + 1)] += weight
+            front[(at + 1) * (ld + 1)] += weight
+            front[(at + 2) * (ld + 1)] += kappa
+    last, right = b if b >= 0 else a, ld - 1
+    front[last * ld + right] += weight * sx
+    front[(last + 1) * ld + right] += weight * sy
+    if b < 0:
+        return
+    front[a * ld + right] -= weight * (fx * sx + fy * sy)
+    front[(a + 1) * ld + right] -= weight * (fx * sy - fy * sx)
+    if a > b:
+        a, b, fy = b, a, -fy
+    r = a * ld + b      # block ij is that of -weight conj(f)
+    front[r] -= weight * fx
+    front[r + 1] -= weight * fy
+    front[r + ld] += weight * fy
+    front[r + ld + 1] -= weight * fx
 
 
 @kernel(forceinline=True)

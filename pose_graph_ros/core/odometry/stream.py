@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core import measurements as ms
-from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometrySource
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, IntArray, Pose
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
@@ -228,15 +228,6 @@ class OdometryStream(ReorderBuffer[Received]):
         self.restarted_ns = saved.restarted_ns
         self.tied, self.next_to_tie = saved.tied, saved.next_to_tie
         self.saved_ns = self.newest_ns
-
-    def usual_noise(self) -> OdometryNoise:
-        """Return the noise by path and turns; of twists what they usually say of a metre."""
-        noise = self._source.noise
-        if self._source.noise_from is NoiseFrom.TWIST:
-            along, across, heading = np.sqrt(self.timeline.usual_variances()).tolist()
-            noise = replace(noise, sigma_distance=along, sigma_lateral=across,
-                            sigma_heading_distance=heading, sigma_heading_turn=0.0)
-        return noise.scaled(math.sqrt(self._source.covariance_scale))
 
     def covariance(self, motion: mo.Motion, *, floor: bool = True) -> FloatArray:
         """

@@ -191,18 +191,6 @@ class OdometryTimeline:
         self._dense.append(dense)
         self._last, self.resting = last, resting
 
-    def usual_variances(self) -> FloatArray:
-        """Return the variances of (x, y, theta) for a metre, shape (3,); 0 at rest."""
-        rows = self._rows(slice(None))
-        steps = np.diff(rows[:, 3:], axis=0)
-        steps[:, 1] = np.diff(self._stamps.values)
-        moving = steps[:, 0] > 0.0
-        if not np.any(moving):
-            return np.zeros(3)
-        # the median over time, as a jump has a variance of its own
-        rates = np.median(steps[moving, 2:] / steps[moving, 1:2], axis=0)
-        return np.asarray(rates * np.sum(steps[moving, 1]) / np.sum(steps[moving, 0]))
-
     def motion(self, start_ns: StampNs, end_ns: StampNs) -> Motion:
         """Return the motion between two instants; raise ValueError if one is not covered."""
         if start_ns > end_ns:

@@ -12,7 +12,7 @@ keep all their values, including their update matrices.
 import numpy as np
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.elimination.assembly import eliminate_clique, work_size
+from pose_graph_ros.core.elimination.assembly import eliminate_clique, RELINEARIZED, work_size
 from pose_graph_ros.core.elimination.ordering import grown, minimum_degree
 from pose_graph_ros.core.elimination.symbolic import in_postorder, newest_last, plant, structure
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
@@ -121,7 +121,7 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
         transaction_log.drop_clique(head, marked[k])
     head[tb.N_ROOTS] = 0
     for c in plant(head, cliques, orphans):
-        bad = eliminate_clique(head, c, True)
+        bad = eliminate_clique(head, c, RELINEARIZED)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             return BAD_PIVOT
@@ -165,7 +165,7 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
         if interruptible and head[tb.INTERRUPT] != 0:
             return INTERRUPTED
         transaction_log.renew_values(head, c)
-        bad = eliminate_clique(head, c, True)
+        bad = eliminate_clique(head, c, RELINEARIZED)
         if bad >= 0:
             head[tb.BAD_NODE] = bad
             return BAD_PIVOT

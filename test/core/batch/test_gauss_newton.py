@@ -9,6 +9,7 @@ from random_graphs import dense_system, free_part, random_graph
 
 from pose_graph_ros.core.batch import gauss_newton, optimizer
 from pose_graph_ros.core.elimination import symbolic
+from pose_graph_ros.core.elimination.assembly import LINEARIZED
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 
@@ -37,7 +38,7 @@ def weighted_graph(seed: int, n_nodes: int = 12) -> Graph:
 def full_step(graph: Graph, damping: float = 0.0) -> FloatArray:
     """Make a step; return the solution of the free nodes, in the order of H."""
     head = graph.memory.head
-    assert gauss_newton.eliminate(head, damping)
+    assert gauss_newton.eliminate(head, damping, LINEARIZED)
     length = gauss_newton.step(head, np.zeros((graph.n_nodes, 3)), False)
     step = graph.node_records['delta']
     assert length == np.max(np.abs(step))

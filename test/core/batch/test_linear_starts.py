@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear starts: exact without noise, in any gauge, independent of the present poses."""
 
+from collections.abc import Callable
+from functools import partial
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -9,7 +11,11 @@ import numpy.typing as npt
 import pytest
 from random_graphs import consistent_graph, random_graph, random_observed, random_poses
 
-from pose_graph_ros.core.batch.linear_starts import chordal, joint
+from pose_graph_ros.core.batch import linear_starts
+from pose_graph_ros.core.batch.gauss_newton import solve_chordal
+from pose_graph_ros.core.batch.linear_starts import joint
+from pose_graph_ros.core.batch.optimizer import plant
+from pose_graph_ros.core.elimination import symbolic
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -21,6 +27,7 @@ EXACT = 1e-11
 
 TO_COMPLEX = np.array([1.0, 1j, 0.0])
 ComplexArray = npt.NDArray[np.complex128]
+Chordal = Callable[[Graph], FloatArray]
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -28,6 +35,15 @@ seeds = st.integers(0, 2**32 - 1)
 def assert_poses_equal(poses: FloatArray, expected: FloatArray) -> None:
     np.testing.assert_allclose(poses[:, :2], expected[:, :2], atol=EXACT)
     np.testing.assert_allclose(se2.wrap(poses[:, 2] - expected[:, 2]), 0.0, atol=EXACT)
+
+
+def compiled(graph: Graph) -> FloatArray:
+    """Return the chordal start as the optimiser finds it, over the cliques of the graph."""
+    plant(graph, symbolic.analyse(graph.memory.head))
+    return linear_starts.chordal(graph, partial(solve_chordal, graph.memory))
+
+
+either = pytest.mark.parametrize('chordal', [linear_starts.chordal, compiled])
 
 
 def scattered(graph: Graph, rng: np.random.Generator) -> None:
@@ -45,9 +61,10 @@ def observe_exactly(graph: Graph, nodes: list[int], rng: np.random.Generator) ->
         observed.i, observed.offset, mean, observed.information, observed.kind)))
 
 
+@either
 @given(seeds, st.integers(0, 7))
 def test_without_noise_it_is_exact_whichever_node_is_fixed(
-    seed: int, fixed: int,
+    chordal: Chordal, seed: int, fixed: int,
 ) -> None:
     graph = consistent_graph(seed)
     truth = graph.poses.copy()
@@ -59,9 +76,10 @@ def test_without_noise_it_is_exact_whichever_node_is_fixed(
     assert np.all((start[:, 2] >= -np.pi) & (start[:, 2] < np.pi))
 
 
+@either
 @given(seeds)
 def test_without_noise_it_is_exact_with_observed_nodes_and_offsets_alone(
-    seed: int,
+    chordal: Chordal, seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
     graph = consistent_graph(seed)
@@ -93,9 +111,10 @@ def dense_solution(
     return v
 
 
+@either
 @given(seeds, st.integers(2, 25), st.integers(0, 30), st.sets(st.integers(0, 1), min_size=1))
 def test_it_solves_two_linear_problems(
-    seed: int, n_nodes: int, extra: int, fix: set[int],
+    chordal: Chordal, seed: int, n_nodes: int, extra: int, fix: set[int],
 ) -> None:
     graph = random_graph(seed, n_nodes, n_nodes - 1 + extra, 5, tuple(fix))
     graph.apply(GraphUpdate(weigh={0: 0.5, n_nodes - 1: 0.0, graph.n_factors - 4: 3.0}))
@@ -119,7 +138,8 @@ def test_it_solves_two_linear_problems(
     np.testing.assert_allclose(start @ TO_COMPLEX, t, atol=1e-6)
 
 
-def test_headings_that_cancel_are_an_error() -> None:
+@either
+def test_headings_that_cancel_are_an_error(chordal: Chordal) -> None:
     graph = Graph()
     graph.apply(GraphUpdate(hidden=np.zeros((1, 3)), factors=Factors.on(
         [0, 0], None, [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]], [np.eye(3)] * 2,
@@ -146,7 +166,8 @@ def test_joint_and_unit_starts_are_exact_without_noise_from_positions_alone(
     assert_poses_equal(joint(graph, unit=unit), truth)
 
 
-def test_headings_alone_do_not_determine_positions() -> None:
+@either
+def test_headings_alone_do_not_determine_positions(chordal: Chordal) -> None:
     graph = Graph()
     graph.apply(GraphUpdate(hidden=np.zeros((2, 3)), fix=(0,), factors=Factors(
         [0], [1], [[1.0, 0.0, 0.5]], [np.diag([0.0, 0.0, 1.0])], [FactorKind.LOOP_CLOSURE])))
