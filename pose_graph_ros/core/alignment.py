@@ -39,13 +39,12 @@ KNOWN, MEASURED_ALONE = 0.3, 0.5
 # The graph is aligned anew if its heading is off by more than both [sigma, rad]; the solver
 # corrects smaller differences.
 OFF_SIGMAS, OFF = 4.0, 0.3
+FIRST_CHECK = 8  # number of measurements at which that is looked at first
 # Exponents of 2 of the variances of odometry and of sources that are tried, in units of those that
 # are claimed or given. With noise of odometry that is far too large the heading is forgotten
 # before it is known; with noise that is too small, or a scale that is off by a fifth, odometry
 # and fixes contradict one another.
 NOISES = (0.0, 0.0), (-6.0, 0.0), (6.0, 0.0), (0.0, 6.0)
-# Number of measurements at which that is checked first.
-FIRST_CHECK = 8
 
 
 class AlignmentState(Enum):
@@ -97,8 +96,8 @@ class Alignment:
     def forget(self) -> None:
         """Look at all that waits anew, as nodes have left the graph."""
         self._banks, self._sources = dict[_Assumed, Bank](), list[str]()
-        # what the banks have of what waits, by source and stamp, and how much they ever had
-        self._seen, self._n_seen = set[tuple[str, int]](), 0
+        # the newest that the banks have, by source and stamp, and how many they ever had
+        self._seen, self._n_seen = dict[tuple[str, int], None](), 0
 
     def find(self, graph: Graph, waiting: Sequence[Queued]) -> FloatArray | None:
         """
@@ -119,31 +118,43 @@ class Alignment:
         self.sigma = found.sigma
         return found.T_map_graph
 
-    def _by_bank(self, graph: Graph, waiting: Sequence[Queued]) -> _Found:
-        """Return the motion that the hypotheses on all positions tell."""
-        sources = sorted({each.source for each in waiting})
-        if sources != self._sources:
-            self.forget()
-            self._sources, given = sources, self._fixes.known(sources).point
-            of_all = ln.Known((), odometry=True, sources=tuple(range((len(given) - 2) // 3)))
-            white = [ln.axes_of(source)[0] for source in of_all.sources]
-            for mirrored, noise in product((False, True), NOISES):
-                more = {ln.WAY: noise[0], ln.TURN: noise[0]} | dict.fromkeys(white, noise[1])
-                prior = ln.log_prior(ln.moved(ln.claimed(len(white)), more), of_all)
-                self._banks[_Assumed(mirrored, noise, prior)] = Bank(ln.noise_at(tuple(
-                    exponent + more.get(axis, 0.0) for axis, exponent in enumerate(given))))
+    def _assume(self, sources: list[str]) -> None:
+        """Begin with empty banks for some sources."""
+        self.forget()
+        self._sources, given = sources, self._fixes.known(sources).point
+        of_all = ln.Known((), odometry=True, sources=tuple(range((len(given) - 2) // 3)))
+        white = [ln.axes_of(source)[0] for source in of_all.sources]
+        for mirrored, noise in product((False, True), NOISES):
+            more = {ln.WAY: noise[0], ln.TURN: noise[0]} | dict.fromkeys(white, noise[1])
+            prior = ln.log_prior(ln.moved(ln.claimed(len(white)), more), of_all)
+            self._banks[_Assumed(mirrored, noise, prior)] = Bank(ln.noise_at(tuple(
+                exponent + more.get(axis, 0.0) for axis, exponent in enumerate(given))))
+
+    def _rows(self, waiting: Sequence[Queued]) -> Records:
+        """Return rows for what the banks do not have yet."""
         new = [each for each in waiting if (each.source, each.stamp_ns) not in self._seen]
-        self._seen = {(each.source, each.stamp_ns) for each in waiting}
+        self._seen |= dict.fromkeys((each.source, each.stamp_ns) for each in new)
+        # no more than wait at most: the older ones do not come again
+        for key in list(self._seen)[:-SOURCES.most_unaligned] if len(new) > 0 else ():
+            del self._seen[key]
         rows = measured(Factors.joined([each.factor for each in new]),
                         [each.stamp_ns for each in new], np.arange(len(new)).tolist())
         own = [new[k] for k in rows['id'].tolist()]
         rows['id'] += self._n_seen
         self._n_seen += len(new)
-        rows['source'] = [min(sources.index(one.source), BANK.sources - 1) for one in own]
+        rows['source'] = [
+            min(self._sources.index(one.source), BANK.sources - 1) for one in own]
         rows['judged'] = [not self._fixes.trusts(one.source, one.measured) for one in own]
+        return rows
+
+    def _by_bank(self, graph: Graph, waiting: Sequence[Queued]) -> _Found:
+        """Return the motion that the hypotheses on all positions tell."""
+        sources = sorted({each.source for each in waiting})
+        if not {*sources} <= {*self._sources}:
+            self._assume(sources)
+        rows, likely = self._rows(waiting), dict[_Assumed, float]()
         self._fixes.prepare()
         odometry = self._fixes.odometry()
-        likely = dict[_Assumed, float]()
         for assumed, bank in self._banks.items():
             if len(rows) > 0:
                 bank.insert(*(_mirrored(rows, odometry) if assumed.mirrored else (rows, odometry)))
@@ -151,16 +162,17 @@ class Alignment:
             if len(bank) > SOURCES.most_unaligned:
                 bank.forget(np.arange(self._n_seen - len(waiting), self._n_seen), len(waiting))
             likely[assumed] = bank.evidence + assumed.prior
-        if len(bank) == 0:
-            return _Found(np.inf)
         straight, turned_over = ([each for each in self._banks if each.mirrored is of]
                                  for of in (False, True))
         best = max(straight, key=lambda each: likely[each])
+        bank = self._banks[best]
+        if len(bank) == 0:
+            return _Found(np.inf)
         # as with a left-handed frame
         is_mirrored = (max(likely[each] for each in turned_over)
                        > likely[best] + BANK.noise_evidence)
         weights = [math.exp(likely[each] - likely[best]) for each in straight]
-        bank, some = self._banks[best], [self._banks[each] for each in straight]
+        some = [self._banks[each] for each in straight]
         off = se2.wrap(np.array([each.spread.pose[2] for each in some]) - bank.spread.pose[2])
         sigma = math.sqrt(np.average(
             np.array([each.heading_sigma for each in some])**2 + off**2, weights=weights))
@@ -176,6 +188,8 @@ class Alignment:
         The poses are those of odometry, moved into the map, shape (N, 3), with biases of 0; None
         if the heading is not checked or not wrong.
         """
+        if self.is_aligned and len(self._banks) > 0:
+            self.forget()   # nothing waits any more
         bank, nodes, n_seen = self._fixes.bank, self._nodes, self._fixes.n_seen
         # where the robot was put elsewhere by hand, the path is not that of odometry
         if (not self.is_aligned or n_seen < self._next_check or len(nodes.relocated) > 0

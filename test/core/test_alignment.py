@@ -366,6 +366,15 @@ def test_the_state_goes_from_local_over_unaligned_to_aligned_once() -> None:
     assert driven.find(queue) is None
 
 
+def test_what_waits_is_looked_at_once_although_an_update_tries_parts_of_it() -> None:
+    some = drive(0, 8, 0.5)
+    driven = Driven(some)
+    queue = driven.queued(*some.positions)
+    for part in (queue, queue[:4], queue[4:], queue):
+        assert driven.find(part) is None
+    assert {len(bank) for bank in driven.alignment._banks.values()} == {len(queue)}
+
+
 @pytest.mark.parametrize('n_wrong', [0, 12])
 def test_an_angle_that_the_first_fixes_told_stays_unless_they_were_wrong(n_wrong: int) -> None:
     done_over = 0
