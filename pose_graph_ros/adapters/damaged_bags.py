@@ -113,9 +113,9 @@ class _Mcap:
             elif kind == _CHANNEL and number not in self._topics:
                 of_type, text = self._types[int.from_bytes(stream.read(2), 'little')]
                 name, form = (storage_mcap.read_string(stream) for _ in range(2))
-                self._topics[
-                    number] = self._connect(name, of_type, form, text,
-                                            storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
+                self._topics[number] = self._connect(
+                    name, of_type, form, text,
+                    storage_mcap.get_qos(storage_mcap.read_bytes(stream)))
 
     def _message(self, data: bytes) -> Iterator[_Message]:
         """Yield the message in a record, if it is of a known topic."""

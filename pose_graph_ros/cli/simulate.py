@@ -198,8 +198,9 @@ def _delivered(
 def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:
     false = np.flatnonzero(group >= 0)
     return {'true_closures': int(np.sum(group < 0)),
-            'false_closures': [{what: pair, 'group': number} for pair, number in zip(ends[
-                false].tolist(), group[false].tolist(), strict=True)], 'missing_groups': missing}
+            'false_closures': [{what: pair, 'group': number} for pair, number in zip(
+                ends[false].tolist(), group[false].tolist(), strict=True)],
+            'missing_groups': missing}
 
 
 def _disturbances(setup: settings.Setup) -> dict[str, Any]:
@@ -216,13 +217,6 @@ def _disturbances(setup: settings.Setup) -> dict[str, Any]:
         **{name: [asdict(each) for each in found] for name, found in (
             ('delays', setup.delays), ('clock_offsets', setup.offsets),
             ('duplicates', setup.duplicates), ('claimed_sigmas', setup.claims))}}
-
-
-def write_bag(folder: str | Path, messages: Iterable[Message]) -> None:
-    """Write messages as a rosbag2, in the order of their stamps."""
-    with BagWriter(folder) as bag:
-        for topic, type_name, stamp, message in sorted(messages, key=lambda item: item[2]):
-            bag.write(topic, type_name, stamp, message)
 
 
 def odometry_messages(

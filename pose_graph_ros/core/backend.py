@@ -8,16 +8,12 @@ from typing import Self
 
 import numpy as np
 
-from pose_graph_ros.core import (
-    disagreement,
-    measurements as ms,
-    newest_estimate,
-    transaction as tr,
-)
+from pose_graph_ros.core import measurements as ms, newest_estimate, transaction as tr
 from pose_graph_ros.core.alignment import Alignment
 from pose_graph_ros.core.batch import final_optimization
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, CovariancePolicy
+from pose_graph_ros.core.disagreement import find as find_disagreement
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -77,7 +73,7 @@ class PoseGraphBackend:
         self.gyro_biases = self._factors.gyro_rates
         self.calibrations = partial(
             self._factors.calibrations, self.graph, self._smoother.covariance)
-        self.disagreement = lambda: disagreement.find(self._smoother, self._nodes, self._factors)
+        self.disagreement = lambda: find_disagreement(self._smoother, self._nodes, self._factors)
         self._tuner = ErrorTuner(
             self._smoother, self._nodes, self._factors, self._reweighting, self._judge)
         self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)

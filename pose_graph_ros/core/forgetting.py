@@ -226,7 +226,7 @@ class Forgetting:
         leaving, judged = self._ask(leaving, sr.NONE, measured=True)
         parts.smoother.linearize(leaving)
         # anchors of thinned nodes that leave have a place in others
-        poses, thinned = nodes.recent_poses(graph), nodes.thinned
+        poses, thinned = nodes.recent_poses(graph), nodes.thinned.places()
         leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
         kept = np.setdiff1d(np.arange(first, len(nodes)), thinned.numbers)
         ends, starts = graph.poses_of(nodes.ids[leave]), graph.poses_of(nodes.ids[kept])

@@ -90,7 +90,7 @@ def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     found = np.full((len(of.path), 3, 3), np.nan)
     inside = np.flatnonzero(rows >= 0)
     found[inside] = covariances[rows[inside]]
-    for number in thinned.numbers.tolist():
+    for number in thinned.places().numbers.tolist():
         place = thinned.place(number)
         assert place is not None, 'it is among them'
         found[number] = covariance.propagated(

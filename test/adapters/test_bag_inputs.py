@@ -5,6 +5,7 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+from bag_of_messages import write_bag
 import numpy as np
 import pytest
 
@@ -16,7 +17,6 @@ from pose_graph_ros.cli.simulate import (
     fix_messages,
     loop_closure_messages,
     odometry_messages,
-    write_bag,
 )
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 

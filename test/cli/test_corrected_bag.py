@@ -5,6 +5,7 @@
 from pathlib import Path
 from typing import Any
 
+from bag_of_messages import write_bag
 from circle_bag import circle, fixes, odometry, write_ros1
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
 from pose_graph_ros.adapters.bags import open_bag
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import Message, write_bag
+from pose_graph_ros.cli.simulate import Message
 from pose_graph_ros.core.geometry import se2
 
 TYPES = message_types()

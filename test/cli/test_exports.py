@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
+from bag_of_messages import write_bag
 from circle_bag import fixes, odometry
 import numpy as np
 import pyproj
@@ -16,7 +17,6 @@ from tum_files import read_tum
 
 from pose_graph_ros.cli.arguments import FORMATS, replay
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import write_bag
 
 DATUM = 50.7, 7.1, 0.3
 ALTITUDE = 60.0

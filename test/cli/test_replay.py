@@ -8,6 +8,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from bag_of_messages import write_bag
 from circle_bag import circle, fixes, odometry, replayed_bag
 import numpy as np
 import pytest
@@ -26,7 +27,6 @@ from pose_graph_ros.cli.simulate import (
     loop_closure_messages,
     Message,
     odometry_messages,
-    write_bag,
 )
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import UpdateReport

@@ -5,6 +5,7 @@
 from pathlib import Path
 import sys
 
+from bag_of_messages import write_bag
 from circle_bag import circle, fixes, NOETIC, odometry, replayed_bag, write_compressed, write_ros1
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.shared import watched_bag
-from pose_graph_ros.cli.simulate import Message, write_bag
+from pose_graph_ros.cli.simulate import Message
 
 START = int(circle().stamps_ns[0])
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import re
 import time
 
+from bag_of_messages import write_bag
 from circle_bag import fixes, odometry
 import numpy as np
 import pytest
 from run_schema import problems
 
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import write_bag
 
 
 def run(*words: object) -> int:

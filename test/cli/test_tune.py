@@ -9,6 +9,7 @@ from pathlib import Path
 import re
 from typing import Any
 
+from bag_of_messages import write_bag
 from helpers.noisy_drive import made, write
 import numpy as np
 from public_data import needs, PUBLIC
@@ -17,7 +18,7 @@ import yaml
 
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages
 from pose_graph_ros.cli.tuned_parameters import changed, odometry_parameters
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory

@@ -19,6 +19,7 @@ from pathlib import Path
 import re
 from typing import Any
 
+from bag_of_messages import write_bag
 from golden_cases import CASES, Drive, Loaded, SECOND, Tool
 import numpy as np
 from public_data import PUBLIC
@@ -30,7 +31,7 @@ from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli.drive import measured_in
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane

@@ -5,9 +5,10 @@
 import math
 from pathlib import Path
 
+from bag_of_messages import write_bag
 import numpy as np
 
-from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory

@@ -10,13 +10,14 @@ The recordings are not part of the project; see `public_data`.
 import json
 from pathlib import Path
 
+from bag_of_messages import write_bag
 import numpy as np
 from public_data import needs, PUBLIC
 import pytest
 from tum_files import read_tum
 
 from pose_graph_ros.cli.main import main
-from pose_graph_ros.cli.simulate import fix_messages, odometry_messages, write_bag
+from pose_graph_ros.cli.simulate import fix_messages, odometry_messages
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 

@@ -92,12 +92,9 @@ def descend(J: FloatArray, W: FloatArray, p: IntArray, q: IntArray) -> None:
             step = -np.linalg.solve(hessian, gradient)
             way = np.zeros_like(W)
             way[p, q] = way[q, p] = step
-            slope, before, length = float(gradient @ step), _cost(J, W, mu), 1.0
-            while not _cost(J, W + length * way, mu) <= before + _DESCENT * length * slope:
-                length *= 0.5
-                if length < 1e-9:
-                    length = 0.0
-            W += length * way
+            slope, before = float(gradient @ step), _cost(J, W, mu)
+            W += way * next((length for length in (0.5**np.arange(30)).tolist() if _cost(
+                J, W + length * way, mu) <= before + _DESCENT * length * slope), 0.0)
             if -slope < mu:
                 break
 

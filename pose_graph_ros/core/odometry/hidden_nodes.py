@@ -407,7 +407,7 @@ class HiddenNodes(NodeTable):
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
-            self.frozen.copy(), float(self.travelled[0]), self.thinned,
+            self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
             np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:

@@ -3,22 +3,19 @@
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Annotated, NamedTuple
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Pose, Poses
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses
 from pose_graph_ros.core.graph.constraints import full, upper
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
-from pose_graph_ros.core.saved_columns import Column, Integers, Numbers, Rows3
-
-Singles = npt.NDArray[np.float32]
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows6
 
 
 class Place(NamedTuple):
@@ -31,62 +28,84 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ThinnedPlaces:
-    """
-    Nodes that have left although older ones stay, each with its place relative to another.
-
-    That is its anchor, in the graph. The poses of these nodes move with the graph, and what
-    concerns them later is attached to their anchors. It is saved as it is. A node takes 52 bytes.
-    """
+    """Nodes that have left although older ones stay, each with its place relative to another."""
 
     # numbers of the nodes, ascending, and of those beside them
     numbers: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     anchors: Integers = field(default_factory=lambda: np.empty(0, np.int64))
-    # poses in the anchors, and upper triangles of the covariances of these, in the frames of the
-    # nodes; both in single precision
-    relative: Annotated[Singles, Column(np.float32, (3,))] = field(
-        default_factory=lambda: np.empty((0, 3), np.float32))
-    noise: Annotated[Singles, Column(np.float32, (6,))] = field(
-        default_factory=lambda: np.empty((0, 6), np.float32))
+    relative: Rows3 = field(default_factory=lambda: np.empty((0, 3)))  # poses in the anchors
+    # upper triangles of the covariances of these poses, in the frames of the nodes
+    noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
+
+
+THINNED = np.dtype([('anchor', np.int32), ('relative', np.float32, 3), ('noise', np.float32, 6)])
+
+
+class ThinnedNodes:
+    """
+    Nodes by number, each with its place relative to another one in the graph, its anchor.
+
+    The poses of these nodes move with the graph, and what concerns them later is attached to their
+    anchors. If an anchor leaves as well, the nodes that were attached to it are passed on to its
+    own anchor. A node takes 40 bytes, and a group of nodes a time that hardly grows with them.
+    """
+
+    def __init__(self, first: int = 0) -> None:
+        # by number, from the first node that is not frozen on; -1 for nodes that are in the graph
+        self._first, self._size = first, 0
+        self._rows = GrowingArray((), THINNED)
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return self._size
 
-    def rows(self, index: IntArray | BoolArray) -> 'ThinnedPlaces':
-        """Return some of the places."""
-        return ThinnedPlaces(self.numbers[index], self.anchors[index], self.relative[index],
-                             self.noise[index])
-
-    def with_more(
+    def add(
         self, numbers: IntArray, anchors: IntArray, relative: Poses, noise: se2.Covariances,
-    ) -> 'ThinnedPlaces':
-        """
-        Return the places with those of more nodes, ascending.
-
-        None of their anchors is among these, or has left before. Nodes that were attached to one
-        of these are passed on to its own anchor.
-        """
-        new = ThinnedPlaces(numbers, anchors, relative.astype(np.float32),
-                            upper(noise).astype(np.float32))
-        stay = ~np.isin(self.anchors, numbers)
-        own = self.rows(~stay)
-        before, mean = new.rows(np.searchsorted(numbers, own.anchors)), own.relative.astype(float)
-        passed = ThinnedPlaces(
-            own.numbers, before.anchors,
-            se2.compose(before.relative.astype(float), mean).astype(np.float32),
-            upper(passed_on(mean, full(before.noise.astype(float)),
-                            full(own.noise.astype(float)))).astype(np.float32))
-        columns = ([getattr(part, each.name) for part in (self.rows(stay), passed, new)]
-                   for each in fields(self))
-        every = ThinnedPlaces(*map(np.concatenate, columns))
-        return every.rows(np.argsort(every.numbers))
+    ) -> None:
+        """Add nodes; none of the anchors is among these, or has left before."""
+        if len(numbers) == 0:
+            return
+        rows = numbers - self._first
+        more = int(np.max(rows)) + 1 - len(self._rows)
+        if more > 0:
+            self._rows.append(np.zeros(more, THINNED))
+            self._rows.values['anchor'][-more:] = -1
+        table = self._rows.values
+        table['anchor'][rows], table['relative'][rows] = anchors, relative
+        table['noise'][rows] = upper(noise)
+        self._size += len(rows)
+        passed = np.flatnonzero(np.isin(table['anchor'], numbers))
+        own, before = table[passed], table[table['anchor'][passed] - self._first]
+        mean = own['relative'].astype(float)
+        table['noise'][passed] = upper(passed_on(
+            mean, full(before['noise'].astype(float)), full(own['noise'].astype(float))))
+        table['relative'][passed] = se2.compose(before['relative'].astype(float), mean)
+        table['anchor'][passed] = before['anchor']
 
     def place(self, number: int) -> Place | None:
         """Return the place of a node; None if it is not among these."""
-        at = int(np.searchsorted(self.numbers, number))
-        if at == len(self) or self.numbers[at] != number:
+        row = number - self._first
+        if not 0 <= row < len(self._rows) or self._rows.values['anchor'][row] < 0:
             return None
-        return Place(int(self.anchors[at]), self.relative[at].astype(float),
-                     full(self.noise[at:at + 1].astype(float))[0])
+        anchor, mean, noise = self._rows.values[row]
+        return Place(int(anchor), mean.astype(float), full(noise[None].astype(float))[0])
+
+    def places(self) -> ThinnedPlaces:
+        """Return the places of all nodes."""
+        rows = np.flatnonzero(self._rows.values['anchor'] >= 0)
+        table = self._rows.values[rows]
+        return ThinnedPlaces(rows + self._first, table['anchor'].astype(np.int64),
+                             table['relative'].astype(float), table['noise'].astype(float))
+
+    def drop_before(self, number: int) -> None:
+        """
+        Drop the nodes before a number, whose poses are frozen with those of the oldest nodes.
+
+        The anchors of the others must not be before it.
+        """
+        n = min(number - self._first, len(self._rows))
+        self._size -= int(np.count_nonzero(self._rows.values['anchor'][:n] >= 0))
+        self._rows.drop_first(n)
+        self._first = number
 
 
 def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
@@ -155,7 +174,7 @@ class NodeTable:
         self._frozen = GrowingArray((3,), np.float64)
         self._odometry = GrowingArray((3,), np.float64)
         self._travelled = 0.0  # path length up to the first node that is not frozen [m]
-        self.thinned = ThinnedPlaces()
+        self.thinned = ThinnedNodes()
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -207,15 +226,14 @@ class NodeTable:
         self._travelled = float(self.travelled[len(poses)])
         self._frozen.append(poses)
         self._odometry.drop_first(len(poses))
-        # their anchors are not frozen
-        self.thinned = self.thinned.rows(self.thinned.numbers >= self.n_frozen)
+        self.thinned.drop_before(self.n_frozen)
 
     def placed(self, present: Poses) -> Poses:
         """Return poses of the nodes that are not frozen, overwritten where one was thinned out."""
         if len(self.thinned) > 0:
-            thinned, first = self.thinned, self.n_frozen
+            thinned, first = self.thinned.places(), self.n_frozen
             present[thinned.numbers - first] = se2.compose(
-                present[thinned.anchors - first], thinned.relative.astype(float))
+                present[thinned.anchors - first], thinned.relative)
         return present
 
     def attachment(self, number: int, mean: se2.PoseVector, noise: se2.Covariance) -> Attachment:
@@ -233,11 +251,9 @@ class NodeTable:
     def thin(
         self, ids: IntArray, anchors: IntArray, relative: Poses, noise: se2.Covariances,
     ) -> None:
-        """Let nodes leave, ascending, each with its place relative to a node that stays."""
-        if len(ids) > 0:
-            self.thinned = self.thinned.with_more(
-                np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors), relative,
-                noise)
+        """Let nodes leave, each with its place relative to a node that stays."""
+        self.thinned.add(np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors),
+                         relative, noise)
 
     def move_frozen(self, T: se2.PoseVector) -> None:
         """Move the frozen poses by a rigid motion of the map."""
@@ -250,4 +266,7 @@ class NodeTable:
         self._ids.append(saved.ids)
         self._odometry.append(saved.odometry)
         self._frozen.append(saved.frozen)
-        self._travelled, self.thinned = saved.travelled, saved.thinned
+        self._travelled, thinned = saved.travelled, saved.thinned
+        self.thinned = ThinnedNodes(self.n_frozen)
+        self.thinned.add(
+            thinned.numbers, thinned.anchors, thinned.relative, full(thinned.noise))

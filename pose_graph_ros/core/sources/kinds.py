@@ -68,8 +68,8 @@ def validate(
         return ms.rejected(defect, f'{name}: {numbers.tolist()}')
     stamps = measurement.stamp_ns, kind.key(measurement)
     if stamps[0] <= 0 or any(abs(stamp) > ms.LARGEST_STAMP for stamp in stamps):
-        return ms.rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp', f'{name}: expected '
-                           f'stamps above 0, got {stamps} ns')
+        return ms.rejected('zero_stamp' if stamps[0] <= 0 else 'no_stamp',
+                           f'{name}: expected stamps above 0, got {stamps} ns')
     return kind.check(measurement, policy)
 
 

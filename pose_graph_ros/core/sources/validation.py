@@ -46,8 +46,9 @@ def check_pose(measurement: ms.GlobalPose, policy: CovariancePolicy) -> Validate
         cov[2, 2] = np.inf  # a sender that does not know its covariance knows no heading
     is_known = 0.0 < cov[2, 2] < covariance.UNKNOWN_HEADING_VARIANCE    # of a flat guess
     if never or (policy.heading is Heading.AUTO and not is_known):
-        return _finished(ms.Position(measurement.stamp_ns, measurement.pose[:2], cov[
-            :2, :2], np.zeros(2)), cov[:2, :2], repairs, policy)
+        position = ms.Position(
+            measurement.stamp_ns, measurement.pose[:2], cov[:2, :2], np.zeros(2))
+        return _finished(position, cov[:2, :2], repairs, policy)
     if not is_known:
         cov[2, :] = cov[:, 2] = 0.0
         cov[2, 2] = policy.default_heading**2
