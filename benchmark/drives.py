@@ -147,8 +147,9 @@ def simulated(
         rates = sensors.yaw_rates(rng, truth.poses[:, 2], gyro)
         others = tuple(('gyro', YawRate(stamp, rate)) for stamp, rate in zip(
             truth.stamps_ns.tolist(), rates.tolist(), strict=True))
+    sigma = float(np.hypot(fixes.white, fixes.correlated))
     return Drive(Trajectory(odometry.stamps_ns[::every], odometry.poses[::every]), truth,
-                 stamps, places, sigma=fixes.sigma, others=others)
+                 stamps, places, sigma=sigma, others=others)
 
 
 def plaza(data: Path, seed: int, folder: str = PLAZA) -> Drive:

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmark.day import GROWN, resident, SLOWER
+from benchmark.day import GROWN, SLOWER
 from benchmark.drives import nees, off_truth
+from benchmark.parts import resident_bytes
 from benchmark.recordings import add, drain, Recording, UPDATE_EVERY
 from benchmark.section import about, Options, Section
 from benchmark.wrong_closures import simulated
@@ -66,7 +67,8 @@ def _run(recording: Recording, thinning: ThinningConfig) -> list[Tenth]:
         found.append(Tenth(
             float(step[0].stamp_ns - recording.stamps_ns[0]) / 3.6e12,
             backend.graph.n_nodes, len(backend.graph.factors.edges), float(np.mean(squared)),
-            float(np.mean(claims)), 1e3 * spent / len(part), resident()))
+            float(np.mean(claims)), 1e3 * spent / len(part),
+            1e-6 * resident_bytes()))
     return found
 
 
