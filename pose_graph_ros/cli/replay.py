@@ -143,8 +143,8 @@ class LivePoses:
         """Yield the lines of a table, as that of the path."""
         stamps = np.array([stamp for stamp, _ in self._found], dtype=np.int64)
         poses = np.array([each.T_map_base for _, each in self._found]).reshape(-1, 3)
-        return path_files.csv_lines(Trajectory(stamps, poses), np.array(
-            [each.covariance for _, each in self._found]).reshape(-1, 3, 3))
+        covariances = np.array([each.covariance for _, each in self._found]).reshape(-1, 3, 3)
+        return path_files.csv_lines(Trajectory(stamps, poses), covariances)
 
 
 class _Corrector:
@@ -208,9 +208,9 @@ def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> di
     """
     corrector, path = _Corrector(bag, inputs, run), run.estimate.path
     begin_ns, step = inputs.span.begin_ns, -(-len(path) // MOST_POSES)
+    thinned = Trajectory(path.stamps_ns[::step], path.poses[::step])
     writer.write(PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
-                 output_cdr.path_cdr(Trajectory(path.stamps_ns[::step], path.poses[::step]), int(
-                     path.stamps_ns[-1]), corrector.map_frame))
+                 output_cdr.path_cdr(thinned, int(path.stamps_ns[-1]), corrector.map_frame))
     if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
         for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
@@ -281,8 +281,9 @@ def run(
                 measurement, backend.graph.n_nodes):
             begin = time.thread_time()  # of this process, however busy the machine is
             report = backend.update()
-            recorder.add_update(Update(int(backend.node_stamps_ns[-1]), len(
-                backend.node_stamps_ns), 1e3 * (time.thread_time() - begin), report.chi2))
+            stamps_ns, spent = backend.node_stamps_ns, time.thread_time() - begin
+            recorder.add_update(Update(
+                int(stamps_ns[-1]), len(stamps_ns), 1e3 * spent, report.chi2))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
             if live is not None:
                 live.updated(backend)

@@ -229,9 +229,9 @@ class Tuning:
         positions = np.array([0.5 * np.trace(each.covariance[:2, :2]) for each in some
                               if not isinstance(each, HeadingOnly)])
         headings = _heading_variances(some)
-        inside = len(positions) == 0 or bool(np.min(positions) > 1.01 * policy.position_floor**2
-                                             and np.max(positions) < 0.99
-                                             * policy.position_ceiling**2)
+        inside = len(positions) == 0 or bool(
+            np.min(positions) > 1.01 * policy.position_floor**2
+            and np.max(positions) < 0.99 * policy.position_ceiling**2)
         both = positions, headings
         return Claims(
             all(np.ptp(each) < 0.05 * np.min(each) for each in both if len(each) > 0),
