@@ -126,7 +126,7 @@ class ErrorTuner:
         If not all, the graph follows only where it differs much.
         """
         fixes = self._judge.fixes
-        fixes.bank.by_noise = found.spread(learnt.pose)
+        fixes.bank.by_noise = found.spread(learnt)
         if newest is None or learnt.point != self._in_use:
             self._in_use = learnt.point
             fixes.adopt(learning.noise_at(learnt.point), newest)

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pose_graph_ros.core.belief import hypotheses as hy
 from pose_graph_ros.core.belief.filter import ERROR, NOISE, RATE, SCALE
 from pose_graph_ros.core.belief.hypotheses import BRANCH, HYPOTHESIS
-from pose_graph_ros.core.belief.rows import count, join_motions, MEASURED, Records
+from pose_graph_ros.core.belief.rows import count, COUNTS, FOLLOWS, join_motions, MEASURED, Records
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
@@ -39,7 +39,7 @@ class Spread(NamedTuple):
     """How far what may have happened, but is not believed, is from the best hypothesis."""
 
     pose: FloatArray  # by the best one, at the newest row, shape (3,) [m, m, rad]
-    # about it, of the poses by which other sources are in a fault, and of those by other noise
+    # what poses by which other sources are in a fault, and those by other noise, add to its own
     covariance: FloatArray
 
 
@@ -201,24 +201,28 @@ class Bank:
         off = se2.wrap(some['state'][:, 2] - some['state'][np.argmax(likely), 2])
         return math.sqrt(np.average(some['covariance'][:, 2, 2] + off**2, weights=likely))
 
+    def newest(self) -> tuple[FloatArray, FloatArray]:
+        """Return the pose at the newest row by the best hypothesis, with its covariance."""
+        best = self._bank[np.argmax(self._bank['weight'][:self._n])]
+        return best['state'][:3].copy(), best['covariance'][:3, :3].copy()
+
     def _note_spread(self) -> None:
-        """Note how far what else may have happened is from the best, at the newest row."""
+        """Note what else may have happened, beside the best, at the newest row."""
         some, self.spread = self._bank[:self._n], NO_SPREAD
         if len(some) == 0:
             return
+        pose, covariance = self.newest()
         likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
-        best = int(np.argmax(likely))
-        off = se2.wrapped(some['state'][:, :3] - some['state'][best, :3])
-        likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
-        self.spread = Spread(
-            some['state'][best, :3].copy(), (off.T * likely) @ off + self.by_noise)
+        likely *= np.any(in_fault != in_fault[np.argmax(likely)], axis=1) / np.sum(likely)
+        self.spread = Spread(pose, self.by_noise + spread(
+            likely, some['state'][:, :3] - pose, some['covariance'][:, :3, :3] - covariance))
 
-    def again(self, noise: Records, newest: int | None = None, least: float | None = None) -> Self:
+    def again(self, noise: Records, newest: int | None = None, *, learns: bool = False) -> Self:
         """
         Return a bank with the same rows and another noise, before the first of them.
 
         Or before about so many of the newest ones; what is decided on those before these stays.
-        The rows may have another least white variance to decide by [m^2].
+        To learn noise all rows count, and how exact receivers are is learnt as it is.
         """
         begin = 0 if newest is None else max(
             (at for at in self._kept if at <= len(self) - newest), default=0)
@@ -227,8 +231,9 @@ class Bank:
         other._begin_at({at: kept for at, kept in self._kept.items() if at <= begin}, begin)
         other._tree.append(self._tree.values[:begin])
         other._path.append(self._path.values[:begin])
-        if least is not None:
-            other._rows.values['least'] = least
+        if learns:
+            rows = other._rows.values
+            rows['least'], rows['decides'][rows['decides'] == FOLLOWS] = 0.0, COUNTS
         return other
 
     def _begin_at(self, kept: dict[int, Records], begin: int = 0) -> None:
@@ -259,6 +264,17 @@ class Bank:
             column.drop_first(begin)
         self.done, self._traced = self.done - begin, self._traced - begin
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
+
+
+def spread(likely: FloatArray, off: FloatArray, wider: FloatArray) -> FloatArray:
+    """
+    Return what poses that are as likely as said add to the covariance of another one, (3, 3).
+
+    They are off by so much, shape (N, 3), and have so much more covariance, (N, 3, 3).
+    """
+    off = se2.wrapped(off)
+    variances, axes = np.linalg.eigh((off.T * likely) @ off + np.tensordot(likely, wider, 1))
+    return np.asarray((axes * np.maximum(variances, 0.0)) @ axes.T)
 
 
 def is_believed(choice: IntArray) -> npt.NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from numba import from_dtype, types
 import numpy as np
 
 from pose_graph_ros.core.belief import filter as ft
-from pose_graph_ros.core.belief.rows import TABLE
+from pose_graph_ros.core.belief.rows import COUNTS, DECIDES, TABLE
 from pose_graph_ros.core.belief.settings import BANK
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel
 from pose_graph_ros.core.graph import factors
@@ -53,7 +53,7 @@ BETWEEN_SLIPS, SLIP, SLIP_SIZE2 = BANK.between_slips, BANK.slip, BANK.slip_size*
 JUMP_SIZE2 = BANK.jump_size**2
 UNMOVED_WAY, UNMOVED = 5.0 * BANK.slip_size, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
-NEAR2, FAR2 = (2.0 * BANK.fault_size)**2, BANK.far_fault**2
+NEAR2, FAR2, FAR = (2.0 * BANK.fault_size)**2, BANK.far_fault**2, BANK.far_share
 RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
 HOPELESS, ALIKE = BANK.hopeless, BANK.alike
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
@@ -124,7 +124,9 @@ def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-
                 p[j, j] = slow
                 p[i, j] = -slow
                 p[j, i] = -slow
-            share = 1.0 - in_fault if fault == 0 else in_fault / n_faults
+            share = 1.0 - in_fault
+            if fault > 0:
+                share = 2.0 * in_fault / n_faults * (1.0 - FAR if fault % 2 == 1 else FAR)
             one.weight = before + math.log(share / n_headings)
             leaf = leaves[n]
             leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0
@@ -227,6 +229,23 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     ft.correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
 
 
+@kernel(allocates=True)
+def _count(one, choice, row, noise, n):  # type: ignore[no-untyped-def]
+    """Take in a measurement that a hypothesis has no choice about."""
+    x, p, first = one.state, one.covariance, ft.ERROR + 2 * row.source
+    white = _white(noise.white[row.source], one, row.source)
+    ex, ey, xx, xy, yy, _, _ = ft.innovation(x, p, row, first, white, 0.0)
+    any_heading = -ft.LOG_2PI if row.heading_variance > 0.0 else 0.0
+    if choice == ALONE:
+        one.weight += any_heading + ft.LN_OUTLIER + ft.cauchy(
+            ex * ex + ey * ey, ft.FAULT_SIZE2 + 0.5 * (xx + yy))
+        return
+    density, _ = ft.density(ex, ey, xx, xy, yy)
+    heading = any_heading if choice == GOES_ON else ft.heading_density(x, p, row)
+    one.weight += ft.LN_NO_OUTLIER + density + heading
+    ft.correct(x, p, n, row, first, white, choice == GOOD)
+
+
 @kernel
 def _joins(bank, n, n_sources):  # type: ignore[no-untyped-def]
     """
@@ -292,7 +311,7 @@ def advance(  # type: ignore[no-untyped-def]
             one = bank[k]
             ft.predict(one.state, one.covariance, n_sources, row, noise, one.in_fault)
             _weigh(one, k, row, noise, weights[k], branches[k])
-        if row.decides == 0:
+        if row.decides != DECIDES:
             # what follows so closely has mostly the same error, so that it tells nothing: it is
             # what the one before it of its source is, unless it alone is wrong
             for k in range(n):
@@ -300,6 +319,8 @@ def advance(  # type: ignore[no-untyped-def]
                 if weights[k, ALONE] > weights[k, choice]:
                     choice = ALONE
                 tree[at, k] = branches[k, choice]
+                if row.decides == COUNTS:
+                    _count(bank[k], choice, row, noise, ft.ERROR + 2 * n_sources)
             continue
         for k in range(n):
             before[k] = bank[k]

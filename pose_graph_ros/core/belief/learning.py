@@ -19,12 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief.bank import as_claimed, Bank, is_believed
+from pose_graph_ros.core.belief.bank import as_claimed, Bank, is_believed, spread
 from pose_graph_ros.core.belief.filter import log_density
 from pose_graph_ros.core.belief.hypotheses import SLIPPED
 from pose_graph_ros.core.belief.rows import Records
 from pose_graph_ros.core.belief.settings import BANK
-from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
@@ -68,7 +67,9 @@ class Learnt(NamedTuple):
     point: Point
     evidence: float  # of all measurements, with the prior of the noise [nats]
     constants: FloatArray  # rate and scale of odometry, and their variances, shape (4,)
-    pose: FloatArray  # of the robot in the map at the newest measurement, shape (3,)
+    # of the robot in the map at the newest measurement, with covariance: shapes (3,) and (3, 3)
+    pose: FloatArray
+    covariance: FloatArray
 
     def odometry(self) -> OdometryErrors:
         rate, scale, *variances = self.constants.tolist()
@@ -102,12 +103,12 @@ class Found(NamedTuple):
         return used if used is not None and (
             self.best.evidence - used.evidence <= BANK.noise_evidence) else self.best
 
-    def spread(self, about: FloatArray) -> FloatArray:
-        """Return the covariance of the poses by all noise about one, by evidence, (3, 3)."""
-        every = self.every.values()
+    def spread(self, used: Learnt) -> FloatArray:
+        """Return what noise other than that in use adds to the covariance of the pose, (3, 3)."""
+        every = [*self.every.values()]
         likely = np.exp([each.evidence - self.best.evidence for each in every])
-        off = se2.wrapped(np.array([each.pose for each in every]) - about)
-        return np.asarray((off.T * likely / np.sum(likely)) @ off)
+        return spread(likely / np.sum(likely), np.array([each.pose for each in every]) - used.pose,
+                      np.array([each.covariance for each in every]) - used.covariance)
 
 
 def claimed(n_sources: int) -> Point:
@@ -278,8 +279,7 @@ def search(
     It begins also with some points, which may be of before some sources have come. The bank stays
     as it is.
     """
-    # how exact receivers are is learnt as it is
-    same, found = bank.again(bank.noise, newest, least=0.0), dict[Point, Learnt]()
+    same, found = bank.again(bank.noise, newest, learns=True), dict[Point, Learnt]()
     first, rows = same.done, same.rows[same.done:].copy()
     posteriors, learnt = dict[bytes, Posterior](), dict[bytes, list[Point]]()  # by the slips
 
@@ -321,27 +321,8 @@ def search(
         # what is believed, and the slips before it, for `log_density`
         slips = np.where(told.choice == SLIPPED, (BANK.slip_size**2 + told.far**2) / 3.0, 0.0)
         slips[~is_believed(told.choice)] = -1.0
-        # the bank has the evidence of what decides; of the others, that of what it believes
-        more = yield from _others(rows, slips, point, posterior(slips))
-        found[point] = Learnt(point, trial.evidence + more + log_prior(point, known), (
-            yield from posterior(slips).shown(point)).constants, trial.spread.pose)
+        found[point] = Learnt(point, trial.evidence + log_prior(point, known), (
+            yield from posterior(slips).shown(point)).constants, *trial.newest())
         if n_rounds < MOST_ROUNDS:
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)
-
-
-def _others(
-    rows: Records, slips: FloatArray, point: Point, believed: Posterior,
-) -> Generator[None, None, float]:
-    """
-    Return the evidence of the rows that do not decide, given those that do.
-
-    Those that are not believed are as likely as the others, so that to doubt gains nothing.
-    """
-    decides = rows['decides'] == 1
-    n_believed = np.count_nonzero(~decides & (slips >= 0.0))
-    if n_believed == 0:
-        return 0.0
-    deciding = Posterior(rows, np.where(decides, slips, -1.0), believed.known)
-    more = (yield from deciding.value(point)) - (yield from believed.value(point))
-    return more * np.count_nonzero(~decides) / n_believed

@@ -17,6 +17,10 @@ from pose_graph_ros.core.graph import factors
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.sources.bias import STRETCH
 
+# What a measurement tells a bank: it follows one that decides, and tells nothing; it is the first
+# of its source in its period; or it follows one, but counts as evidence of noise.
+FOLLOWS, DECIDES, COUNTS = range(3)
+
 # A measurement in the map, and the motion by odometry since the one before it.
 MEASURED = np.dtype([
     ('stamp_ns', 'i8'),
@@ -24,7 +28,7 @@ MEASURED = np.dtype([
     ('source', 'i8'),  # place of its error among those of all sources
     ('node', 'i8'),  # id of the hidden node before it
     ('judged', 'i8'),  # whether its source may be in a fault; others only tell of noise
-    ('decides', 'i8'),  # whether it is the first of its source in its period
+    ('decides', 'i8'),  # `FOLLOWS`, `DECIDES` or `COUNTS`
     ('gap', 'f8'),  # time since the one of its source before it that decides [s]
     ('offset', 'f8', (3,)),  # pose of what was measured in the node [m, m, rad]
     ('mean', 'f8', (3,)),  # what was measured; of a position, the heading is 0 [m, m, rad]
@@ -158,10 +162,11 @@ def count(table, first, period_ns):  # type: ignore[no-untyped-def]
     """Write from a row on which rows decide, and how long ago their source decided before."""
     for row in range(first, len(table)):
         one, before = table[row], row - 1
-        while before >= 0 and (table[before].source != one.source or table[before].decides == 0):
+        while before >= 0 and not (
+                table[before].source == one.source and table[before].decides == DECIDES):
             before -= 1
         since_ns = one.stamp_ns - table[max(before, 0)].stamp_ns
         one.gap = since_ns * 1e-9
-        one.decides = 1
+        one.decides = DECIDES
         if before >= 0 and one.stamp_ns // period_ns == table[before].stamp_ns // period_ns:
-            one.decides = 0
+            one.decides = FOLLOWS

@@ -30,8 +30,9 @@ class BankSettings:
     # --- what is known at the beginning
     headings: int = 16  # headings that are tried, also after a turn that is less known, with
     heading: float = 0.15  # such a sigma [rad]
-    # how far a receiver is off that begins in a fault: mostly twice `fault_size`, or as after a
-    # cold start [m]
+    # how far a receiver is off that begins in a fault: mostly twice `fault_size`; in such a share
+    # as after a cold start [m]
+    far_share: float = 0.1
     far_fault: float = 1000.0
     rate: float = 0.005  # sigma of the constant error of the yaw rate [rad/s]
     scale: float = 0.01  # sigma of that of the scale of the way
@@ -52,7 +53,7 @@ class BankSettings:
     # of the logarithm of all of what a source claims, below and above: hardly any receiver is
     # better than it says, many are worse
     spread: tuple[float, float] = (0.5, 1.0)
-    slow: tuple[float, float] = (0.25, 2.0)
+    slow: tuple[float, float] = (1.0, 2.0)
     tau: tuple[float, float] = (40.0, 1.0)  # of the time constant of slow errors [s]
     least_white: float = 0.01  # least white part of what a source claims, as a variance
     astray: int = 8  # successive measurements that are wrong after which a filter begins again

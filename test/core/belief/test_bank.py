@@ -242,3 +242,23 @@ def test_the_oldest_rows_can_be_forgotten() -> None:
             pass
         again.decide()
         assert again.told(0).choice.tolist() == bank.told(0).choice.tolist()
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seen', [30, 33, 45, 60])
+def test_the_newest_pose_allows_for_wrong_fixes_at_the_start(seed: int, seen: int) -> None:
+    """Nobody can tell yet, but that receivers may begin in a fault is known."""
+    drive = Drive(seed)
+    drive.fixes[:30] += (40.0 * np.cos(seed), 40.0 * np.sin(seed))
+    drive.fixes, drive.source = drive.fixes[:seen], drive.source[:seen]
+    bank = drive.bank()
+    bank.decide()
+    pose, covariance = bank.newest()
+    off = (pose - drive.truth[seen - 1])[:2]
+    assert off @ np.linalg.solve((covariance + bank.spread.covariance)[:2, :2], off) < 40.0
+
+
+def test_of_a_good_start_the_newest_pose_is_known_soon() -> None:
+    bank = Drive(0).bank()
+    bank.decide()
+    assert np.trace(bank.spread.covariance[:2, :2]) < 0.1

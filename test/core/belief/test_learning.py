@@ -182,7 +182,7 @@ def test_evidence_counts_what_a_prior_says_and_prefers_the_truth() -> None:
     assert best.point[WAY] > 2.0
     assert best.point[3] == NO_SLOW
     for each in every.values():
-        again = bank.again(noise_at(each.point))
+        again = bank.again(noise_at(each.point), learns=True)
         again.decide()
         assert each.evidence == pytest.approx(again.evidence + log_prior(each.point, ALL))
 
@@ -196,17 +196,61 @@ def test_the_newest_measurements_are_learnt_from_alone() -> None:
     assert np.array_equal(bank.rows, later)     # the bank stays as it is
 
 
+def test_evidence_is_that_of_all_measurements_with_their_full_covariance() -> None:
+    """Also of those that follow so closely that they decide nothing."""
+    n, tau, slow, white, way = 40, 7.0, 0.8, 0.3, 2.0
+    rng, seconds = np.random.default_rng(0), 0.25 * np.arange(n)
+    rows = np.zeros(n, MEASURED)
+    rows['id'] = rows['node'] = np.arange(n)
+    rows['stamp_ns'] = stamps_ns = (SECOND * seconds).astype(np.int64)
+    rows['slow'], rows['noise'] = 1.0, (1.0, 0.0, 1.0)
+    rows['mean'][:, :2] = rng.standard_normal((n, 2))
+    rows['mean'][:, 0] += np.arange(n)
+    poses = np.arange(n)[:, None] * (1.0, 0.0, 0.0)
+    sums = np.arange(n)[:, None] * (0.04, 0.0, 0.0, 0.04, 0.0, 1e-18)
+    bank = Bank(noise_at((np.log2(way), 0.0, np.log2(white), np.log2(slow), np.log2(tau))))
+    bank.begin_with(0, np.zeros(3), np.diag((4.0, 4.0, 1e-12)))
+    bank.insert(rows, Odometry(np.arange(n), poses, sums, stamps_ns, AS_CLAIMED))
+    learning = bank.again(bank.noise, learns=True)
+    learning.decide()
+    steps = np.minimum.outer(np.arange(n), np.arange(n))
+    common = slow * np.exp(-np.abs(np.subtract.outer(seconds, seconds)) / tau) + (
+        white * np.eye(n) + 4.0 + way * 0.04 * steps)
+    rest = seconds[-1] // 1 * (1.0 / BANK.between_faults + 1.0 / BANK.between_slips)
+    expected = -n * np.log(2.0 * np.pi) + n * np.log(1.0 - BANK.outliers) - rest
+    lever = 0.5 * seconds * np.arange(n)    # what the rate has turned the way by
+    for off, constant in ((rows['mean'][:, 0] - np.arange(n), BANK.scale * np.arange(n)),
+                          (rows['mean'][:, 1], BANK.rate * lever)):
+        full = common + np.outer(constant, constant)
+        expected -= 0.5 * (np.linalg.slogdet(full)[1] + off @ np.linalg.solve(full, off))
+    assert learning.evidence == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_noise_by_which_hardly_anything_is_believed_is_not_the_best(seed: int) -> None:
+    """Positions at 4 Hz with slow errors, and odometry that could as well be far worse."""
+    bank = a_drive(seed, n=400, period=0.25, tau=30.0, sigma=2.0, white=0.02)
+    worse = (5.0, 7.0, -6.0, NO_SLOW, 0.0)
+    best = to_the_end(search(bank, ALL, begins=[worse])).best
+    assert best.point[3] > NO_SLOW
+    assert max(best.point[:2]) < 3.0
+
+
 def test_where_other_noise_leads_to_spreads_the_newest_pose_by_its_evidence() -> None:
-    def learnt(turn: float, evidence: float, *pose: float) -> Learnt:
-        return Learnt((0.0, turn), evidence, np.zeros(4), np.array(pose))
-    best, other = learnt(0.0, -10.0, 1.0, 2.0, 3.1), learnt(4.0, -11.0, 21.0, 2.0, -3.1)
+    def learnt(turn: float, evidence: float, variance: float, *pose: float) -> Learnt:
+        return Learnt((0.0, turn), evidence, np.zeros(4), np.array(pose), variance * np.eye(3))
+    best, other = learnt(0.0, -10.0, 1.0, 1.0, 2.0, 3.1), learnt(4.0, -11.0, 5.0, 21.0, 2.0, -3.1)
     found = Found(best, {each.point: each for each in (best, other)})
     off, weight = np.array((20.0, 0.0, 2.0 * np.pi - 6.2)), 1.0 / (1.0 + np.e)
-    np.testing.assert_allclose(found.spread(best.pose), weight * np.outer(off, off), atol=1e-12)
+    np.testing.assert_allclose(
+        found.spread(best), weight * (np.outer(off, off) + 4.0 * np.eye(3)), atol=1e-12)
+    # what is known better by other noise is not known worse
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(found.spread(other))[:2], 0.0, atol=1e-9)
     assert found.instead_of(other.point) is other, 'too little speaks against it'
     hopeless = other._replace(evidence=-50.0)
     found = Found(best, {each.point: each for each in (best, hopeless)})
-    np.testing.assert_allclose(found.spread(best.pose), 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.spread(best), 0.0, atol=1e-9)
     assert found.instead_of(hopeless.point) is best
 
 
