@@ -214,8 +214,11 @@ class Bank:
         pose, covariance = self.newest()
         likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
         likely *= np.any(in_fault != in_fault[np.argmax(likely)], axis=1) / np.sum(likely)
+        # a small part that is hardly known at all would make the covariance useless
+        own = some['covariance'][:, :3, :3]
+        own = own * np.minimum(1.0, hy.NEAR2 / own[:, 0, 0])[:, None, None]
         self.spread = Spread(pose, self.by_noise + spread(
-            likely, some['state'][:, :3] - pose, some['covariance'][:, :3, :3] - covariance))
+            likely, some['state'][:, :3] - pose, own - covariance))
 
     def again(self, noise: Records, newest: int | None = None, *, learns: bool = False) -> Self:
         """

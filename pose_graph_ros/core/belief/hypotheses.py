@@ -53,7 +53,7 @@ BETWEEN_SLIPS, SLIP, SLIP_SIZE2 = BANK.between_slips, BANK.slip, BANK.slip_size*
 JUMP_SIZE2 = BANK.jump_size**2
 UNMOVED_WAY, UNMOVED = 5.0 * BANK.slip_size, BANK.unmoved
 HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
-NEAR2, FAR2, FAR = (2.0 * BANK.fault_size)**2, BANK.far_fault**2, BANK.far_share
+NEAR2, FAR2 = (2.0 * BANK.fault_size)**2, BANK.far_fault**2
 RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
 HOPELESS, ALIKE = BANK.hopeless, BANK.alike
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
@@ -124,9 +124,7 @@ def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-
                 p[j, j] = slow
                 p[i, j] = -slow
                 p[j, i] = -slow
-            share = 1.0 - in_fault
-            if fault > 0:
-                share = 2.0 * in_fault / n_faults * (1.0 - FAR if fault % 2 == 1 else FAR)
+            share = 1.0 - in_fault if fault == 0 else in_fault / n_faults
             one.weight = before + math.log(share / n_headings)
             leaf = leaves[n]
             leaf.before, leaf.far, leaf.d2 = best, 0.0, 0.0

@@ -30,9 +30,8 @@ class BankSettings:
     # --- what is known at the beginning
     headings: int = 16  # headings that are tried, also after a turn that is less known, with
     heading: float = 0.15  # such a sigma [rad]
-    # how far a receiver is off that begins in a fault: mostly twice `fault_size`; in such a share
-    # as after a cold start [m]
-    far_share: float = 0.1
+    # how far a receiver is off that begins in a fault: mostly twice `fault_size`, or as after a
+    # cold start [m]
     far_fault: float = 1000.0
     rate: float = 0.005  # sigma of the constant error of the yaw rate [rad/s]
     scale: float = 0.01  # sigma of that of the scale of the way
