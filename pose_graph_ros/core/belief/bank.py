@@ -213,12 +213,16 @@ class Bank:
             return
         pose, covariance = self.newest()
         likely, in_fault = np.exp(some['weight'] - np.max(some['weight'])), some['in_fault'] != 0
-        likely *= np.any(in_fault != in_fault[np.argmax(likely)], axis=1) / np.sum(likely)
-        # a small part that is hardly known at all would make the covariance useless
-        own = some['covariance'][:, :3, :3]
-        own = own * np.minimum(1.0, hy.NEAR2 / own[:, 0, 0])[:, None, None]
+        best = int(np.argmax(likely))
+        likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
+        wider = np.zeros((len(some), 3, 3))
+        if np.any(in_fault[best]) or self._tree[-1, best]['choice'] != hy.GOOD:
+            # something speaks for it that one was in a fault from the start; a small part that
+            # hardly knows where the robot is would make the covariance useless
+            own = some['covariance'][:, :3, :3]
+            wider = own * np.minimum(1.0, hy.NEAR2 / own[:, 0, 0])[:, None, None] - covariance
         self.spread = Spread(pose, self.by_noise + spread(
-            likely, some['state'][:, :3] - pose, own - covariance))
+            likely, some['state'][:, :3] - pose, wider))
 
     def again(self, noise: Records, newest: int | None = None, *, learns: bool = False) -> Self:
         """
