@@ -216,7 +216,7 @@ class Bank:
         best = int(np.argmax(likely))
         likely *= np.any(in_fault != in_fault[best], axis=1) / np.sum(likely)
         wider = np.zeros((len(some), 3, 3))
-        if np.any(in_fault[best]) or self._tree[-1, best]['choice'] != hy.GOOD:
+        if np.any(in_fault[best]) or self._tree.values[-1, best]['choice'] != hy.GOOD:
             # something speaks for it that one was in a fault from the start; a small part that
             # hardly knows where the robot is would make the covariance useless
             own = some['covariance'][:, :3, :3]
