@@ -171,7 +171,26 @@ def best(
         if choice is not None:
             choice = yield from problem.improved(choice)
             choices.append((choice.cost - less, choice))
-    return min(choices, key=lambda each: each[0], default=(0.0, None))[1]
+    choice = min(choices, key=lambda each: each[0], default=(0.0, None))[1]
+    return None if choice is None else (yield from _completed(problem, choice))
+
+
+def _completed(problem: TruncatedProblem, choice: Choice) -> Choosing:
+    """
+    Return a set with all that passes its gate by what it believes, if that costs less.
+
+    What is beyond its limit at the poses of the set may be well within it if it is believed.
+    """
+    problem.begin_at(choice.poses)
+    if not (yield from problem.solve(choice.believed.astype(np.float64))):
+        return choice
+    passing = yield from _Gates(problem).passing(np.flatnonzero(~choice.believed))
+    believed = choice.believed.copy()
+    believed[passing] = True
+    other = None if len(passing) == 0 else (yield from problem.choice(believed))
+    if other is not None:
+        other = yield from problem.improved(other)
+    return choice if other is None or other.cost >= choice.cost else other
 
 
 CONFIG = SolverConfig(max_iterations=100)

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which constraints of a whole graph are believed when the surest ones come first."""
 
+from collections.abc import Generator
+
 from false_loops import Drive, laps
 import numpy as np
 import pytest
@@ -33,6 +35,25 @@ def test_the_right_closures_are_found(seed: int, n_wrong: int, groups: tuple[int
     choice = to_the_end(closure_search.best(problem))
     assert not np.any(choice.believed & ~drive.right)
     assert drive.error(choice.poses) < 1.0
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_passes_its_gate_is_believed_though_its_error_is_beyond_its_limit(
+    seed: int, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Here nothing is believed at first, by which odometry is off by more than any limit."""
+    drive = laps(seed, n_wrong=4)
+    problem = TruncatedProblem(drive.graph, drive.closures)
+    nothing = np.zeros(len(problem), dtype=bool)
+
+    def no_others(problem: TruncatedProblem) -> Generator[None, None, np.ndarray]:
+        yield
+        return nothing
+
+    monkeypatch.setattr(closure_search, 'select', no_others)
+    choice = to_the_end(closure_search.best(problem, nothing))
+    assert not np.any(choice.believed & ~drive.right)
+    assert np.sum(choice.believed) >= 0.9 * np.sum(drive.right)
 
 
 @pytest.mark.parametrize('seed', range(3))
