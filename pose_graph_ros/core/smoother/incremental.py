@@ -258,7 +258,12 @@ class IncrementalSmoother:
 
     def newest_covariance(self) -> se2.Covariance:
         """Return the covariance of the newest pose in map axes."""
-        return self.covariance(self.graph.newest_pose)
+        head, out = self._memory.head, np.empty((3, 3))
+        newest = int(head[tb.NEWEST])
+        if newest < 0 or head[tb.N_TOUCHED] > 0:
+            return self.covariance(self.graph.newest_pose)  # raises an error with the cause
+        covariances.write_covariance(head, newest, _UNIT, -1, _UNIT, out)
+        return out
 
     def covariance(self, node: int) -> se2.Covariance:
         """
