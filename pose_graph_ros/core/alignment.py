@@ -142,8 +142,7 @@ class Alignment:
         own = [new[k] for k in rows['id'].tolist()]
         rows['id'] += self._n_seen
         self._n_seen += len(new)
-        rows['source'] = [
-            min(self._sources.index(one.source), BANK.sources - 1) for one in own]
+        rows['source'] = [min(self._sources.index(one.source), BANK.sources - 1) for one in own]
         rows['judged'] = [not self._fixes.trusts(one.source, one.measured) for one in own]
         return rows
 

@@ -95,7 +95,6 @@ def predict(x, p, n_sources, row, noise, in_fault):  # type: ignore[no-untyped-d
             x[i] *= part
             for j in range(n):
                 p[i, j] *= part
-            for j in range(n):
                 p[j, i] *= part
             p[i, i] += more
 

@@ -116,14 +116,12 @@ def _begin(bank, n, seen, n_sources, noise, leaves):  # type: ignore[no-untyped-
                 one.in_fault[r] = QUIET if fault <= 2 else NOISY
             white = _white(noise.white[r], one, r)
             p[0, 0] = max(white * seen.noise[0], seen.least) + slow
-            p[0, 1] = white * seen.noise[1]
-            p[1, 0] = p[0, 1]
+            p[0, 1] = p[1, 0] = white * seen.noise[1]
             p[1, 1] = max(white * seen.noise[2], seen.least) + slow
             for i in range(2):
                 j = ft.ERROR + 2 * r + i
                 p[j, j] = slow
-                p[i, j] = -slow
-                p[j, i] = -slow
+                p[i, j] = p[j, i] = -slow
             share = 1.0 - in_fault if fault == 0 else in_fault / n_faults
             one.weight = before + math.log(share / n_headings)
             leaf = leaves[n]
@@ -215,8 +213,7 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
             for i in range(first, first + 2):
                 x[i] = 0.0
                 for j in range(n):
-                    p[i, j] = 0.0
-                    p[j, i] = 0.0
+                    p[i, j] = p[j, i] = 0.0
                 p[i, i] = noise.slow[r] * row.slow
         one.in_fault[r] = 0
         if choice == SLIPPED:

@@ -145,13 +145,6 @@ class Minimum(NamedTuple):
     point: Point
 
 
-class Shown(NamedTuple):
-    """Constant errors of odometry that are shown."""
-
-    cost: float  # of the measurements with these, and of the evidence that they need [nats]
-    constants: FloatArray  # as in `Learnt`
-
-
 class Posterior:
     """The negative logarithm of the posterior density of noise, at most once at each point."""
 
@@ -196,16 +189,20 @@ class Posterior:
             yield from self._pause()
         return self._values[point]
 
-    def shown(self, point: Point) -> Generator[None, None, Shown]:
-        """Return the constant errors of odometry that the measurements show; the others are 0."""
-        heading, best = (yield from self.heading()), Shown(math.inf, np.zeros(4))
+    def shown(self, point: Point) -> Generator[None, None, tuple[float, FloatArray]]:
+        """
+        Return the constant errors of odometry that the measurements show, as in `Learnt`.
+
+        Before them comes the cost of the measurements, and of the evidence that they need [nats].
+        """
+        heading, best = (yield from self.heading()), (math.inf, np.zeros(4))
         prior = log_prior(point, self.known, self._spread)
         for shown in product((False, True) if self.known.odometry else (False,), repeat=2):
             density, constants = self._density(point, heading, *shown)
             yield from self._pause()
             cost = BANK.constant_evidence * sum(shown) - density - prior
-            if cost < best.cost:
-                best = Shown(cost, constants)
+            if cost < best[0]:
+                best = cost, constants
         return best
 
     def _pause(self) -> Generator[None, None, None]:
@@ -297,8 +294,8 @@ def search(
                         every, [(*known.point[:2], *best.point[2:])],
                         [axis for source in known.sources for axis in axes_of(source)
                          if best.point[axis] > NO_SLOW])
-                    gained = (yield from every.shown(given.point)).cost - (
-                        yield from every.shown(best.point)).cost
+                    gained = (yield from every.shown(given.point))[0] - (
+                        yield from every.shown(best.point))[0]
                     better = best if gained >= BANK.noise_evidence else given
                 learnt[key].append(better.point)
         return learnt[key]
@@ -322,7 +319,7 @@ def search(
         slips = np.where(told.choice == SLIPPED, (BANK.slip_size**2 + told.far**2) / 3.0, 0.0)
         slips[~is_believed(told.choice)] = -1.0
         found[point] = Learnt(point, trial.evidence + log_prior(point, known), (
-            yield from posterior(slips).shown(point)).constants, *trial.newest())
+            yield from posterior(slips).shown(point))[1], *trial.newest())
         if n_rounds < MOST_ROUNDS:
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)
