@@ -57,8 +57,7 @@ def execute(options: argparse.Namespace) -> int:
     if bag_path is None:
         bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
         print(f'simulating a drive (seed {options.seed})')
-        way = recording.course(
-            worlds.WORLDS['drive'], options.seed, settings.DURATIONS_S['drive'])
+        way = recording.course(worlds.WORLDS['drive'], options.seed, settings.DURATIONS_S['drive'])
         write_drive(recording.record(way), bag_path, overwrite=True)
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}

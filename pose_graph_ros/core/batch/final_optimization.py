@@ -8,8 +8,9 @@ the weights of constraints with a robust loss are computed from initial values.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +21,7 @@ from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
 
 
-@dataclass(frozen=True, slots=True)
-class Tuning:
+class Tuning(NamedTuple):
     """Numbers of the optimisation with robust losses."""
 
     reweightings: int = 200  # at most

@@ -19,7 +19,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
@@ -31,8 +31,7 @@ SAME_MINIMUM = 1e-9
 TRUSTED_ITERATIONS = 20
 
 
-@dataclass(frozen=True, slots=True)
-class Tuning:
+class Tuning(NamedTuple):
     """Numbers of the loop, found on graphs of the benchmark; lengths of steps in m and rad."""
 
     # lambda after the first rejected step, its growth after each further one, its decay after each

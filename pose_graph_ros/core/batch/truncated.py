@@ -33,10 +33,9 @@ from twice the largest s to 1 for that of Geman-McClure.
 """
 
 from collections.abc import Generator
-from dataclasses import dataclass
 from enum import Enum
 import math
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -82,8 +81,7 @@ class Surrogate(Enum):
         return max(1.0 / (2.0 * largest - 1.0), 1e-6)
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
+class Choice(NamedTuple):
     """A set of believed constraints."""
 
     believed: BoolArray  # of the M edges that may be wrong

@@ -50,14 +50,11 @@ TREE = types.Array(from_dtype(BRANCH), 2, 'C')
 # Copies of the settings that kernels use.
 BETWEEN_FAULTS, FAULT, BETWEEN_JUMPS = BANK.between_faults, BANK.fault, BANK.fault / 3.0
 BETWEEN_SLIPS, SLIP, SLIP_SIZE2 = BANK.between_slips, BANK.slip, BANK.slip_size**2
-JUMP_SIZE2 = BANK.jump_size**2
-UNMOVED_WAY, UNMOVED = 5.0 * BANK.slip_size, BANK.unmoved
-HEADINGS, HEADING2 = BANK.headings, BANK.heading**2
+UNMOVED_WAY, UNMOVED, JUMP_SIZE2 = 5.0 * BANK.slip_size, BANK.unmoved, BANK.jump_size**2
+HEADINGS, HEADING2, RATE2, SCALE2 = BANK.headings, BANK.heading**2, BANK.rate**2, BANK.scale**2
 NEAR2, FAR2 = (2.0 * BANK.fault_size)**2, BANK.far_fault**2
-RATE2, SCALE2 = BANK.rate**2, BANK.scale**2
-HOPELESS, ALIKE = BANK.hopeless, BANK.alike
+HOPELESS, ALIKE, ALIKE_SPREAD = BANK.hopeless, BANK.alike, BANK.alike_spread
 SAME_PLACE2, SAME_HEADING = BANK.same_place**2, BANK.same_place
-ALIKE_SPREAD = BANK.alike_spread
 EQUAL2, EQUAL = BANK.equal**2, BANK.equal
 LEAST = -1e300
 
@@ -148,10 +145,12 @@ def _weigh(one, number, row, noise, weights, branches):  # type: ignore[no-untyp
     heading = ft.heading_density(x, p, row)
     any_heading = -ft.LOG_2PI if row.heading_variance > 0.0 else 0.0
     size2 = JUMP_SIZE2 if in_fault else ft.FAULT_SIZE2
-    begins = 1.0 - math.exp(-row.gap / (BETWEEN_JUMPS if in_fault else BETWEEN_FAULTS))
-    ends = 1.0 - math.exp(-row.gap / FAULT)
-    slips = math.exp(-row.gap / SLIP) if one.slips != 0 else (
-        1.0 - math.exp(-row.gap / BETWEEN_SLIPS))
+    # nothing happens before one that does not decide
+    gap = row.gap if row.decides == DECIDES else 0.0
+    begins = 1.0 - math.exp(-gap / (BETWEEN_JUMPS if in_fault else BETWEEN_FAULTS))
+    ends, slips = 1.0 - math.exp(-gap / FAULT), 1.0 - math.exp(-gap / BETWEEN_SLIPS)
+    if one.slips != 0 and row.decides == DECIDES:
+        slips = math.exp(-gap / SLIP)
     changed = math.log(max(ends if in_fault else 1.0 - begins, 1e-12))
     weights[GOOD] = changed + ft.LN_NO_OUTLIER + fresh + heading
     weights[ALONE] = ft.LN_OUTLIER + ft.cauchy(square, ft.FAULT_SIZE2 + spread) + any_heading
@@ -198,7 +197,8 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
     first, choice = ft.ERROR + 2 * r, branch.choice
     if choice == ALONE:
         return
-    one.slips = 1 if choice == SLIPPED else 0
+    if row.decides == DECIDES:
+        one.slips = 1 if choice == SLIPPED else 0
     one.turned[r] = factors.wrap(row.mean[2] - row.offset[2] - x[2])
     if choice in (BEGINS, BEGINS_NOISY):
         ex, ey, _, _, _, _, _ = ft.innovation(x, p, row, first, 0.0, 0.0)
@@ -222,23 +222,6 @@ def _follow(one, row, branch, noise, n_sources):  # type: ignore[no-untyped-def]
             p[1, 1] += more
             p[2, 2] += ft.SLIP_HEADING2
     ft.correct(x, p, n, row, first, _white(noise.white[r], one, r), one.in_fault[r] == 0)
-
-
-@kernel(allocates=True)
-def _count(one, choice, row, noise, n):  # type: ignore[no-untyped-def]
-    """Take in a measurement that a hypothesis has no choice about."""
-    x, p, first = one.state, one.covariance, ft.ERROR + 2 * row.source
-    white = _white(noise.white[row.source], one, row.source)
-    ex, ey, xx, xy, yy, _, _ = ft.innovation(x, p, row, first, white, 0.0)
-    any_heading = -ft.LOG_2PI if row.heading_variance > 0.0 else 0.0
-    if choice == ALONE:
-        one.weight += any_heading + ft.LN_OUTLIER + ft.cauchy(
-            ex * ex + ey * ey, ft.FAULT_SIZE2 + 0.5 * (xx + yy))
-        return
-    density, _ = ft.density(ex, ey, xx, xy, yy)
-    heading = any_heading if choice == GOES_ON else ft.heading_density(x, p, row)
-    one.weight += ft.LN_NO_OUTLIER + density + heading
-    ft.correct(x, p, n, row, first, white, choice == GOOD)
 
 
 @kernel
@@ -315,7 +298,8 @@ def advance(  # type: ignore[no-untyped-def]
                     choice = ALONE
                 tree[at, k] = branches[k, choice]
                 if row.decides == COUNTS:
-                    _count(bank[k], choice, row, noise, ft.ERROR + 2 * n_sources)
+                    bank[k].weight = weights[k, choice]
+                    _follow(bank[k], row, branches[k, choice], noise, n_sources)
             continue
         for k in range(n):
             before[k] = bank[k]

@@ -9,7 +9,6 @@ it a small weight.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +24,7 @@ from pose_graph_ros.core.graph.graph import Graph
 DIAGONAL = [0, 3, 5]
 
 
-@dataclass(frozen=True, slots=True)
-class Lines:
+class Lines(NamedTuple):
     """Factors as straight lines; the arrays are copies."""
 
     ends: FloatArray    # both ends of each line in the map, shape (M, 2, 2) [m]
@@ -49,8 +47,7 @@ class DrawnRows(NamedTuple):
 ALL_BELIEVED = DrawnRows()
 
 
-@dataclass(frozen=True, slots=True)
-class GraphView:
+class GraphView(NamedTuple):
     """View of a graph for display, which does not change with it."""
 
     nodes: Points   # hidden nodes in the map without biases

@@ -31,7 +31,7 @@ correlated.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, assert_never, Final
+from typing import Annotated, Any, assert_never, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -46,8 +46,7 @@ from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
 _LOSSES = tuple(Loss)
 
 
-@dataclass(frozen=True, slots=True)
-class _Tuning:
+class _Tuning(NamedTuple):
     """How much work reweighting is."""
 
     window: int = 200           # the newest factors, and as many older, at a time

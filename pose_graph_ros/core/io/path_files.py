@@ -79,8 +79,7 @@ def _points(stamps_ns: IntArray, places: FloatArray) -> Iterator[tuple[str, str,
 def gpx_lines(stamps_ns: IntArray, places: FloatArray, name: str) -> Iterator[str]:
     """Yield the lines of a GPX file with one track, given latitudes and longitudes [degrees]."""
     yield _XML
-    yield (f'<gpx version="1.1" creator="{CREATOR}" '
-           'xmlns="http://www.topografix.com/GPX/1/1">')
+    yield f'<gpx version="1.1" creator="{CREATOR}" xmlns="http://www.topografix.com/GPX/1/1">'
     yield f'<trk><name>{escape(name)}</name><trkseg>'
     for latitude, longitude, time in _points(stamps_ns, places):
         yield f'<trkpt lat="{latitude}" lon="{longitude}"><time>{time}</time></trkpt>'

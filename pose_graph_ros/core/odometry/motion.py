@@ -11,7 +11,6 @@ done to edges with any errors in use, and undone, without loss.
 """
 
 from dataclasses import dataclass
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -153,11 +152,6 @@ class OdometryErrors(NamedTuple):
     def mean_sigma(self) -> float:
         """Factor on the sigmas of an edge, in the geometric mean."""
         return float((self.way**2 * self.turn)**(1.0 / 6.0))
-
-    def is_close(self, other: 'OdometryErrors') -> bool:
-        """Tell whether the errors are the same, but for rounding, however well they are known."""
-        return all(math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
-                   for a, b in zip(self[:4], other[:4], strict=True))
 
 
 AS_CLAIMED = OdometryErrors()

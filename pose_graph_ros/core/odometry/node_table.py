@@ -268,5 +268,4 @@ class NodeTable:
         self._frozen.append(saved.frozen)
         self._travelled, thinned = saved.travelled, saved.thinned
         self.thinned = ThinnedNodes(self.n_frozen)
-        self.thinned.add(
-            thinned.numbers, thinned.anchors, thinned.relative, full(thinned.noise))
+        self.thinned.add(thinned.numbers, thinned.anchors, thinned.relative, full(thinned.noise))

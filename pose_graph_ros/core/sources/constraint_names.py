@@ -3,7 +3,7 @@
 """Names of the constraints with the largest energies: source, stamp and hidden nodes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.queued import Queued
 
 
-@dataclass(frozen=True, slots=True)
-class ConstraintEnergy:
+class ConstraintEnergy(NamedTuple):
     energy: float  # weighted energy, its part of chi2
     unweighted: float  # energy without the weight, by the covariance alone
     freedom: int  # degrees of freedom, which is the expected value of the unweighted energy

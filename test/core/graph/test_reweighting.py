@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reweighting by robust losses, in time independent of the graph."""
 
-from dataclasses import replace
 
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -80,7 +79,7 @@ def robust_edges(graph: Graph) -> Reweighting:
 def test_the_newest_are_reweighted_at_every_update_and_all_others_in_turn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(reweighting, 'TUNING', replace(reweighting.TUNING, window=4))
+    monkeypatch.setattr(reweighting, 'TUNING', reweighting.TUNING._replace(window=4))
     graph = random_graph(2, n_edges=20)     # with three duplicates
     some, seen = robust_edges(graph), []
     for _ in range(5):
@@ -95,7 +94,7 @@ def test_the_newest_are_reweighted_at_every_update_and_all_others_in_turn(
 def test_a_saved_state_goes_on_with_the_constraint_that_is_next(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(reweighting, 'TUNING', replace(reweighting.TUNING, window=4))
+    monkeypatch.setattr(reweighting, 'TUNING', reweighting.TUNING._replace(window=4))
     graph = random_graph(2, n_edges=20)
     one, other = robust_edges(graph), Reweighting()
     one.add(23, Loss.HUBER, 2.0)
