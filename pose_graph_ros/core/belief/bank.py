@@ -203,7 +203,7 @@ class Bank:
 
     def newest(self) -> tuple[FloatArray, FloatArray]:
         """Return the pose at the newest row by the best hypothesis, with its covariance."""
-        best = self._bank[np.argmax(self._bank['weight'][:self._n])]
+        best = self._bank[np.argmax(self._bank['weight'][:max(self._n, 1)])]
         return best['state'][:3].copy(), best['covariance'][:3, :3].copy()
 
     def _note_spread(self) -> None:
@@ -220,7 +220,7 @@ class Bank:
             # something speaks for it that one was in a fault from the start; a small part that
             # hardly knows where the robot is would make the covariance useless
             own = some['covariance'][:, :3, :3]
-            wider = own * np.minimum(1.0, hy.NEAR2 / own[:, 0, 0])[:, None, None] - covariance
+            wider = own * (hy.NEAR2 / np.maximum(own[:, :1, :1], hy.NEAR2)) - covariance
         self.spread = Spread(pose, self.by_noise + spread(
             likely, some['state'][:, :3] - pose, wider))
 
