@@ -221,7 +221,7 @@ class Bank:
             # hardly knows where the robot is would make the covariance useless
             own = some['covariance'][:, :3, :3]
             wider = own * (hy.NEAR2 / np.maximum(own[:, :1, :1], hy.NEAR2)) - covariance
-        self.spread = Spread(pose, self.by_noise + spread(
+        self.spread = Spread(pose, self.by_noise + added_covariance(
             likely, some['state'][:, :3] - pose, wider))
 
     def again(self, noise: Records, newest: int | None = None, *, learns: bool = False) -> Self:
@@ -273,11 +273,12 @@ class Bank:
         self._kept = {at - begin: kept for at, kept in self._kept.items() if at >= begin}
 
 
-def spread(likely: FloatArray, off: FloatArray, wider: FloatArray) -> FloatArray:
+def added_covariance(likely: FloatArray, off: FloatArray, wider: FloatArray) -> FloatArray:
     """
-    Return what poses that are as likely as said add to the covariance of another one, (3, 3).
+    Return what other poses add to the covariance of one, shape (3, 3), in [m, m, rad].
 
-    They are off by so much, shape (N, 3), and have so much more covariance, (N, 3, 3).
+    Given are their probabilities, their differences from it, (N, 3), and by how much their own
+    covariances are larger, (N, 3, 3).
     """
     off = se2.wrapped(off)
     variances, axes = np.linalg.eigh((off.T * likely) @ off + np.tensordot(likely, wider, 1))

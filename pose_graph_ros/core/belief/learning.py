@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.core.belief.bank import as_claimed, Bank, is_believed, spread
+from pose_graph_ros.core.belief.bank import added_covariance, as_claimed, Bank, is_believed
 from pose_graph_ros.core.belief.filter import log_density
 from pose_graph_ros.core.belief.hypotheses import SLIPPED
 from pose_graph_ros.core.belief.rows import Records
@@ -43,6 +43,8 @@ SLOW_BEGINS = (-2.0, -3.0), (0.0, -3.0), (2.0, -3.0), (-1.0, -1.0), (1.0, -1.0)
 SLOW_TAUS = 10.0, 60.0
 UNLEARNT = -1.0, -1.0, math.log2(40.0)
 MOST_ROUNDS = 2  # of learning from what is believed
+# Positions are not correlated with headings: how they are is of a place that the robot leaves.
+APART = np.array(((1.0, 1.0, 0.0), (1.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
 UNDECIDED = 5.0  # what is less likely by so many nats may be the best with all hypotheses
 ROWS_IN_STEP = 8000  # measurements that are filtered in a step, of about a microsecond each
 BANK_ROWS_IN_STEP = 80  # the same of a bank, of 0.1 to 0.4 ms each
@@ -107,8 +109,9 @@ class Found(NamedTuple):
         """Return what noise other than that in use adds to the covariance of the pose, (3, 3)."""
         every = [*self.every.values()]
         likely = np.exp([each.evidence - self.best.evidence for each in every])
-        return spread(likely / np.sum(likely), np.array([each.pose for each in every]) - used.pose,
-                      np.array([each.covariance for each in every]) - used.covariance)
+        return APART * added_covariance(
+            likely / np.sum(likely), np.array([each.pose for each in every]) - used.pose,
+            np.array([each.covariance for each in every]) - used.covariance)
 
 
 def claimed(n_sources: int) -> Point:

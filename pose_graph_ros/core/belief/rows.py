@@ -165,8 +165,7 @@ def count(table, first, period_ns):  # type: ignore[no-untyped-def]
         while before >= 0 and not (
                 table[before].source == one.source and table[before].decides == DECIDES):
             before -= 1
-        since_ns = one.stamp_ns - table[max(before, 0)].stamp_ns
-        one.gap = since_ns * 1e-9
+        one.gap = (one.stamp_ns - table[max(before, 0)].stamp_ns) * 1e-9
         one.decides = DECIDES
         if before >= 0 and one.stamp_ns // period_ns == table[before].stamp_ns // period_ns:
             one.decides = FOLLOWS

@@ -185,8 +185,7 @@ def _completed(problem: TruncatedProblem, choice: Choice) -> Choosing:
     if not (yield from problem.solve(choice.believed.astype(np.float64))):
         return choice
     passing = yield from _Gates(problem).passing(np.flatnonzero(~choice.believed))
-    believed = choice.believed.copy()
-    believed[passing] = True
+    believed = choice.believed | np.isin(np.arange(len(problem)), passing)
     other = None if len(passing) == 0 else (yield from problem.choice(believed))
     if other is not None:
         other = yield from problem.improved(other)
