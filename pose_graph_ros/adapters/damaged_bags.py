@@ -89,10 +89,9 @@ class _Mcap:
         try:
             first, last, size, checksum, n = _CHUNK_HEAD.unpack_from(chunk)
             name, data = chunk[32:32 + n].decode(), chunk[40 + n:]
-            if len(data) >= int.from_bytes(chunk[32 + n:40 + n], 'little'):
-                content = storage_mcap.decompress(data, name, size, checksum)
-            else:   # its begin
-                content = bytes(_DECOMPRESSORS[name]().decompress(data)) if name else data
+            is_whole = len(data) >= int.from_bytes(chunk[32 + n:40 + n], 'little')
+            content = (storage_mcap.decompress(data, name, size, checksum) if is_whole else
+                       bytes(_DECOMPRESSORS[name]().decompress(data)) if name else data)
         except Exception:   # decompression can raise anything
             self.n_damaged += 1
             return

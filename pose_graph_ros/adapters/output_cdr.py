@@ -25,7 +25,6 @@ from pose_graph_ros.core.quantities import NANOSECONDS, StampNs
 # Variances of height, roll and pitch, which are not estimated, in messages for filters, and in
 # poses for viewers, which would draw an ellipsoid of a kilometre [m^2, rad^2].
 UNKNOWN_VARIANCE, PLANAR_VARIANCE = 1e6, 1e-6
-PATH_CHUNK = 2048  # number of poses of a path that are written at a time
 
 CDR = b'\x00\x01\x00\x00'  # little endian
 Colours = npt.NDArray[np.float32]
@@ -35,14 +34,18 @@ _TWIST_WITH_COVARIANCE = struct.Struct('<42d')
 _UNKNOWN_TWIST = bytes(48) + (UNKNOWN_VARIANCE * np.eye(6)).tobytes()
 
 
+def _text(at: int, text: str) -> bytes:
+    """Serialise a string at an offset [bytes]."""
+    name = text.encode() + b'\0'
+    return bytes(-at % 4) + _LENGTH.pack(len(name)) + name
+
+
 @functools.cache
 def _names(at: int, *frames: str) -> bytes:
     """Serialise frame ids at an offset [bytes], padded for a double to follow."""
     data = b''
-    for text in frames:
-        data += bytes(-(at + len(data)) % 4)
-        name = text.encode() + b'\0'
-        data += _LENGTH.pack(len(name)) + name
+    for name in frames:
+        data += _text(at + len(data), name)
     return data + bytes(-(at + len(data)) % 8)
 
 
@@ -101,33 +104,23 @@ def path_cdr(path: Trajectory, stamp_ns: StampNs, frame_id: str) -> bytes:
     Return a serialised nav_msgs/Path whose poses all lie in one frame.
 
     A PoseStamped ends at a multiple of 8 bytes, so all but the first have the same layout, and
-    NumPy fills many at once.
+    NumPy fills them at once.
     """
-    name = frame_id.encode() + b'\0'
-    head = _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)) + _LENGTH.pack(len(name)) + name
+    head = _STAMP.pack(*divmod(stamp_ns, NANOSECONDS)) + _text(8, frame_id)
     head += bytes(-len(head) % 4) + _LENGTH.pack(len(path))
-    if len(path) == 0:
-        return CDR + head
-    # as many at a time as stay in the processor's cache while they are filled in
-    size = 12 + len(name) + -(12 + len(name)) % 8 + 7 * 8
-    numbers = np.zeros((PATH_CHUNK, size // 8), dtype='<f8')
-    pose, integers = numbers[:, -7:], numbers.view('<u4')
-    integers[:, 2] = len(name)
-    numbers.view(np.uint8)[:, 12:12 + len(name)] = np.frombuffer(name, np.uint8)
-    parts = [CDR, head]
-    for begin in range(0, len(path), PATH_CHUNK):
-        chunk = slice(begin, begin + PATH_CHUNK)
-        stamps, poses = path.stamps_ns[chunk], path.poses[chunk]
-        n, half = len(stamps), poses[:, 2] / 2.0
-        integers[:n, 0], integers[:n, 1] = np.divmod(stamps, NANOSECONDS)
-        pose[:n, :2] = poses[:, :2]
-        pose[:n, 5], pose[:n, 6] = np.sin(half), np.cos(half)
-        if begin == 0:
-            # the first pose begins at the end of the head, the others at a multiple of 8
-            first, names_end = numbers[0].tobytes(), 12 + len(name)
-            parts += (first[:names_end], bytes(-(len(head) + names_end) % 8), first[-56:])
-        parts.append(numbers[begin == 0:n].tobytes())
-    return b''.join(parts)
+    name = _text(8, frame_id)
+    end = 8 + len(name)     # of the header of a pose, from where it begins
+    rows = np.zeros(len(path), np.dtype({
+        'names': ('stamp', 'frame', 'pose'), 'formats': ('(2,)<u4', f'V{len(name)}', '(7,)<f8'),
+        'offsets': (0, 8, end + -end % 8)}))
+    rows['stamp'] = np.column_stack(np.divmod(path.stamps_ns, NANOSECONDS))
+    rows['frame'], half = np.void(name), path.poses[:, 2] / 2.0
+    rows['pose'][:, :2] = path.poses[:, :2]
+    rows['pose'][:, 5:] = np.column_stack((np.sin(half), np.cos(half)))
+    # the first pose begins at the end of the head, the others at a multiple of 8
+    first = rows[:1].tobytes()
+    return b''.join((CDR, head, first[:end], bytes(-(len(head) + end) % 8 if first else 0),
+                     first[-56:], rows[1:].tobytes()))
 
 
 class CdrStream:
@@ -143,8 +136,7 @@ class CdrStream:
 
     def add_text(self, text: str) -> None:
         """Add a string."""
-        name = text.encode() + b'\0'
-        self.data += bytes(-len(self.data) % 4) + _LENGTH.pack(len(name)) + name
+        self.data += _text(len(self.data), text)
 
 
 class Look(NamedTuple):

@@ -19,10 +19,9 @@ from typing import Any, cast
 import yaml
 
 from pose_graph_ros.adapters import parameter_table as table, sources
-from pose_graph_ros.adapters.conversions import frame
+from pose_graph_ros.adapters.conversions import datum_of, frame
 from pose_graph_ros.adapters.parameter_table import Change, OF_ALL, Parameter, PARAMETERS, Value
 from pose_graph_ros.adapters.sources import KINDS, KNOWN_SOURCES, TYPE, Values
-from pose_graph_ros.adapters.surroundings import datum_of
 from pose_graph_ros.core.exceptions import ConfigError
 
 LIKENESS = 0.7  # from which on one name may be meant by another, as difflib measures it

@@ -13,9 +13,8 @@ import math
 from typing import Any
 
 from pose_graph_ros.adapters import conversions, parameter_table as table
-from pose_graph_ros.adapters.conversions import Message
+from pose_graph_ros.adapters.conversions import frame, Message
 from pose_graph_ros.adapters.parameter_table import Change, Parameter
-from pose_graph_ros.adapters.surroundings import datum_of, frame, StaticFrames, Surroundings
 from pose_graph_ros.core import config
 from pose_graph_ros.core.config import GyroSource, Integrate, MeasurementSource, OdometrySource
 from pose_graph_ros.core.exceptions import ConfigError
@@ -39,7 +38,7 @@ class Kind:
 
     name: str  # value of the parameter `type`
     message_type: str
-    convert: Callable[[Message, 'Source', Surroundings], Measured | Answer]
+    convert: Callable[[Message, 'Source', conversions.Surroundings], Measured | Answer]
     # of a source, but for those that have parameters
     settings: OdometrySource | MeasurementSource | GyroSource
     parameters: tuple[Parameter, ...]  # beside `OF_ALL`
@@ -209,14 +208,15 @@ class MessageReader:
     """Converts the messages of all sources to measurements, by the checked parameters."""
 
     def __init__(
-        self, values: Values, frames: StaticFrames | None = None, keeper: TimeKeeper | None = None,
+        self, values: Values, frames: conversions.StaticFrames | None = None,
+        keeper: TimeKeeper | None = None,
     ) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
         self.keeper = keeper or TimeKeeper([name for name, source in self.sources.items()
                                             if source.kind.is_odometry], CLOCK_JUMP_NS)
-        self.frames = StaticFrames() if frames is None else frames
-        self.datum = datum_of(values)
-        self.surroundings = Surroundings(
+        self.frames = conversions.StaticFrames() if frames is None else frames
+        self.datum = conversions.datum_of(values)
+        self.surroundings = conversions.Surroundings(
             frame(values['map_frame']), frame(values['base_link_frame']), self.datum, self.frames)
 
     def configure(self, values: Values) -> None:

@@ -25,8 +25,7 @@ import sys
 import tempfile
 import time
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs
-from pose_graph_ros.adapters.bags import BagError, open_bag
+from pose_graph_ros.adapters.bags import BagError, choose_inputs, Inputs, open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
 from pose_graph_ros.adapters.sources import backend_config, source_list, Values
 from pose_graph_ros.cli import shared

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, read_inputs, reader_of
-from pose_graph_ros.adapters.bags import Bag, BagError, MessageError, Span, WHOLE
+from pose_graph_ros.adapters import bags
+from pose_graph_ros.adapters.bags import Bag, BagError, Inputs, MessageError, reader_of
 from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, MessageReader, ODOMETRY
 from pose_graph_ros.core import measurements as kinds
@@ -242,7 +242,7 @@ def measured_in(
     held_out: bool,
 ) -> Iterator[Measured]:
     """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
-    for source, message, is_held_out in read_inputs(bag, inputs):
+    for source, message, is_held_out in bags.read_inputs(bag, inputs):
         if is_held_out and not held_out:
             continue
         try:
@@ -340,7 +340,7 @@ def collect_drive(
         [source for source, _, _ in loops], arrived_ns=arrived)
 
 
-def read_truth(bag: Bag, topic: str, span: Span = WHOLE) -> Trajectory:
+def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory:
     """
     Return the true poses that were recorded in a span; invalid messages are ignored.
 

@@ -19,13 +19,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters import output_cdr, sources
-from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of, STATIC_FRAMES
+from pose_graph_ros.adapters import bags, output_cdr, sources
 from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
-from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, MessageError, open_bag, Span
-from pose_graph_ros.adapters.conversions import frame
+from pose_graph_ros.adapters.bags import Bag, BagError, BagMessage, Inputs, MessageError, reader_of
+from pose_graph_ros.adapters.conversions import Datum, frame
 from pose_graph_ros.adapters.sources import CLOSURES, Kind, KINDS, Measured, MessageReader, Values
-from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, ON_EARTH
 from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
@@ -211,8 +209,8 @@ def write_corrected(writer: BagWriter, bag: Bag, inputs: Inputs, run: Run) -> di
     thinned = Trajectory(path.stamps_ns[::step], path.poses[::step])
     writer.write(PATH, TYPES[PATH], bag.start_ns if begin_ns is None else begin_ns,
                  output_cdr.path_cdr(thinned, int(path.stamps_ns[-1]), corrector.map_frame))
-    if begin_ns is not None and STATIC_FRAMES[0] in bag.topics:
-        for message in bag.messages([STATIC_FRAMES[0]], Span(None, begin_ns)):
+    if begin_ns is not None and bags.STATIC_FRAMES[0] in bag.topics:
+        for message in bag.messages([bags.STATIC_FRAMES[0]], bags.Span(None, begin_ns)):
             writer.copy(replace(message, recorded_ns=begin_ns))
     counts = {'original': 0, 'corrected': 0, 'left_out': 0}
     for message in bag.messages(list(bag.topics), inputs.span):
@@ -303,7 +301,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
     """Replay bags."""
     values = shared.parameter_values(options)
     with ExitStack() as stack:
-        bag = stack.enter_context(open_bag(*options.bags))
+        bag = stack.enter_context(bags.open_bag(*options.bags))
         inputs = shared.inputs_of(bag, options, values, options.hold_out)
         require_datum(options.export, known=len(values['datum']) > 0 or len(inputs.fixes) > 0)
         writer = None if options.new_bag is None else stack.enter_context(

@@ -27,7 +27,7 @@ import re
 from typing import Any
 import webbrowser
 
-from pose_graph_ros.adapters import bag_inputs, bags
+from pose_graph_ros.adapters import bags
 from pose_graph_ros.cli import replay
 from pose_graph_ros.cli.arguments import Exports
 from pose_graph_ros.cli.run.document import FILE, read_document
@@ -35,7 +35,7 @@ from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
 SUMMARY = ('title', 'subtitle', 'start', 'duration', 'facts', 'findings', 'error_table', 'sources',
            'springs')  # keys of run.json that --json prints
-OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth', *bag_inputs.OPTIONS,
+OF_REPLAY = ('begin', 'until', 'stamps', 'edge2', 'params_file', 'truth', *bags.OPTIONS,
              'param', 'hold_out')  # of bags alone
 PAGES = ('.html', '.htm')
 BAG_SUFFIXES = ('.mcap', '.db3', '.bag', '.g2o', '.graph')

@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, OPTIONS
-from pose_graph_ros.adapters.bags import Bag, BagError, one_line, Span
+from pose_graph_ros.adapters import bags
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list, Values
 from pose_graph_ros.core.exceptions import ConfigError
@@ -24,7 +23,7 @@ Item = TypeVar('Item')
 
 def wanted_topics(options: argparse.Namespace) -> dict[str, str | None]:
     """Return the topics given by the options, by name of the source; None if not given."""
-    return {source: getattr(options, source) for source in OPTIONS}
+    return {source: getattr(options, source) for source in bags.OPTIONS}
 
 
 def parameter_values(options: argparse.Namespace, usual: Values | None = None) -> dict[str, Any]:
@@ -58,7 +57,7 @@ def _read_file(path: Path | None) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text(encoding='utf-8'))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f'{path}: cannot be read as yaml: {one_line(error)}') from error
+        raise ConfigError(f'{path}: cannot be read as yaml: {bags.one_line(error)}') from error
     given: dict[str, Any] = {}
     for name, section in (content if isinstance(content, Mapping) else {}).items():
         if str(name).rpartition('/')[2] not in ('**', '*', 'pose_graph'):
@@ -68,9 +67,8 @@ def _read_file(path: Path | None) -> dict[str, Any]:
             raise ConfigError(f'{path}: {name}: expected ros__parameters')
         _flatten(parameters, '', given)
     # `ros2 param dump` writes null for what is not set, and what every node has
-    of_rclpy = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
-    return {name: value for name, value in given.items()
-            if value is not None and not name.startswith(of_rclpy)}
+    return {name: value for name, value in given.items() if value is not None and not (
+        name.startswith(('qos_overrides.', 'use_sim_time', 'start_type_description_service')))}
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None:
@@ -81,17 +79,18 @@ def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None
             flat[prefix + name] = value
 
 
-def inputs_of(bag: Bag, options: argparse.Namespace, values: Values, hold_out: int = 0) -> Inputs:
+def inputs_of(bag: bags.Bag, options: argparse.Namespace, values: Values,
+              hold_out: int = 0) -> bags.Inputs:
     """Return what is read of a bag by the options; raises `BagError` if that is nothing."""
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]
     length = (bag.end_ns - bag.start_ns) * 1e-9
     until = math.inf if options.until is None else options.until
     if (options.begin or 0.0) >= min(length, until):
-        raise BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
-                       f'recording is {max(length, 0.0):.3f} s long')
-    return choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
-                         Span(*limits), truth=options.truth)
+        raise bags.BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
+                            f'recording is {max(length, 0.0):.3f} s long')
+    return bags.choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,
+                              bags.Span(*limits), truth=options.truth)
 
 
 def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
@@ -103,7 +102,7 @@ def watched(items: Iterable[Item], **looks: Any) -> Iterable[Item]:
     return tqdm(items, leave=False, delay=DELAY, **looks)
 
 
-def watched_bag(bag: Bag, title: str) -> Bag:
+def watched_bag(bag: bags.Bag, title: str) -> bags.Bag:
     """Return a bag that shows on a terminal how far its messages have been read."""
     seen = copy(bag)
     seen.watch = lambda messages, total: watched(messages, desc=title, total=total)

@@ -24,8 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
-from pose_graph_ros.adapters.bags import Bag, BagError, open_bag
+from pose_graph_ros.adapters.bags import Bag, BagError, Inputs, open_bag, reader_of
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, IMU, Values
 from pose_graph_ros.cli import finite, shared, tuned_parameters

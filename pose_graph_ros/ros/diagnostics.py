@@ -178,17 +178,17 @@ def concerns(session: 'Session') -> Iterator[Concern]:
     if not worker.thread.is_alive():
         yield Concern(ERROR, 'the worker thread has ended: restart the node')
     if report is not None and report.status is Status.FAILED:
-        names = ', '.join(worker.status.set_aside) or 'the newest measurements'
-        yield Concern(ERROR, f'the solver failed with {names}: set aside until ~/optimize; the '
-                      'estimate is without them. See the log for the reason')
+        yield Concern(ERROR, 'the solver failed with ' + (
+            ', '.join(worker.status.set_aside) or 'the newest measurements') + ': set aside until '
+            '~/optimize; the estimate is without them. See the log for the reason')
     if not session.active:
         yield Concern(GOOD, 'inactive: activate the node (ros2 lifecycle set)')
     if received.paused:
         yield Concern(WARN, 'paused: call ~/pause with false to resume')
     if not worker.prepared:
-        doing = ('compiling kernels, as at every first start' if session.compiling
-                 else 'loading compiled kernels')
-        yield Concern(WARN, f'{doing}: {received.posted} measurements wait until then')
+        yield Concern(WARN, ('compiling kernels, as at every first start' if session.compiling else
+                             'loading compiled kernels')
+                      + f': {received.posted} measurements wait until then')
     yield from _missing_input(session)
     if session.out.transforms is not None and session.out.transforms.other != '':
         yield Concern(WARN, session.out.transforms.other, logged=True)
@@ -202,7 +202,6 @@ def concerns(session: 'Session') -> Iterator[Concern]:
     if estimate is not None and estimate.alignment is AlignmentState.UNALIGNED:
         yield Concern(WARN, 'unaligned: the angle between odometry and map is not known yet. '
                       'Drive some metres while fixes come in')
-    yield from _disagreements(session)
     yield from _doubted(session)
     if estimate is not None and estimate.alignment is AlignmentState.LOCAL:
         yield Concern(GOOD, 'running without measurements in the map: its frame is that of the '
@@ -233,28 +232,9 @@ def _missing_input(session: 'Session') -> Iterator[Concern]:
 
 
 def _doubted(session: 'Session') -> Iterator[Concern]:
-    """Yield what is to be said of a node that works, but with wrong settings or errors."""
-    status = session.worker.status
-    for name in (name for name, each in status.verdicts.items() if each.doubting):
-        yield Concern(WARN, f'the newest measurements of {name} are doubted and not used, as they '
-                      'contradict the others: see ~/verdicts', logged=True)
-    for name, fit in status.sources.items():
-        if fit.wrongly_white:
-            yield Concern(WARN, f'the errors of {name} are correlated in time but treated as '
-                          f'white, so the covariances are too small: set {name}.correlation_time '
-                          f'to about {short(fit.errors.tau)} s')
-    errors = sum(count for (_, reason), count in status.counts.items()
-                 if reason == 'internal_error')
-    if errors > 0:
-        yield Concern(WARN, f'running, but {errors} internal errors are in the log: please report '
-                      'them')
-
-
-def _disagreements(session: 'Session') -> Iterator[Concern]:
-    """Yield who disagrees with others, and what is probably wrong with them."""
+    """Yield who disagrees with others, and what is wrong with settings of a node that works."""
     status, estimate = session.worker.status, session.worker.estimate
-    found = session.searches.contradiction
-    if found is not None:
+    if (found := session.searches.contradiction) is not None:
         yield Concern(WARN, found.text, logged=True)
     for name, source in session.input.reader.sources.items():
         if source.kind is not GYRO or estimate is None:
@@ -271,6 +251,18 @@ def _disagreements(session: 'Session') -> Iterator[Concern]:
         elif abs(bias) > MOST_BIAS * session.values[f'{name}.sigma_bias']:
             yield Concern(WARN, f'the bias of {name} is {short(bias)} rad/s, more than five times '
                           'its sigma_bias: check its mounting and its unit, rad/s', logged=True)
+    for name in (name for name, each in status.verdicts.items() if each.doubting):
+        yield Concern(WARN, f'the newest measurements of {name} are doubted and not used, as they '
+                      'contradict the others: see ~/verdicts', logged=True)
+    for name, fit in status.sources.items():
+        if fit.wrongly_white:
+            yield Concern(WARN, f'the errors of {name} are correlated in time but treated as '
+                          f'white, so the covariances are too small: set {name}.correlation_time '
+                          f'to about {short(fit.errors.tau)} s')
+    errors = sum(n for (_, reason), n in status.counts.items() if reason == 'internal_error')
+    if errors > 0:
+        yield Concern(WARN, f'running, but {errors} internal errors are in the log: please report '
+                      'them')
 
 
 # --- what around the node is probably not as it was meant
@@ -297,8 +289,7 @@ def doubts(session: 'Session') -> Iterator[str]:
         topic = session.values[f'outputs.{name}']
         if default.startswith('/') or node.count_publishers(topic) < 2:
             continue    # /diagnostics is for all
-        others = other_publishers(node, topic)
-        if len(others) > 0:
+        if len(others := other_publishers(node, topic)) > 0:
             yield (f'{node.resolve_topic_name(topic)} is published by {" and ".join(others)} as '
                    f'well: give one of them another topic, of this node {moved(node, name)}')
 
@@ -311,29 +302,26 @@ def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str
         name not in DEFAULT_SOURCES and not source.kind.is_rare)
     if session.input.arrivals[name].count > 0 or not expected:
         return
-    types = {info.topic_type for info in node.get_publishers_info_by_topic(source.topic)}
+    types = sorted({info.topic_type for info in node.get_publishers_info_by_topic(source.topic)})
     if wanted in types:
         return
-    found = 'nobody publishes it' if len(types) == 0 else (
-        f'its messages are {", ".join(sorted(types))}')
+    found = 'nobody publishes it' if types == [] else f'its messages are {", ".join(types)}'
     own = {publisher.topic_name for publisher in node.publishers}
-    others = [each for each, kinds in node.get_topic_names_and_types()
-              if wanted in kinds and each not in own and node.count_publishers(each) > 0]
-    there = f'; there is {", ".join(sorted(others)[:3])}' if len(others) > 0 else ''
-    yield f'{name} listens to {topic} for {wanted}, but {found}{there}'
+    others = sorted(each for each, kinds in node.get_topic_names_and_types()
+                    if wanted in kinds and each not in own and node.count_publishers(each) > 0)
+    yield f'{name} listens to {topic} for {wanted}, but {found}' + (
+        f'; there is {", ".join(others[:3])}' if len(others) > 0 else '')
 
 
 def _frames(session: 'Session', source: Source) -> Iterator[str]:
     name, out, estimate = source.name, session.out, session.worker.estimate
-    frames = session.input.arrivals[name].frames
-    if frames is None:
+    if (frames := session.input.arrivals[name].frames) is None:
         return
     parent, child = map(frame, frames)
     if source.kind.names_frames:
-        is_primary = estimate is not None and estimate.primary == name
         for what, found, parameter, expected, consequence in (
-                ('frame_id', parent if is_primary else out.odom_frame, 'odom_frame',
-                 out.odom_frame, 'no transform to it is published'),
+                ('frame_id', parent if estimate is not None and estimate.primary == name else
+                 out.odom_frame, 'odom_frame', out.odom_frame, 'no transform to it is published'),
                 ('child_frame_id', child, 'base_link_frame', out.base_frame,
                  'its motion is taken for that of the robot')):
             if found == '':

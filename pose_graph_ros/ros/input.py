@@ -144,10 +144,9 @@ class Arrivals:
             return ''
         begin = f'{count} of {self.count}' if accepted == 0 else f'the newest {count}'
         # all reasons with the newest detail of each, the most frequent first
-        reasons = '; '.join((f'{n} times ' if len(newest) > 1 else '')
-                            + f'{reason} ({details[self.source, reason]})'
-                            for reason, n in newest.most_common())
-        return f'{begin} messages of {self.source} were refused: {reasons}'
+        return f'{begin} messages of {self.source} were refused: ' + '; '.join(
+            (f'{n} times ' if len(newest) > 1 else '')
+            + f'{reason} ({details[self.source, reason]})' for reason, n in newest.most_common())
 
 
 def silent(sources: Collection[Arrivals], now: Seconds) -> list[str]:
@@ -209,16 +208,16 @@ class TimeJumps:
         received = received._replace(refusal=judged.refusal)
         if judged.jump_ns > 0:
             self._expect_old(newest_ns, judged.jump_ns, {received.source})
-            return Decision(self.release([received]), judged.jump_ns)
+            return Decision(self.release(received), judged.jump_ns)
         if self._keeper.in_doubt and len(self._held) < 10_000:
             self._held.append(received)
             return Decision([])
-        return Decision(self.release([received]))
+        return Decision(self.release(received))
 
-    def release(self, more: list[ReceivedMessage] | None = None) -> list[ReceivedMessage]:
+    def release(self, *more: ReceivedMessage) -> list[ReceivedMessage]:
         """Remove and return the messages that are held back, with more appended."""
-        held, self._held = self._held, []
-        return held + (more or [])
+        held, self._held = [*self._held, *more], []
+        return held
 
     def forget(self) -> None:
         """Forget all stamps; messages that are held back stay so."""
@@ -306,8 +305,8 @@ class Input:
 
     def release_overdue(self) -> list[ReceivedMessage]:
         """Remove and return the messages that were held back if no odometry has come for long."""
-        overdue = time.monotonic() - self._odometry_at > LONGEST_DOUBT
-        return self.time_jumps.release() if overdue else []
+        return self.time_jumps.release() if (
+            time.monotonic() - self._odometry_at > LONGEST_DOUBT) else []
 
     def read(self, source: str, message: Message) -> Measured | None:
         """Return the measurement of a message; None if it cannot be used, whatever its stamp."""
@@ -325,10 +324,8 @@ class Input:
     def post(self, received: ReceivedMessage, post: Callable[[str, Measured], bool]) -> None:
         """Hand a measurement to the engine, unless its stamp is refused or the input is paused."""
         source, _, measurement, refusal = received
-        if refusal is not None:
-            self.reject(source, refusal)
-        elif self.paused:
-            self.reject(source, PAUSED)
+        if refusal is not None or self.paused:
+            self.reject(source, refusal or PAUSED)
         elif not post(source, measurement):
             self.reject(source, rejected('inbox_full', 'the solver does not keep up'))
         else:

@@ -126,7 +126,7 @@ class PoseGraphNode(LifecycleNode):
 
     def close(self) -> None:
         """Stop the worker and destroy all that was configured."""
-        closing = self._offered, self._session
+        closing: list[Services | Session | None] = [self._offered, self._session]
         self._offered = self._session = None
         for each in closing:
             if each is not None:
@@ -181,10 +181,9 @@ class PoseGraphNode(LifecycleNode):
             if not self.has_parameter(name):
                 return _refused(rules.unknown(name, self._own))
             value = self._plain(name, parameter.value)
-            refused_by_rclpy = value == [] or self.describe_parameter(name).read_only
-            if not refused_by_rclpy or not rules.is_same(
+            # rclpy refuses what is read-only; without a value it would undeclare it
+            if (value != [] and not self.describe_parameter(name).read_only) or not rules.is_same(
                     value, self._plain(name, self.get_parameter(name).value)):
-                # without a value rclpy would undeclare it
                 changes.append(parameter if value != [] else RosParameter(
                     name, RosParameter.Type.DOUBLE_ARRAY, []))
         own = {each.name: each.value for each in changes if each.name in self._own}

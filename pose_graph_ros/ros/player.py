@@ -28,7 +28,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from pose_graph_ros.adapters import bag_inputs, bag_writer, parameter_table
+from pose_graph_ros.adapters import bag_writer, bags, parameter_table
 from pose_graph_ros.adapters.bags import MessageError, open_bag
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.quantities import NANOSECONDS
@@ -61,7 +61,7 @@ class Player(Node):
     """Publishes a bag and records the node's outputs."""
 
     def __init__(
-        self, inputs: bag_inputs.Inputs, topics: Mapping[str, str], context: Context,
+        self, inputs: bags.Inputs, topics: Mapping[str, str], context: Context,
         is_running: Callable[[], bool],
     ) -> None:
         super().__init__('pose_graph_player', context=context)
@@ -72,7 +72,7 @@ class Player(Node):
             message_class(kind.message_type), topics[source], RELIABLE)
             for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
-            TFMessage, bag_inputs.STATIC_FRAMES[0], STATIC)
+            TFMessage, bags.STATIC_FRAMES[0], STATIC)
         # topic, type, time of arrival [ns] and bytes of the node's messages
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
@@ -134,7 +134,7 @@ class Player(Node):
         published: Counter[str] = Counter()
         with open_bag(bag) as reader:
             if self._static is not None:
-                for frames in bag_inputs.read_static_frames(reader):
+                for frames in bags.read_static_frames(reader):
                     self._static.publish(frames.raw)
             # the other side of a match may learn of it a little later
             settled = time.monotonic() + 0.5
@@ -142,7 +142,7 @@ class Player(Node):
             total = sum(reader.topics[topic].count for topic in self._inputs.topics.values())
             start = first_ns = None
             progress = tqdm(total=total, disable=None, unit=' messages')     # on a terminal
-            for source, message, held_out in bag_inputs.read_inputs(reader, self._inputs):
+            for source, message, held_out in bags.read_inputs(reader, self._inputs):
                 if held_out:
                     published['held_out'] += 1
                     continue
@@ -213,7 +213,7 @@ class Player(Node):
 
 
 def play(
-    bag: Path, out: Path, inputs: bag_inputs.Inputs, topics: Mapping[str, str], *, rate: float,
+    bag: Path, out: Path, inputs: bags.Inputs, topics: Mapping[str, str], *, rate: float,
     is_running: Callable[[], bool],
 ) -> bool:
     """

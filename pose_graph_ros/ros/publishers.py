@@ -5,9 +5,11 @@ The outputs of the node, with strictly increasing stamps.
 
 Pose, odometry, fix and transform are published with each odometry message, from the executor's
 thread; path, markers and verdicts, which can be large, from the thread that owns the engine. All
-but the transform and the diagnostics are made only while there is a subscriber.
+but the transform and the diagnostics are made only while there is a subscriber. Of the transform
+it is also about its speed, and others that publish it.
 """
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 import math
 import threading
@@ -21,36 +23,42 @@ import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pose_graph_ros.adapters import output_cdr, parameter_table, parameters
-from pose_graph_ros.adapters.conversions import frame, Message
+from pose_graph_ros.adapters.conversions import Datum, frame, Message, stamp_ns
 from pose_graph_ros.adapters.sources import JUDGE, source_list
-from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict
-from pose_graph_ros.core.geometry import covariance as cov
-from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
+from pose_graph_ros.core.geometry import covariance as cov, se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS, Seconds, StampNs
 from pose_graph_ros.ros import topics
-from pose_graph_ros.ros.topics import Slew, TFMessage, TransformPublisher
+from pose_graph_ros.ros.spinning import guarded
+from pose_graph_ros.ros.topics import TFMessage, TOPIC
 from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
 # Late subscribers receive the newest path and graph at once.
 LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
+# The profile of tf2_ros, which is reliable.
+TF_QOS = QoSProfile(depth=100)
+# Reading all of /tf costs as much as odometry: how long it is read, and the period of that [s].
+LISTENING, PAUSE = 2.0, 30.0
+
 LATCHED = ('path', 'graph', 'verdicts')
 # Covariance of a pose of which only the motion since the start is known.
 UNPLACED = np.diag((
-    output_cdr.UNKNOWN_VARIANCE, output_cdr.UNKNOWN_VARIANCE, UNKNOWN_HEADING_VARIANCE))
+    output_cdr.UNKNOWN_VARIANCE, output_cdr.UNKNOWN_VARIANCE, cov.UNKNOWN_HEADING_VARIANCE))
 LEVELS = {State.BELIEVED: DiagnosticStatus.OK, State.WEAKLY_BELIEVED: DiagnosticStatus.OK,
           State.DOUBTED: DiagnosticStatus.WARN, State.WAITING: DiagnosticStatus.STALE}
 
@@ -104,10 +112,7 @@ class Publishers:
             self._node.get_logger().warning('tf2_msgs is not installed: the transform from map to '
                                             'odom is not published', once=True)
         elif values['publish_tf'] and self.transforms is None:
-            publisher = self._node.create_publisher(
-                TFMessage, topics.TOPIC, **topics.overridable(topics.TF_QOS))
-            self.transforms = TransformPublisher(
-                self._node, publisher, self.map_frame, self.odom_frame)
+            self.transforms = TransformPublisher(self._node, self.map_frame, self.odom_frame)
         elif not values['publish_tf'] and self.transforms is not None:
             self.transforms.close()
             self.transforms = None
@@ -205,9 +210,8 @@ class Publishers:
         state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
         if self.verdicts.is_due(state, 0.0 if at_once else period):
             # of those that are believed, the newest of each source
-            verdicts = backend.verdicts(50)
             publish(self.verdicts, state, lambda at: verdicts_message(
-                verdicts, status.verdicts, _header(at, self.map_frame)))
+                backend.verdicts(50), status.verdicts, _header(at, self.map_frame)))
 
     def start_new_graph(self) -> None:
         """Forget all stamps; take path, markers and verdicts back if any were published."""
@@ -226,11 +230,10 @@ class Publishers:
 
     def publish_diagnostics(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
         """Publish the state of the node; the only output that is stamped by the node's clock."""
-        name = f'{self._node.get_fully_qualified_name()}: pose graph'
-        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id='pose_graph',
-                                  values=_key_values(values))
         self._publishers['diagnostics'].publish(DiagnosticArray(
-            header=Header(stamp=self._node.get_clock().now().to_msg()), status=[status]))
+            header=Header(stamp=self._node.get_clock().now().to_msg()), status=[DiagnosticStatus(
+                level=level, name=f'{self._node.get_fully_qualified_name()}: pose graph',
+                message=text, hardware_id='pose_graph', values=_key_values(values))]))
 
     def close(self) -> None:
         """Destroy all publishers."""
@@ -248,11 +251,10 @@ def verdicts_message(
     """Return a status for each constraint, after one that also counts those not listed."""
     n_all = sum(sum(each.counts.values()) for each in totals.values())
     of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
-    doubting = any(each.doubting for each in totals.values())
-    text = f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}'
-    summary = DiagnosticStatus(level=DiagnosticStatus.WARN if doubting else DiagnosticStatus.OK,
-                               name='summary', message=text,
-                               values=_key_values(total_values(totals)))
+    summary = DiagnosticStatus(
+        level=DiagnosticStatus.WARN if any(each.doubting for each in totals.values()) else
+        DiagnosticStatus.OK, name='summary', values=_key_values(total_values(totals)),
+        message=f'{len(verdicts)} of {n_all} are listed; {of_sources or "nothing is judged yet"}')
     return DiagnosticArray(header=header, status=[summary, *(DiagnosticStatus(
         level=LEVELS[each.state], name=each.id, message=sentence(each), hardware_id=each.source,
         values=_key_values(details(each))) for each in verdicts)])
@@ -279,3 +281,120 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
 def _header(stamp_ns: StampNs, frame_id: str) -> Header:
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
+
+
+# --- the transform from map to odom
+
+class TransformPublisher:
+    """Publishes the transform from map to odom, each with a newer stamp than the one before."""
+
+    def __init__(self, node: Node, map_frame: str, odom_frame: str) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(TFMessage, TOPIC, **topics.overridable(TF_QOS))
+        self._map_frame, self._odom_frame = map_frame, odom_frame
+        self._newest_ns, self._aligned, self.slew = 0, False, Slew()
+        # its newest, to recognise them
+        self._own: deque[tuple[int, float, float]] = deque(maxlen=2000)
+        self._subscription: Subscription | None = None
+        self._since = -math.inf
+        self.other = ''  # warning about another publisher of the transform; empty if there is none
+
+    def publish(
+        self, estimate: Estimate, sample: OdometrySample, offset_ns: int,
+        limits: tuple[float, float],
+    ) -> None:
+        """Publish the transform at odometry, unless its stamp is not newer than the last one."""
+        if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
+            # the map frame itself has moved, which is no correction of the pose
+            self._aligned = not self._aligned
+            self.slew = Slew()
+        T_map_odom = self.slew.limited(sample.stamp_ns, estimate.T_map_odom, sample.pose, *limits)
+        at_ns = sample.stamp_ns + offset_ns
+        if at_ns <= self._newest_ns:
+            return
+        self._newest_ns = at_ns
+        self._own.append((at_ns, float(T_map_odom[0]), math.sin(T_map_odom[2] / 2.0)))
+        self._publisher.publish(output_cdr.transform_cdr(
+            at_ns, T_map_odom, self._map_frame, self._odom_frame))
+
+    def forget(self) -> None:
+        """Let the next transform have any stamp, and be without limits."""
+        self._newest_ns, self._aligned, self.slew = 0, False, Slew()
+
+    def check_for_others(self) -> None:
+        """Listen to /tf for a while if other nodes publish there; to be called periodically."""
+        silence = time.monotonic() - self._since
+        if self._subscription is not None:
+            if silence > LISTENING:
+                self._stop_listening()
+        # by endpoint: a second instance of this node, started by mistake, has the same name
+        elif self.other == '' and silence > PAUSE and self._node.count_publishers(TOPIC) > 1:
+            self._since = time.monotonic()
+            self._subscription = self._node.create_subscription(
+                TFMessage, TOPIC, guarded(self._on_transforms, lambda: True), TF_QOS, raw=True)
+
+    def close(self) -> None:
+        """Destroy the publisher and the subscription."""
+        self._stop_listening()
+        self._node.destroy_publisher(self._publisher)
+
+    def _stop_listening(self) -> None:
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _on_transforms(self, data: bytes) -> None:
+        # most transforms are of the robot's joints: not worth a deserialisation
+        if self._odom_frame.encode() not in data or self.other != '':
+            return
+        for transform in deserialize_message(data, TFMessage).transforms:
+            parent, t = frame(transform.header.frame_id), transform.transform
+            if frame(transform.child_frame_id) != self._odom_frame or (
+                    stamp_ns(transform), t.translation.x, t.rotation.z) in self._own:
+                continue
+            names = ' or '.join(topics.other_publishers(self._node, TOPIC))
+            self.other = (f'another node publishes {parent} -> {self._odom_frame} on '
+                          f'{self._node.resolve_topic_name(TOPIC)}{names and ", by "}{names}' + (
+                              '' if parent == self._map_frame else ', so that it has two parents')
+                          + ': set publish_tf of one of the two to false; if it is that of '
+                          'another robot, give each a namespace and its own tf, with '
+                          'remap_tf:=true of the launch file or -r /tf:=tf '
+                          '-r /tf_static:=tf_static')
+            return
+
+
+class Slew:
+    """
+    Limits the speed at which corrections move the robot in the published transform.
+
+    A small turn of the odometry frame moves a robot far from its origin by much, so the limits
+    hold at the robot. They do not affect the graph.
+    """
+
+    def __init__(self) -> None:
+        self._last: se2.FloatArray | None = None
+        self._stamp_ns = 0
+
+    def limited(
+        self, stamp_ns: int, T_map_odom: se2.FloatArray, T_odom_base: se2.FloatArray,
+        linear: float, angular: float,
+    ) -> se2.FloatArray:
+        """
+        Return the transform from map to odom to publish, given the estimate and odometry now.
+
+        The limits are the greatest speeds of corrections at the robot [m/s, rad/s]; 0: no limit.
+        """
+        if self._last is not None and (linear > 0.0 or angular > 0.0):
+            elapsed = (stamp_ns - self._stamp_ns) * 1e-9
+            shown = se2.compose(self._last, T_odom_base)
+            step = se2.compose(T_map_odom, T_odom_base) - shown
+            step[2] = se2.wrap(step[2])
+            distance, turn = math.hypot(step[0], step[1]), abs(float(step[2]))
+            if 0.0 < linear * elapsed < distance:
+                step[:2] *= linear * elapsed / distance
+            if 0.0 < angular * elapsed < turn:
+                step[2] *= angular * elapsed / turn
+            T_map_odom = se2.compose(
+                se2.wrapped(np.asarray(shown + step)), se2.inverse(T_odom_base))
+        self._last, self._stamp_ns = T_map_odom, stamp_ns
+        return T_map_odom

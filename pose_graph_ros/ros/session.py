@@ -18,7 +18,6 @@ from typing import Any
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
@@ -32,7 +31,7 @@ from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros import diagnostics, publishers, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
-from pose_graph_ros.ros.requests import continued, decide, initial_graph, set_pose, SetPoseInput
+from pose_graph_ros.ros.services import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.worker import Worker
 
@@ -47,7 +46,7 @@ class Session:
     def __init__(self, node: Node, values: Mapping[str, Any]) -> None:
         self.node, self.values = node, dict(values)
         self._config = backend_config(values)
-        path, datum = initial_graph(values) or (None, None)
+        path, datum = initial_graph(values)
         self.input, self.out = Input(values), publishers.Publishers(node, values)
         self._set_pose_input = SetPoseInput(self.out.frames)
         self.active = False
@@ -109,19 +108,17 @@ class Session:
         sources = self.input.reader.sources.values()
         callbacks: dict[str, Callable[[Any], None]] = {
             'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
-            topics.JUDGE_TOPIC: lambda message: decide(message, self.worker),
-            topics.STATIC_TOPIC: self.input.reader.frames.receive}
-        in_frames = any(source.kind.in_frames for source in sources)
-        wanted: list[tuple[str, str, QoSProfile, Callable[[Any], None]]] = [
-            (topic, *given, callbacks[topic]) for topic, given in topics.INPUTS.items()
-            if topic != topics.STATIC_TOPIC or in_frames]
+            topics.JUDGE_TOPIC: lambda message: decide(message, self.worker)}
+        if any(source.kind.in_frames for source in sources):
+            callbacks[topics.STATIC_TOPIC] = self.input.reader.frames.receive
+        wanted = [(topic, *given, callbacks[topic]) for topic, given in topics.INPUTS.items()
+                  if topic in callbacks]
         wanted += [(source.topic, source.kind.message_type,
                     topics.CLOSURE_QOS if source.kind.is_rare else topics.SENSOR_QOS,
                     partial(self._on_message, source)) for source in sources]
-        for topic, kind, qos, callback in wanted:
-            self._subscriptions.append(self.node.create_subscription(
-                topics.message_class(kind), topic, guarded(callback, lambda: self.active),
-                **topics.overridable(qos)))
+        self._subscriptions = [self.node.create_subscription(
+            topics.message_class(kind), topic, guarded(callback, lambda: self.active),
+            **topics.overridable(qos)) for topic, kind, qos, callback in wanted]
         self._watch_time()
         self.active, self.activated_at = True, time.monotonic()
         for arrivals in self.input.arrivals.values():

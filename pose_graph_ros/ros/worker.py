@@ -202,10 +202,10 @@ class Worker:
         result = self._backend.refine()
         self._may_refine = not result.finished
         self._refined += result.moved
-        # it judges again, too
-        has_judged = result.finished and self._report(None, 0) > 0
-        if has_judged or self._refined > 1e-3:  # that can be seen [m]
+        # it judges again, too; and a move that can be seen [m]
+        if (result.finished and self._report(None, 0) > 0) or self._refined > 1e-3:
             self._publish()
+
 
     def _do(self, what: str, job: Job[object], future: Future[object]) -> None:
         """Do a job and answer it, unless the thread is to end."""
@@ -214,12 +214,10 @@ class Worker:
         if not future.set_running_or_notify_cancel():
             return
         try:
-            result = job(self._backend)
+            future.set_result(job(self._backend))
         except Exception as error:
             self._count_failure(what, error)
             future.set_exception(error)
-        else:
-            future.set_result(result)
 
     def optimize_fully(self, backend: PoseGraphBackend) -> UpdateReport:
         """Optimise the whole graph; a job for `call`."""

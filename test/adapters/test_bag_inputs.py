@@ -9,8 +9,14 @@ from bag_of_messages import write_bag
 import numpy as np
 import pytest
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs, Inputs, read_inputs
-from pose_graph_ros.adapters.bags import BagError, open_bag, TopicInfo
+from pose_graph_ros.adapters.bags import (
+    BagError,
+    choose_inputs,
+    Inputs,
+    open_bag,
+    read_inputs,
+    TopicInfo,
+)
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import FIX, GLOBAL_POSE, KNOWN_SOURCES, source_list
 from pose_graph_ros.cli.simulate import (

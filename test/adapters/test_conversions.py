@@ -11,9 +11,9 @@ from sensor_msgs.msg import Range as RangeMessage
 from tf2_msgs.msg import TFMessage
 
 from pose_graph_ros.adapters import conversions
+from pose_graph_ros.adapters.conversions import Datum, StaticFrames, Surroundings
 from pose_graph_ros.adapters.parameters import checked, checked_together
 from pose_graph_ros.adapters.sources import MessageReader, ODOMETRY, Source
-from pose_graph_ros.adapters.surroundings import Datum, StaticFrames, Surroundings
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.measurements import (
     Answer,

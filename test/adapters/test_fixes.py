@@ -10,9 +10,9 @@ import pyproj
 import pytest
 from sensor_msgs.msg import NavSatFix
 
+from pose_graph_ros.adapters.conversions import Datum, StaticFrames
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import MessageReader
-from pose_graph_ros.adapters.surroundings import Datum, StaticFrames
 from pose_graph_ros.core.measurements import Answer, Fix, Position
 
 

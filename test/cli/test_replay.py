@@ -15,9 +15,8 @@ import pytest
 from run_schema import problems
 from tum_files import read_tum
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs
 from pose_graph_ros.adapters.bag_writer import message_types
-from pose_graph_ros.adapters.bags import BagError, open_bag
+from pose_graph_ros.adapters.bags import BagError, choose_inputs, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli import replay

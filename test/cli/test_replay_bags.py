@@ -13,8 +13,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionMode
 from tum_files import read_tum
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs
-from pose_graph_ros.adapters.bags import open_bag
+from pose_graph_ros.adapters.bags import choose_inputs, open_bag
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.main import main

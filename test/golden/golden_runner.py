@@ -25,8 +25,7 @@ import numpy as np
 from public_data import PUBLIC
 from tum_files import read_tum
 
-from pose_graph_ros.adapters.bag_inputs import choose_inputs, reader_of
-from pose_graph_ros.adapters.bags import Bag, open_bag
+from pose_graph_ros.adapters.bags import Bag, choose_inputs, open_bag, reader_of
 from pose_graph_ros.adapters.parameters import checked
 from pose_graph_ros.adapters.sources import backend_config, source_list
 from pose_graph_ros.cli.drive import measured_in

@@ -12,8 +12,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
-from pose_graph_ros.adapters.bag_inputs import Inputs, reader_of
-from pose_graph_ros.adapters.bags import Bag
+from pose_graph_ros.adapters.bags import Bag, Inputs, reader_of
 from pose_graph_ros.cli.drive import measured_in
 from pose_graph_ros.cli.replay import Replayed, run
 from pose_graph_ros.cli.simulate import fix_messages, Message, odometry_messages

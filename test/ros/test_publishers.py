@@ -18,8 +18,8 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
+from pose_graph_ros.adapters.conversions import Datum
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.surroundings import Datum
 from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.config import OdometrySource
 from pose_graph_ros.core.estimate import Estimate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.ros.topics import Slew
+from pose_graph_ros.ros.publishers import Slew
 
 poses = st.tuples(st.floats(-500.0, 500.0), st.floats(-500.0, 500.0), st.floats(-3.0, 3.0)).map(
     np.array)
