@@ -36,9 +36,8 @@ class BagWriter:
     late subscribers.
     """
 
-    def __init__(
-        self, folder: str | Path, *, overwrite: bool = False, latched: Collection[str] = (),
-    ) -> None:
+    def __init__(self, folder: str | Path, *, overwrite: bool = False,
+                 latched: Collection[str] = ()) -> None:
         self.folder = Path(folder).resolve()
         if self.folder.exists() and not overwrite:
             raise BagError(f'{folder}: exists already, not overwritten')
@@ -123,9 +122,8 @@ class BagWriter:
                               *source.ext.offered_qos_profiles, digest=source.digest)
         self._writer.write(self._connections[key], message.recorded_ns, data)
 
-    def _connect(
-        self, key: tuple[str, str], types: Typestore, *qos: Qos, digest: str = '',
-    ) -> None:
+    def _connect(self, key: tuple[str, str], types: Typestore, *qos: Qos,
+                 digest: str = '') -> None:
         known = key[1] in types.fielddefs
         # without a definition the type is left to the reader, as rosbag2 itself does
         self._connections[key] = self._writer.add_connection(

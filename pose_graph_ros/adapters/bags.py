@@ -149,9 +149,8 @@ class Bag:
         return ', '.join(
             f'{name} ({info.type})' for name, info in self.topics.items()) or 'no topics'
 
-    def _read(
-        self, path: Path, reader: Reader, topics: Collection[str], span: Span,
-    ) -> Iterator[BagMessage]:
+    def _read(self, path: Path, reader: Reader, topics: Collection[str],
+              span: Span) -> Iterator[BagMessage]:
         """Iterate over the messages of a reader; where it fails, over what can be repaired."""
         connections = [c for c in reader.connections if _absolute(c) in topics]
         if len(connections) == 0:  # rosbags reads all topics if it is given none
@@ -308,10 +307,8 @@ class Inputs:
         return self.of(lambda kind: kind.on_earth)
 
 
-def choose_inputs(
-    reader: Bag, sources: Sequence[Source], wanted: Mapping[str, str | None],
-    hold_out: int = 0, span: Span = WHOLE, *, truth: str | None = None,
-) -> Inputs:
+def choose_inputs(reader: Bag, sources: Sequence[Source], wanted: Mapping[str, str | None],
+                  hold_out: int = 0, span: Span = WHOLE, *, truth: str | None = None) -> Inputs:
     """
     Return the topics that feed the sources: wanted ones, else by parameter, else guessed.
 
@@ -363,10 +360,8 @@ def _option(name: str) -> str:
     return name.replace('_', '-')
 
 
-def _guess(
-    reader: Bag, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str],
-    *, asked: bool, truth: str | None,
-) -> str | None:
+def _guess(reader: Bag, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str], *,
+           asked: bool, truth: str | None) -> str | None:
     """Return the topic of a source for which none was given; None if there is no candidate."""
     kind, option = kinds[name], f'--{_option(name)}'
     free = [topic for topic, info in reader.topics.items()

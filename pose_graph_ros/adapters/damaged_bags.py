@@ -68,9 +68,8 @@ class _Mcap:
             else:
                 yield from self._message(self._file[begin:end])
 
-    def _records(
-        self, data: bytes | mmap.mmap, at: int, kinds: range,
-    ) -> Iterator[tuple[int, int, int]]:
+    def _records(self, data: bytes | mmap.mmap, at: int,
+                 kinds: range) -> Iterator[tuple[int, int, int]]:
         """Yield kind, begin and end of the content of each record that makes sense."""
         while at + 9 <= len(data):
             kind, end = data[at], at + 9 + int.from_bytes(data[at + 1:at + 9], 'little')
@@ -205,9 +204,8 @@ def repair(path: Path, reason: str, copy: Path) -> bool:
     found: list[_Mcap | _Sqlite] = []
     connections: dict[tuple[str, str], Connection] = {}
 
-    def connect(
-        topic: str, of_type: str, encoding: str, definition: str, qualities: list[Qos],
-    ) -> Connection:
+    def connect(topic: str, of_type: str, encoding: str, definition: str,
+                qualities: list[Qos]) -> Connection:
         if (topic, of_type) not in connections:
             connections[topic, of_type] = writer.add_connection(
                 topic, of_type, msgdef=definition, rihs01=NO_HASH, serialization_format=encoding,

@@ -55,9 +55,8 @@ def _head(stamp_ns: int, *frames: str, count: bytes = b'') -> bytes:
                      _names(8 + len(count), *frames)))
 
 
-def odometry_cdr(
-    stamp_ns: int, prediction: Prediction, source: Message, map_frame: str, base_frame: str,
-) -> bytes:
+def odometry_cdr(stamp_ns: int, prediction: Prediction, source: Message, map_frame: str,
+                 base_frame: str) -> bytes:
     """Return a serialised nav_msgs/Odometry: the pose in the map and the twist of the odometry."""
     twist = source.twist
     linear, angular = twist.twist.linear, twist.twist.angular

@@ -207,10 +207,8 @@ def _same(own: Mapping[str, Any], settings: type, but: Collection[str] = ()) -> 
 class MessageReader:
     """Converts the messages of all sources to measurements, by the checked parameters."""
 
-    def __init__(
-        self, values: Values, frames: conversions.StaticFrames | None = None,
-        keeper: TimeKeeper | None = None,
-    ) -> None:
+    def __init__(self, values: Values, frames: conversions.StaticFrames | None = None,
+                 keeper: TimeKeeper | None = None) -> None:
         self.sources = {source.name: source for source in source_list(values)}  # sources by name
         self.keeper = keeper or TimeKeeper([name for name, source in self.sources.items()
                                             if source.kind.is_odometry], CLOCK_JUMP_NS)

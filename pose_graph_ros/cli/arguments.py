@@ -328,9 +328,8 @@ def _add_parameters(parser: argparse.ArgumentParser) -> None:
                         help='parameter of the node, as after --ros-args; may be repeated')
 
 
-def number(
-    least: float = -math.inf, most: float = math.inf, *, whole: bool = False, factor: float = 1,
-) -> Callable[[str], Any]:
+def number(least: float = -math.inf, most: float = math.inf, *, whole: bool = False,
+           factor: float = 1) -> Callable[[str], Any]:
     """Return what reads a finite number, times a factor; it raises ArgumentTypeError."""
     kind = 'a whole number' if whole else 'a number'
     expected = kind if least == -math.inf else f'{kind} of at least {least:g}'

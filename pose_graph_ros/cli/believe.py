@@ -67,9 +67,8 @@ class BelievedEdges(NamedTuple):
     cost_of_all: float | None  # likewise at the minimum of chi2 with all closures, if computed
 
 
-def believe(
-    graph: Graph, sigmas: FloatArray, method: str = METHODS[0], *, given: bool = False,
-) -> BelievedEdges | None:
+def believe(graph: Graph, sigmas: FloatArray, method: str = METHODS[0], *,
+            given: bool = False) -> BelievedEdges | None:
     """
     Return which edges of a graph to believe, and poses at which they agree; None if it fails.
 
@@ -81,9 +80,8 @@ def believe(
     place = np.cumsum(graph.is_pose)
     is_motion = edges.kind <= FactorKind.LOOP_CLOSURE
     is_closure = is_motion & (np.abs(place[edges.j] - place[edges.i]) != 1)
-    kind = np.where(is_closure, FactorKind.LOOP_CLOSURE, np.where(
-        is_motion, FactorKind.ODOMETRY, edges.kind)).astype(np.uint8)
-    edges = edges.replaced(kind=kind)
+    edges = edges.replaced(kind=np.where(is_closure, FactorKind.LOOP_CLOSURE, np.where(
+        is_motion, FactorKind.ODOMETRY, edges.kind)).astype(np.uint8))
     softened = edges.replaced(information=np.where(
         is_closure[:, None, None], floored(edges, sigmas).information, edges.information))
     closures = np.flatnonzero(is_closure & (edges.weight > 0.0) & (edges.i != edges.j))
@@ -129,10 +127,8 @@ def believe(
     return _not_worse(result, graph, edges, starts if np.all(sigmas <= FLOORS) else [], plain)
 
 
-def _not_worse(
-    result: BelievedEdges, graph: Graph, edges: Factors, starts: list[FloatArray],
-    plain: FloatArray | None,
-) -> BelievedEdges:
+def _not_worse(result: BelievedEdges, graph: Graph, edges: Factors, starts: list[FloatArray],
+               plain: FloatArray | None) -> BelievedEdges:
     """Return the result, or what is better by the sigmas that it has found, near other poses."""
     closures, information = result.closures, edges.information.copy()
     information[closures] *= result.scale**-2.0
@@ -176,9 +172,8 @@ def _joining(edges: Factors, closures: IntArray, part: IntArray, number: int) ->
     return closures[order[np.sort(tree.data).astype(np.int64) - 1]]
 
 
-def doubt(
-    problem: Problem, method: str, sigma: Sequence[float],
-) -> tuple[IntArray, dict[str, Any], list[str]]:
+def doubt(problem: Problem, method: str,
+          sigma: Sequence[float]) -> tuple[IntArray, dict[str, Any], list[str]]:
     """
     Return rows of closures that are not believed, after giving them the weight 0.
 
@@ -194,16 +189,13 @@ def doubt(
         print('warning: there is no set of loop closures with a solution; all are believed',
               file=sys.stderr)
         return np.empty(0, np.int64), decision, []
-    lines = []
-    if beliefs.n_parts > 1:
-        lines.append(f'odometry, edges between neighbouring poses, leaves '
-                     f'{beliefs.n_parts} parts; loop closures that join them are believed')
     doubted = beliefs.closures[~beliefs.believed]
-    lines.append(f'{len(beliefs.closures)} loop closures: {int(np.sum(beliefs.believed))} '
-                 f'believed, {len(doubted)} doubted')
-    lines.append(f'truncated cost {beliefs.cost:.6g}' + (
-        '' if beliefs.cost_of_all is None else
-        f'; {beliefs.cost_of_all:.6g} at the minimum of chi2 with all of them'))
+    lines = [f'odometry, edges between neighbouring poses, leaves {beliefs.n_parts} parts; loop '
+             'closures that join them are believed'] if beliefs.n_parts > 1 else []
+    lines += [f'{len(beliefs.closures)} loop closures: {int(np.sum(beliefs.believed))} '
+              f'believed, {len(doubted)} doubted', f'truncated cost {beliefs.cost:.6g}' + (
+                  '' if beliefs.cost_of_all is None else
+                  f'; {beliefs.cost_of_all:.6g} at the minimum of chi2 with all of them')]
     graph.set_poses(beliefs.poses)
     graph.apply(GraphUpdate(remove=doubted.tolist()))
     if beliefs.scale > 1.0:
@@ -256,10 +248,8 @@ def give_scale(graph: Graph, closures: IntArray) -> float:
     return scale
 
 
-def residual_scale(
-    errors: FloatArray, covariances: FloatArray, information: FloatArray, group: IntArray,
-    scale: float,
-) -> float:
+def residual_scale(errors: FloatArray, covariances: FloatArray, information: FloatArray,
+                   group: IntArray, scale: float) -> float:
     """
     Return the factor on the sigmas of a source, at least 1, given the present one.
 

@@ -83,14 +83,14 @@ def execute(options: argparse.Namespace) -> int:
             counts[source, answer] = int(value)
     with open_bag(bag_path) as bag:
         drive = drive_in(bag, inputs, values, backend, truth, origin=saved.datum)
-    lines = write_results(Run(
-        title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds, counts,
-        report, seconds), options.out, {
+    run = Run(title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds, counts,
+              report, seconds)
+    print('\n'.join([
+        *write_results(run, options.out, {
             'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
-            'seconds': seconds, 'node': diagnostics})
-    print('\n'.join([*lines, f'written to {options.out}/: path.tum, corrected/ (rosbag2), '
-                     f'drive.png, summary.json, {GRAPH}, run.json',
-                     f'a page of it: pose-graph report {options.out}']))
+            'seconds': seconds, 'node': diagnostics}),
+        f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json, '
+        f'{GRAPH}, run.json', f'a page of it: pose-graph report {options.out}']))
     return 0 if converged and report.status is Status.CONVERGED else 1
 
 
@@ -110,10 +110,10 @@ def _updates(recorded: Path, recorder: Recorder, last_ns: int) -> Mapping[str, s
             longest = float(values.get('solve_max_ms', 0.0))
             # of the last one, the final optimisation has a part
             if before[0] < count and 0 < newest_ns < last_ns and 'chi2' in values:
-                mean = (total - before[1]) / (count - before[0])
                 recorder.add_update(Update(
-                    newest_ns, int(values['hidden_nodes']), longest if longest > before[2]
-                    else max(mean, 0.0), float(values['chi2'])), count - before[0])
+                    newest_ns, int(values['hidden_nodes']), longest if longest > before[2] else
+                    max((total - before[1]) / (count - before[0]), 0.0), float(values['chi2'])),
+                    count - before[0])
                 before = count, total, longest
     return values
 
@@ -168,17 +168,15 @@ def isolated_environment(log: Path) -> Iterator[dict[str, str]]:
     with ExitStack() as locks:
         for domain in random.SystemRandom().sample(range(1, 101), 100):
             try:
-                lock = locks.enter_context(open(
-                    f'{tempfile.gettempdir()}/pose_graph_ros_domain_{domain}', 'a'))
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(locks.enter_context(open(
+                    f'{tempfile.gettempdir()}/pose_graph_ros_domain_{domain}', 'a')),
+                    fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except OSError:
                 continue  # it is used; if all are, the last one is used twice
         env = dict(os.environ)
         # set by a sourced ROS, but not by the wheels from PyPI
         env.setdefault('AMENT_PREFIX_PATH', sys.prefix)
-        env['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        env['ROS_DOMAIN_ID'] = str(domain)
-        env['ROS_LOG_DIR'] = str(log)
         env.pop('ROS_LOCALHOST_ONLY', None)
-        yield env
+        yield env | {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': str(domain),
+                     'ROS_LOG_DIR': str(log)}

@@ -268,10 +268,10 @@ def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
             lines.append(f'  n{n}_{node} [label={name}, '
                          f'shape={shape}, width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
                          f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
-        for start, end, arc in panel.view.edges(data=True):
-            style = ('' if arc['directed'] else ', dir=none') + (
-                '' if arc['used'] else ', style=dashed')
-            lines.append(f'  n{n}_{start} -> n{n}_{end} [color="{COLOURS[arc["sort"]]}"{style}];')
+        lines += [f'  n{n}_{start} -> n{n}_{end} [color="{COLOURS[arc["sort"]]}"'
+                  + ('' if arc['directed'] else ', dir=none')
+                  + ('' if arc['used'] else ', style=dashed') + '];'
+                  for start, end, arc in panel.view.edges(data=True)]
         if len(panels) > 1:
             lines.append('  }')
     return '\n'.join([*lines, '}']) + '\n'

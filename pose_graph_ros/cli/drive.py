@@ -112,9 +112,9 @@ class Drive:
                          for row in error_rows(f'{name} to truth', distances(
                              truth, stamps[chosen], positions[chosen])[1])]
             inside = self.corrected.covers(truth.stamps_ns)
-            turns = se2.wrap(
-                self.corrected.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2])
-            rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(turns)), 'deg')
+            rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(se2.wrap(
+                self.corrected.at(truth.stamps_ns[inside])[:, 2]
+                - truth.poses[inside, 2]))), 'deg')
         for kind in ('used', 'doubted', 'held out'):
             chosen = self.fix_kinds[kind]
             for name, path in paths.items():
@@ -135,9 +135,8 @@ def place_truth(drive: Drive) -> Drive:
     return replace(drive, truth=placed, truth_moved=(float(np.hypot(*shift)), abs(float(pose[2]))))
 
 
-def distances(
-    path: Trajectory, stamps_ns: IntArray, positions: Points,
-) -> tuple[IntArray, FloatArray]:
+def distances(path: Trajectory, stamps_ns: IntArray,
+              positions: Points) -> tuple[IntArray, FloatArray]:
     """Return the stamps that a path covers, and its distances from positions at these [m]."""
     inside = path.covers(stamps_ns)
     offsets = path.at(stamps_ns[inside])[:, :2] - positions[inside]
@@ -237,10 +236,8 @@ Measured = tuple[str, OdometrySample | Measurement, bool]
 """A measurement after its source, and whether it is kept out of the graph."""
 
 
-def measured_in(
-    bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]], *,
-    held_out: bool,
-) -> Iterator[Measured]:
+def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counter[tuple[str, str]],
+                *, held_out: bool) -> Iterator[Measured]:
     """Yield the valid measurements of a bag, with those that are held out if they are wanted."""
     for source, message, is_held_out in bags.read_inputs(bag, inputs):
         if is_held_out and not held_out:
@@ -256,11 +253,9 @@ def measured_in(
             yield source, measurement, is_held_out
 
 
-def drive_in(
-    bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
-    truth_topic: str | None, *, origin: MapOrigin | None,
-    refused: Collection[Key] | None = None,
-) -> Drive:
+def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
+             truth_topic: str | None, *, origin: MapOrigin | None,
+             refused: Collection[Key] | None = None) -> Drive:
     """
     Return the path of an engine together with the measurements of the bag that it is made of.
 
@@ -278,10 +273,8 @@ def drive_in(
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
 
 
-def collect_drive(
-    measurements: Iterable[Measured], backend: PoseGraphBackend, odometry_source: str,
-    refused: Collection[Key] | None,
-) -> Drive:
+def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
+                  odometry_source: str, refused: Collection[Key] | None) -> Drive:
     """
     Return the path of an engine together with the measurements that it is made of.
 

@@ -82,9 +82,8 @@ def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
     return np.flatnonzero(chosen)
 
 
-def read_measurements(
-    path: Path, stamps: Path | None = None, edge2: str | None = None,
-) -> list[OdometrySample | LoopClosure]:
+def read_measurements(path: Path, stamps: Path | None = None,
+                      edge2: str | None = None) -> list[OdometrySample | LoopClosure]:
     """
     Return the measurements in a g2o file, in the order in which they come.
 

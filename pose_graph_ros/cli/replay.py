@@ -264,9 +264,8 @@ class Replayed(NamedTuple):
         return {*self.recorder.refused, *self.backend.refused_closures}
 
 
-def run(
-    measurements: Iterable[tuple[str, Measured]], values: Values, live: LivePoses | None = None,
-) -> Replayed:
+def run(measurements: Iterable[tuple[str, Measured]], values: Values,
+        live: LivePoses | None = None) -> Replayed:
     """Return a new engine after adding measurements and a full optimisation."""
     start, next_update = time.monotonic(), UPDATE_EVERY
     backend, recorder = PoseGraphBackend(sources.backend_config(values)), Recorder()
@@ -315,10 +314,9 @@ def _execute_bags(options: argparse.Namespace) -> int:
             values, live)
         result = result._replace(counts=result.counts + refused)
         if len(result.backend.node_stamps_ns) == 0:
-            names = inputs.odometry
-            topics = ' or '.join(inputs.topics[name] for name in names)
+            topics = ' or '.join(inputs.topics[name] for name in inputs.odometry)
             why = ', '.join(f'{answer} {count}' for (source, answer), count
-                            in sorted(result.counts.items()) if source in names)
+                            in sorted(result.counts.items()) if source in inputs.odometry)
             raise BagError(f'{bag.path}: no usable odometry on {topics}: {why or "no messages"}')
         plane = reader.datum.plane
         done = _run_of(options, result, drive_in(
@@ -346,24 +344,19 @@ def _execute_g2o(options: argparse.Namespace) -> int:
     result = run(measurements, values)
     drive = collect_drive(
         ((*each, False) for each in measurements), result.backend, odometry, result.refused)
-    kinds = {odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}
-    return _report(options, _run_of(options, result, drive, values, kinds),
-                   {'seconds': result.seconds})
+    return _report(options, _run_of(options, result, drive, values, {
+        odometry: sources.ODOMETRY, CLOSURES: sources.LOOP_CLOSURE}), {'seconds': result.seconds})
 
 
-def _run_of(
-    options: argparse.Namespace, result: Replayed, drive: Drive, values: Values,
-    kinds: Mapping[str, Kind],
-) -> Run:
+def _run_of(options: argparse.Namespace, result: Replayed, drive: Drive, values: Values,
+            kinds: Mapping[str, Kind]) -> Run:
     return Run(options.bags[0].stem, f'replay of {", ".join(path.name for path in options.bags)}',
                drive, result.backend, result.recorder, values, kinds, result.counts,
                result.report, result.seconds)
 
 
-def _report(
-    options: argparse.Namespace, done: Run, facts: Mapping[str, Any], datum: Datum | None = None,
-    live: LivePoses | None = None,
-) -> int:
+def _report(options: argparse.Namespace, done: Run, facts: Mapping[str, Any],
+            datum: Datum | None = None, live: LivePoses | None = None) -> int:
     """Write the results and print a summary; return the exit code."""
     lines = write_results(done, options.out, facts)
     write_g2o(done.backend.graph, options.out / 'graph.g2o')

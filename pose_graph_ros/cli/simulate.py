@@ -178,9 +178,8 @@ def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
     return topics
 
 
-def _delivered(
-    messages: Iterable[Message], index: IntArray, recorded_ns: IntArray,
-) -> Iterator[Message]:
+def _delivered(messages: Iterable[Message], index: IntArray,
+               recorded_ns: IntArray) -> Iterator[Message]:
     """Yield messages in the order in which they arrive; only those on their way are kept."""
     left = np.bincount(index).tolist()
     made, kept = enumerate(messages), dict[int, Message]()
@@ -219,10 +218,8 @@ def _disturbances(setup: settings.Setup) -> dict[str, Any]:
             ('duplicates', setup.duplicates), ('claimed_sigmas', setup.claims))}}
 
 
-def odometry_messages(
-    topic: str, frame: str, path: Trajectory, variances: Sequence[float],
-    rates: FloatArray | None = None,
-) -> Iterator[Message]:
+def odometry_messages(topic: str, frame: str, path: Trajectory, variances: Sequence[float],
+                      rates: FloatArray | None = None) -> Iterator[Message]:
     """
     Return nav_msgs/Odometry messages of poses of base_link in a frame.
 
@@ -233,15 +230,14 @@ def odometry_messages(
     rates = velocities(path) if rates is None else rates
     for stamp, pose, (vx, _, yaw_rate) in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), rates.tolist(), strict=True):
-        twist = _of('Twist', _of('Vector3', vx, 0.0, 0.0), _of('Vector3', 0.0, 0.0, yaw_rate))
         yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
             _header(stamp, frame), 'base_link', _of('PoseWithCovariance', _pose(pose), covariance),
-            _of('TwistWithCovariance', twist, covariance))
+            _of('TwistWithCovariance', _of('Twist', _of('Vector3', vx, 0.0, 0.0), _of(
+                'Vector3', 0.0, 0.0, yaw_rate)), covariance))
 
 
-def fix_messages(
-    topic: str, stamps_ns: StampsNs, geodetic: FloatArray, sigma: Metres,
-) -> Iterator[Message]:
+def fix_messages(topic: str, stamps_ns: StampsNs, geodetic: FloatArray,
+                 sigma: Metres) -> Iterator[Message]:
     """
     Return sensor_msgs/NavSatFix messages, of rows of latitude, longitude [deg] and height [m].
 
@@ -255,9 +251,8 @@ def fix_messages(
             covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
 
 
-def loop_closure_messages(
-    topic: str, stamps_ns: IntArray, poses: Poses, covariance: Covariance,
-) -> Iterator[Message]:
+def loop_closure_messages(topic: str, stamps_ns: IntArray, poses: Poses,
+                          covariance: Covariance) -> Iterator[Message]:
     """
     Return loop closures as geometry_msgs/PoseWithCovarianceStamped messages.
 
@@ -268,9 +263,8 @@ def loop_closure_messages(
     return _poses(topic, stamps_ns[:, 1], frames, poses, covariance)
 
 
-def _poses(
-    topic: str, stamps_ns: StampsNs, frames: Sequence[str], poses: Poses, covariance: Covariance,
-) -> Iterator[Message]:
+def _poses(topic: str, stamps_ns: StampsNs, frames: Sequence[str], poses: Poses,
+           covariance: Covariance) -> Iterator[Message]:
     """Return poses in frames with one covariance, as PoseWithCovarianceStamped messages."""
     spatial = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
     spatial[PLANAR] = covariance

@@ -100,8 +100,7 @@ def solve(problem: Problem, start: str) -> Solution:
     # poses that were composed from edges are those of odometry
     names = [name for name in STARTS if name != 'best' and (name != 'file' or problem.has_start)]
     for name in names:
-        solution = _solve_from(problem, name, present)
-        found.append((solution, problem.graph.poses.copy()))
+        found.append((_solve_from(problem, name, present), problem.graph.poses.copy()))
     best, poses = min(found, key=lambda each: (
         each[0].result.status is Status.FAILED, each[0].result.chi2))
     if best is not found[-1][0]:
@@ -114,9 +113,8 @@ def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
     Return a solution after optimising from its poses again, so that the graph is factorised there.
     """
     again = _solve_from(problem, 'present', poses)
-    if again.result.status is not Status.CONVERGED:
-        return again._replace(start=solution.start)
-    return solution._replace(result=replace(solution.result, chi2=again.result.chi2))
+    return (solution._replace(result=replace(solution.result, chi2=again.result.chi2))
+            if again.result.status is Status.CONVERGED else again._replace(start=solution.start))
 
 
 def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
@@ -205,30 +203,24 @@ class Report(NamedTuple):
         made = self.certificate
         if made is None:
             return [f'certificate: not attempted, because {self.reason}']
-        took = f'{self.seconds:.3f} s'
-        if made.verdict is Verdict.CERTIFIED:
-            lines = [f'certificate: certified, {took}: the chordal objective, {made.chi2:.9g} at '
-                     f'its minimum, is nowhere lower by more than {made.gap:.2g}']
-        else:
-            lines = [f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
-                     f'{took}: the chordal objective is {made.chi2:.9g} at the lowest minimum '
-                     'found']
+        lines = [(f'certificate: certified, {self.seconds:.3f} s: the chordal objective, '
+                  f'{made.chi2:.9g} at its minimum, is nowhere lower by more than {made.gap:.2g}')
+                 if made.verdict is Verdict.CERTIFIED else
+                 (f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
+                  f'{self.seconds:.3f} s: the chordal objective is {made.chi2:.9g} at the lowest '
+                  'minimum found')]
         if made.is_lower:
             lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
         if self.chi2_from_it is not None:
             lines.append(f'  from there, chi2 becomes {self.chi2_from_it:.9g}')
-        if self.bound is None:
-            lines.append('  this bounds no chi2, whose information depends on the direction; it '
-                         'only speaks for the headings')
-        else:
-            lines.append(f'  so no poses have a chi2 below {self.bound:.9g}; that found is '
-                         f'{max(self.chi2 - self.bound, 0.0):.2g} above this')
-        return lines
+        return [*lines, '  this bounds no chi2, whose information depends on the direction; it '
+                'only speaks for the headings' if self.bound is None else
+                f'  so no poses have a chi2 below {self.bound:.9g}; that found is '
+                f'{max(self.chi2 - self.bound, 0.0):.2g} above this']
 
 
-def with_certificate(
-    problem: Problem, solution: Solution, *, eigenvalue: bool,
-) -> tuple[Solution, Report]:
+def with_certificate(problem: Problem, solution: Solution, *,
+                     eigenvalue: bool) -> tuple[Solution, Report]:
     """Return the certificate of a solution, and a better solution if it leads to one."""
     begin, graph = time.monotonic(), problem.graph
 
@@ -360,9 +352,8 @@ def _lines(problem: Problem, solution: Solution, seconds: float, doubted: IntArr
           for k in order[~is_edge][:N_LARGEST])]
 
 
-def _marginals(
-    problem: Problem, solution: Solution, rows: IntArray,
-) -> tuple[list[dict[str, float | None]], float]:
+def _marginals(problem: Problem, solution: Solution,
+               rows: IntArray) -> tuple[list[dict[str, float | None]], float]:
     """
     Return poses and covariances in map axes of some nodes by `COLUMNS`, after the optimisation.
 

@@ -53,10 +53,8 @@ class Claims(NamedTuple):
     sigma_heading: Radians  # median; 0 without headings
 
 
-def source_parameters(
-    source: str, claims: Claims, values: Values, *, size: Found | None,
-    heading: Found | None = None,
-) -> Iterator[Tuned]:
+def source_parameters(source: str, claims: Claims, values: Values, *, size: Found | None,
+                      heading: Found | None = None) -> Iterator[Tuned]:
     """Yield the parameters of a source by the size of its errors, of positions and headings."""
     leading = heading if size is None else size
     if leading is None:
@@ -90,9 +88,8 @@ def source_parameters(
             yield Tuned(scale, values[scale], 1.0, note='part of covariance_override')
 
 
-def _one(
-    name: str, found: Found, values: Values, power: float, largest: float = math.inf,
-) -> Tuned:
+def _one(name: str, found: Found, values: Values, power: float,
+         largest: float = math.inf) -> Tuned:
     """Return a parameter by the factor on the variances, of which it is a power."""
     before = values[name]
     low, after, high = (min(before * factor**power, largest)

@@ -134,9 +134,8 @@ class PoseGraphNode(LifecycleNode):
 
     # ---- parameters
 
-    def declare_parameters(
-        self, namespace: str, parameters: Any, ignore_override: bool = False,
-    ) -> list[RosParameter]:
+    def declare_parameters(self, namespace: str, parameters: Any,
+                           ignore_override: bool = False) -> list[RosParameter]:
         """Return parameters after declaring them; of all that are given only note the values."""
         if ignore_override:
             self._overrides = {name: value for name, value, _ in parameters}

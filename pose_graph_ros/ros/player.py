@@ -60,10 +60,8 @@ PATIENCE = Patience()
 class Player(Node):
     """Publishes a bag and records the node's outputs."""
 
-    def __init__(
-        self, inputs: bags.Inputs, topics: Mapping[str, str], context: Context,
-        is_running: Callable[[], bool],
-    ) -> None:
+    def __init__(self, inputs: bags.Inputs, topics: Mapping[str, str], context: Context,
+                 is_running: Callable[[], bool]) -> None:
         super().__init__('pose_graph_player', context=context)
         self._inputs, self._is_running = inputs, is_running
         self._executor = SingleThreadedExecutor(context=context)
@@ -212,10 +210,8 @@ class Player(Node):
         return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
 
 
-def play(
-    bag: Path, out: Path, inputs: bags.Inputs, topics: Mapping[str, str], *, rate: float,
-    is_running: Callable[[], bool],
-) -> bool:
+def play(bag: Path, out: Path, inputs: bags.Inputs, topics: Mapping[str, str], *, rate: float,
+         is_running: Callable[[], bool]) -> bool:
     """
     Play a bag to the node on its topics, and write its outputs as a rosbag2.
 

@@ -121,9 +121,8 @@ class Publishers:
         self._slew_limits = tuple(values['transform_slew'])
         self._path_period = values['path_period']
 
-    def publish_pose(
-        self, estimate: Estimate, odometry: Message, sample: OdometrySample, datum: Datum,
-    ) -> None:
+    def publish_pose(self, estimate: Estimate, odometry: Message, sample: OdometrySample,
+                     datum: Datum) -> None:
         """
         Publish pose, odometry, fix and transform at an odometry message, if they are not held.
         """
@@ -177,9 +176,8 @@ class Publishers:
         if self.transforms is not None:
             self.transforms.slew = Slew()
 
-    def publish_views(
-        self, worker: Worker, graph: int, backend: PoseGraphBackend, *, at_once: bool = False,
-    ) -> None:
+    def publish_views(self, worker: Worker, graph: int, backend: PoseGraphBackend, *,
+                      at_once: bool = False) -> None:
         """
         Publish path, markers and verdicts that are due; the path and verdicts also `at_once`.
 
@@ -245,9 +243,8 @@ class Publishers:
                 self._node.destroy_publisher(publisher)
 
 
-def verdicts_message(
-    verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts], header: Header,
-) -> DiagnosticArray:
+def verdicts_message(verdicts: Sequence[Verdict], totals: Mapping[str, SourceVerdicts],
+                     header: Header) -> DiagnosticArray:
     """Return a status for each constraint, after one that also counts those not listed."""
     n_all = sum(sum(each.counts.values()) for each in totals.values())
     of_sources = '; '.join(f'{source}: {totals_text(each)}' for source, each in totals.items())
@@ -299,10 +296,8 @@ class TransformPublisher:
         self._since = -math.inf
         self.other = ''  # warning about another publisher of the transform; empty if there is none
 
-    def publish(
-        self, estimate: Estimate, sample: OdometrySample, offset_ns: int,
-        limits: tuple[float, float],
-    ) -> None:
+    def publish(self, estimate: Estimate, sample: OdometrySample, offset_ns: int,
+                limits: tuple[float, float]) -> None:
         """Publish the transform at odometry, unless its stamp is not newer than the last one."""
         if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
             # the map frame itself has moved, which is no correction of the pose
@@ -375,10 +370,8 @@ class Slew:
         self._last: se2.FloatArray | None = None
         self._stamp_ns = 0
 
-    def limited(
-        self, stamp_ns: int, T_map_odom: se2.FloatArray, T_odom_base: se2.FloatArray,
-        linear: float, angular: float,
-    ) -> se2.FloatArray:
+    def limited(self, stamp_ns: int, T_map_odom: se2.FloatArray, T_odom_base: se2.FloatArray,
+                linear: float, angular: float) -> se2.FloatArray:
         """
         Return the transform from map to odom to publish, given the estimate and odometry now.
 

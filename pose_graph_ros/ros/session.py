@@ -69,10 +69,8 @@ class Session:
             self.input.reader.datum.keep(datum)
         self._set_timer('diagnostics', values['diagnostics_period'], self.publish_diagnostics)
 
-    def _begin(
-        self, backend: PoseGraphBackend, prepare: Callable[[Callable[[], bool]], Any], *,
-        resumes: bool,
-    ) -> None:
+    def _begin(self, backend: PoseGraphBackend, prepare: Callable[[Callable[[], bool]], Any], *,
+               resumes: bool) -> None:
         """Start the thread that owns a graph, which may resume a drive."""
         self._continuity = {name: PoseContinuity(source.maximum_speed, resumes=resumes)
                             for name, source in self._config.odometry.items()}

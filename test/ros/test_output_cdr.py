@@ -60,8 +60,7 @@ def check_covariance(values: object, prediction: Prediction, other: float) -> No
 
 @pytest.mark.parametrize('frame', ['', *FRAMES])
 @pytest.mark.parametrize('count', [0, 1, 2, 50])
-def test_a_path(frame: str, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output_cdr, 'PATH_CHUNK', 7)
+def test_a_path(frame: str, count: int) -> None:
     generator = np.random.default_rng(count)
     path = Trajectory(1_700_000_000_123_456_789 + np.cumsum(generator.integers(1, 2**31, count)),
                       generator.normal(0.0, 100.0, (count, 3)))

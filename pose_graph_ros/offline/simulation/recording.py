@@ -75,10 +75,8 @@ class Course(NamedTuple):
     streams: Mapping[str, Generator]
 
 
-def course(
-    world: World, seed: int, duration_s: Seconds,
-    change: Callable[[Setup], Setup] = lambda usual: usual,
-) -> Course:
+def course(world: World, seed: int, duration_s: Seconds,
+           change: Callable[[Setup], Setup] = lambda usual: usual) -> Course:
     """Return a motion through a world; equal arguments give equal ones."""
     streams = {name: np.random.default_rng((seed, k)) for k, name in enumerate(STREAMS)}
     generator = np.random.default_rng(seed) if world.one_stream else streams['world']
@@ -179,9 +177,8 @@ def absolute(way: Course, topic: str, truth: Trajectory) -> Measured:
                          setup.jumps_of(topic))
 
 
-def _true_closures(
-    generator: Generator, path: Motion, closures: settings.Closures,
-) -> tuple[IntArray, FloatArray]:
+def _true_closures(generator: Generator, path: Motion,
+                   closures: settings.Closures) -> tuple[IntArray, FloatArray]:
     """Return stamps (L, 2) and measured poses (L, 3) of loop closures at revisited places."""
     stamps = path.truth.stamps_ns
     # by distance, so that a vehicle at rest is at one place only
@@ -256,9 +253,8 @@ def graph_of(way: Course, node_distance: Metres) -> SimulatedGraph:
         np.append(wrong_fixes, len(fixes) + wrong_poses), missing)
 
 
-def odometry_edges(
-    generator: Generator, truth: Trajectory, jumps: Iterable[settings.Jump] = (),
-) -> Factors:
+def odometry_edges(generator: Generator, truth: Trajectory,
+                   jumps: Iterable[settings.Jump] = ()) -> Factors:
     """Return the edges from each node to the next, with the noise of the model."""
     steps, n = se2.between(truth.poses[:-1], truth.poses[1:]), len(truth) - 1
     variances = sensors.model_variances(steps)

@@ -147,9 +147,8 @@ def yaw_rates(generator: Generator, heading: FloatArray, gyro: settings.Gyro) ->
     return np.asarray(np.gradient(heading, PERIOD_S) + bias + noise)
 
 
-def positions(
-    generator: Generator, truth: Trajectory, fixes: settings.Fixes,
-) -> tuple[IntArray, FloatArray]:
+def positions(generator: Generator, truth: Trajectory,
+              fixes: settings.Fixes) -> tuple[IntArray, FloatArray]:
     """Return the stamps of fixes, shape (M,), and their positions, shape (M, 2) [m]."""
     stamps = jittered_stamps(generator, truth, fixes.period_s)
     errors = np.column_stack([
@@ -159,9 +158,8 @@ def positions(
     return stamps, truth.at(stamps)[:, :2] + errors
 
 
-def revisits(
-    generator: Generator, path: Motion, places: IntArray, closures: Closures,
-) -> tuple[IntArray, IntArray]:
+def revisits(generator: Generator, path: Motion, places: IntArray,
+             closures: Closures) -> tuple[IntArray, IntArray]:
     """
     Return the earlier and the later pose of true closures, shape (L,) each, as numbers of places.
     """
@@ -178,10 +176,8 @@ def revisits(
     return old[order[first]], new[order[first]]
 
 
-def with_false(
-    generator: Generator, path: Motion, closures: Closures, ends: IntArray,
-    poses: FloatArray,
-) -> tuple[Measured, int]:
+def with_false(generator: Generator, path: Motion, closures: Closures, ends: IntArray,
+               poses: FloatArray) -> tuple[Measured, int]:
     """
     Return true closures and false ones by their later ends, and how many groups are missing.
 
@@ -243,10 +239,8 @@ def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
     return Trajectory(odometry.stamps_ns, poses)
 
 
-def moved(
-    generator: Generator, stamps_ns: IntArray, values: FloatArray,
-    jumps: list[settings.Jump],
-) -> Measured:
+def moved(generator: Generator, stamps_ns: IntArray, values: FloatArray,
+          jumps: list[settings.Jump]) -> Measured:
     """Return fixes or global poses, shape (M, 2 or 3), with jumps."""
     time = (stamps_ns - START_NS) * 1e-9
     values, wrong = values.copy(), np.full(len(values), -1)
@@ -269,9 +263,8 @@ def heard(stamps_ns: IntArray, topic: str, outages: Iterable[settings.Outage]) -
     return kept
 
 
-def arrivals(
-    generator: Generator, topic: str, stamps_ns: IntArray, setup: Setup,
-) -> tuple[IntArray, IntArray]:
+def arrivals(generator: Generator, topic: str, stamps_ns: IntArray,
+             setup: Setup) -> tuple[IntArray, IntArray]:
     """
     Return which messages of a topic are recorded, and when [ns], shape (K,) each, by that time.
     """

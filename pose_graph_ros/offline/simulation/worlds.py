@@ -54,9 +54,8 @@ class Limits(NamedTuple):
     lateral_acceleration: float  # and across it [m/s^2]
 
 
-def follow(
-    path: FloatArray, stops: IntArray, waits: FloatArray, limits: Limits, duration_s: float,
-) -> tuple[Motion, FloatArray]:
+def follow(path: FloatArray, stops: IntArray, waits: FloatArray, limits: Limits,
+           duration_s: float) -> tuple[Motion, FloatArray]:
     """
     Return the motion along a path every 10 ms, and when each point is reached, shape (P,) [s].
 
@@ -122,9 +121,8 @@ def gauss_markov(generator: Generator, count: int, sigma: float, step: float) ->
     return np.array(list(accumulate(noise.tolist(), lambda last, new: new + decay * last)))
 
 
-def street_corners(
-    rng: Generator, length: float, spacing: FloatArray, *, fresh: float,
-) -> FloatArray:
+def street_corners(rng: Generator, length: float, spacing: FloatArray, *,
+                   fresh: float) -> FloatArray:
     """
     Return the crossings of a random drive through a grid of streets, shape (K, 2) [m].
 
