@@ -89,10 +89,8 @@ class Datum:
                 self.altitude = altitude
             known = math.isfinite(self.altitude)
             if (plane := self.plane) is None or (self._to_lift and known):
-                where = (latitude, longitude) if plane is None else (
-                    plane.latitude, plane.longitude)
-                self.plane = plane = TangentPlane(
-                    *where, self.altitude if known else 0.0, self.yaw)
+                self.plane = plane = TangentPlane(*((latitude, longitude) if plane is None else (
+                    plane.latitude, plane.longitude)), self.altitude if known else 0.0, self.yaw)
                 self._to_lift = not known
         return plane.to_map(
             latitude, longitude, altitude if math.isfinite(altitude) else plane.altitude)
@@ -238,8 +236,7 @@ def yaw_of(q: Message) -> float | None:
 def planar_pose(pose: Message) -> FloatArray | Answer:
     """Return (x, y, yaw) of a Pose, shape (3,), unless it is not finite or has no rotation."""
     p, q = pose.position, pose.orientation
-    yaw = yaw_of(q)
-    if yaw is None or not (math.isfinite(p.x) and math.isfinite(p.y)):
+    if (yaw := yaw_of(q)) is None or not (math.isfinite(p.x) and math.isfinite(p.y)):
         return rejected('not_finite', f'position ({p.x}, {p.y}), quaternion ({q.x}, {q.y}, {q.z}, '
                                       f'{q.w})')
     return np.array((p.x, p.y, wrap_one(yaw)))
@@ -251,8 +248,7 @@ def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometryS
 
     The covariance of its pose is accumulated over the drive, so it is not used.
     """
-    pose = planar_pose(message.pose.pose)
-    if isinstance(pose, Answer):
+    if isinstance(pose := planar_pose(message.pose.pose), Answer):
         return pose
     x, y, _ = pose.tolist()
     if max(abs(x), abs(y)) > ms.LARGEST_COORDINATE:
@@ -294,8 +290,7 @@ def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> ms.G
 
     It is in one of some frames, or in the first of them if it names none.
     """
-    named = frame(message.header.frame_id)
-    if named not in ('', *frames):
+    if (named := frame(message.header.frame_id)) not in ('', *frames):
         return rejected('wrong_frame', f'expected frame {" or ".join(map(repr, frames))}, got '
                                        f'{named!r}')
     pose = planar_pose(message.pose.pose)
@@ -309,8 +304,7 @@ def heading(message: Message, source: 'Source', by: Surroundings) -> ms.HeadingO
     """
     if message.orientation_covariance[0] == -1.0:   # by the definition of the message
         return rejected('no_orientation', 'the sensor reports no orientation')
-    yaw = yaw_of(message.orientation)
-    if yaw is None:
+    if (yaw := yaw_of(message.orientation)) is None:
         q = message.orientation
         return rejected('not_finite', f'quaternion ({q.x}, {q.y}, {q.z}, {q.w})')
     return ms.HeadingOnly(stamp_ns(message, source.time_offset_ns), float(se2.wrap(
@@ -324,8 +318,7 @@ def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> ms.Lo
     The frame of the header names the other pose: a hidden node, such as `x42`, or the pose at a
     stamp [s], such as `@1695.250000000`.
     """
-    pose = planar_pose(message.pose.pose)
-    if isinstance(pose, Answer):
+    if isinstance(pose := planar_pose(message.pose.pose), Answer):
         return pose
     offset_ns, named = source.time_offset_ns, message.header.frame_id
     stamp, cov = stamp_ns(message, offset_ns), _planar(message.pose.covariance)
@@ -353,8 +346,7 @@ def fix(message: Message, source: 'Source', by: Surroundings) -> ms.Fix | Answer
     if abs(latitude) > 90.0 or abs(longitude) > 360.0 or abs(altitude) > 1e5:
         return rejected('out_of_range', f'latitude {latitude}, longitude {longitude}, '
                                         f'altitude {altitude}')
-    stamp = stamp_ns(message, source.time_offset_ns)
-    if stamp <= 0:
+    if (stamp := stamp_ns(message, source.time_offset_ns)) <= 0:
         return rejected('zero_stamp', 'a fix without a stamp')
     if by.datum.waits and by.datum.plane is None:
         return rejected('no_datum', 'wait_for_datum is set: call ~/set_datum, or set datum')
@@ -398,8 +390,7 @@ def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate
     if source.mounting != 'tf' or by.is_of_base(message):
         rate, variance = -velocity.z if source.mounting == 'down' else velocity.z, values[8]
     else:
-        found = by.in_base(message)
-        if found is None:
+        if (found := by.in_base(message)) is None:
             return rejected('unknown_frame', (
                 f'no transform from {frame(message.header.frame_id)!r} to {by.base_frame!r} on '
                 f'/tf_static: publish it, or set {source.name}.mounting'))
@@ -415,12 +406,10 @@ def yaw_rate(message: Message, source: 'Source', by: Surroundings) -> ms.YawRate
 
 def twist(message: Message, source: 'Source', by: Surroundings) -> OdometrySample | Answer:
     """Return the odometry by a TwistWithCovarianceStamped, or the reason for rejecting it."""
-    twist = planar_twist(message.twist.twist)
-    if isinstance(twist, Answer):
+    if isinstance(twist := planar_twist(message.twist.twist), Answer):
         return twist
     if not by.is_of_base(message):
-        found = by.in_base(message)
-        if found is None:
+        if (found := by.in_base(message)) is None:
             return rejected('wrong_frame', (
                 f'expected frame {by.base_frame!r} or one with a transform to it on '
                 f'/tf_static, got {frame(message.header.frame_id)!r}'))

@@ -78,8 +78,7 @@ class _Mcap:
                 at = end
                 continue
             self.n_damaged += 1
-            following = _RECORD.search(data, at + 1)
-            if following is None:
+            if (following := _RECORD.search(data, at + 1)) is None:
                 return
             at = following.start()
 

@@ -44,8 +44,7 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
 
 def switch(given: Mapping[str, str], name: str) -> bool:
     """Return an argument that is true or false, or 1 or 0, in any case of letters."""
-    text = given[name].strip().lower()
-    if text not in SWITCHES:
+    if (text := given[name].strip().lower()) not in SWITCHES:
         raise ConfigError(f'argument {name}: expected true or false, got {given[name]!r}')
     return SWITCHES[text]
 

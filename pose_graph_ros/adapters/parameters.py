@@ -81,8 +81,7 @@ def checked(given: Values) -> dict[str, Any]:
     """Return all parameters: the given values, after a check of type and range, or defaults."""
     parameters = all_parameters(given)
     known = {parameter.name for parameter in parameters}
-    wrong = [str(unknown(name, known)) for name in sorted(set(given) - known)]
-    if len(wrong) > 0:
+    if len(wrong := [str(unknown(name, known)) for name in sorted(set(given) - known)]) > 0:
         raise ConfigError('; '.join(wrong))
     return {parameter.name: checked_value(parameter, given[parameter.name])
             if parameter.name in given else parameter.default for parameter in parameters}

@@ -230,8 +230,7 @@ class MessageReader:
 
     def read(self, name: str, message: Message) -> Measured | Answer:
         """Return the measurement in a message of a source, or the reason for rejecting it."""
-        measurement = self.convert(name, message)
-        if isinstance(measurement, Answer):
+        if isinstance(measurement := self.convert(name, message), Answer):
             return measurement
         return self.keeper.judge(name, measurement).refusal or measurement
 

@@ -91,8 +91,7 @@ def believe(graph: Graph, sigmas: FloatArray, method: str = METHODS[0], *,
     n_parts -= int(np.sum(~graph.is_pose))
     best, rows = None, closures
     for k in range(TRIES if n_parts > 1 else 1):
-        known = _joining(edges, closures, part.astype(np.int64), k)
-        unsure = closures[~np.isin(closures, known)]
+        unsure = closures[~np.isin(closures, _joining(edges, closures, part.astype(np.int64), k))]
         # the start that all other constraints give
         copy = _filled(graph, softened)
         copy.apply(GraphUpdate(remove=unsure.tolist()))
@@ -270,8 +269,7 @@ def residual_scale(errors: FloatArray, covariances: FloatArray, information: Flo
     trace = np.einsum('mij,mji->m', total, common)
     rank = np.count_nonzero(np.einsum('mii->mi', total) > 0.0, axis=1)
     redundancy = np.maximum(rank - trace / scale**2, 0.0) / 3.0
-    n = float(np.sum(redundancy))
-    if n < LEAST_SHOWN:
+    if (n := float(np.sum(redundancy))) < LEAST_SHOWN:
         return scale
     squares = np.einsum('mi,mij,mj->m', mean, total, mean)
     shown = math.sqrt(float(np.sum(squares)) / (3.0 * n))

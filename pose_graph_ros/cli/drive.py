@@ -91,8 +91,7 @@ class Drive:
         if self.truth is not None:
             anchors.insert(0, (self.truth.stamps_ns, self.truth.poses[:, :2]))
         for stamps, positions in anchors:
-            inside = self.odometry.covers(stamps)
-            if np.any(inside):
+            if np.any(inside := self.odometry.covers(stamps)):
                 pose = fit_motion(self.odometry.at(stamps[inside])[:, :2], positions[inside])
                 return Trajectory(self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
         return self.odometry
@@ -339,8 +338,7 @@ def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory
 
     Raises `BagError` if the topic is missing or of an unsupported type.
     """
-    info = bag.topics.get(topic)
-    if info is None or info.type not in POSE_TYPES:
+    if (info := bag.topics.get(topic)) is None or info.type not in POSE_TYPES:
         what = 'no topic' if info is None else f'type {info.type} of'
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')

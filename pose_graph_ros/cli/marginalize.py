@@ -21,8 +21,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     file = read(options.graph, options.edge2)
     if options.nodes == LANDMARKS:
-        leaving = np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)
-        if len(leaving) == 0:
+        if len(leaving := np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)) == 0:
             raise ConfigError(f'{options.graph}: has no landmarks')
     else:
         leaving = rows_of(file.ids, options.nodes, '--nodes')
@@ -32,8 +31,7 @@ def execute(options: argparse.Namespace) -> int:
     graph.fill(file.rows)
     before = graph.energies().chi2
     graph.apply(marginalize(graph, file.rows.node_ids[leaving]))
-    sizes = [len(prior.nodes) for prior in graph.priors]
-    if len(sizes) > 0 and not options.sparse:
+    if len(sizes := [len(prior.nodes) for prior in graph.priors]) > 0 and not options.sparse:
         raise ConfigError(f'{options.graph}: without these nodes there are {len(sizes)} dense '
                           f'priors, the largest one on {max(sizes)} nodes, which g2o does not '
                           'have; --sparse puts edges in their place')
@@ -42,8 +40,7 @@ def execute(options: argparse.Namespace) -> int:
         without.fill(rows._replace(priors=()))
         without.apply(GraphUpdate(factors=standing_for(rows)))
         graph = without
-    n_biases = int(np.count_nonzero(graph.is_bias))
-    if n_biases > 0:
+    if (n_biases := int(np.count_nonzero(graph.is_bias))) > 0:
         print(f'warning: {n_biases} biases are left out of the g2o file; measurements with them '
               'are written as if their errors were white', file=sys.stderr)
     write_g2o(graph, options.out, np.delete(file.ids, leaving))

@@ -131,8 +131,7 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
     rows, (reference, _) = {row.name: row for row in drive.rows}, _compared(drive)
 
     def label(name: str) -> str:
-        row = rows.get(f'{name} to {reference}')
-        if row is None:
+        if (row := rows.get(f'{name} to {reference}')) is None:
             return name
         digits = 2 if row.rms < 10.0 else 1
         return f'{name}\nmedian {row.median:.{digits}f} m, rms {row.rms:.{digits}f} m'

@@ -175,12 +175,10 @@ class _Corrector:
             source = message.decode()
         except MessageError:
             return
-        sample = self._reader.read(self._source, source)
-        if not isinstance(sample, OdometrySample):
+        if not isinstance(sample := self._reader.read(self._source, source), OdometrySample):
             return
         stamp_ns, odometry = sample.stamp_ns, _pose(sample)
-        pose = self._correction.at(stamp_ns, odometry)
-        if pose is None:
+        if (pose := self._correction.at(stamp_ns, odometry)) is None:
             return
         covariance = self._covariances[bisect.bisect_right(self._stamps, stamp_ns) - 1]
         yield ODOMETRY, output_cdr.odometry_cdr(

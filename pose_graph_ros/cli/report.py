@@ -91,8 +91,7 @@ def _file(options: argparse.Namespace) -> Path | None:
             raise FileFormatError(f'{first}: expected {FILE}, or a file with the suffix '
                                   f'{", ".join(BAG_SUFFIXES)}')
         return None
-    given = [name for name in OF_REPLAY if getattr(options, name)]
-    if len(given) > 0:
+    if len(given := [name for name in OF_REPLAY if getattr(options, name)]) > 0:
         option = {'begin': 'from'}.get(given[0], given[0]).replace('_', '-')
         raise ConfigError(f'--{option}: {first} has been run already; the option is for a bag')
     return file

@@ -85,8 +85,7 @@ def inputs_of(bag: bags.Bag, options: argparse.Namespace, values: Values,
     limits = [None if seconds is None else bag.start_ns + round(seconds * 1e9)
               for seconds in (options.begin, options.until)]
     length = (bag.end_ns - bag.start_ns) * 1e-9
-    until = math.inf if options.until is None else options.until
-    if (options.begin or 0.0) >= min(length, until):
+    if (options.begin or 0.0) >= min(length, math.inf if options.until is None else options.until):
         raise bags.BagError(f'{bag.path}: nothing was recorded between --from and --until; the '
                             f'recording is {max(length, 0.0):.3f} s long')
     return bags.choose_inputs(bag, source_list(values), wanted_topics(options), hold_out,

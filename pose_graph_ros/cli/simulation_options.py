@@ -213,8 +213,7 @@ def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:
 
 def _groups(text: str) -> tuple[int, int]:
     """Return the number of groups of false closures and their size."""
-    words = text.split(':')
-    if len(words) > 2 or not all(each.isdecimal() for each in words):
+    if len(words := text.split(':')) > 2 or not all(each.isdecimal() for each in words):
         raise argparse.ArgumentTypeError(f'expected N or N:SIZE, got {text!r}')
     groups, size = int(words[0]), int(words[1]) if len(words) == 2 else FALSE_SIZE
     if size < 2:

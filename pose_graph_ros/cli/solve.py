@@ -200,8 +200,7 @@ class Report(NamedTuple):
 
     def lines(self) -> list[str]:
         """Return what is printed."""
-        made = self.certificate
-        if made is None:
+        if (made := self.certificate) is None:
             return [f'certificate: not attempted, because {self.reason}']
         lines = [(f'certificate: certified, {self.seconds:.3f} s: the chordal objective, '
                   f'{made.chi2:.9g} at its minimum, is nowhere lower by more than {made.gap:.2g}')

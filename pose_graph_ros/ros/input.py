@@ -134,8 +134,7 @@ class Arrivals:
         """Return what to say if its newest messages were all refused, else an empty text."""
         refused = Counter({reason: counts[name, reason] for name, reason in details
                            if name == self.source and reason not in INTENDED})
-        accepted = counts[self.source, 'accepted']
-        if accepted > self.accepted:
+        if (accepted := counts[self.source, 'accepted']) > self.accepted:
             self.accepted, self.accepted_at, self.refused = accepted, now, refused
         newest = refused - self.refused
         count = newest.total()
@@ -290,8 +289,7 @@ class Input:
         """Return which messages can be used now, after counting a new one."""
         now, arrivals = time.monotonic(), self.arrivals[source]
         arrivals.receive(now)
-        measurement = self.read(source, message)
-        if measurement is None:
+        if (measurement := self.read(source, message)) is None:
             return Decision([])
         if isinstance(measurement, OdometrySample):
             self._odometry_at = now

@@ -72,8 +72,7 @@ class NodeLog(logging.Handler):
 
     def _repeated(self, record: logging.LogRecord) -> int:
         """Return how many records like this one were left out; -1 if this one is to be, too."""
-        key = getattr(record, 'way', None)
-        if key is None:
+        if (key := getattr(record, 'way', None)) is None:
             key = record.levelno, record.pathname, record.lineno, NUMBER.sub(
                 '', record.getMessage())
             if record.exc_info and record.exc_info[2] is not None:
@@ -106,8 +105,7 @@ def verdict_lines(changes: list[Change], doubted: set[str]) -> Iterator[tuple[in
     """
     ways: dict[tuple[str, Judged, int, str], list[Change]] = {}
     for change in changes:
-        was_in = change.before is not None and change.before.in_graph
-        if was_in and not change.after.in_graph:
+        if (change.before is not None and change.before.in_graph) and not change.after.in_graph:
             way = logging.WARNING, 'that had been believed {} thrown out'
         elif change.before is State.DOUBTED and change.after.in_graph:
             way = logging.INFO, 'that had been doubted {} now believed'

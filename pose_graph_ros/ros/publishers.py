@@ -268,8 +268,7 @@ def thinned(path: Trajectory, n_frozen: int) -> Trajectory:
     n is the smallest with at most 20 000 of them, a quarter of a day at 1 m/s: so poses that are
     published stay the same until it grows.
     """
-    step = -(-n_frozen // 20_000)
-    if step <= 1:
+    if (step := -(-n_frozen // 20_000)) <= 1:
         return path
     kept = np.concatenate((np.arange(0, n_frozen, step), np.arange(n_frozen, len(path))))
     return Trajectory(path.stamps_ns[kept], path.poses[kept])

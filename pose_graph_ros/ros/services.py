@@ -1,58 +1,45 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What a person asks for: the services of the node, poses that are set, decisions on constraints.
+The services of the node; each answers what was done, or why it was not.
 
-Each service answers what was done, or why it was not. Those that wait, for the worker or for
-files, are served by a thread and a hidden node of their own, so that neither odometry nor
-transforms wait for them.
+Those that wait, for the worker or for files, are served by a thread and a hidden node of their
+own, so that neither odometry nor transforms wait for them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 import logging
 from pathlib import Path
 from threading import Thread
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-import numpy as np
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from pose_graph_ros.adapters.conversions import datum_of, frame, Message, pose_in
-from pose_graph_ros.adapters.sources import backend_config, JUDGE, SET_POSE
-from pose_graph_ros.core import measurements
+from pose_graph_ros.adapters.sources import backend_config
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig
-from pose_graph_ros.core.estimate import Estimate
-from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGraphError
-from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph, site_refusal
-from pose_graph_ros.core.judgement.verdicts import Decision
-from pose_graph_ros.core.measurements import Answer, AnswerStatus, GlobalPose, rejected
-from pose_graph_ros.ros.log import ANSWER
+from pose_graph_ros.core.exceptions import FileFormatError, PoseGraphError
+from pose_graph_ros.core.io.graph_files import write_graph
+from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
+from pose_graph_ros.ros.session import Session
 from pose_graph_ros.ros.spinning import Spinner
-from pose_graph_ros.ros.worker import Worker
-
-if TYPE_CHECKING:
-    from pose_graph_ros.ros.session import Session
+from pose_graph_ros.ros.worker import graph_path, restored, Worker
 
 logger = logging.getLogger(__name__)
 
 REPLACED = 'the graph was replaced meanwhile'
 CLOSED = 'the node was cleaned up meanwhile'
 SERVICE_THREAD, HIDDEN_NODE = 'pose graph services', '_services'
-Done = tuple[bool, str]
+Answer = tuple[bool, str]
 """Whether what was asked for was done, and a sentence on it."""
 
 
 class Services:
     """Offers the services of a configured node."""
 
-    def __init__(self, node: Node, session: 'Session') -> None:
+    def __init__(self, node: Node, session: Session) -> None:
         self._node, self._session = node, session
         self._closed = self._saving = False
         self._quick = [node.create_service(Trigger, '~/reset', self._answering(self._reset)),
@@ -86,7 +73,7 @@ class Services:
             self._node.destroy_service(service)
         self._spinner.stop()
 
-    def _answering(self, act: Callable[[Any], Done]) -> Callable[[Any, Any], Any]:
+    def _answering(self, act: Callable[[Any], Answer]) -> Callable[[Any, Any], Any]:
         """Return the callback of a service, which never raises."""
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -106,7 +93,7 @@ class Services:
         if self._closed or self._session.worker is not worker:
             raise CancelledError
 
-    def _optimize(self, _: Trigger.Request) -> Done:
+    def _optimize(self, _: Trigger.Request) -> Answer:
         worker = self._session.worker
         try:
             report = self._session.optimize().result()
@@ -121,7 +108,7 @@ class Services:
             f'{report.status.value} after {report.iterations} iterations, chi2 {report.chi2:.6g}'
             + (f': {report.reason}' if report.reason != '' else ''))
 
-    def _reset(self, _: Trigger.Request) -> Done:
+    def _reset(self, _: Trigger.Request) -> Answer:
         estimate = self._session.worker.estimate
         self._session.reset()
         plane = self._session.input.reader.datum.plane
@@ -129,7 +116,7 @@ class Services:
             'the next good fix will be the datum' if plane is None else
             f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]')
 
-    def _pause(self, request: SetBool.Request) -> Done:
+    def _pause(self, request: SetBool.Request) -> Answer:
         received = self._session.input
         if received.paused == request.data:
             return True, 'paused already' if request.data else 'was not paused'
@@ -137,7 +124,7 @@ class Services:
         return True, ('paused: measurements are counted but not used; poses still '
                       'follow the odometry' if request.data else 'resumed')
 
-    def _set_datum(self, _: Trigger.Request) -> Done:
+    def _set_datum(self, _: Trigger.Request) -> Answer:
         """Let the next good fix be the datum, unless the graph refers to the present one."""
         session, worker = self._session, self._session.worker
         for _ in range(10):  # more may be posted meanwhile
@@ -159,12 +146,12 @@ class Services:
         datum.renew()
         return True, 'the next good fix will be the datum'
 
-    def _with_file(self, act: Callable[[Path], str]) -> Callable[[Trigger.Request], Done]:
+    def _with_file(self, act: Callable[[Path], str]) -> Callable[[Trigger.Request], Answer]:
         """Return an action on the file of the graph."""
         hint = (f'; to name another file: ros2 param set {self._node.get_fully_qualified_name()} '
                 'graph_file FILE')
 
-        def answer(_: Trigger.Request) -> Done:
+        def answer(_: Trigger.Request) -> Answer:
             try:
                 return True, act(graph_path(self._session.values)) + hint
             except PoseGraphError as error:
@@ -218,137 +205,3 @@ class Services:
         done.result()
         return (f'{len(saved.nodes.ids)} hidden nodes from {path}, datum '
                 f'{"none" if saved.datum is None else saved.datum}')
-
-
-# --- what the engine is asked for, and the file of the graph; no rclpy
-
-# Stamps that stand for the newest odometry (if the message has no stamp), and for the first
-# odometry (if the message came before it) [ns].
-NEWEST, FIRST = 2**62, 1
-
-
-class SetPoseInput:
-    """Keeps the newest pose that was set until there is odometry that it can be applied to."""
-
-    def __init__(self, frames: Sequence[str]) -> None:
-        self._frames = frames  # of map, odometry and robot
-        self.waiting: tuple[str, GlobalPose] | None = None     # and the frame that it is in
-
-    def receive(self, message: Message, *, early: bool = False) -> Answer | None:
-        """Return why a message cannot be used; None if it can and is kept for `pop`."""
-        given = pose_in(message, self._frames)
-        if isinstance(given, Answer):
-            return given
-        if (broken := measurements.value_defect(given.pose)) is not None:
-            return rejected(broken, f'pose {given.pose.tolist()}')
-        cov, variance = given.covariance, np.diagonal(given.covariance)
-        if not (np.all(np.isfinite(cov)) and np.all(variance > 0.0)
-                and np.all(variance <= covariance.LARGEST_VARIANCE)):
-            cov = np.diag((0.5, 0.5, 0.26)) ** 2    # what RViz sends [m, m, rad]
-        stamp = FIRST if early else given.stamp_ns
-        self.waiting = frame(message.header.frame_id), GlobalPose(
-            stamp if stamp > 0 else NEWEST, given.pose, cov)
-        return None
-
-    def pop(self, estimate: Estimate) -> GlobalPose | None:
-        """Remove and return the pose, transformed to the map by an estimate; None for none."""
-        waiting, self.waiting = self.waiting, None
-        if waiting is None:
-            return None
-        named, given = waiting
-        _, odom_frame, base_frame = self._frames
-        T_map_frame = {odom_frame: estimate.T_map_odom, base_frame: estimate.T_map_base}.get(named)
-        if T_map_frame is None:
-            return given
-        turn = np.eye(3)
-        turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
-        return GlobalPose(given.stamp_ns, se2.compose(T_map_frame, given.pose),
-                          turn @ given.covariance @ turn.T)
-
-
-def decide(message: Message, worker: Worker) -> None:
-    """Hand a decision to the engine, which answers in the log; an update follows at once."""
-    def act(backend: PoseGraphBackend) -> None:
-        name, text = str(message.key).strip(), str(message.value).strip().lower()
-        choices = [decision.value for decision in Decision]
-        answer = backend.decide(name, Decision(text)) if text in choices else rejected(
-            'unknown_decision', f'expected one of {", ".join(choices)} as the value for the key '
-            f'{name!r}, got {text!r}')
-        refused = answer.status is AnswerStatus.REJECTED
-        backend.counts[JUDGE, answer.reason if refused else 'accepted'] += 1
-        _tell(answer, 'nothing is decided', answer.detail or f'{message.key}: {message.value}')
-        worker.request_update()     # here, as jobs are done after one that was asked for before
-    worker.call(act, 'a decision')
-
-
-def set_pose(pose: GlobalPose, map_frame: str, worker: Worker) -> None:
-    """Hand a pose to the engine, which answers in the log; an update follows at once."""
-    def act(backend: PoseGraphBackend) -> None:
-        x, y, yaw = pose.pose
-        where = f'to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {map_frame}'
-        _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
-              f'the pose is set {where}')
-        worker.request_update()
-    worker.call(act, 'a pose that is set')
-
-
-def _tell(answer: Answer, refused: str, done: str) -> None:
-    """Log an answer to a person."""
-    if answer.status is AnswerStatus.REJECTED:
-        logger.warning('%s: %s: %s', refused, answer.reason, answer.detail, extra=ANSWER)
-    else:
-        logger.info('%s', done)
-
-
-def graph_path(values: Mapping[str, Any]) -> Path:
-    """Return the file that graph_file names; raises `ConfigError` if it names none."""
-    name = values['graph_file']
-    if name == '':
-        raise ConfigError('parameter graph_file: expected the name of a file, such as '
-                          "~/map.g2o, got ''")
-    try:
-        return Path(name).expanduser().absolute()
-    except RuntimeError as error:
-        raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
-
-
-def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, MapOrigin | None]:
-    """
-    Return file and datum of the graph that a node starts with; None before one was saved.
-
-    Only the checksums and the datum are read, as whoever configures the node waits for it.
-    """
-    if not values['load_graph_on_start']:
-        return None, None
-    path, plane = graph_path(values), datum_of(values).plane
-    try:
-        if not path.is_dir() and not any(map(Path.exists, graph_paths(path))):
-            logger.warning('there is no graph in %s yet: starting with an empty one, which '
-                           '~/save_graph writes there', path)
-            return None, None
-        datum = read_datum(path)
-    except (FileFormatError, OSError) as error:
-        raise ConfigError(f'parameter load_graph_on_start: {error}') from error
-    if datum is not None and plane is not None and (
-            refusal := datum_refusal(datum, plane.origin)) is not None:
-        raise ConfigError(f'parameter load_graph_on_start: {path}: {refusal}')
-    return path, datum
-
-
-def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
-    """Return an engine that continues a saved graph; None, which is logged, if that fails."""
-    try:
-        saved, backend = restored(path, config)
-    except Exception:
-        logger.exception('%s could not be loaded: a new graph is started', path)
-        return None
-    logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), path)
-    return backend
-
-
-def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
-    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
-    saved = read_graph(path)
-    backend = PoseGraphBackend.restored(config, saved)
-    backend.update()
-    return saved, backend

@@ -31,9 +31,8 @@ from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros import diagnostics, publishers, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.log import ANSWER, NUMBER
-from pose_graph_ros.ros.services import continued, decide, initial_graph, set_pose, SetPoseInput
 from pose_graph_ros.ros.spinning import guarded
-from pose_graph_ros.ros.worker import Worker
+from pose_graph_ros.ros.worker import continued, initial_graph, SetPoseInput, Worker
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +105,8 @@ class Session:
         sources = self.input.reader.sources.values()
         callbacks: dict[str, Callable[[Any], None]] = {
             'initialpose': self._on_set_pose, 'set_pose': self._on_set_pose,
-            topics.JUDGE_TOPIC: lambda message: decide(message, self.worker)}
+            # the worker is replaced with the graph
+            topics.JUDGE_TOPIC: lambda message: self.worker.decide(message)}  # noqa: PLW0108
         if any(source.kind.in_frames for source in sources):
             callbacks[topics.STATIC_TOPIC] = self.input.reader.frames.receive
         wanted = [(topic, *given, callbacks[topic]) for topic, given in topics.INPUTS.items()
@@ -212,7 +212,7 @@ class Session:
         if estimate is None or (pose := self._set_pose_input.pop(estimate)) is None:
             return
         self.out.jump()
-        set_pose(pose, self.out.map_frame, self.worker)
+        self.worker.set_pose(pose, self.out.map_frame)
 
     # ---- time
 
@@ -245,8 +245,7 @@ class Session:
         for source, message, *_ in messages:
             self.input.arrivals[source].count += 1
             # read again, as the first fix of the new graph may be its datum
-            measurement = self.input.read(source, message)
-            if measurement is not None:
+            if (measurement := self.input.read(source, message)) is not None:
                 self._use(ReceivedMessage(source, message, measurement))
 
     def load(self, saved: SavedGraph, backend: PoseGraphBackend, name: str) -> None:

@@ -1,8 +1,9 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The thread that owns the engine: the single writer of the graph. Imports no ROS.
+The thread that owns the engine: the single writer of the graph, and what a person asks it for.
 
+Imports no ROS.
 Callbacks post measurements and request updates or jobs; they never wait for a solver. They read
 an immutable estimate that the thread replaces as a whole. While there is nothing else to do after
 an update, the thread refines the estimate, and then waits.
@@ -13,21 +14,30 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 import logging
+from pathlib import Path
 import threading
 import time
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from pose_graph_ros.adapters.sources import Measured
+import numpy as np
+
+from pose_graph_ros.adapters.conversions import datum_of, frame, Message, pose_in
+from pose_graph_ros.adapters.sources import JUDGE, Measured, SET_POSE
+from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
-from pose_graph_ros.core.exceptions import PoseGraphError
-from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
-from pose_graph_ros.core.measurements import OdometrySample
+from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGraphError
+from pose_graph_ros.core.geometry import covariance, se2
+from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph
+from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
+from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
 from pose_graph_ros.core.odometry.gyro import Difference
 from pose_graph_ros.core.sources.bias import Calibration
 from pose_graph_ros.core.sources.source_report import SourceReport
-from pose_graph_ros.ros.log import verdict_lines
+from pose_graph_ros.ros.log import ANSWER, verdict_lines
 
 logger = logging.getLogger(__name__)
 
@@ -135,6 +145,30 @@ class Worker:
                 self._condition.notify()
         return future
 
+    def decide(self, message: Message) -> None:
+        """Hand a decision to the engine, which answers in the log; an update follows at once."""
+        def act(backend: PoseGraphBackend) -> None:
+            name, text = str(message.key).strip(), str(message.value).strip().lower()
+            choices = [decision.value for decision in Decision]
+            answer = backend.decide(name, Decision(text)) if text in choices else ms.rejected(
+                'unknown_decision', f'expected one of {", ".join(choices)} as the value for the '
+                f'key {name!r}, got {text!r}')
+            refused = answer.status is ms.AnswerStatus.REJECTED
+            backend.counts[JUDGE, answer.reason if refused else 'accepted'] += 1
+            _tell(answer, 'nothing is decided', answer.detail or f'{message.key}: {message.value}')
+            self.request_update()   # here, as jobs are done after one that was asked for before
+        self.call(act, 'a decision')
+
+    def set_pose(self, pose: ms.GlobalPose, map_frame: str) -> None:
+        """Hand a pose to the engine, which answers in the log; an update follows at once."""
+        def act(backend: PoseGraphBackend) -> None:
+            x, y, yaw = pose.pose
+            where = f'to ({x:.3f}, {y:.3f}, {yaw:.3f}) in {map_frame}'
+            _tell(backend.set_pose(pose, SET_POSE), f'the pose is not set {where}',
+                  f'the pose is set {where}')
+            self.request_update()
+        self.call(act, 'a pose that is set')
+
     def _run(self) -> None:
         try:
             self._backend = self._prepare(lambda: self._stopping) or self._backend
@@ -179,7 +213,7 @@ class Worker:
             if self._stopping:
                 return
             try:
-                if isinstance(measurement, OdometrySample):
+                if isinstance(measurement, ms.OdometrySample):
                     self._backend.add_odometry(measurement, source)
                 else:
                     self._backend.add_measurement(measurement, source)
@@ -282,3 +316,109 @@ class Worker:
             differences=backend.gyro_differences(),
             verdicts=verdicts, n_changes=status.n_changes + len(changes))
         return len(changes)
+
+
+# --- what a person asks for: poses that are set, decisions on constraints, files of the graph
+
+# Stamps that stand for the newest odometry (if the message has no stamp), and for the first
+# odometry (if the message came before it) [ns].
+NEWEST, FIRST = 2**62, 1
+
+
+class SetPoseInput:
+    """Keeps the newest pose that was set until there is odometry that it can be applied to."""
+
+    def __init__(self, frames: Sequence[str]) -> None:
+        self._frames = frames  # of map, odometry and robot
+        self.waiting: tuple[str, ms.GlobalPose] | None = None     # and the frame that it is in
+
+    def receive(self, message: Message, *, early: bool = False) -> ms.Answer | None:
+        """Return why a message cannot be used; None if it can and is kept for `pop`."""
+        if isinstance(given := pose_in(message, self._frames), ms.Answer):
+            return given
+        if (broken := ms.value_defect(given.pose)) is not None:
+            return ms.rejected(broken, f'pose {given.pose.tolist()}')
+        cov, variance = given.covariance, np.diagonal(given.covariance)
+        if not (np.all(np.isfinite(cov)) and np.all(variance > 0.0)
+                and np.all(variance <= covariance.LARGEST_VARIANCE)):
+            cov = np.diag((0.5, 0.5, 0.26)) ** 2    # what RViz sends [m, m, rad]
+        stamp = FIRST if early else given.stamp_ns
+        self.waiting = frame(message.header.frame_id), ms.GlobalPose(
+            stamp if stamp > 0 else NEWEST, given.pose, cov)
+        return None
+
+    def pop(self, estimate: Estimate) -> ms.GlobalPose | None:
+        """Remove and return the pose, transformed to the map by an estimate; None for none."""
+        waiting, self.waiting = self.waiting, None
+        if waiting is None:
+            return None
+        named, given = waiting
+        _, odom_frame, base_frame = self._frames
+        T_map_frame = {odom_frame: estimate.T_map_odom, base_frame: estimate.T_map_base}.get(named)
+        if T_map_frame is None:
+            return given
+        turn = np.eye(3)
+        turn[:2, :2] = se2.rotation(float(T_map_frame[2]))
+        return ms.GlobalPose(given.stamp_ns, se2.compose(T_map_frame, given.pose),
+                          turn @ given.covariance @ turn.T)
+
+
+def _tell(answer: ms.Answer, refused: str, done: str) -> None:
+    """Log an answer to a person."""
+    if answer.status is ms.AnswerStatus.REJECTED:
+        logger.warning('%s: %s: %s', refused, answer.reason, answer.detail, extra=ANSWER)
+    else:
+        logger.info('%s', done)
+
+
+def graph_path(values: Mapping[str, Any]) -> Path:
+    """Return the file that graph_file names; raises `ConfigError` if it names none."""
+    if (name := values['graph_file']) == '':
+        raise ConfigError('parameter graph_file: expected the name of a file, such as '
+                          "~/map.g2o, got ''")
+    try:
+        return Path(name).expanduser().absolute()
+    except RuntimeError as error:
+        raise ConfigError(f'parameter graph_file: {name!r}: {error}') from error
+
+
+def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, MapOrigin | None]:
+    """
+    Return file and datum of the graph that a node starts with; None before one was saved.
+
+    Only the checksums and the datum are read, as whoever configures the node waits for it.
+    """
+    if not values['load_graph_on_start']:
+        return None, None
+    path, plane = graph_path(values), datum_of(values).plane
+    try:
+        if not path.is_dir() and not any(map(Path.exists, graph_paths(path))):
+            logger.warning('there is no graph in %s yet: starting with an empty one, which '
+                           '~/save_graph writes there', path)
+            return None, None
+        datum = read_datum(path)
+    except (FileFormatError, OSError) as error:
+        raise ConfigError(f'parameter load_graph_on_start: {error}') from error
+    if datum is not None and plane is not None and (
+            refusal := datum_refusal(datum, plane.origin)) is not None:
+        raise ConfigError(f'parameter load_graph_on_start: {path}: {refusal}')
+    return path, datum
+
+
+def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
+    """Return an engine that continues a saved graph; None, which is logged, if that fails."""
+    try:
+        saved, backend = restored(path, config)
+    except Exception:
+        logger.exception('%s could not be loaded: a new graph is started', path)
+        return None
+    logger.info('continuing with %d hidden nodes from %s', len(saved.nodes.ids), path)
+    return backend
+
+
+def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
+    """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
+    saved = read_graph(path)
+    backend = PoseGraphBackend.restored(config, saved)
+    backend.update()
+    return saved, backend

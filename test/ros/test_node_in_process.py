@@ -32,7 +32,7 @@ from std_srvs.srv import SetBool, Trigger
 from pose_graph_ros.adapters.parameter_table import Change
 from pose_graph_ros.adapters.parameters import all_parameters, checked, constraints
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros import diagnostics, requests, services
+from pose_graph_ros.ros import diagnostics, services, worker as requests
 from pose_graph_ros.ros.diagnostics import concerns
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED

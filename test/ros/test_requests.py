@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.ros.services import NEWEST, SetPoseInput
+from pose_graph_ros.ros.worker import NEWEST, SetPoseInput
 
 ESTIMATE = Space(T_map_odom=np.array([10.0, 5.0, 1.0]), T_map_base=np.array([20.0, -3.0, -2.0]))
 

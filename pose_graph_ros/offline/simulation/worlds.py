@@ -64,9 +64,8 @@ def follow(path: FloatArray, stops: IntArray, waits: FloatArray, limits: Limits,
     starts at rest, and at the stops, which are indices of poses.
     """
     length = path_length(path)
-    curvature = np.gradient(path[:, 2], length)
     speed_limit = np.minimum(limits.speed, np.sqrt(
-        limits.lateral_acceleration / np.maximum(np.abs(curvature), 1e-6)))
+        limits.lateral_acceleration / np.maximum(np.abs(np.gradient(path[:, 2], length)), 1e-6)))
     speed_limit[[0, *stops]] = 0.0
     # v^2 changes by at most 2 a per metre: take the lower envelope of cones over the limits
     slope = 2.0 * limits.acceleration * length
