@@ -251,31 +251,20 @@ def as_yaml() -> str:
              '# Generated from the tables in pose_graph_ros/adapters/parameter_table.py by',
              '# `pose-graph parameters --yaml`. pose_graph.yaml has what most robots need.',
              '/**:', '  ros__parameters:']
-    commented, group = set[str](), ''
-    for parameter in PARAMETERS:
+    group = ''
+    for parameter in all_parameters({}):
         before, (group, _, leaf) = group, parameter.name.rpartition('.')
         if group not in ('', before):
             lines.append(f'    {group}:')
-        lines += _entry(parameter, leaf, '    ' if group == '' else '      ', commented)
-    for source in listed_sources({}):
-        lines.append(f'    {source}:')
-        for parameter in source_parameters(source, str(type_parameter(source).default)):
-            lines += _entry(parameter, parameter.name.partition('.')[2], '      ', commented)
+        indent = '    ' if group == '' else '      '
+        facts = '; '.join(filter(None, (
+            parameter.unit, _range(parameter), parameter.change.value)))
+        comment = f'{indent}# {parameter.description} [{facts}]'
+        # the same one is not repeated
+        lines += [] if comment in lines else [comment]
+        lines.append(f'{indent}# {leaf}: {_EXAMPLES[leaf]}' if parameter.default == [] else
+                     f'{indent}{leaf}: {_yaml(parameter.default)}')
     return '\n'.join(lines) + '\n'
-
-
-def _entry(parameter: Parameter, leaf: str, indent: str, commented: set[str]) -> Iterator[str]:
-    """Return the lines of one parameter; a comment in `commented` is not repeated."""
-    facts = '; '.join(fact for fact in (
-        parameter.unit, _range(parameter), parameter.change.value) if fact != '')
-    comment = f'{indent}# {parameter.description} [{facts}]'
-    if comment not in commented:
-        commented.add(comment)
-        yield comment
-    if parameter.default == []:
-        yield f'{indent}# {leaf}: {_EXAMPLES[leaf]}'
-    else:
-        yield f'{indent}{leaf}: {_yaml(parameter.default)}'
 
 
 def as_markdown() -> str:
@@ -314,7 +303,7 @@ def constraints(parameter: Parameter) -> str:
         f'{sizes} numbers' + (', or unset' if 0 in parameter.sizes else '') if sizes else '',
         f'unit: {parameter.unit}' if parameter.unit != '' else '',
         'only while the node is not configured' if parameter.change is Change.UNCONFIGURED else '')
-    return '; '.join(fact for fact in facts if fact != '')
+    return '; '.join(filter(None, facts))
 
 
 def _yaml(value: Value) -> str:

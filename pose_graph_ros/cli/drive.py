@@ -211,24 +211,13 @@ def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
             'errors': [asdict(row) for row in drive.rows], **extra}
 
 
-class Samples:
-    """Samples of a path, as they come."""
-
-    def __init__(self) -> None:
-        self._stamps, self._poses = array('q'), array('d')
-
-    def add(self, stamp_ns: StampNs, pose: se2.PoseVector) -> None:
-        """Add a sample."""
-        self._stamps.append(stamp_ns)
-        self._poses.extend(pose)
-
-    def path(self) -> Trajectory:
-        """Return them by stamp, the first one of equal stamps; of very many only some."""
-        stride = 1
-        while len(self._stamps) // stride >= MOST_SAMPLES:
-            stride *= 2
-        stamps, first = np.unique(np.array(self._stamps)[::stride], return_index=True)
-        return Trajectory(stamps, np.array(self._poses).reshape(-1, 3)[::stride][first])
+def _path_of(samples: 'array[int]', poses: 'array[float]') -> Trajectory:
+    """Return samples as a path, the first one of equal stamps; of very many only some."""
+    stride = 1
+    while len(samples) // stride >= MOST_SAMPLES:
+        stride *= 2
+    stamps, first = np.unique(np.array(samples)[::stride], return_index=True)
+    return Trajectory(stamps, np.array(poses).reshape(-1, 3)[::stride][first])
 
 
 Measured = tuple[str, OdometrySample | Measurement, bool]
@@ -283,7 +272,8 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
     estimate, verdicts = backend.estimate(), backend.verdicts()
     assert estimate is not None, 'a drive has a hidden node'
     corrected = estimate.path
-    odometry, loops, sources, held = Samples(), list[Key](), list[str](), list[bool]()
+    loops, sources, held = list[Key](), list[str](), list[bool]()
+    odometry = array('q'), array('d')
     fixes = list[Fix | kinds.GlobalPose | kinds.Position]()
     arrived: dict[str, array[int]] = {}
     for source, measurement, held_out in measurements:
@@ -297,7 +287,8 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
             case kinds.LoopClosure(stamp, _, _, int(reference)):
                 loops.append((source, stamp, reference))
             case OdometrySample(stamp, pose) if source == odometry_source:
-                odometry.add(stamp, pose)
+                odometry[0].append(stamp)
+                odometry[1].extend(pose)
     stamps = np.array([each.stamp_ns for each in fixes], dtype=np.int64)
     arms = np.array([np.zeros(2) if isinstance(each, kinds.GlobalPose) else each.lever_arm
                      for each in fixes]).reshape(-1, 2)
@@ -325,7 +316,7 @@ def collect_drive(measurements: Iterable[Measured], backend: PoseGraphBackend,
         lost[at[np.unique(stamps[at], return_index=True)[1]]] = False
     refused = {key for key in loops if key[0] in judged} if refused is None else refused
     return Drive(
-        odometry.path(), corrected, None, stamps, positions,
+        _path_of(*odometry), corrected, None, stamps, positions,
         np.where(kept_out, HELD_OUT, np.where(lost, REFUSED, states)), sources,
         np.array([(earlier, later) for _, later, earlier in loops], np.int64).reshape(-1, 2),
         np.array([known.get(key, REFUSED if key in refused else BELIEVED) for key in loops], int),
@@ -342,11 +333,12 @@ def read_truth(bag: Bag, topic: str, span: bags.Span = bags.WHOLE) -> Trajectory
         what = 'no topic' if info is None else f'type {info.type} of'
         raise BagError(f'{bag.path}: {what} {topic} (--truth); expected one of '
                        f'{", ".join(POSE_TYPES)}; the bag has {bag.describe()}')
-    poses = Samples()
+    samples, poses = array('q'), array('d')
     for bag_message in bag.messages([topic], span):
         with suppress(MessageError):
             message = bag_message.decode()
             pose = planar_pose(message.pose if info.type == POSE else message.pose.pose)
             if not isinstance(pose, Answer):
-                poses.add(stamp_ns(message), pose)
-    return poses.path()
+                samples.append(stamp_ns(message))
+                poses.extend(pose)
+    return _path_of(samples, poses)

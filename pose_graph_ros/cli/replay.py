@@ -103,46 +103,6 @@ def write_lines(path: Path, lines: Iterator[str]) -> None:
         file.writelines(f'{line}\n' for line in lines)
 
 
-class LivePoses:
-    """
-    Poses at the messages of odometry, each by the newest estimate that there was by then.
-
-    As in the node, odometry goes on from the estimate of the last update, and the graph is updated
-    as often, by the stamps of odometry; but each update is ready at once.
-    """
-
-    def __init__(self, frequency: float) -> None:
-        self._period_ns = round(1e9 / frequency)
-        self._estimate: Estimate | None = None
-        self._next_ns = self._newest_ns = 0
-        self._found: list[tuple[int, Prediction]] = []
-
-    def is_due(self, sample: Measured, n_nodes: int) -> bool:
-        """Return whether the graph is to be updated with a measurement."""
-        return (isinstance(sample, OdometrySample) and n_nodes > 0
-                and sample.stamp_ns >= self._next_ns)
-
-    def updated(self, backend: PoseGraphBackend) -> None:
-        """Take the estimate of an update."""
-        self._estimate = backend.estimate(with_path=False)
-        if self._estimate is not None:
-            self._next_ns = self._estimate.stamp_ns + self._period_ns
-
-    def add(self, sample: Measured, source: str) -> None:
-        """Add the pose at a sample of the primary odometry, unless it is late."""
-        estimate = self._estimate
-        if not isinstance(sample, OdometrySample) or estimate is None or (
-                estimate.primary != source or sample.stamp_ns <= self._newest_ns):
-            return
-        self._newest_ns = sample.stamp_ns
-        self._found.append((sample.stamp_ns, predict(estimate, sample)))
-
-    def lines(self) -> Iterator[str]:
-        """Yield the lines of a table, as that of the path."""
-        stamps = np.array([stamp for stamp, _ in self._found], dtype=np.int64)
-        poses = np.array([each.T_map_base for _, each in self._found]).reshape(-1, 3)
-        covariances = np.array([each.covariance for _, each in self._found]).reshape(-1, 3, 3)
-        return path_files.csv_lines(Trajectory(stamps, poses), covariances)
 
 
 class _Corrector:
@@ -247,6 +207,10 @@ def _pose(sample: OdometrySample) -> Pose:
 
 # --- the tool
 
+LivePoses = dict[int, Prediction]
+"""By stamp."""
+
+
 class Replayed(NamedTuple):
     """Result of running a bag through the engine."""
 
@@ -264,26 +228,38 @@ class Replayed(NamedTuple):
 
 def run(measurements: Iterable[tuple[str, Measured]], values: Values,
         live: LivePoses | None = None) -> Replayed:
-    """Return a new engine after adding measurements and a full optimisation."""
-    start, next_update = time.monotonic(), UPDATE_EVERY
+    """
+    Return a new engine after adding measurements and a full optimisation.
+
+    Live poses are at the messages of odometry, each by the newest estimate that there was by then:
+    as in the node, odometry goes on from the estimate of the last update, and the graph is updated
+    as often, by the stamps of odometry; but each update is ready at once.
+    """
+    start, next_update, next_ns = time.monotonic(), UPDATE_EVERY, 0
     backend, recorder = PoseGraphBackend(sources.backend_config(values)), Recorder()
+    estimate: Estimate | None = None
     for source, measurement in measurements:
         if isinstance(measurement, OdometrySample):
             backend.add_odometry(measurement, source)
         else:
             recorder.add_answer(source, measurement, backend.add_measurement(measurement, source))
-        if backend.graph.n_nodes >= next_update if live is None else live.is_due(
-                measurement, backend.graph.n_nodes):
+        if backend.graph.n_nodes >= next_update if live is None else (
+                isinstance(measurement, OdometrySample) and backend.graph.n_nodes > 0
+                and measurement.stamp_ns >= next_ns):
             begin = time.thread_time()  # of this process, however busy the machine is
             report = backend.update()
             stamps_ns, spent = backend.node_stamps_ns, time.thread_time() - begin
             recorder.add_update(Update(
                 int(stamps_ns[-1]), len(stamps_ns), 1e3 * spent, report.chi2))
             next_update = backend.graph.n_nodes + UPDATE_EVERY
-            if live is not None:
-                live.updated(backend)
-        if live is not None:
-            live.add(measurement, source)
+            if live is not None and (
+                    estimate := backend.estimate(with_path=False)) is not None:
+                next_ns = estimate.stamp_ns + round(1e9 / values['frequency'])
+        # at the samples of the primary odometry, unless they are late
+        if (isinstance(measurement, OdometrySample) and live is not None and estimate is not None
+                and estimate.primary == source
+                and measurement.stamp_ns > next(reversed(live), 0)):
+            live[measurement.stamp_ns] = predict(estimate, measurement)
     report = backend.optimize()
     return Replayed(backend, report, backend.counts, recorder, time.monotonic() - start)
 
@@ -306,7 +282,7 @@ def _execute_bags(options: argparse.Namespace) -> int:
         if not options.json:
             print('\n'.join(f'{source}: {topic}' for source, topic in inputs.topics.items()))
         reader, refused = reader_of(bag, values), Counter[tuple[str, str]]()
-        live = LivePoses(values['frequency']) if options.live else None
+        live: LivePoses | None = {} if options.live else None
         result = run((each[:2] for each in measured_in(
             shared.watched_bag(bag, 'optimising'), inputs, reader, refused, held_out=False)),
             values, live)
@@ -361,7 +337,10 @@ def _report(options: argparse.Namespace, done: Run, facts: Mapping[str, Any],
     exported = write_exports(options.export, options.out, done, datum)
     if live is not None:
         exported.append(options.out / 'live.csv')
-        write_lines(exported[-1], live.lines())
+        poses = np.array([each.T_map_base for each in live.values()]).reshape(-1, 3)
+        covariances = np.array([each.covariance for each in live.values()]).reshape(-1, 3, 3)
+        write_lines(exported[-1], path_files.csv_lines(
+            Trajectory(np.array([*live], dtype=np.int64), poses), covariances))
     names = 'drive.png', 'summary.json', 'run.json', 'graph.g2o', *(each.name for each in exported)
     if options.json:
         print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')

@@ -45,6 +45,10 @@ CONFIG = SolverConfig(max_iterations=200)
 MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
+Report = tuple[dict[str, Any], list[str]]
+"""What is said of the minimum: `certificate` in the JSON output, as in docs/tools.md; lines."""
+
+
 class Solution(NamedTuple):
     """A graph at the lowest minimum that was found."""
 
@@ -176,46 +180,37 @@ def _held_weakly(
                    reason=f'{result.reason}; it is held near its start'), False
 
 
-class Report(NamedTuple):
-    """What the certificate says of a solution."""
+def _report(made: Certificate | None, reason: str, seconds: float, chi2: float, *,
+            bound: float | None = None, from_it: float | None = None) -> Report:
+    """
+    Return what a certificate says of a solution, given its chi2 with the error (3.48).
 
-    certificate: Certificate | None
-    reason: str  # why there is none; else empty
-    seconds: float
-    chi2: float  # of the solution, with the error (3.48)
-    bound: float | None = None  # lower one of chi2, if one was proved
-    chi2_from_it: float | None = None  # reached from the minimum that it found, if tried
-
-    def values(self) -> dict[str, Any]:
-        """Return the keys of `certificate` in the JSON output, as in docs/tools.md."""
-        made, bound = self.certificate, self.bound
-        return {
-            'verdict': (Verdict.NOT_ATTEMPTED if made is None else made.verdict).value,
-            'reason': self.reason, 'seconds': self.seconds,
-            **{key: getattr(made, {'lambda_min': 'smallest'}.get(key, key), None) for key in (
-                'chi2', 'gap', 'relative_gap', 'lambda_min', 'rank')},
-            'lower_minimum': made is not None and made.is_lower,
-            'chi2_from_it': self.chi2_from_it, 'chi2_bound': bound,
-            'chi2_gap': None if bound is None else max(self.chi2 - bound, 0.0)}
-
-    def lines(self) -> list[str]:
-        """Return what is printed."""
-        if (made := self.certificate) is None:
-            return [f'certificate: not attempted, because {self.reason}']
-        lines = [(f'certificate: certified, {self.seconds:.3f} s: the chordal objective, '
-                  f'{made.chi2:.9g} at its minimum, is nowhere lower by more than {made.gap:.2g}')
-                 if made.verdict is Verdict.CERTIFIED else
-                 (f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
-                  f'{self.seconds:.3f} s: the chordal objective is {made.chi2:.9g} at the lowest '
-                  'minimum found')]
-        if made.is_lower:
-            lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
-        if self.chi2_from_it is not None:
-            lines.append(f'  from there, chi2 becomes {self.chi2_from_it:.9g}')
-        return [*lines, '  this bounds no chi2, whose information depends on the direction; it '
-                'only speaks for the headings' if self.bound is None else
-                f'  so no poses have a chi2 below {self.bound:.9g}; that found is '
-                f'{max(self.chi2 - self.bound, 0.0):.2g} above this']
+    Without one there is a reason. A lower bound of chi2 is given if one was proved, and the chi2
+    that was reached from the minimum that it found, if that was tried.
+    """
+    values = {
+        'verdict': (Verdict.NOT_ATTEMPTED if made is None else made.verdict).value,
+        'reason': reason, 'seconds': seconds,
+        **{key: getattr(made, {'lambda_min': 'smallest'}.get(key, key), None) for key in (
+            'chi2', 'gap', 'relative_gap', 'lambda_min', 'rank')},
+        'lower_minimum': made is not None and made.is_lower, 'chi2_from_it': from_it,
+        'chi2_bound': bound, 'chi2_gap': None if bound is None else max(chi2 - bound, 0.0)}
+    if made is None:
+        return values, [f'certificate: not attempted, because {reason}']
+    lines = [(f'certificate: certified, {seconds:.3f} s: the chordal objective, {made.chi2:.9g} '
+              f'at its minimum, is nowhere lower by more than {made.gap:.2g}')
+             if made.verdict is Verdict.CERTIFIED else
+             (f'certificate: not certified, gap {made.gap:.4g} ({made.relative_gap:.2%}), '
+              f'{seconds:.3f} s: the chordal objective is {made.chi2:.9g} at the lowest minimum '
+              'found')]
+    if made.is_lower:
+        lines.append(f'  near the poses found first, its minimum is {made.near:.9g}')
+    if from_it is not None:
+        lines.append(f'  from there, chi2 becomes {from_it:.9g}')
+    return values, [*lines, '  this bounds no chi2, whose information depends on the direction; '
+                    'it only speaks for the headings' if bound is None else
+                    f'  so no poses have a chi2 below {bound:.9g}; that found is '
+                    f'{max(chi2 - bound, 0.0):.2g} above this']
 
 
 def with_certificate(problem: Problem, solution: Solution, *,
@@ -224,7 +219,7 @@ def with_certificate(problem: Problem, solution: Solution, *,
     begin, graph = time.monotonic(), problem.graph
 
     def none(reason: str) -> tuple[Solution, Report]:
-        return solution, Report(None, reason, time.monotonic() - begin, solution.result.chi2)
+        return solution, _report(None, reason, time.monotonic() - begin, solution.result.chi2)
 
     if not solution.determined:
         return none('the constraints do not determine the poses')
@@ -247,7 +242,8 @@ def with_certificate(problem: Problem, solution: Solution, *,
             other.result, 'minimum of the chordal objective', other.determined, solution.tried,
         ) if other.result.is_better_than(solution.result) else resumed(problem, solution, poses)
     bound = max(made.bound, 0.0) if formulation.below_chi2 else None
-    return solution, Report(made, '', time.monotonic() - begin, solution.result.chi2, bound, found)
+    return solution, _report(made, '', time.monotonic() - begin, solution.result.chi2,
+                             bound=bound, from_it=found)
 
 
 # --- the tool
@@ -289,7 +285,8 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         say(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
             f'fixed: {names}{", ..." if len(held) > N_LARGEST else ""}')
     begin, start = time.monotonic(), options.start
-    doubted, decision, certificate = np.empty(0, np.int64), None, None
+    doubted, decision = np.empty(0, np.int64), None
+    certificate, proof = None, list[str]()
     if options.robust is not None:
         from pose_graph_ros.cli.believe import doubt
 
@@ -300,9 +297,9 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
     solution = solve(problem, start)
     seconds = time.monotonic() - begin
     if options.certificate:
-        solution, certificate = with_certificate(problem, solution, eigenvalue=options.json)
-    say('\n'.join([*_lines(problem, solution, seconds, doubted),
-                   *([] if certificate is None else certificate.lines())]))
+        solution, (certificate, proof) = with_certificate(
+            problem, solution, eigenvalue=options.json)
+    say('\n'.join([*_lines(problem, solution, seconds, doubted), *proof]))
     table, error = ([], 0.0) if rows is None else _marginals(problem, solution, rows)
     text = '\n'.join([','.join(COLUMNS), *(','.join(
         '' if value is None else repr(value) for value in row.values()) for row in table), ''])
@@ -324,7 +321,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
             'held': file.ids[held].tolist(),
             'doubted': np.stack((problem.ids[edges.i], problem.ids[edges.j]), axis=1).tolist(),
             'chi2_start': before, 'seconds': seconds, 'edge2': file.edge2_order,
-            'robust': decision, 'certificate': certificate and certificate.values(),
+            'robust': decision, 'certificate': certificate,
             **({} if rows is None else {'marginals_relative_error': error}),
             **({} if rows is None or len(tables) > 0 else {'marginals': table})}),
             indent=2, allow_nan=False))
