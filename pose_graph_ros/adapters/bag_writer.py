@@ -15,9 +15,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-from pose_graph_ros.adapters import bags
+from pose_graph_ros.adapters import bags, damaged_bags
 from pose_graph_ros.adapters.bags import BagError, BagMessage, MessageError
-from pose_graph_ros.adapters.damaged_bags import NO_HASH
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 # the "infinite" duration of rmw, 2^63 - 1 ns
@@ -128,7 +127,7 @@ class BagWriter:
         # without a definition the type is left to the reader, as rosbag2 itself does
         self._connections[key] = self._writer.add_connection(
             *key, typestore=types if known else None, msgdef=None if known else '',
-            rihs01=None if known else digest or NO_HASH, offered_qos_profiles=qos)
+            rihs01=None if known else digest or damaged_bags.NO_HASH, offered_qos_profiles=qos)
 
 
 def _qos(*, latched: bool) -> Qos:

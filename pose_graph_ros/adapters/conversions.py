@@ -20,15 +20,12 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from pose_graph_ros.core import measurements as ms
-from pose_graph_ros.core.config import Integrate
-from pose_graph_ros.core.exceptions import ConfigError
+from pose_graph_ros.core import config, exceptions, measurements as ms, quantities
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose, wrap_one
 from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
 from pose_graph_ros.core.odometry.motion import integrated
-from pose_graph_ros.core.quantities import NANOSECONDS
 
 if TYPE_CHECKING:
     from pose_graph_ros.adapters.sources import Source
@@ -113,7 +110,7 @@ def datum_of(values: Mapping[str, Any]) -> Datum:
     try:
         return Datum(values['datum'], wait=values['wait_for_datum'])
     except ValueError as error:
-        raise ConfigError(f'parameter {error}') from error
+        raise exceptions.ConfigError(f'parameter {error}') from error
 
 
 class Antenna(NamedTuple):
@@ -221,7 +218,7 @@ class Surroundings:
 def stamp_ns(message: Message, offset_ns: int = 0) -> int:
     """Return the stamp of a message's header plus an offset [ns]; a stamp of 0 stays 0."""
     stamp = message.header.stamp
-    whole = int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    whole = int(stamp.sec) * quantities.NANOSECONDS + int(stamp.nanosec)
     return whole + offset_ns if whole > 0 else whole
 
 
@@ -255,7 +252,7 @@ def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometryS
         return rejected('too_large', f'odometry pose {pose.tolist()}')
     linear = message.twist.twist.linear
     speed = math.hypot(linear.x, linear.y)
-    twist = (planar_twist(message.twist.twist) if source.integrate == Integrate.TWIST.value
+    twist = (planar_twist(message.twist.twist) if source.integrate == config.Integrate.TWIST.value
              else None)
     if isinstance(twist, Answer):
         return twist
@@ -325,8 +322,8 @@ def loop_closure(message: Message, source: 'Source', _by: Surroundings) -> ms.Lo
     if (node := _REFERENCE_NODE.fullmatch(named)) is not None:
         return ms.LoopClosure(stamp, pose, cov, reference_node=int(node[1]))
     if (time := _REFERENCE_TIME.fullmatch(named)) is not None:
-        return ms.LoopClosure(stamp, pose, cov, reference_ns=(
-            int(time[1]) * NANOSECONDS + int((time[2] or '').ljust(9, '0')) + offset_ns))
+        return ms.LoopClosure(stamp, pose, cov, reference_ns=(int(
+            time[1]) * quantities.NANOSECONDS + int((time[2] or '').ljust(9, '0')) + offset_ns))
     return rejected('wrong_frame', f'expected a hidden node such as x42 or a time such as '
                                    f'@1695.250000000, got {named!r}')
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 from pose_graph_ros.core import config
-from pose_graph_ros.core.config import GyroSource, Integrate, RateNoise
 
 Value = bool | float | str | list[float] | list[str]
 
@@ -56,7 +55,7 @@ def _values(choices: type[Enum]) -> tuple[str, ...]:
 
 
 _BACKEND, _ODOMETRY = config.BackendConfig(), config.OdometrySource()
-_COVARIANCE, _RATES = config.CovariancePolicy(), GyroSource()
+_COVARIANCE, _RATES = config.CovariancePolicy(), config.GyroSource()
 _NODES, _NOISE = _BACKEND.nodes, _ODOMETRY.noise
 _WINDOW, _THINNING = _BACKEND.window, _BACKEND.thinning
 
@@ -163,7 +162,7 @@ OF_WHEELS = (
 
 INTEGRATE = Parameter('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the '
                       '`pose` in the messages, or their `twist`, integrated between messages.',
-                      choices=_values(Integrate), change=Change.UNCONFIGURED)
+                      choices=_values(config.Integrate), change=Change.UNCONFIGURED)
 
 OF_GYROS = (
     Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
@@ -171,7 +170,7 @@ OF_GYROS = (
               '/tf_static; messages are refused until it is there.', choices=('tf', 'up', 'down')),
     Parameter('noise', _RATES.noise_from.value, '', 'Origin of the noise of the rate: `message` '
               'uses the variance in the messages, if it is positive, `model` uses `sigma_rate`.',
-              choices=_values(RateNoise)),
+              choices=_values(config.RateNoise)),
     Parameter('sigma_rate', _RATES.sigma_rate, 'rad/sqrt(s)', 'Noise density of the rate (angle '
               'random walk).', 1e-9, 10.0),
     Parameter('sigma_turn', _RATES.sigma_turn, 'rad/sqrt(rad)', 'Noise of the rotation, per '

@@ -28,8 +28,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.special import gammainc, gammaincc
 
-from pose_graph_ros.cli.arguments import METHODS
-from pose_graph_ros.cli.solve import Problem
+from pose_graph_ros.cli import arguments, solve
 from pose_graph_ros.core.batch import optimizer
 from pose_graph_ros.core.batch.optimizer import optimize, SAME_MINIMUM, Status, to_the_end
 from pose_graph_ros.core.batch.truncated import Choosing, CONFIG, Surrogate, TruncatedProblem
@@ -67,7 +66,7 @@ class BelievedEdges(NamedTuple):
     cost_of_all: float | None  # likewise at the minimum of chi2 with all closures, if computed
 
 
-def believe(graph: Graph, sigmas: FloatArray, method: str = METHODS[0], *,
+def believe(graph: Graph, sigmas: FloatArray, method: str = arguments.METHODS[0], *,
             given: bool = False) -> BelievedEdges | None:
     """
     Return which edges of a graph to believe, and poses at which they agree; None if it fails.
@@ -171,7 +170,7 @@ def _joining(edges: Factors, closures: IntArray, part: IntArray, number: int) ->
     return closures[order[np.sort(tree.data).astype(np.int64) - 1]]
 
 
-def doubt(problem: Problem, method: str,
+def doubt(problem: solve.Problem, method: str,
           sigma: Sequence[float]) -> tuple[IntArray, dict[str, Any], list[str]]:
     """
     Return rows of closures that are not believed, after giving them the weight 0.

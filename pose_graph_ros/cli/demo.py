@@ -28,11 +28,9 @@ import time
 from pose_graph_ros.adapters.bags import BagError, choose_inputs, Inputs, open_bag
 from pose_graph_ros.adapters.conversions import stamp_ns
 from pose_graph_ros.adapters.sources import backend_config, source_list, Values
-from pose_graph_ros.cli import shared
+from pose_graph_ros.cli import shared, simulate
 from pose_graph_ros.cli.drive import drive_in
-from pose_graph_ros.cli.run import Recorder, Run, Update
-from pose_graph_ros.cli.run.document import write_results
-from pose_graph_ros.cli.simulate import write_drive
+from pose_graph_ros.cli.run import document, Recorder, Run, Update
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.exceptions import PoseGraphError
@@ -57,7 +55,7 @@ def execute(options: argparse.Namespace) -> int:
         bag_path, truth = options.out / 'simulated_drive', truth or '/ground_truth'
         print(f'simulating a drive (seed {options.seed})')
         way = recording.course(worlds.WORLDS['drive'], options.seed, settings.DURATIONS_S['drive'])
-        write_drive(recording.record(way), bag_path, overwrite=True)
+        simulate.write_drive(recording.record(way), bag_path, overwrite=True)
         wanted = {source: topic or SIMULATED_TOPICS.get(source)
                   for source, topic in wanted.items()}
     with open_bag(bag_path) as bag:
@@ -86,7 +84,7 @@ def execute(options: argparse.Namespace) -> int:
     run = Run(title, 'the node over DDS', drive, backend, recorder, values, inputs.kinds, counts,
               report, seconds)
     print('\n'.join([
-        *write_results(run, options.out, {
+        *document.write_results(run, options.out, {
             'bag': bag_path.name, 'topics': dict(inputs.topics), 'rate': options.rate,
             'seconds': seconds, 'node': diagnostics}),
         f'written to {options.out}/: path.tum, corrected/ (rosbag2), drive.png, summary.json, '

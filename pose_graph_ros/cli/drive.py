@@ -26,8 +26,7 @@ from pose_graph_ros.adapters.conversions import planar_pose, stamp_ns
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, MessageReader, ODOMETRY
 from pose_graph_ros.core import measurements as kinds
 from pose_graph_ros.core.backend import PoseGraphBackend
-from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.geodesy import MapOrigin
+from pose_graph_ros.core.geometry import geodesy, se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray, IntArray, Points
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.judgement.texts import Key
@@ -242,7 +241,7 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
 
 
 def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseGraphBackend,
-             truth_topic: str | None, *, origin: MapOrigin | None,
+             truth_topic: str | None, *, origin: geodesy.MapOrigin | None,
              refused: Collection[Key] | None = None) -> Drive:
     """
     Return the path of an engine together with the measurements of the bag that it is made of.

@@ -19,7 +19,6 @@ import numpy as np
 
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.io.g2o import GraphFile, read_g2o
 from pose_graph_ros.core.measurements import LoopClosure, OdometrySample
@@ -62,7 +61,7 @@ def read_file(path: Path, edge2_order: str | None) -> GraphFile:
     return file
 
 
-def rows_of(ids: IntArray, text: str, option: str) -> IntArray:
+def rows_of(ids: se2.IntArray, text: str, option: str) -> se2.IntArray:
     """
     Return the rows of the nodes that a text names, such as `3,7,20:25`, ascending.
 
@@ -128,7 +127,7 @@ def read_measurements(path: Path, stamps: Path | None = None,
     return [each for _, each in sorted(events, key=itemgetter(0))]
 
 
-def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
+def _odometry(edges: Factors, stamps_ns: se2.IntArray) -> Iterator[OdometrySample]:
     """Yield composed poses at all stamps, given the edge from each vertex to the next."""
     motions = np.where((edges.i < edges.j)[:, None], edges.mean, se2.inverse(edges.mean))
     variances = np.diagonal(_covariances(edges), axis1=1, axis2=2)
@@ -140,7 +139,7 @@ def _odometry(edges: Factors, stamps_ns: IntArray) -> Iterator[OdometrySample]:
         pose = se2.compose(pose, motions[step])
 
 
-def _covariances(edges: Factors) -> FloatArray:
+def _covariances(edges: Factors) -> se2.FloatArray:
     """Return the inverses of the information, shape (M, 3, 3); zero if there is none."""
     covariances = np.zeros((len(edges), 3, 3))
     regular = np.linalg.det(edges.information) > 0.0

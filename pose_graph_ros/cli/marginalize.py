@@ -8,8 +8,7 @@ import sys
 
 import numpy as np
 
-from pose_graph_ros.cli.arguments import LANDMARKS
-from pose_graph_ros.cli.graph_input import read, rows_of
+from pose_graph_ros.cli import arguments, graph_input
 from pose_graph_ros.core.exceptions import ConfigError
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
@@ -19,12 +18,12 @@ from pose_graph_ros.core.marginalization.marginalize import marginalize, standin
 
 def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
-    file = read(options.graph, options.edge2)
-    if options.nodes == LANDMARKS:
+    file = graph_input.read(options.graph, options.edge2)
+    if options.nodes == arguments.LANDMARKS:
         if len(leaving := np.flatnonzero(file.rows.node_kind == NodeKind.LANDMARK)) == 0:
             raise ConfigError(f'{options.graph}: has no landmarks')
     else:
-        leaving = rows_of(file.ids, options.nodes, '--nodes')
+        leaving = graph_input.rows_of(file.ids, options.nodes, '--nodes')
     if not np.any(np.delete(file.rows.is_pose, leaving)):
         raise ConfigError('--nodes: no pose would be left')
     graph = Graph()

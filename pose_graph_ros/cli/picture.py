@@ -19,8 +19,7 @@ import numpy as np
 
 from pose_graph_ros.cli import drive as drives
 from pose_graph_ros.cli.drive import distances, Drive, extent
-from pose_graph_ros.core.geometry.geodesy import TangentPlane
-from pose_graph_ros.core.geometry.trajectory import Trajectory
+from pose_graph_ros.core.geometry import geodesy, trajectory
 from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
 from pose_graph_ros.offline.simulation.settings import CLOSURES, FIXES, POSES
 
@@ -231,7 +230,7 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
     """Draw what was simulated: what is false or moved looks as if it were doubted."""
     truth = simulated.truth
     if isinstance(simulated, SimulatedGraph):
-        odometry = Trajectory(truth.stamps_ns, simulated.start)
+        odometry = trajectory.Trajectory(truth.stamps_ns, simulated.start)
         ends = truth.stamps_ns[np.column_stack((simulated.loops.i, simulated.loops.j))]
         group, stamps = simulated.group, truth.stamps_ns[simulated.observed.i]
         measured = simulated.observed.mean[:, :2]
@@ -241,11 +240,11 @@ def draw_simulated(simulated: SimulatedGraph | Recording, file: Path, title: str
         fixes, poses, closures = (simulated.measured[topic] for topic in (FIXES, POSES, CLOSURES))
         ends, group, measured = closures.stamps_ns, closures.wrong, poses.values[:, :2]
         if len(fixes.values) > 0:
-            plane = TangentPlane(*fixes.values[0].tolist())
+            plane = geodesy.TangentPlane(*fixes.values[0].tolist())
             measured = np.concatenate((plane.to_map(*fixes.values.T), measured))
         stamps = np.append(fixes.stamps_ns, poses.stamps_ns)
         wrong = np.append(fixes.wrong, poses.wrong) >= 0
-    nothing = Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    nothing = trajectory.Trajectory(np.empty(0, dtype=np.int64), np.empty((0, 3)))
     fix_states, loop_states = (np.where(false, drives.DOUBTED, drives.BELIEVED)
                                for false in (wrong, group >= 0))
     draw_drive(Drive(odometry, nothing, truth, stamps, measured, fix_states, [''] * len(

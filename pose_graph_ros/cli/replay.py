@@ -28,17 +28,14 @@ from pose_graph_ros.cli import shared
 from pose_graph_ros.cli.arguments import Exports, ON_EARTH
 from pose_graph_ros.cli.drive import collect_drive, Drive, drive_in, measured_in
 from pose_graph_ros.cli.graph_input import GRAPH_SUFFIXES, read_measurements
-from pose_graph_ros.cli.run import Recorder, Run, Update
-from pose_graph_ros.cli.run.document import write_results
-from pose_graph_ros.core.alignment import AlignmentState
+from pose_graph_ros.cli.run import document, Recorder, Run, Update
+from pose_graph_ros.core import alignment, exceptions
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.estimate import Estimate, predict, Prediction, UpdateReport
-from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.geometry.se2 import between_one, compose_one, Pose
 from pose_graph_ros.core.geometry.trajectory import interpolated, PathCorrection, Trajectory
-from pose_graph_ros.core.io import path_files
-from pose_graph_ros.core.io.g2o import write_g2o
+from pose_graph_ros.core.io import g2o, path_files
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.measurements import OdometrySample
 
@@ -55,7 +52,7 @@ UNKNOWN = output_cdr.UNKNOWN_VARIANCE * np.eye(3)
 MOST_POSES = 100_000  # of a path in a message; of more only every second is written, or fewer
 
 
-class ExportError(PoseGraphError, ValueError):
+class ExportError(exceptions.PoseGraphError, ValueError):
     """A path cannot be written in a format."""
 
 
@@ -79,7 +76,7 @@ def write_exports(exports: Exports, folder: Path, run: Run, datum: Datum | None)
     written, path = [], run.estimate.path
     # before the first measurement in the map, its place on the Earth is unknown
     placed = (datum is not None and datum.plane is not None
-              and run.estimate.alignment is not AlignmentState.LOCAL)
+              and run.estimate.alignment is not alignment.AlignmentState.LOCAL)
     for name in exports.formats:
         if name == 'kitti':
             lines = path_files.kitti_lines(path)
@@ -332,8 +329,8 @@ def _run_of(options: argparse.Namespace, result: Replayed, drive: Drive, values:
 def _report(options: argparse.Namespace, done: Run, facts: Mapping[str, Any],
             datum: Datum | None = None, live: LivePoses | None = None) -> int:
     """Write the results and print a summary; return the exit code."""
-    lines = write_results(done, options.out, facts)
-    write_g2o(done.backend.graph, options.out / 'graph.g2o')
+    lines = document.write_results(done, options.out, facts)
+    g2o.write_g2o(done.backend.graph, options.out / 'graph.g2o')
     exported = write_exports(options.export, options.out, done, datum)
     if live is not None:
         exported.append(options.out / 'live.csv')

@@ -28,8 +28,7 @@ from typing import Any
 import webbrowser
 
 from pose_graph_ros.adapters import bags
-from pose_graph_ros.cli import replay
-from pose_graph_ros.cli.arguments import Exports
+from pose_graph_ros.cli import arguments, replay
 from pose_graph_ros.cli.run.document import FILE, read_document
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 
@@ -49,9 +48,9 @@ def execute(options: argparse.Namespace) -> int:
     if file is None:
         if (options.folder / 'metadata.yaml').is_file():
             raise bags.BagError(f'--run {options.folder}: this is a bag; name another folder')
-        file, words = options.folder / FILE, argparse.Namespace(**vars(options) | {
-            'bags': options.runs, 'out': options.folder, 'json': False, 'export': Exports(),
-            'new_bag': None, 'live': False})
+        file, words = options.folder / FILE, argparse.Namespace(
+            **vars(options) | {'bags': options.runs, 'out': options.folder, 'json': False,
+                               'export': arguments.Exports(), 'new_bag': None, 'live': False})
         with redirect_stdout(io.StringIO()):
             code = replay.execute(words)
     data = read_document(file)

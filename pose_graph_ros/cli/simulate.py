@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pose_graph_ros.adapters.bag_writer import BagWriter, message_types
-from pose_graph_ros.adapters.conversions import PLANAR
+from pose_graph_ros.adapters import bag_writer, conversions
 from pose_graph_ros.cli.shared import watched
 from pose_graph_ros.cli.simulation_options import changed, PICTURES, refuse_what_graphs_lack
 from pose_graph_ros.core.exceptions import ConfigError, FileWriteError
@@ -26,16 +25,13 @@ from pose_graph_ros.core.geometry.se2 import Covariance, FloatArray, IntArray, P
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.io import atomic_files, g2o, path_files
 from pose_graph_ros.core.quantities import Metres, StampsNs
-from pose_graph_ros.offline.simulation import recording, settings
-from pose_graph_ros.offline.simulation.recording import Recording, SimulatedGraph
-from pose_graph_ros.offline.simulation.sensors import velocities
-from pose_graph_ros.offline.simulation.worlds import PERIOD_S, WORLDS
+from pose_graph_ros.offline.simulation import recording, sensors, settings, worlds
 
 GRAPH_SUFFIX = '.g2o'
 ODOMETRY_VARIANCES = (1e-3, 1e-3, 1e6, 1e6, 1e6, 3e-2)  # constant, as many drivers set them
 Message = tuple[str, str, int, Any]
 """Topic, type, time of recording [ns] and message; recorded at its stamp, if made here."""
-_TYPES = message_types()
+_TYPES = bag_writer.message_types()
 _ODOMETRY, _FIX = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/NavSatFix'
 _IMU, _POSE = 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
@@ -58,12 +54,12 @@ def execute(options: argparse.Namespace) -> int:
         if path.exists():
             raise FileWriteError(f'{path}: exists already, not overwritten')
     duration = options.duration or settings.DURATIONS_S[options.world]
-    way = recording.course(WORLDS[options.world], options.seed, duration,
+    way = recording.course(worlds.WORLDS[options.world], options.seed, duration,
                            lambda usual: changed(usual, options))
     about = {'world': options.world, 'seed': options.seed,
              'duration_s': float(way.motion.truth.stamps_ns[-1] - settings.START_NS) / 1e9}
     files = dict[Path, bytes]()
-    simulated: SimulatedGraph | Recording
+    simulated: recording.SimulatedGraph | recording.Recording
     if is_graph:
         simulated = recording.graph_of(
             way, options.node_distance or settings.NODE_DISTANCES[options.world])
@@ -118,7 +114,8 @@ def _lines(about: Mapping[str, Any]) -> Iterator[str]:
                'places that are apart and driven in the same direction')
 
 
-def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> dict[str, Any]:
+def write_drive(drive: recording.Recording, folder: Path, *,
+                overwrite: bool = False) -> dict[str, Any]:
     """
     Write a recording as a rosbag2, message by message; return what there is to say of it.
 
@@ -128,7 +125,7 @@ def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> d
     messages = heapq.merge(*(
         _delivered(each, *drive.arrivals[topic]) for topic, each in _messages(drive).items()),
         key=itemgetter(2))
-    with BagWriter(folder, overwrite=overwrite) as bag:
+    with bag_writer.BagWriter(folder, overwrite=overwrite) as bag:
         for topic, type_name, recorded_ns, message in watched(
                 messages, desc='writing', total=total):
             bag.write(topic, type_name, recorded_ns, message)
@@ -147,7 +144,7 @@ def write_drive(drive: Recording, folder: Path, *, overwrite: bool = False) -> d
     return about
 
 
-def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
+def _messages(drive: recording.Recording) -> dict[str, Iterator[Message]]:
     """Return the messages of all topics by stamp; of equally late ones the first is written."""
     setup, (odometry, gyro, fixes, poses, closures) = drive.setup, settings.TOPICS
     covariances = {topic: np.diag(np.square(setup.sigmas(topic))) for topic in (poses, closures)
@@ -160,7 +157,7 @@ def _messages(drive: Recording) -> dict[str, Iterator[Message]]:
             settings.TRUTH, 'map', drive.truth, (0.0,) * 6)}
     if setup.gyro is not None:
         stamps_ns, values, _ = drive.measured[gyro]
-        sigma = setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(PERIOD_S)
+        sigma = setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(worlds.PERIOD_S)
         nothing, variances = np.append(-1.0, np.zeros(8)), sigma**2 * np.eye(3).ravel()
         # yaw rates in base_link [rad/s], and nothing else
         topics[gyro] = ((gyro, _IMU, stamp, _TYPES[_IMU](
@@ -227,7 +224,7 @@ def odometry_messages(topic: str, frame: str, path: Trajectory, variances: Seque
     shape (N, 3) [m/s, m/s, rad/s]; by default those between consecutive poses.
     """
     covariance = np.diag(variances).ravel()
-    rates = velocities(path) if rates is None else rates
+    rates = sensors.velocities(path) if rates is None else rates
     for stamp, pose, (vx, _, yaw_rate) in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), rates.tolist(), strict=True):
         yield topic, _ODOMETRY, stamp, _TYPES[_ODOMETRY](
@@ -267,7 +264,7 @@ def _poses(topic: str, stamps_ns: StampsNs, frames: Sequence[str], poses: Poses,
            covariance: Covariance) -> Iterator[Message]:
     """Return poses in frames with one covariance, as PoseWithCovarianceStamped messages."""
     spatial = np.diag([0.0, 0.0, 0.01, 3e-4, 3e-4, 0.0])
-    spatial[PLANAR] = covariance
+    spatial[conversions.PLANAR] = covariance
     for stamp, frame, pose in zip(stamps_ns.tolist(), frames, poses.tolist(), strict=True):
         yield topic, _POSE, stamp, _TYPES[_POSE](
             _header(stamp, frame), _of('PoseWithCovariance', _pose(pose), spatial.ravel()))

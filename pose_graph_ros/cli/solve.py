@@ -23,15 +23,13 @@ import numpy as np
 from pose_graph_ros.cli import finite
 from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
+from pose_graph_ros.core import config, sparse
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
 from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, PlainOptimizer
-from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import ConfigError, LinearSolveError, PoseGraphError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors, upper
-from pose_graph_ros.core.graph.graph_update import GraphUpdate
+from pose_graph_ros.core.graph import constraints, graph_update
 from pose_graph_ros.core.io.g2o import compose_missing, GraphFile, write_g2o
-from pose_graph_ros.core.sparse import components
 from pose_graph_ros.offline.certify import Certificate, certify, NearHessian, Verdict
 from pose_graph_ros.offline.chordal_objective import formulate, NotCoveredError
 
@@ -41,7 +39,7 @@ if TYPE_CHECKING:
 N_LARGEST = 5  # edges, observed nodes, and names, that are printed
 COLUMNS = ('id', 'x', 'y', 'theta', 'cov_xx', 'cov_xy', 'cov_xtheta', 'cov_yy', 'cov_ytheta',
            'cov_thetatheta')
-CONFIG = SolverConfig(max_iterations=200)
+CONFIG = config.SolverConfig(max_iterations=200)
 MOST_PLAIN_NODES = 20_000  # up to which a graph is solved without compiled kernels, if possible
 
 
@@ -69,7 +67,7 @@ class Problem:
 
     def __init__(self, file: GraphFile, *, plain: bool) -> None:
         rows, edges, observed = file.rows, file.rows.factors.edges, file.rows.factors.observed
-        part = components(edges.i, edges.j, len(file.ids))
+        part = sparse.components(edges.i, edges.j, len(file.ids))
         is_held = np.isin(part, part[rows.fixed]) | np.isin(part, part[observed.i])
         is_first = (part == np.arange(len(part))) & ~is_held
         self.ids, self.has_start = file.ids, file.has_start
@@ -154,7 +152,7 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
 
 
 def _held_weakly(
-    graph: 'Graph', optimize: Callable[['Graph', SolverConfig], BatchResult],
+    graph: 'Graph', optimize: Callable[['Graph', config.SolverConfig], BatchResult],
 ) -> tuple[BatchResult, bool]:
     """
     Optimise a graph; if poses are not determined, choose those near the present ones.
@@ -170,8 +168,8 @@ def _held_weakly(
     typical = np.einsum('mii->mi', graph.factors.weighted_information)
     weak = 1e-7 * np.median(typical[typical > 0.0]) * (
         np.eye(3) * (np.arange(3) < graph.dimension[:, None, None]))
-    copy.apply(GraphUpdate(factors=Factors.on(
-        np.arange(n), None, graph.poses.copy(), weak, [FactorKind.GLOBAL_POSE] * n)))
+    copy.apply(graph_update.GraphUpdate(factors=constraints.Factors.on(
+        np.arange(n), None, graph.poses.copy(), weak, [constraints.FactorKind.GLOBAL_POSE] * n)))
     other = optimize(copy, CONFIG)
     if other.status is Status.FAILED:
         return result, False
@@ -367,7 +365,7 @@ def _marginals(problem: Problem, solution: Solution,
     covariances = IncrementalSmoother(graph=graph).covariances()
     table = []
     for row, pose, numbers in zip(rows.tolist(), graph.poses[rows].tolist(),
-                                  upper(covariances[rows]).tolist(), strict=True):
+                                  constraints.upper(covariances[rows]).tolist(), strict=True):
         values: list[float | None] = [*pose, *numbers]
         if not graph.is_pose[row]:
             values = [None if k in {2, 5, 7, 8} else value for k, value in enumerate(values)]

@@ -19,18 +19,14 @@ from typing import NamedTuple, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from pose_graph_ros.adapters.conversions import frame
-from pose_graph_ros.adapters.parameter_table import DEFAULT_SOURCES, OUTPUTS
+from pose_graph_ros.adapters import conversions, parameter_table
 from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
-from pose_graph_ros.core.alignment import AlignmentState
+from pose_graph_ros.core import alignment, disagreement
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.disagreement import Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
-from pose_graph_ros.core.odometry.gyro import CONTRADICTORY, MOST_BIAS
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED
-from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
-from pose_graph_ros.core.sources.settings import SOURCES
+from pose_graph_ros.core.odometry import gyro, motion
+from pose_graph_ros.core.sources import constraint_names, settings
 from pose_graph_ros.ros.input import EXPECTED
 from pose_graph_ros.ros.topics import moved, other_publishers
 from pose_graph_ros.ros.worker import Worker
@@ -71,7 +67,7 @@ def values(session: 'Session') -> dict[str, object]:
                       'thinned_nodes': estimate.n_thinned, 'priors': estimate.n_priors,
                       'edges': estimate.n_edges, 'observed_nodes': estimate.n_observed,
                       'biases': estimate.n_biases, 'chi2': f'{estimate.chi2:.6g}'})
-        if (errors := estimate.odometry_errors) != AS_CLAIMED:
+        if (errors := estimate.odometry_errors) != motion.AS_CLAIMED:
             # never a whole number: those are counts
             found |= {f'{estimate.primary}.errors_{name}': f'{value:.6f}'
                       for name, value in errors._asdict().items()}
@@ -86,8 +82,8 @@ class Searches:
     """The constraints with the largest energies, and a source that contradicts the others."""
 
     def __init__(self) -> None:
-        self.energies: Sequence[ConstraintEnergy] = ()
-        self.contradiction: Disagreement | None = None
+        self.energies: Sequence[constraint_names.ConstraintEnergy] = ()
+        self.contradiction: disagreement.Disagreement | None = None
         self.due = 0.0  # time from which on the worker is asked again [s]
         self._n = 0     # number of measurements from which on a contradiction is searched again
 
@@ -150,7 +146,7 @@ def _of_sources(session: 'Session') -> dict[str, object]:
             found[f'{name}.errors_live'] = (
                 f'{short(in_use.tau)} s, with {short(math.sqrt(in_use.correlated))} times the '
                 f'sigma of the messages; found by {name}.correlation_time of -1, and treated so')
-        elif errors.significant and report.energy >= SOURCES.least_energy:
+        elif errors.significant and report.energy >= settings.SOURCES.least_energy:
             found[f'{name}.errors_live'] = (
                 f'{short(errors.tau)} s, with a sigma of {short(errors.sigma_correlated)} m'
                 + (f'; treated as white: set {name}.correlation_time'
@@ -199,11 +195,11 @@ def concerns(session: 'Session') -> Iterator[Concern]:
         yield from (Concern(WARN, text, logged=True) for text in doubts(session))
     yield from (Concern(WARN, text, logged=True) for text in (
         each.wrong for each in received.arrivals.values()) if text != '')
-    if estimate is not None and estimate.alignment is AlignmentState.UNALIGNED:
+    if estimate is not None and estimate.alignment is alignment.AlignmentState.UNALIGNED:
         yield Concern(WARN, 'unaligned: the angle between odometry and map is not known yet. '
                       'Drive some metres while fixes come in')
     yield from _doubted(session)
-    if estimate is not None and estimate.alignment is AlignmentState.LOCAL:
+    if estimate is not None and estimate.alignment is alignment.AlignmentState.LOCAL:
         yield Concern(GOOD, 'running without measurements in the map: its frame is that of the '
                       'first odometry')
     yield Concern(GOOD, 'running')
@@ -245,10 +241,10 @@ def _doubted(session: 'Session') -> Iterator[Concern]:
             yield Concern(WARN, f'no message of {name} could be used: either their stamps are not '
                           f'in the time of odometry, or they are farther apart than '
                           f'{name}.maximum_gap', logged=True)
-        if difference is not None and difference.sigmas > CONTRADICTORY and difference.reason:
+        if difference is not None and difference.sigmas > gyro.CONTRADICTORY and difference.reason:
             yield Concern(WARN, f'of {name} and odometry one is wrong: {difference.reason}',
                           logged=True)
-        elif abs(bias) > MOST_BIAS * session.values[f'{name}.sigma_bias']:
+        elif abs(bias) > gyro.MOST_BIAS * session.values[f'{name}.sigma_bias']:
             yield Concern(WARN, f'the bias of {name} is {short(bias)} rad/s, more than five times '
                           'its sigma_bias: check its mounting and its unit, rad/s', logged=True)
     for name in (name for name, each in status.verdicts.items() if each.doubting):
@@ -285,7 +281,7 @@ def doubts(session: 'Session') -> Iterator[str]:
                 yield from _unpublished(session, topic, source)
     for source in session.input.reader.sources.values():
         yield from _frames(session, source)
-    for name, (default, *_) in OUTPUTS.items():
+    for name, (default, *_) in parameter_table.OUTPUTS.items():
         topic = session.values[f'outputs.{name}']
         if default.startswith('/') or node.count_publishers(topic) < 2:
             continue    # /diagnostics is for all
@@ -299,7 +295,7 @@ def _unpublished(session: 'Session', topic: str, source: Source) -> Iterator[str
     node, name, wanted = session.node, source.name, source.kind.message_type
     usual = node.resolve_topic_name(KNOWN_SOURCES[name][1]) if name in KNOWN_SOURCES else ''
     expected = source.kind.is_odometry or topic != usual or (
-        name not in DEFAULT_SOURCES and not source.kind.is_rare)
+        name not in parameter_table.DEFAULT_SOURCES and not source.kind.is_rare)
     if session.input.arrivals[name].count > 0 or not expected:
         return
     types = sorted({info.topic_type for info in node.get_publishers_info_by_topic(source.topic)})
@@ -317,7 +313,7 @@ def _frames(session: 'Session', source: Source) -> Iterator[str]:
     name, out, estimate = source.name, session.out, session.worker.estimate
     if (frames := session.input.arrivals[name].frames) is None:
         return
-    parent, child = map(frame, frames)
+    parent, child = map(conversions.frame, frames)
     if source.kind.names_frames:
         for what, found, parameter, expected, consequence in (
                 ('frame_id', parent if estimate is not None and estimate.primary == name else

@@ -14,10 +14,7 @@ from pose_graph_ros.adapters import parameters as rules
 from pose_graph_ros.adapters.parameter_table import Change, Parameter, PARAMETERS
 from pose_graph_ros.adapters.sources import KNOWN_SOURCES
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros.log import NodeLog
-from pose_graph_ros.ros.services import Services
-from pose_graph_ros.ros.session import Session
-from pose_graph_ros.ros.topics import check_topics, OVERRIDES
+from pose_graph_ros.ros import log, services, session, topics
 
 logger = logging.getLogger(__name__)
 
@@ -35,10 +32,10 @@ class PoseGraphNode(LifecycleNode):
         self._overrides: dict[str, Any] = {}
         super().__init__(
             'pose_graph', automatically_declare_parameters_from_overrides=True, **node_options)
-        self._log = NodeLog(self.get_logger())
+        self._log = log.NodeLog(self.get_logger())
         self.failure = ''  # why the last transition failed
-        self._session: Session | None = None
-        self._offered: Services | None = None
+        self._session: session.Session | None = None
+        self._offered: services.Services | None = None
         self._given = self._declare(PARAMETERS)  # the node's own parameters that have a value
         for source in rules.listed_sources(self._given):
             kind = self._declare([rules.type_parameter(source)])[f'{source}.type']
@@ -50,7 +47,7 @@ class PoseGraphNode(LifecycleNode):
                  for parameter in rules.source_parameters(source, kind.name)}
         for name, value in sorted(self._overrides.items()):
             # those of rclpy are declared, or will be with the publishers and subscriptions
-            if not self.has_parameter(name) and not name.startswith(OVERRIDES) and (
+            if not self.has_parameter(name) and not name.startswith(topics.OVERRIDES) and (
                     rules.is_own(name, self._own)) and (
                     name not in usual or not rules.is_same(rules.plain(value), usual[name])):
                 logger.warning('%s', rules.unknown(name, self._own))
@@ -114,19 +111,19 @@ class PoseGraphNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     @property
-    def _configured(self) -> Session:
+    def _configured(self) -> session.Session:
         assert self._session is not None, 'rclpy allows the transition only when configured'
         return self._session
 
     def _configure(self) -> None:
         values = rules.checked_together(self._given)
-        check_topics(self, values, self._overrides)
-        self._session = Session(self, values)
-        self._offered = Services(self, self._session)
+        topics.check_topics(self, values, self._overrides)
+        self._session = session.Session(self, values)
+        self._offered = services.Services(self, self._session)
 
     def close(self) -> None:
         """Stop the worker and destroy all that was configured."""
-        closing: list[Services | Session | None] = [self._offered, self._session]
+        closing: list[services.Services | session.Session | None] = [self._offered, self._session]
         self._offered = self._session = None
         for each in closing:
             if each is not None:

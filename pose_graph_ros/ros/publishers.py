@@ -29,20 +29,17 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pose_graph_ros.adapters import output_cdr, parameter_table, parameters
+from pose_graph_ros.adapters import output_cdr, parameter_table, parameters, sources
 from pose_graph_ros.adapters.conversions import Datum, frame, Message, stamp_ns
-from pose_graph_ros.adapters.sources import JUDGE, source_list
-from pose_graph_ros.core.alignment import AlignmentState
+from pose_graph_ros.core import alignment, measurements
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import Estimate, predict
 from pose_graph_ros.core.geometry import covariance as cov, se2
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.judgement.texts import details, sentence, total_values, totals_text
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts, State, Verdict
-from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS, Seconds, StampNs
-from pose_graph_ros.ros import topics
-from pose_graph_ros.ros.spinning import guarded
+from pose_graph_ros.ros import spinning, topics
 from pose_graph_ros.ros.topics import TFMessage, TOPIC
 from pose_graph_ros.ros.worker import Worker
 
@@ -98,7 +95,7 @@ class Publishers:
         # None if `publish_tf` is false or tf2_msgs is not installed
         self.transforms: TransformPublisher | None = None
         self._map_topics = [node.resolve_topic_name(source.topic)
-                            for source in source_list(values) if source.kind.in_map]
+                            for source in sources.source_list(values) if source.kind.in_map]
         self._awaits_map = False    # whether there ever was a publisher on one of these
         self._newest_ns = 0
         self.graph = 0  # number of the present graph: how many were started after the first
@@ -121,8 +118,8 @@ class Publishers:
         self._slew_limits = tuple(values['transform_slew'])
         self._path_period = values['path_period']
 
-    def publish_pose(self, estimate: Estimate, odometry: Message, sample: OdometrySample,
-                     datum: Datum) -> None:
+    def publish_pose(self, estimate: Estimate, odometry: Message,
+                     sample: measurements.OdometrySample, datum: Datum) -> None:
         """
         Publish pose, odometry, fix and transform at an odometry message, if they are not held.
         """
@@ -138,7 +135,7 @@ class Publishers:
         if len(wanted) == 0:
             return
         prediction = predict(estimate, sample)
-        is_local = estimate.alignment is AlignmentState.LOCAL
+        is_local = estimate.alignment is alignment.AlignmentState.LOCAL
         if is_local:
             # without a source that is to tell where odometry lies, that is the map
             self._awaits_map = self._awaits_map or any(
@@ -169,7 +166,7 @@ class Publishers:
     def _holds(self, estimate: Estimate) -> bool:
         """Tell whether nothing is to be published of an estimate, as it is not in the map yet."""
         return (self._waits and len(self._map_topics) > 0
-                and estimate.alignment is not AlignmentState.ALIGNED)
+                and estimate.alignment is not alignment.AlignmentState.ALIGNED)
 
     def jump(self) -> None:
         """Let the next transform be published without limits: the robot was put elsewhere."""
@@ -205,7 +202,7 @@ class Publishers:
         if self.markers.is_due(None, period) and (view := backend.view()) is not None:
             publish(self.markers, None,
                     lambda at: output_cdr.markers_cdr(view, at, self.map_frame))
-        state = status.verdicts, status.n_changes, status.counts[JUDGE, 'accepted']
+        state = status.verdicts, status.n_changes, status.counts[sources.JUDGE, 'accepted']
         if self.verdicts.is_due(state, 0.0 if at_once else period):
             # of those that are believed, the newest of each source
             publish(self.verdicts, state, lambda at: verdicts_message(
@@ -295,10 +292,10 @@ class TransformPublisher:
         self._since = -math.inf
         self.other = ''  # warning about another publisher of the transform; empty if there is none
 
-    def publish(self, estimate: Estimate, sample: OdometrySample, offset_ns: int,
+    def publish(self, estimate: Estimate, sample: measurements.OdometrySample, offset_ns: int,
                 limits: tuple[float, float]) -> None:
         """Publish the transform at odometry, unless its stamp is not newer than the last one."""
-        if (estimate.alignment is AlignmentState.ALIGNED) != self._aligned:
+        if (estimate.alignment is alignment.AlignmentState.ALIGNED) != self._aligned:
             # the map frame itself has moved, which is no correction of the pose
             self._aligned = not self._aligned
             self.slew = Slew()
@@ -324,8 +321,8 @@ class TransformPublisher:
         # by endpoint: a second instance of this node, started by mistake, has the same name
         elif self.other == '' and silence > PAUSE and self._node.count_publishers(TOPIC) > 1:
             self._since = time.monotonic()
-            self._subscription = self._node.create_subscription(
-                TFMessage, TOPIC, guarded(self._on_transforms, lambda: True), TF_QOS, raw=True)
+            self._subscription = self._node.create_subscription(TFMessage, TOPIC, spinning.guarded(
+                self._on_transforms, lambda: True), TF_QOS, raw=True)
 
     def close(self) -> None:
         """Destroy the publisher and the subscription."""

@@ -23,15 +23,12 @@ from rclpy.timer import Timer
 
 from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import backend_config, CLOCK_JUMP_NS, SET_POSE, Source
+from pose_graph_ros.core import measurements, quantities
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.io.saved_graph import SavedGraph
-from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.quantities import NANOSECONDS
-from pose_graph_ros.ros import diagnostics, publishers, topics
+from pose_graph_ros.ros import diagnostics, log, publishers, spinning, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
-from pose_graph_ros.ros.log import ANSWER, NUMBER
-from pose_graph_ros.ros.spinning import guarded
 from pose_graph_ros.ros.worker import continued, initial_graph, SetPoseInput, Worker
 
 logger = logging.getLogger(__name__)
@@ -115,7 +112,7 @@ class Session:
                     topics.CLOSURE_QOS if source.kind.is_rare else topics.SENSOR_QOS,
                     partial(self._on_message, source)) for source in sources]
         self._subscriptions = [self.node.create_subscription(
-            topics.message_class(kind), topic, guarded(callback, lambda: self.active),
+            topics.message_class(kind), topic, spinning.guarded(callback, lambda: self.active),
             **topics.overridable(qos)) for topic, kind, qos, callback in wanted]
         self._watch_time()
         self.active, self.activated_at = True, time.monotonic()
@@ -160,10 +157,10 @@ class Session:
             self._watch_time()
 
     def _set_timer(self, name: str, period: float, tick: Callable[[], None]) -> None:
-        timer, period_ns = self._timers.get(name), round(period * NANOSECONDS)
+        timer, period_ns = self._timers.get(name), round(period * quantities.NANOSECONDS)
         if timer is None:
             self._timers[name] = self.node.create_timer(
-                period, guarded(tick, lambda: name in self._timers), clock=self._steady)
+                period, spinning.guarded(tick, lambda: name in self._timers), clock=self._steady)
         elif timer.timer_period_ns != period_ns:
             # not a new one: the executor knows it before the one that it replaces is gone
             timer.timer_period_ns = period_ns
@@ -185,7 +182,7 @@ class Session:
         """Post the measurement of a message; publish the pose at once for odometry."""
         self.input.post(received, self.worker.post)
         name, message, sample, refusal = received
-        if refusal is not None or not isinstance(sample, OdometrySample):
+        if refusal is not None or not isinstance(sample, measurements.OdometrySample):
             return
         estimate = self.worker.estimate
         covers = self._continuity[name].covers(estimate, sample)
@@ -203,7 +200,7 @@ class Session:
         if answer is not None:
             self.input.reject(SET_POSE, answer)
             logger.warning(
-                'the pose is not set: %s: %s', answer.reason, answer.detail, extra=ANSWER)
+                'the pose is not set: %s: %s', answer.reason, answer.detail, extra=log.ANSWER)
         self._set_pose()
 
     def _set_pose(self) -> None:
@@ -226,7 +223,7 @@ class Session:
             self._jump_handle = self.node.get_clock().create_jump_callback(
                 JumpThreshold(min_forward=None, on_clock_change=False,
                               min_backward=Duration(nanoseconds=-CLOCK_JUMP_NS)),
-                post_callback=guarded(self._on_clock_jump, lambda: self.active))
+                post_callback=spinning.guarded(self._on_clock_jump, lambda: self.active))
 
     def _on_clock_jump(self, jump: TimeJump) -> None:
         back_ns = -jump.delta.nanoseconds
@@ -256,7 +253,7 @@ class Session:
             self.input.reader.datum.keep(saved.datum)
 
     def _replace(self, backend: PoseGraphBackend, reason: str, *, resumes: bool = False) -> None:
-        logger.warning('%s', reason, extra=ANSWER)
+        logger.warning('%s', reason, extra=log.ANSWER)
         prepared = self.worker.prepared
         self.worker.stop(0.0)  # the result of a running solve is discarded
         self.out.start_new_graph()
@@ -311,7 +308,7 @@ class Session:
         level, text, _ = found[0]
         self.out.publish_diagnostics(level, f'{text[0].upper()}{text[1:]}.', values)
         if self.active:
-            present = {NUMBER.sub('', each.text): each.text for each in found if each.logged}
+            present = {log.NUMBER.sub('', each.text): each.text for each in found if each.logged}
             for key in present.keys() - self._told.keys():
                 logger.warning('%s', present[key])
             for key in self._told.keys() - present.keys():

@@ -24,9 +24,8 @@ import numpy as np
 from numpy.random import Generator
 from scipy.ndimage import gaussian_filter1d
 
-from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry import se2, trajectory
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Points
-from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.quantities import Metres
 from pose_graph_ros.offline.simulation import settings
 from pose_graph_ros.offline.simulation.settings import Closures, FalseClosures, FIXES, Setup
@@ -41,7 +40,7 @@ TURN_POINTS = 1000  # at which a turn is tabulated
 class Motion(NamedTuple):
     """True poses of a vehicle in the frame of the world, and how far it has driven."""
 
-    truth: Trajectory  # headings need not be wrapped
+    truth: trajectory.Trajectory  # headings need not be wrapped
     distance: FloatArray  # driven up to each pose, shape (N,) [m]
     lap_time: float = np.inf  # when the second lap begins [s]; never if there are no laps
 
@@ -84,7 +83,7 @@ def follow(path: FloatArray, stops: IntArray, waits: FloatArray, limits: Limits,
     time, distance = time[time <= duration_s], distance[time <= duration_s]
     poses = np.column_stack([np.interp(distance, length, column) for column in path.T])
     stamps: IntArray = settings.START_NS + np.round(time * 1e9).astype(np.int64)
-    return Motion(Trajectory(stamps, poses), distance), arrival
+    return Motion(trajectory.Trajectory(stamps, poses), distance), arrival
 
 
 def path_length(path: FloatArray) -> FloatArray:
