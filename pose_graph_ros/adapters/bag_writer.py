@@ -131,11 +131,10 @@ class BagWriter:
 
 
 def _qos(*, latched: bool) -> Qos:
-    depth, durability = ((1, QosDurability.TRANSIENT_LOCAL) if latched
-                         else (10, QosDurability.VOLATILE))
-    return Qos(interfaces.QosHistory.KEEP_LAST, depth, interfaces.QosReliability.RELIABLE,
-               durability, FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC, FOREVER,
-               avoid_ros_namespace_conventions=False)
+    return Qos(interfaces.QosHistory.KEEP_LAST, 1 if latched else 10,
+               interfaces.QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL if latched else
+               QosDurability.VOLATILE, FOREVER, FOREVER, interfaces.QosLiveliness.AUTOMATIC,
+               FOREVER, avoid_ros_namespace_conventions=False)
 
 
 def _from_ros1(source: Connection, jazzy: Typestore) -> tuple[str, Typestore, Convert]:

@@ -324,8 +324,9 @@ def choose_inputs(reader: Bag, sources: Sequence[Source], wanted: Mapping[str, s
     kinds = {source.name: source.kind for source in sources}
     chosen = {name: topic for name, topic in wanted.items() if topic is not None}
     asked = 'global_pose' in chosen
+    options = {name: f'--{name.replace("_", "-")}' for name in OPTIONS}
     for name in sorted(set(chosen) - set(kinds)):
-        raise BagError(f'--{_option(name)} {chosen[name]}: the parameter sources has no {name}')
+        raise BagError(f'{options[name]} {chosen[name]}: the parameter sources has no {name}')
     named = {source.name: '/' + source.topic.removeprefix('/') for source in sources
              if source.topic != KNOWN_SOURCES.get(source.name, (None, None))[1]}
     for name, topic in named.items():
@@ -335,7 +336,7 @@ def choose_inputs(reader: Bag, sources: Sequence[Source], wanted: Mapping[str, s
             logger.warning('%s: no topic %s for %s', reader.path, topic, name)
     topics = dict(chosen)
     for name, topic in chosen.items():
-        option = f'--{_option(name)}' if name in OPTIONS else f'{name}.topic'
+        option = options.get(name, f'{name}.topic')
         info, wanted_type = reader.topics.get(topic), kinds[name].message_type
         if info is None:
             raise BagError(
@@ -356,14 +357,12 @@ def choose_inputs(reader: Bag, sources: Sequence[Source], wanted: Mapping[str, s
     return inputs
 
 
-def _option(name: str) -> str:
-    return name.replace('_', '-')
 
 
 def _guess(reader: Bag, name: str, kinds: Mapping[str, Kind], topics: Mapping[str, str], *,
            asked: bool, truth: str | None) -> str | None:
     """Return the topic of a source for which none was given; None if there is no candidate."""
-    kind, option = kinds[name], f'--{_option(name)}'
+    kind, option = kinds[name], f'--{name.replace("_", "-")}'
     free = [topic for topic, info in reader.topics.items()
             if info.type == kind.message_type and topic != truth and not TRUTH.search(topic)
             and not any(used == topic and (kind.part == '' or kinds[source].part == kind.part)

@@ -225,9 +225,8 @@ def stamp_ns(message: Message, offset_ns: int = 0) -> int:
 def yaw_of(q: Message) -> float | None:
     """Return the yaw of a quaternion of any norm [rad]; None if the norm is zero or not finite."""
     norm = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w
-    if not (math.isfinite(norm) and norm > 1e-12):
-        return None
-    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - (
+        q.z * q.z)) if math.isfinite(norm) and norm > 1e-12 else None
 
 
 def planar_pose(pose: Message) -> FloatArray | Answer:
@@ -250,10 +249,9 @@ def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometryS
     x, y, _ = pose.tolist()
     if max(abs(x), abs(y)) > ms.LARGEST_COORDINATE:
         return rejected('too_large', f'odometry pose {pose.tolist()}')
-    linear = message.twist.twist.linear
-    speed = math.hypot(linear.x, linear.y)
-    twist = (planar_twist(message.twist.twist) if source.integrate == config.Integrate.TWIST.value
-             else None)
+    given, integrated_twist = message.twist.twist, config.Integrate.TWIST.value
+    speed = math.hypot(given.linear.x, given.linear.y)
+    twist = planar_twist(given) if source.integrate == integrated_twist else None
     if isinstance(twist, Answer):
         return twist
     return OdometrySample(stamp_ns(message, source.time_offset_ns), pose, speed if math.isfinite(
@@ -263,9 +261,8 @@ def odometry(message: Message, source: 'Source', _by: Surroundings) -> OdometryS
 def planar_twist(twist: Message) -> Pose | Answer:
     """Return (v_x, v_y, yaw rate) of a Twist, or the reason for rejecting it."""
     x, y, rate = float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
-    if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(rate)):
-        return rejected('not_finite', f'twist ({x}, {y}), yaw rate {rate}')
-    return x, y, rate
+    return (x, y, rate) if all(map(math.isfinite, (x, y, rate))) else rejected(
+        'not_finite', f'twist ({x}, {y}), yaw rate {rate}')
 
 
 def twist_variance(values: Sequence[float]) -> FloatArray | None:
@@ -290,8 +287,7 @@ def pose_in(message: Message, frames: Sequence[str], offset_ns: int = 0) -> ms.G
     if (named := frame(message.header.frame_id)) not in ('', *frames):
         return rejected('wrong_frame', f'expected frame {" or ".join(map(repr, frames))}, got '
                                        f'{named!r}')
-    pose = planar_pose(message.pose.pose)
-    return pose if isinstance(pose, Answer) else ms.GlobalPose(
+    return pose if isinstance(pose := planar_pose(message.pose.pose), Answer) else ms.GlobalPose(
         stamp_ns(message, offset_ns), pose, _planar(message.pose.covariance))
 
 

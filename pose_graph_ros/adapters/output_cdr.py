@@ -122,20 +122,6 @@ def path_cdr(path: Trajectory, stamp_ns: StampNs, frame_id: str) -> bytes:
                      first[-56:], rows[1:].tobytes()))
 
 
-class CdrStream:
-    """A stream of CDR: the position of each number is a multiple of its size."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-
-    def add(self, code: str, *numbers: npt.ArrayLike) -> None:
-        """Add numbers, or an array, as a type of NumPy."""
-        array = np.asarray(numbers, dtype=code)
-        self.data += bytes(-len(self.data) % array.itemsize) + array.tobytes()
-
-    def add_text(self, text: str) -> None:
-        """Add a string."""
-        self.data += _text(len(self.data), text)
 
 
 class Look(NamedTuple):
@@ -182,15 +168,32 @@ def markers_cdr(view: GraphView, stamp_ns: int, frame_id: str) -> bytes:
         (LINE_LIST, LOOK.edge_width, *_plain(view.unused.ends, LOOK.doubted)),
         (POINTS, LOOK.observed_size, *_plain(view.unused.ends[:, 1], LOOK.doubted))]
     shown = [number for number, (_, _, points, _) in enumerate(drawn) if len(points) > 0]
-    header = (*divmod(stamp_ns, NANOSECONDS), frame_id)
-    stream = CdrStream()
-    stream.add('<u4', 1 + len(shown))
-    _add_marker(stream, header, '', (0, 0, DELETEALL), 0.0, np.empty((0, 2)), plain)
-    for number in shown:
-        kind, size, points, point_colours = drawn[number]
-        _add_marker(
-            stream, header, NAMESPACES[number], (number, kind, ADD), size, points, point_colours)
-    return CDR + bytes(stream.data)
+    header = ('<u4', divmod(stamp_ns, NANOSECONDS)), ('text', frame_id)
+    stream = bytearray(_LENGTH.pack(1 + len(shown)))
+    for number, namespace, action in ((0, '', DELETEALL), *(
+            (number, NAMESPACES[number], ADD) for number in shown)):
+        kind, size, points, point_colours = drawn[number] if action == ADD else (
+            0, 0.0, np.empty((0, 2)), plain)
+        # a visualization_msgs/Marker field by field
+        for code, value in (
+                *header, ('text', namespace), ('<i4', (number, kind, action)),
+                # pose and scale, of which lines use the first
+                ('<f8', (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, size, size, 0.0)),
+                ('<f4', LOOK.node),     # of points without their own
+                ('<i4', (0, 0)), ('u1', 0),     # lifetime: forever; frame_locked
+                ('<u4', len(points)),
+                *([('<f8', np.pad(points, ((0, 0), (0, 1))))] if len(points) > 0 else []),
+                ('<u4', len(point_colours)), ('<f4', point_colours),
+                # texture_resource; texture with its data, and uv_coordinates
+                ('text', ''), *header, ('text', ''), ('<u4', (0, 0)),
+                # text, mesh_resource and the name of mesh_file; mesh_use_embedded_materials
+                ('text', ''), ('text', ''), ('text', ''), ('<u4', 0), ('u1', 0)):
+            if code == 'text':
+                stream += _text(len(stream), str(value))
+            else:   # the position of each number is a multiple of its size
+                array = np.asarray(value, dtype=code)
+                stream += bytes(-len(stream) % array.itemsize) + array.tobytes()
+    return CDR + bytes(stream)
 
 
 def colours(sigmas: FloatArray) -> Colours:
@@ -216,35 +219,3 @@ def _plain(points: FloatArray, colour: tuple[float, ...]) -> tuple[FloatArray, C
     """Return points, shape (..., 2), as one array, and the same colour for each of them."""
     points = points.reshape(-1, 2)
     return points, np.tile(np.array(colour, dtype=np.float32), (len(points), 1))
-
-
-def _add_marker(  # noqa: PLR0917  fields of a marker
-    stream: CdrStream, header: tuple[int, int, str], namespace: str, what: tuple[int, int, int],
-    size: float, points: FloatArray, point_colours: Colours,
-) -> None:
-    """Add a visualization_msgs/Marker field by field."""
-    def add_header() -> None:
-        stream.add('<u4', *header[:2])
-        stream.add_text(header[2])
-
-    add_header()
-    stream.add_text(namespace)
-    stream.add('<i4', *what)
-    # pose and scale, of which lines use the first
-    stream.add('<f8', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, size, size, 0.0)
-    stream.add('<f4', *LOOK.node)                           # of points without their own
-    stream.add('<i4', 0, 0)                                 # lifetime: forever
-    stream.add('u1', 0)                                     # frame_locked
-    stream.add('<u4', len(points))
-    if len(points) > 0:
-        stream.add('<f8', np.pad(points, ((0, 0), (0, 1))))
-    stream.add('<u4', len(point_colours))
-    stream.add('<f4', point_colours)
-    stream.add_text('')         # texture_resource
-    add_header()                # texture
-    stream.add_text('')
-    stream.add('<u4', 0, 0)     # its data, and uv_coordinates
-    for _ in range(3):
-        stream.add_text('')     # text, mesh_resource and the name of mesh_file
-    stream.add('<u4', 0)
-    stream.add('u1', 0)         # mesh_use_embedded_materials

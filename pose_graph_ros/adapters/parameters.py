@@ -309,6 +309,5 @@ def constraints(parameter: Parameter) -> str:
 def _yaml(value: Value) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    if isinstance(value, list):
-        return f'[{", ".join(_yaml(item) for item in value)}]'
-    return value if isinstance(value, str) and value != '' else repr(value)
+    return f'[{", ".join(map(_yaml, value))}]' if isinstance(value, list) else (
+        value if isinstance(value, str) and value != '' else repr(value))

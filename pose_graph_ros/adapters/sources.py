@@ -230,16 +230,14 @@ class MessageReader:
 
     def read(self, name: str, message: Message) -> Measured | Answer:
         """Return the measurement in a message of a source, or the reason for rejecting it."""
-        if isinstance(measurement := self.convert(name, message), Answer):
-            return measurement
-        return self.keeper.judge(name, measurement).refusal or measurement
+        return measurement if isinstance(measurement := self.convert(name, message), Answer) else (
+            self.keeper.judge(name, measurement).refusal or measurement)
 
     def convert(self, name: str, message: Message) -> Measured | Answer:
         """Return the same without a judgement of its stamp."""
         source = self.sources[name]
         measurement = source.kind.convert(message, source, self.surroundings)
-        if not isinstance(measurement, Answer) and (
-                # the seconds have 31 bits, of which one hour is left for offsets
-                measurement.stamp_ns > (2**31 - 3600) * NANOSECONDS):
-            return rejected('stamp_out_of_range', f'{measurement.stamp_ns} ns')
-        return measurement
+        # the seconds have 31 bits, of which one hour is left for offsets
+        return measurement if isinstance(measurement, Answer) or (
+            measurement.stamp_ns <= (2**31 - 3600) * NANOSECONDS) else rejected(
+                'stamp_out_of_range', f'{measurement.stamp_ns} ns')

@@ -29,11 +29,9 @@ def execute(_: argparse.Namespace) -> int:
               file=sys.stderr)
         return 1
     folders = jit.cache_folders()
-    whose = ', where only this user finds it; set NUMBA_CACHE_DIR for others'
-    if numba.config.CACHE_DIR:
-        whose = ' (NUMBA_CACHE_DIR)'
-    elif all(folder.name == '__pycache__' for folder in folders):
-        whose = ', in each __pycache__'
+    whose = (' (NUMBA_CACHE_DIR)' if numba.config.CACHE_DIR else
+             ', in each __pycache__' if all(each.name == '__pycache__' for each in folders) else
+             ', where only this user finds it; set NUMBA_CACHE_DIR for others')
     print(f'{"loaded" if complete else "compiled"} in {seconds:.1f} s; kept in '
           f'{os.path.commonpath(folders)}{whose}')
     return 0

@@ -93,8 +93,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.example and options.view == 'mrf':
         notes = ['Terms of a single node are not in the picture: a Markov random field has lines '
                  'for pairs of nodes only.']
-    for note in notes:
-        print(note, file=sys.stderr)
+    print(*notes, sep='\n', end='\n' if notes else '', file=sys.stderr)
     if options.out.suffix.lower() == '.dot':
         options.out.write_text(_dot(panels, notes), encoding='utf-8')
     else:

@@ -31,7 +31,7 @@ from pose_graph_ros.core.geometry.se2 import BoolArray, Covariances, FloatArray,
 from pose_graph_ros.core.geometry.trajectory import fit_motion, Trajectory
 from pose_graph_ros.core.judgement.texts import Key
 from pose_graph_ros.core.judgement.verdicts import State
-from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometrySample
+from pose_graph_ros.core.measurements import Answer, Fix, Measurement, OdometrySample, rejected
 from pose_graph_ros.core.quantities import StampNs
 
 MOST_SAMPLES = 200_000  # of a path that are compared and drawn
@@ -85,11 +85,10 @@ class Drive:
     @cached_property
     def placed_odometry(self) -> Trajectory:
         """Odometry laid over truth, else fixes, else result; as it is if none overlaps."""
-        anchors = [(self.fix_stamps_ns, self.fix_positions),
-                   (self.corrected.stamps_ns, self.corrected.poses[:, :2])]
-        if self.truth is not None:
-            anchors.insert(0, (self.truth.stamps_ns, self.truth.poses[:, :2]))
-        for stamps, positions in anchors:
+        for stamps, positions in (
+                *(() if self.truth is None else [(self.truth.stamps_ns, self.truth.poses[:, :2])]),
+                (self.fix_stamps_ns, self.fix_positions),
+                (self.corrected.stamps_ns, self.corrected.poses[:, :2])):
             if np.any(inside := self.odometry.covers(stamps)):
                 pose = fit_motion(self.odometry.at(stamps[inside])[:, :2], positions[inside])
                 return Trajectory(self.odometry.stamps_ns, se2.compose(pose, self.odometry.poses))
@@ -99,25 +98,22 @@ class Drive:
     def rows(self) -> list[ErrorRow]:
         """The errors of odometry, fixes and path; a row without any is left out."""
         rows: list[ErrorRow] = []
-        paths = {'odometry alone': self.placed_odometry, 'corrected path': self.corrected}
-        truth, stamps, positions = self.truth, self.fix_stamps_ns, self.fix_positions
+        odometry, path, truth = self.placed_odometry, self.corrected, self.truth
+        of_kind = {kind: (self.fix_stamps_ns[chosen], self.fix_positions[chosen])
+                   for kind, chosen in self.fix_kinds.items()}
         if truth is not None:
-            for name, path in paths.items():
-                _, errors = distances(path, truth.stamps_ns, truth.poses[:, :2])
-                rows += error_rows(f'{name} to truth', errors)
-            doubted = self.fix_kinds['doubted']
-            rows[1:1] = [row for name, chosen in (('fixes', ~doubted), ('doubted fixes', doubted))
-                         for row in error_rows(f'{name} to truth', distances(
-                             truth, stamps[chosen], positions[chosen])[1])]
-            inside = self.corrected.covers(truth.stamps_ns)
+            true, doubted = (truth.stamps_ns, truth.poses[:, :2]), self.fix_kinds['doubted']
+            for name, one, other in (
+                    ('odometry alone', odometry, true),
+                    ('fixes', truth, (self.fix_stamps_ns[~doubted], self.fix_positions[~doubted])),
+                    ('doubted fixes', truth, of_kind['doubted']), ('corrected path', path, true)):
+                rows += error_rows(f'{name} to truth', distances(one, *other)[1])
+            inside = path.covers(truth.stamps_ns)
             rows += error_rows('corrected heading to truth', np.rad2deg(np.abs(se2.wrap(
-                self.corrected.at(truth.stamps_ns[inside])[:, 2]
-                - truth.poses[inside, 2]))), 'deg')
+                path.at(truth.stamps_ns[inside])[:, 2] - truth.poses[inside, 2]))), 'deg')
         for kind in ('used', 'doubted', 'held out'):
-            chosen = self.fix_kinds[kind]
-            for name, path in paths.items():
-                _, errors = distances(path, stamps[chosen], positions[chosen])
-                rows += error_rows(f'{name} to fixes {kind}', errors)
+            for name, one in (('odometry alone', odometry), ('corrected path', path)):
+                rows += error_rows(f'{name} to fixes {kind}', distances(one, *of_kind[kind])[1])
         return rows
 
 
@@ -193,11 +189,10 @@ def format_table(rows: Sequence[ErrorRow]) -> str:
     if len(rows) == 0:
         return 'nothing to compare: neither truth nor fixes overlap with the paths in time'
     width = max(len(row.name) for row in rows)
-    lines = [f'{"":{width}}  {"median":>7} {"rms":>7} {"95 %":>7} {"max":>7}      {"count":>7}']
-    for row in rows:
-        values = ' '.join(f'{v:7.2f}' for v in (row.median, row.rms, row.p95, row.maximum))
-        lines.append(f'{row.name:{width}}  {values} {row.unit:<4} {row.count:7}')
-    return '\n'.join(lines)
+    return '\n'.join([
+        f'{"":{width}}  {"median":>7} {"rms":>7} {"95 %":>7} {"max":>7}      {"count":>7}',
+        *(f'{row.name:{width}}  {row.median:7.2f} {row.rms:7.2f} {row.p95:7.2f} '
+          f'{row.maximum:7.2f} {row.unit:<4} {row.count:7}' for row in rows)])
 
 
 def summary(drive: Drive, extra: Mapping[str, Any]) -> dict[str, Any]:
@@ -232,8 +227,7 @@ def measured_in(bag: Bag, inputs: Inputs, reader: MessageReader, refused: Counte
         try:
             measurement = reader.read(source, message.decode())
         except MessageError:
-            refused[source, 'malformed'] += 1
-            continue
+            measurement = rejected('malformed', '')
         if isinstance(measurement, Answer):
             refused[source, measurement.reason] += 1
         else:
@@ -253,10 +247,10 @@ def drive_in(bag: Bag, inputs: Inputs, values: Mapping[str, Any], backend: PoseG
     if origin is not None:
         reader.datum.keep(origin)
     is_on_earth = len(inputs.fixes) > 0 and not any(values['datum'][2:])
-    drive = collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
-                          inputs.odometry[0], refused)
     return place_truth(replace(
-        drive, map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
+        collect_drive(measured_in(bag, inputs, reader, Counter(), held_out=True), backend,
+                      inputs.odometry[0], refused),
+        map_axes=('east', 'north') if is_on_earth else ('x', 'y'),
         truth=None if truth_topic is None else read_truth(bag, truth_topic, inputs.span)))
 
 

@@ -32,8 +32,7 @@ SUMMARIES = {
     'tune': 'estimate the noise of the sources from bags; write a parameter file',
     'simulate': 'write a simulated drive as a rosbag2 or a graph',
     'parameters': 'print the parameters of the node',
-    'compile-kernels': 'compile the solver for later starts',
-}
+    'compile-kernels': 'compile the solver for later starts'}
 """Tools and what they do."""
 RETRY = 0.01  # after which an interrupt is tried again [s]
 

@@ -45,16 +45,13 @@ def execute(options: argparse.Namespace) -> int:
     write_g2o(graph, options.out, np.delete(file.ids, leaving))
     n_edges = len(graph.factors.edges)
     n_observed = graph.n_factors - n_edges
-    if options.json:
-        print(json.dumps({
-            'file': str(options.out), 'removed_nodes': len(leaving), 'hidden_nodes': graph.n_nodes,
-            'edges': n_edges, 'observed_nodes': n_observed, 'dense_priors': len(sizes),
-            'largest_dense_prior': max(sizes, default=0), 'chi2_before': before}, indent=2))
-    else:
-        print(f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {n_edges} '
-              f'edges and {n_observed} observed nodes')
-        if len(sizes) > 0:
-            print(f'edges stand for {len(sizes)} dense priors, the largest one on {max(sizes)} '
-                  'nodes')
-        print(f'written: {options.out}')
+    print(json.dumps({
+        'file': str(options.out), 'removed_nodes': len(leaving), 'hidden_nodes': graph.n_nodes,
+        'edges': n_edges, 'observed_nodes': n_observed, 'dense_priors': len(sizes),
+        'largest_dense_prior': max(sizes, default=0), 'chi2_before': before}, indent=2)
+        if options.json else
+        f'{len(leaving)} hidden nodes removed; {graph.n_nodes} left, with {n_edges} edges and '
+        f'{n_observed} observed nodes\n' + (
+            f'edges stand for {len(sizes)} dense priors, the largest one on {max(sizes)} nodes\n'
+            if len(sizes) > 0 else '') + f'written: {options.out}')
     return 0

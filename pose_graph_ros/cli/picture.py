@@ -211,12 +211,11 @@ def _draw_errors(axes: Axes, drive: Drive) -> None:
     axes.set_title(f'distance to {target}', loc='left', fontsize=13, fontweight='bold')
     used = np.sort(drive.fix_stamps_ns[drive.fix_kinds['used']])
     used = used[(used > begin) & (used < end)]
-    if len(used) < 3:
-        return
     # no fixes were used for 5 s and 10 median periods
     edges = (np.concatenate(([begin], used, [end])) - begin) * 1e-9
     pauses = np.diff(edges)
-    for k in np.flatnonzero(pauses > max(5.0, 10.0 * float(np.median(pauses)))).tolist():
+    long = len(used) >= 3 and pauses > max(5.0, 10.0 * float(np.median(pauses)))
+    for k in np.flatnonzero(long).tolist():
         axes.axvspan(float(edges[k]), float(edges[k + 1]), color=SHADE, zorder=0)
         axes.set_title('shaded: no fixes used', loc='right', fontsize=12, color=GREY)
 

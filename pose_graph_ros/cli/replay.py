@@ -339,8 +339,6 @@ def _report(options: argparse.Namespace, done: Run, facts: Mapping[str, Any],
         write_lines(exported[-1], path_files.csv_lines(
             Trajectory(np.array([*live], dtype=np.int64), poses), covariances))
     names = 'drive.png', 'summary.json', 'run.json', 'graph.g2o', *(each.name for each in exported)
-    if options.json:
-        print((options.out / 'summary.json').read_text(encoding='utf-8'), end='')
-    else:
-        print('\n'.join([*lines, f'written: {options.out}/path.tum, {", ".join(names)}']))
+    print((options.out / 'summary.json').read_text(encoding='utf-8').rstrip('\n') if options.json
+          else '\n'.join([*lines, f'written: {options.out}/path.tum, {", ".join(names)}']))
     return 0 if done.report.status is Status.CONVERGED else 1

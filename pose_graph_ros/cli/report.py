@@ -57,16 +57,13 @@ def execute(options: argparse.Namespace) -> int:
     page = options.out or file.parent / 'report.html'
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(render(data), encoding='utf-8')
-    if options.json:
-        # without its large tables
-        print(json.dumps({key: data[key] for key in SUMMARY} | {'sources': [
-            {key: value for key, value in source.items() if key not in ('series', 'histogram')}
-            for source in data['sources']], 'page': str(page), 'bytes': page.stat().st_size},
-            indent=2))
-    else:
-        for each in data['findings']:
-            print(f'{each["level"]:8} {each["text"]}')
-        print(f'written: {page} ({1e-6 * page.stat().st_size:.1f} MB)')
+    # without its large tables
+    print(json.dumps({key: data[key] for key in SUMMARY} | {'sources': [
+        {key: value for key, value in source.items() if key not in ('series', 'histogram')}
+        for source in data['sources']], 'page': str(page), 'bytes': page.stat().st_size}, indent=2)
+        if options.json else '\n'.join([
+            *(f'{each["level"]:8} {each["text"]}' for each in data['findings']),
+            f'written: {page} ({1e-6 * page.stat().st_size:.1f} MB)']))
     if options.open:
         webbrowser.open(page.resolve().as_uri())
     return code

@@ -40,8 +40,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the tool; return the exit code."""
     if options.plot is not None and options.plot.suffix not in PICTURES:
         raise ConfigError(f'--plot {options.plot}: the name must end in {", ".join(PICTURES)}')
-    is_graph = options.out.suffix == GRAPH_SUFFIX
-    if is_graph:
+    if is_graph := options.out.suffix == GRAPH_SUFFIX:
         refuse_what_graphs_lack(options)
     elif options.node_distance is not None:
         raise ConfigError(f'--node-distance: only a graph has nodes, but {options.out} is a bag; '
@@ -50,9 +49,8 @@ def execute(options: argparse.Namespace) -> int:
     beside = {kind: options.out.with_name(f'{name}_truth.{kind}') for kind in (
         'json', *(['tum'] if options.tum else []), *(['g2o'] if is_graph else []))}
     written = [options.out, *beside.values()]
-    for path in written:
-        if path.exists():
-            raise FileWriteError(f'{path}: exists already, not overwritten')
+    for path in filter(Path.exists, written):
+        raise FileWriteError(f'{path}: exists already, not overwritten')
     duration = options.duration or settings.DURATIONS_S[options.world]
     way = recording.course(worlds.WORLDS[options.world], options.seed, duration,
                            lambda usual: changed(usual, options))
@@ -101,14 +99,12 @@ def _lines(about: Mapping[str, Any]) -> Iterator[str]:
     """Yield what people want to know of a simulation."""
     yield (f'{about["world"]}, seed {about["seed"]}: {about["distance_m"]:.0f} m in '
            f'{about["duration_s"]:g} s')
-    if 'topics' in about:
-        yield from (f'  {topic:<14} {count}' for topic, count in about['topics'].items())
-    else:
+    yield from (f'  {topic:<14} {count}' for topic, count in about.get('topics', {}).items())
+    if 'nodes' in about:
         yield (f'  {about["nodes"]} nodes, {about["edges"]} edges, {about["observed_nodes"]} '
                f'observed nodes; chi2 of the truth {about["chi2_of_the_truth"]:.6g}, of '
                f'{about["measured_numbers"]} numbers')
-    yield (f'  {about["true_closures"]} true and {len(about["false_closures"])} false loop '
-           'closures')
+    yield f'  {about["true_closures"]} true and {len(about["false_closures"])} false loop closures'
     if about['missing_groups'] > 0:
         yield (f'  warning: {about["missing_groups"]} false closures or groups of them found no '
                'places that are apart and driven in the same direction')
@@ -122,9 +118,8 @@ def write_drive(drive: recording.Recording, folder: Path, *,
     An existing bag raises `BagError`, unless it is to be replaced.
     """
     total = sum(len(recorded) for _, recorded in drive.arrivals.values())
-    messages = heapq.merge(*(
-        _delivered(each, *drive.arrivals[topic]) for topic, each in _messages(drive).items()),
-        key=itemgetter(2))
+    messages = heapq.merge(*(_delivered(each, *drive.arrivals[topic]) for topic, each in
+                             _messages(drive).items()), key=itemgetter(2))
     with bag_writer.BagWriter(folder, overwrite=overwrite) as bag:
         for topic, type_name, recorded_ns, message in watched(
                 messages, desc='writing', total=total):
@@ -132,9 +127,8 @@ def write_drive(drive: recording.Recording, folder: Path, *,
     fixes, poses, closures = (
         drive.measured[topic] for topic in (settings.FIXES, settings.POSES, settings.CLOSURES))
     about = {
-        'distance_m': drive.distance,
-        'topics': {topic: len(recorded) for topic, (_, recorded) in drive.arrivals.items()
-                   if len(recorded) > 0},
+        'distance_m': drive.distance, 'topics': {topic: len(recorded) for topic, (
+            _, recorded) in drive.arrivals.items() if len(recorded) > 0},
         **_closures(closures.wrong, drive.missing_groups, 'stamps_ns', closures.stamps_ns),
         'wrong_fixes_ns': fixes.stamps_ns[fixes.wrong >= 0].tolist(),
         'wrong_global_poses_ns': poses.stamps_ns[poses.wrong >= 0].tolist(),
@@ -147,14 +141,10 @@ def write_drive(drive: recording.Recording, folder: Path, *,
 def _messages(drive: recording.Recording) -> dict[str, Iterator[Message]]:
     """Return the messages of all topics by stamp; of equally late ones the first is written."""
     setup, (odometry, gyro, fixes, poses, closures) = drive.setup, settings.TOPICS
-    covariances = {topic: np.diag(np.square(setup.sigmas(topic))) for topic in (poses, closures)
-                   if topic in setup.sensors}
     topics = {
-        odometry: odometry_messages(
-            odometry, 'odom', drive.odometry, ODOMETRY_VARIANCES,
-            drive.measured[odometry].values[:, 3:]),
-        settings.TRUTH: odometry_messages(
-            settings.TRUTH, 'map', drive.truth, (0.0,) * 6)}
+        odometry: odometry_messages(odometry, 'odom', drive.odometry, ODOMETRY_VARIANCES,
+                                    drive.measured[odometry].values[:, 3:]),
+        settings.TRUTH: odometry_messages(settings.TRUTH, 'map', drive.truth, (0.0,) * 6)}
     if setup.gyro is not None:
         stamps_ns, values, _ = drive.measured[gyro]
         sigma = setup.claimed(gyro) * setup.gyro.sigma / np.sqrt(worlds.PERIOD_S)
@@ -168,10 +158,11 @@ def _messages(drive: recording.Recording) -> dict[str, Iterator[Message]]:
         topics[fixes] = fix_messages(fixes, *drive.measured[fixes][:2], setup.sigmas(fixes)[0])
     if setup.poses is not None:
         stamps_ns, values, _ = drive.measured[poses]
-        topics[poses] = _poses(poses, stamps_ns, ['map'] * len(values), values, covariances[poses])
+        topics[poses] = _poses(poses, stamps_ns, ['map'] * len(values), values,
+                               np.diag(np.square(setup.sigmas(poses))))
     if setup.closures is not None:
         topics[closures] = loop_closure_messages(
-            closures, *drive.measured[closures][:2], covariances[closures])
+            closures, *drive.measured[closures][:2], np.diag(np.square(setup.sigmas(closures))))
     return topics
 
 
@@ -192,10 +183,9 @@ def _delivered(messages: Iterable[Message], index: IntArray,
 
 
 def _closures(group: IntArray, missing: int, what: str, ends: IntArray) -> dict[str, Any]:
-    false = np.flatnonzero(group >= 0)
-    return {'true_closures': int(np.sum(group < 0)),
-            'false_closures': [{what: pair, 'group': number} for pair, number in zip(
-                ends[false].tolist(), group[false].tolist(), strict=True)],
+    return {'true_closures': int(np.sum(group < 0)), 'false_closures': [
+        {what: pair, 'group': number} for pair, number in zip(
+            ends[group >= 0].tolist(), group[group >= 0].tolist(), strict=True)],
             'missing_groups': missing}
 
 
@@ -205,9 +195,9 @@ def _disturbances(setup: settings.Setup) -> dict[str, Any]:
         return settings.START_NS + round(seconds * 1e9) if np.isfinite(seconds) else None
 
     return {
-        'start_ns': settings.START_NS,
-        'outages': [{'topic': each.topic, 'begin_ns': stamp(each.begin_s),
-                     'end_ns': stamp(each.end_s)} for each in setup.outages],
+        'start_ns': settings.START_NS, 'outages': [
+            {'topic': each.topic, 'begin_ns': stamp(each.begin_s), 'end_ns': stamp(each.end_s)}
+            for each in setup.outages],
         'jumps': [{'topic': each.topic, 'at_ns': stamp(each.at_s), 'end_ns': stamp(
             each.at_s + each.seconds), 'step': each.step} for each in setup.jumps],
         **{name: [asdict(each) for each in found] for name, found in (
@@ -240,12 +230,12 @@ def fix_messages(topic: str, stamps_ns: StampsNs, geodetic: FloatArray,
 
     Sigma is that of east and of north; that of the height is twice as large.
     """
-    status = _TYPES['sensor_msgs/msg/NavSatStatus']
+    status, kind = _TYPES['sensor_msgs/msg/NavSatStatus'], _TYPES[_FIX]
     covariance = sigma**2 * np.diag([1.0, 1.0, 4.0]).ravel()
     for stamp, fix in zip(stamps_ns.tolist(), geodetic.tolist(), strict=True):
-        yield topic, _FIX, stamp, _TYPES[_FIX](
+        yield topic, _FIX, stamp, kind(
             _header(stamp, 'gps'), status(status.STATUS_FIX, status.SERVICE_GPS), *fix,
-            covariance, _TYPES[_FIX].COVARIANCE_TYPE_DIAGONAL_KNOWN)
+            covariance, kind.COVARIANCE_TYPE_DIAGONAL_KNOWN)
 
 
 def loop_closure_messages(topic: str, stamps_ns: IntArray, poses: Poses,

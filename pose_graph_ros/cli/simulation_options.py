@@ -101,8 +101,7 @@ def _by_world(values: dict[str, float]) -> str:
 def _add_sensors(parser: argparse.ArgumentParser) -> None:
     """Add the options on sensors; `dest` is the sensor, with the fields of it that are set."""
     wheels = parser.add_argument_group('odometry on /odom, 20 Hz')
-    wheels.add_argument('--odometry',
-                        dest='wheels.errors', choices=[each.value for each in OdometryErrors],
+    wheels.add_argument('--odometry', dest='wheels.errors', choices=[*map(str, OdometryErrors)],
                         type=lambda text: next((e for e in OdometryErrors if e == text), text),
                         help='errors of two wheels, or a random walk as the node assumes it '
                         '(default: wheels; a graph always has the latter)')
@@ -190,9 +189,8 @@ def refuse_what_graphs_lack(options: argparse.Namespace) -> None:
     for option, place in ONLY_IN_BAGS.items():
         if getattr(options, place) not in (None, False, []):
             raise ConfigError(f'{option}: only a bag has it, but {options.out} is a graph')
-    for topic, _ in options.outage:
-        if topic == settings.ODOMETRY:
-            raise ConfigError(f'--outage {settings.ODOMETRY}: a graph cannot do without odometry')
+    if any(topic == settings.ODOMETRY for topic, _ in options.outage):
+        raise ConfigError(f'--outage {settings.ODOMETRY}: a graph cannot do without odometry')
 
 
 def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:
@@ -201,7 +199,7 @@ def _numbers(*order: int) -> Callable[[str], tuple[float, ...]]:
 
     def read(text: str) -> tuple[float, ...]:
         try:
-            values = tuple(float(each) for each in text.split(','))
+            values = tuple(map(float, text.split(',')))
         except ValueError:
             values = ()
         if len(values) != count or not all(map(math.isfinite, values)):

@@ -95,8 +95,7 @@ class Searches:
             self.contradiction, self._n = None, 0
         if not worker.prepared or time.monotonic() < self.due:
             return
-        is_new = badly and n >= self._n
-        if is_new:
+        if is_new := badly and n >= self._n:
             self._n = 2 * n
 
         def search(backend: PoseGraphBackend) -> None:

@@ -48,11 +48,9 @@ class NodeLog(logging.Handler):
         Those that answer a person are always logged: `extra=ANSWER`.
         """
         try:
-            left_out = 0
-            if hasattr(record, 'way') or (
-                    record.levelno >= logging.WARNING and not hasattr(record, 'is_answer')):
-                left_out = self._repeated(record)
-            if left_out < 0:
+            repeats = hasattr(record, 'way') or (
+                record.levelno >= logging.WARNING and not hasattr(record, 'is_answer'))
+            if (left_out := self._repeated(record) if repeats else 0) < 0:
                 return
             text = self.format(record) + (
                 f' ({left_out} more like it before)' if left_out > 0 else '')

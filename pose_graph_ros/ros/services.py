@@ -117,10 +117,9 @@ class Services:
             f'the datum is still [{plane.latitude:.9f}, {plane.longitude:.9f}]')
 
     def _pause(self, request: SetBool.Request) -> Answer:
-        received = self._session.input
-        if received.paused == request.data:
+        before, self._session.input.paused = self._session.input.paused, request.data
+        if before == request.data:
             return True, 'paused already' if request.data else 'was not paused'
-        received.paused = request.data
         return True, ('paused: measurements are counted but not used; poses still '
                       'follow the odometry' if request.data else 'resumed')
 
@@ -136,11 +135,10 @@ class Services:
                    in session.input.reader.sources.items() if source.kind.on_earth)
         if datum.is_of_graph:
             return False, 'refused: the graph that was loaded refers to the present datum'
-        if datum.plane is not None and used > 0:
+        if (plane := datum.plane) is not None and used > 0:
             return False, (f'refused: {used} fixes in the graph refer to the datum '
-                           f'[{datum.plane.latitude:.9f}, {datum.plane.longitude:.9f}]')
-        if datum.plane is not None and (
-                status.pending > 0 or status.processed < session.input.posted):
+                           f'[{plane.latitude:.9f}, {plane.longitude:.9f}]')
+        if plane is not None and (status.pending > 0 or status.processed < session.input.posted):
             return False, ('refused: measurements that wait for odometry may refer to the '
                            'present datum')
         datum.renew()
@@ -190,9 +188,8 @@ class Services:
                 self._require_present(worker)
                 datum = session.input.reader.datum
                 origin = None if datum.plane is None else datum.plane.origin
-                refusal = site_refusal(
-                    saved, *((origin, None) if datum.is_given else (None, origin)))
-                if refusal is not None:
+                if (refusal := site_refusal(
+                        saved, *((origin, None) if datum.is_given else (None, origin)))):
                     raise FileFormatError(refusal)
                 backend.configure(backend_config(session.values))
                 session.load(saved, backend, str(path))
@@ -203,5 +200,4 @@ class Services:
         assert self._node.executor is not None, 'a node that is served is spun'
         self._node.executor.create_task(replace)    # in the thread of the node's callbacks
         done.result()
-        return (f'{len(saved.nodes.ids)} hidden nodes from {path}, datum '
-                f'{"none" if saved.datum is None else saved.datum}')
+        return f'{len(saved.nodes.ids)} hidden nodes from {path}, datum {saved.datum or "none"}'

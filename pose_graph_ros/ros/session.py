@@ -186,12 +186,11 @@ class Session:
             return
         estimate = self.worker.estimate
         covers = self._continuity[name].covers(estimate, sample)
-        if estimate is None or estimate.primary != name:
-            return
-        if covers:
-            self.out.publish_pose(estimate, message, sample, self.input.reader.datum)
-        elif not self.input.paused:
-            self.worker.request_update()  # with this sample
+        if estimate is not None and estimate.primary == name:
+            if covers:
+                self.out.publish_pose(estimate, message, sample, self.input.reader.datum)
+            elif not self.input.paused:
+                self.worker.request_update()  # with this sample
 
     def _on_set_pose(self, message: Message) -> None:
         """Receive a pose that a user sets."""
@@ -206,10 +205,9 @@ class Session:
     def _set_pose(self) -> None:
         """Hand the pose that was set, if there is one, to the engine once there is odometry."""
         estimate = self.worker.estimate
-        if estimate is None or (pose := self._set_pose_input.pop(estimate)) is None:
-            return
-        self.out.jump()
-        self.worker.set_pose(pose, self.out.map_frame)
+        if estimate is not None and (pose := self._set_pose_input.pop(estimate)) is not None:
+            self.out.jump()
+            self.worker.set_pose(pose, self.out.map_frame)
 
     # ---- time
 

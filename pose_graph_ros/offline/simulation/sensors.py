@@ -231,11 +231,10 @@ def jumped(odometry: Trajectory, setup: Setup) -> Trajectory:
     poses = odometry.poses.copy()
     for jump in sorted(setup.jumps_of(settings.ODOMETRY), key=lambda each: each.at_s):
         k = int(np.searchsorted(odometry.stamps_ns, START_NS + round(jump.at_s * 1e9)))
-        if k == len(poses):
-            continue
         # where it is, moved in the frame of the robot, or the origin
-        there = np.zeros(3) if jump.step is None else se2.compose(poses[k], np.array(jump.step))
-        poses[k:] = se2.compose(there, se2.between(poses[k], poses[k:]))
+        if k < len(poses):
+            there = se2.compose(poses[k], np.array(jump.step)) if jump.step else np.zeros(3)
+            poses[k:] = se2.compose(there, se2.between(poses[k], poses[k:]))
     return Trajectory(odometry.stamps_ns, poses)
 
 
@@ -257,9 +256,8 @@ def heard(stamps_ns: IntArray, topic: str, outages: Iterable[settings.Outage]) -
     """Return which measurements of a topic are in no outage, shape (M,)."""
     time = (stamps_ns - START_NS) * 1e-9
     kept = np.ones(len(stamps_ns), dtype=bool)
-    for outage in outages:
-        if outage.topic == topic:
-            kept &= (time < outage.begin_s) | (time >= outage.end_s)
+    for outage in (each for each in outages if each.topic == topic):
+        kept &= (time < outage.begin_s) | (time >= outage.end_s)
     return kept
 
 
@@ -271,16 +269,14 @@ def arrivals(generator: Generator, topic: str, stamps_ns: IntArray,
     n = len(stamps_ns)
     late, again = generator.random(n), generator.random((2, n))
     seconds = np.full(n, settings.LATENCY_S[topic])
-    for delay in setup.delays:
-        if delay.topic == topic:
-            seconds = delay.seconds + delay.jitter_s * late
+    for delay in (each for each in setup.delays if each.topic == topic):
+        seconds = delay.seconds + delay.jitter_s * late
     recorded = stamps_ns + np.round(seconds * 1e9).astype(np.int64)
     index = np.arange(n)
-    for twice in setup.duplicates:
-        if twice.topic == topic:
-            chosen = np.flatnonzero(again[0] < twice.share)
-            index = np.append(index, chosen)
-            recorded = np.append(recorded, recorded[chosen] + np.round(
-                AGAIN_S * 1e9 * again[1, chosen]).astype(np.int64))
+    for twice in (each for each in setup.duplicates if each.topic == topic):
+        chosen = np.flatnonzero(again[0] < twice.share)
+        index = np.append(index, chosen)
+        recorded = np.append(recorded, recorded[chosen] + np.round(
+            AGAIN_S * 1e9 * again[1, chosen]).astype(np.int64))
     order = np.argsort(recorded, kind='stable')
     return index[order], recorded[order]

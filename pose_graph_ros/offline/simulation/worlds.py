@@ -275,12 +275,6 @@ def _circuit(duration_s: float) -> tuple[FloatArray, IntArray, float]:
     return heading, np.round(stops / CIRCUIT_STEP).astype(np.int64), lap_length
 
 
-def _drive_setup(motion: Motion) -> Setup:
-    outage = (motion.lap_time + OUTAGE_S[0], motion.lap_time + OUTAGE_S[1])
-    return Setup(wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
-                 closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
-                 outages=(settings.Outage(FIXES, *outage),) if np.isfinite(motion.lap_time)
-                 else (), jumps=(REFLECTED,))
 
 
 def _hall(generator: Generator, duration_s: float) -> Motion:
@@ -320,7 +314,11 @@ def _grid(generator: Generator, duration_s: float) -> Motion:
 
 
 WORLDS = {
-    'drive': World(drive_circuit, _drive_setup, one_stream=True),
+    'drive': World(drive_circuit, lambda motion: Setup(
+        wheels=settings.Wheels(start=(3.2, -1.4, -2.0)), fixes=settings.Fixes(),
+        closures=Closures(false=FalseClosures(groups=1, size=4, singles=4, loose=True)),
+        outages=(settings.Outage(FIXES, *(motion.lap_time + np.array(OUTAGE_S)).tolist()),)
+        if np.isfinite(motion.lap_time) else (), jumps=(REFLECTED,)), one_stream=True),
     'hall': World(_hall, lambda _: Setup(
         wheels=settings.Wheels(track_width=0.6, slip_events_per_s=1.0 / 120.0),
         closures=Closures(
@@ -328,9 +326,6 @@ WORLDS = {
             place_distance=1.0, first_s=REST_S,
             false=FalseClosures(min_distance=3.0, spacing=1.0, from_s=60.0)))),
     'grid': World(_grid, lambda _: Setup(
-        wheels=settings.Wheels(track_width=0.8),
-        closures=Closures(
+        wheels=settings.Wheels(track_width=0.8), closures=Closures(
             rate=0.5, sigmas=(0.1, 0.1, 0.02), spacing=1.0, radius=1.5, min_distance=10.0,
-            first_s=REST_S,
-            false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0)))),
-}
+            first_s=REST_S, false=FalseClosures(min_distance=8.0, spacing=1.0, from_s=60.0))))}
