@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from functools import partial
 import glob
 import heapq
-from itertools import groupby
 import logging
 from pathlib import Path
 import re
@@ -112,12 +111,12 @@ class Bag:
         self._decoders: dict[tuple[Path, str], Callable[[bytes], Any]] = {}
         self.watch: Watch = lambda messages, _: messages    # all messages pass it
         self.path = ', '.join(str(path) for path, _ in self._parts)
-        connections = sorted((c for _, reader in parts for c in reader.connections), key=_absolute)
-        self.topics = {}
-        for name, group in groupby(connections, key=_absolute):
-            found = list(group)
-            types = ' | '.join(sorted({c.msgtype for c in found}))
-            self.topics[name] = TopicInfo(types, sum(c.msgcount for c in found))
+        found: dict[str, list[Connection]] = {}
+        for connection in (each for _, reader in parts for each in reader.connections):
+            found.setdefault(_absolute(connection), []).append(connection)
+        self.topics = {name: TopicInfo(
+            ' | '.join(sorted({each.msgtype for each in own})), sum(
+                each.msgcount for each in own)) for name, own in sorted(found.items())}
         self.start_ns = min(reader.start_time for _, reader in parts)   # an empty one begins late
         self.end_ns = max(reader.end_time for _, reader in parts)
 

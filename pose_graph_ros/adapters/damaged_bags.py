@@ -54,19 +54,20 @@ class _Mcap:
         self.close = self._file.close
 
     def messages(self) -> Iterator[_Message]:
-        """Yield all messages; what defines them may stand behind them, where the index is."""
+        """Yield all messages."""
+        return self._messages(self._file, 8, _ANY)
+
+    def _messages(self, data: bytes | mmap.mmap, at: int, kinds: range) -> Iterator[_Message]:
+        """Yield the messages; what defines them may stand behind them, where the index is."""
         blocks = []
-        for kind, begin, end in self._records(self._file, 8, _ANY):
+        for kind, begin, end in self._records(data, at, kinds):
             self.complete |= kind == _FOOTER
             if kind in {_CHUNK, _MESSAGE}:
                 blocks.append((kind, begin, end))
             else:
-                self._define(kind, self._file[begin:end])
+                self._define(kind, data[begin:end])
         for kind, begin, end in blocks:
-            if kind == _CHUNK:
-                yield from self._in_chunk(self._file[begin:end])
-            else:
-                yield from self._message(self._file[begin:end])
+            yield from (self._in_chunk if kind == _CHUNK else self._message)(data[begin:end])
 
     def _records(self, data: bytes | mmap.mmap, at: int,
                  kinds: range) -> Iterator[tuple[int, int, int]]:
@@ -93,12 +94,8 @@ class _Mcap:
         except Exception:   # decompression can raise anything
             self.n_damaged += 1
             return
-        for kind, begin, end in self._records(content, 0, _IN_CHUNK):
-            if kind == _MESSAGE:
-                yield from (message for message in self._message(content[begin:end])
-                            if first <= message[1] <= last)
-            else:
-                self._define(kind, content[begin:end])
+        yield from (message for message in self._messages(content, 0, _IN_CHUNK)
+                    if first <= message[1] <= last)
 
     def _define(self, kind: int, data: bytes) -> None:
         """Note what a record of a schema or a channel says, unless another one said it."""

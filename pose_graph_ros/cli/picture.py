@@ -36,9 +36,9 @@ USED_FIXES: dict[str, Any] = {
     'color': ORANGE, 'marker': 'o', 'linestyle': 'none', 'markeredgewidth': 0, 'alpha': 0.6}
 DOUBTED_FIXES: dict[str, Any] = {
     'color': GREY, 'marker': 'x', 'linestyle': 'none', 'markersize': 5.5, 'markeredgewidth': 1.1}
-HELD_OUT_FIXES: dict[str, Any] = {'color': 'none', 'marker': 'D', 'linestyle': 'none',
-                                  'markersize': 4.5, 'markeredgecolor': VERMILION,
-                                  'markeredgewidth': 0.9}
+HELD_OUT_FIXES: dict[str, Any] = {
+    'color': 'none', 'marker': 'D', 'linestyle': 'none', 'markersize': 4.5,
+    'markeredgecolor': VERMILION, 'markeredgewidth': 0.9}
 STYLE: Any = {
     'font.size': 12, 'text.color': INK, 'axes.labelcolor': INK, 'axes.edgecolor': GREY,
     'xtick.color': GREY, 'ytick.color': GREY, 'grid.color': GRID, 'axes.grid': True,
@@ -73,14 +73,11 @@ def draw_drive(drive: Drive, file: Path, title: str, names: dict[str, str] | Non
     low, high = low - pad, high + pad
     wide, tall = (high - low).tolist()
     with rc_context(STYLE):
-        is_tall = tall > 1.15 * wide
-        if is_tall:
-            figure = Figure(figsize=(16.0, 10.0), dpi=100, layout='constrained')
-            plan, errors = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-        else:
-            height = float(np.clip(12.0 * tall / wide, 4.5, 9.0))
-            figure = Figure(figsize=(16.0, height + 4.5), dpi=100, layout='constrained')
-            plan, errors = figure.subplots(2, 1, height_ratios=(height, 2.5))
+        is_tall, height = tall > 1.15 * wide, float(np.clip(12.0 * tall / wide, 4.5, 9.0))
+        figure = Figure(figsize=(16.0, 10.0 if is_tall else height + 4.5), dpi=100,
+                        layout='constrained')
+        plan, errors = (figure.subplots(1, 2, width_ratios=(1.0, 1.5)) if is_tall else
+                        figure.subplots(2, 1, height_ratios=(height, 2.5)))
         _draw_map(plan, drive)
         plan.set_aspect('equal', anchor='NW')
         plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))

@@ -3,7 +3,7 @@
 """What several tools share: topics, parameters and times by their options; progress bars."""
 
 import argparse
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
 import math
 from pathlib import Path
@@ -40,14 +40,13 @@ def parameter_values(options: argparse.Namespace, usual: Values | None = None) -
     return checked(given)
 
 
+
+
 def ros_arguments(options: argparse.Namespace) -> list[str]:
     """Return the command line arguments that give the node the same parameters."""
-    arguments = ['--ros-args']
-    if options.params_file is not None:
-        arguments += ['--params-file', str(options.params_file.resolve())]
-    for text in options.param:
-        arguments += ['-p', text]
-    return arguments
+    file = options.params_file
+    return ['--ros-args', *([] if file is None else ['--params-file', str(file.resolve())]),
+            *(word for text in options.param for word in ('-p', text))]
 
 
 def _read_file(path: Path | None) -> dict[str, Any]:
@@ -65,18 +64,16 @@ def _read_file(path: Path | None) -> dict[str, Any]:
         parameters = section.get('ros__parameters') if isinstance(section, Mapping) else None
         if not isinstance(parameters, Mapping):
             raise ConfigError(f'{path}: {name}: expected ros__parameters')
-        _flatten(parameters, '', given)
+        given.update(_flat(parameters))
     # `ros2 param dump` writes null for what is not set, and what every node has
     return {name: value for name, value in given.items() if value is not None and not (
         name.startswith(('qos_overrides.', 'use_sim_time', 'start_type_description_service')))}
 
 
-def _flatten(tree: Mapping[str, Any], prefix: str, flat: dict[str, Any]) -> None:
+def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
     for name, value in tree.items():
-        if isinstance(value, Mapping):
-            _flatten(value, f'{prefix}{name}.', flat)
-        else:
-            flat[prefix + name] = value
+        yield from (_flat(value, f'{prefix}{name}.') if isinstance(value, Mapping)
+                    else [(f'{prefix}{name}', value)])
 
 
 def inputs_of(bag: bags.Bag, options: argparse.Namespace, values: Values,

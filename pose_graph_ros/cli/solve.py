@@ -143,10 +143,9 @@ def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
     result, determined = _held_weakly(graph, optimize)
     reason = re.sub(r'hidden node (\d+)', lambda node: f'hidden node {problem.ids[int(node[1])]}',
                     result.reason)
-    names = {'file': 'present poses', 'odometry': 'odometry'}
-    if result.status is Status.FAILED and start == 'chordal':
-        # the poses are those before, but all linear starts were tried
-        names[start] = Start.CHORDAL.value
+    # where it failed, the poses are those before, but all linear starts were tried
+    names = {'file': 'present poses', 'odometry': 'odometry'} | (
+        {'chordal': Start.CHORDAL.value} if result.status is Status.FAILED else {})
     return Solution(replace(result, reason=reason), names.get(start, result.start.value),
                     determined)
 
@@ -224,8 +223,7 @@ def with_certificate(problem: Problem, solution: Solution, *,
     if solution.result.status is Status.FAILED:
         return none(f'the optimisation failed: {solution.result.reason}')
     try:
-        formulation = formulate(graph)
-        by = solution.optimizer
+        formulation, by = formulate(graph), solution.optimizer
         made = certify(formulation, graph.poses, eigenvalue=eigenvalue, hessian=(
             None if by is None else NearHessian(by.places, by.heading_steps)))
     except (NotCoveredError, LinearSolveError) as error:
@@ -256,9 +254,8 @@ def execute(options: argparse.Namespace) -> int:
         options.graph, options.robust = Path(options.robust), METHODS[0]
     if options.graph is None:
         raise ConfigError('expected the file of a graph')
-    for path in options.out:
-        if not path.parent.is_dir():
-            raise ConfigError(f'--out: there is no folder {path.parent} for {path.name}')
+    for path in (each for each in options.out if not each.parent.is_dir()):
+        raise ConfigError(f'--out: there is no folder {path.parent} for {path.name}')
     return _solve(options, (lambda _: None) if options.json else print)
 
 
@@ -283,8 +280,7 @@ def _solve(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         say(f'nothing held {len(held)} more parts of the graph; now their first nodes are '
             f'fixed: {names}{", ..." if len(held) > N_LARGEST else ""}')
     begin, start = time.monotonic(), options.start
-    doubted, decision = np.empty(0, np.int64), None
-    certificate, proof = None, list[str]()
+    doubted, decision, certificate, proof = np.empty(0, np.int64), None, None, list[str]()
     if options.robust is not None:
         from pose_graph_ros.cli.believe import doubt
 

@@ -39,14 +39,15 @@ def values(session: 'Session') -> dict[str, object]:
     """Return all values of the diagnostics by key."""
     worker, rejected = session.worker, session.input.rejected
     status, estimate = worker.status, worker.estimate
+    updates, total, longest = worker.durations
     found: dict[str, object] = {
         'received': sum(each.count for each in session.input.arrivals.values()),
         'processed': status.processed + sum(rejected.values()), 'pending': status.pending,
-        'quarantined': status.quarantined, 'updates': status.updates,
+        'quarantined': status.quarantined, 'updates': updates,
         'prepared': int(worker.prepared), 'active': int(session.active),
         'paused': int(session.input.paused), 'resets': session.n_resets,
-        'solve_mean_ms': f'{1e3 * status.solve_mean:.3f}',
-        'solve_max_ms': f'{1e3 * status.solve_max:.3f}', 'memory_mb': f'{memory() / 1e6:.0f}'}
+        'solve_mean_ms': f'{1e3 * total / max(updates, 1):.3f}',
+        'solve_max_ms': f'{1e3 * longest:.3f}', 'memory_mb': f'{memory() / 1e6:.0f}'}
     if session.reset_reason != '':
         found['reset_reason'] = session.reset_reason
     found |= {f'{source}.{answer}': count

@@ -77,14 +77,13 @@ class Services:
         """Return the callback of a service, which never raises."""
         def answer(request: Any, response: Any) -> Any:
             try:
-                response.success, response.message = (
-                    (False, CLOSED) if self._closed else act(request))
+                done = (False, CLOSED) if self._closed else act(request)
             except CancelledError:
-                response.success, response.message = False, CLOSED if self._closed else REPLACED
+                done = False, CLOSED if self._closed else REPLACED
             except Exception as error:
                 logger.exception('a service failed')
-                response.success = False
-                response.message = f'failed: {type(error).__name__}: {error}'
+                done = False, f'failed: {type(error).__name__}: {error}'
+            response.success, response.message = done
             return response
         return answer
 

@@ -61,9 +61,6 @@ class WorkerStatus:
     pending: int = 0
     quarantined: int = 0
     set_aside: Sequence[str] = ()  # names of the newest of these
-    updates: int = 0  # number of updates that ran the solver
-    solve_mean: float = 0.0  # mean duration of such an update [s]
-    solve_max: float = 0.0  # longest such duration [s]
     report: UpdateReport | None = None  # of the newest update
     sources: Mapping[str, SourceReport] = field(default_factory=dict)  # how well each fits
     # what is believed of each
@@ -97,7 +94,7 @@ class Worker:
         self._may_refine, self._refined = False, 0.0  # and the distance that nodes have moved [m]
         self._condition = threading.Condition()
         self._revision = backend.revision
-        self._durations = 0, 0.0, 0.0  # number, sum and longest of updates with a solve [s]
+        self.durations = 0, 0.0, 0.0  # number, sum and longest of updates with a solve [s]
         self._jumps: Counter[str] = Counter()  # of odometries, that were told
         self.estimate: Estimate | None = None  # the newest, without its path; replaced as a whole
         self.status = WorkerStatus()  # the newest status; replaced as a whole
@@ -263,12 +260,11 @@ class Worker:
 
     def _count_failure(self, what: str, error: Exception, processed: int = 0) -> None:
         """Log and count an error; one of this project tells users why, and needs no traceback."""
-        if isinstance(error, PoseGraphError):
+        if is_ours := isinstance(error, PoseGraphError):
             logger.warning('%s: %s', what, error)
         else:
             logger.error('%s failed', what, exc_info=error)
-        reason = 'refused_job' if isinstance(error, PoseGraphError) else 'internal_error'
-        self._backend.counts['worker', reason] += 1
+        self._backend.counts['worker', 'refused_job' if is_ours else 'internal_error'] += 1
         self._report(None, processed)
 
     def _update(self, update: Callable[[], UpdateReport]) -> UpdateReport:
@@ -276,8 +272,8 @@ class Worker:
         report = update()
         if report.iterations > 0:
             seconds = time.monotonic() - start
-            count, total, longest = self._durations
-            self._durations = count + 1, total + seconds, max(longest, seconds)
+            count, total, longest = self.durations
+            self.durations = count + 1, total + seconds, max(longest, seconds)
         if report.reason != '':
             logger.warning('the solver failed with what is set aside, the estimate is without it: '
                            '%s', report.reason)
@@ -304,17 +300,15 @@ class Worker:
         doubted = {source for source, each in verdicts.items() if each.doubting}
         for level, text, way in verdict_lines(changes, doubted):
             logger.log(level, '%s', text, extra={'way': way})
-        count, total, longest = self._durations
         self.status = WorkerStatus(
             processed=status.processed + processed, counts=Counter(backend.counts),
             refusals=dict(backend.refusals), pending=backend.n_waiting,
-            quarantined=backend.n_quarantined, set_aside=backend.set_aside(3), updates=count,
-            solve_mean=total / max(count, 1), solve_max=longest,
+            quarantined=backend.n_quarantined, set_aside=backend.set_aside(3),
             report=status.report if report is None else report,
             sources=status.sources if report is None else backend.reports(),
             biases=backend.gyro_biases(backend.graph), calibrations=backend.calibrations(),
-            differences=backend.gyro_differences(),
-            verdicts=verdicts, n_changes=status.n_changes + len(changes))
+            differences=backend.gyro_differences(), verdicts=verdicts,
+            n_changes=status.n_changes + len(changes))
         return len(changes)
 
 
