@@ -3,6 +3,7 @@
 """Write rosbag2 folders in the format of ROS 2 Jazzy, without a ROS installation."""
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 import shutil
@@ -16,7 +17,7 @@ from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
 from pose_graph_ros.adapters import bags, damaged_bags
-from pose_graph_ros.adapters.bags import BagError, BagMessage, MessageError
+from pose_graph_ros.adapters.bags import BagError, BagMessage
 
 BAG_VERSION: Final = 9  # of the metadata of ROS 2 Jazzy
 # the "infinite" duration of rmw, 2^63 - 1 ns
@@ -106,11 +107,7 @@ class BagWriter:
             if type_name not in self._converters:
                 self._converters[type_name] = _from_ros1(source, self._types)
             type_name, types, convert = self._converters[type_name]
-            try:
-                data = bytes(convert(data))
-            except Exception as error:  # generated code can raise anything on invalid bytes
-                raise MessageError(f'{message.topic}: message recorded at {message.recorded_ns} '
-                                   f'ns is no {message.type}: {bags.one_line(error)}') from error
+            data = bytes(replace(message, _decode=convert).decode())
         key = message.topic, type_name
         if key not in self._connections:
             if isinstance(source.ext, ConnectionExtRosbag1):

@@ -19,10 +19,6 @@ SWITCHES = {'true': True, '1': True, 'false': False, '0': False}
 def arguments(share: Path) -> dict[str, tuple[str, str]]:
     """Return default and description by name, given the folder of the installed package."""
     config = share / 'config'
-    inputs = {
-        source: (AS_IN_FILE, f'topic of the input, {kind.message_type}; sets {source}.topic' + (
-            '' if source in {*DEFAULT_SOURCES, CLOSURES} else f', if sources lists {source}'))
-        for source, (kind, _) in KNOWN_SOURCES.items()}
     return {
         'params_file': (str(config / 'pose_graph.yaml'), 'yaml file of parameters'),
         'name': ('pose_graph', 'name of the node'),
@@ -37,7 +33,9 @@ def arguments(share: Path) -> dict[str, tuple[str, str]]:
         'rviz': ('false', 'true or false: start RViz as well, if it is installed'),
         'rviz_config': (str(config / 'pose_graph.rviz'), 'configuration of RViz'),
         'sources': (AS_IN_FILE, 'names of the sources, such as [odom, fix, gyro]'),
-        **inputs,
+        **{source: (AS_IN_FILE, f'topic of the input, {kind.message_type}; sets {source}.topic' + (
+            '' if source in {*DEFAULT_SOURCES, CLOSURES} else f', if sources lists {source}'))
+           for source, (kind, _) in KNOWN_SOURCES.items()},
         **{name: (AS_IN_FILE, f'topic of the output, {type_name}; sets outputs.{name}, by default '
                               f'{topic}') for name, (topic, type_name, _) in OUTPUTS.items()}}
 

@@ -220,9 +220,8 @@ def without_effect(arguments: Sequence[str], node: str) -> Iterator[str]:
             continue  # what rcl cannot read ends the node
         sections = list(_sections(content))
         # with wildcards as rcl matches them
-        patterns = [re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(r'/\*', r'/\w+')
-                    for section in sections]
-        if not any(re.fullmatch(pattern, node) for pattern in patterns):
+        if not any(re.fullmatch(re.escape(section).replace(r'/\*\*', r'(/\w+)*').replace(
+                r'/\*', r'/\w+'), node) for section in sections):
             yield (f'{name} has no effect: it has parameters for '
                    f'{", ".join(sections) or "no node"}, and none for {node}: begin it with '
                    f'{node} or /**')
@@ -298,12 +297,11 @@ def _range(parameter: Parameter) -> str:
 def constraints(parameter: Parameter) -> str:
     """Return what `ros2 param describe` tells of the values that a parameter can have."""
     sizes = ' or '.join(str(size) for size in parameter.sizes if size > 0)
-    facts = (
+    return '; '.join(filter(None, (
         f'one of: {", ".join(parameter.choices)}' if len(parameter.choices) > 0 else '',
         f'{sizes} numbers' + (', or unset' if 0 in parameter.sizes else '') if sizes else '',
-        f'unit: {parameter.unit}' if parameter.unit != '' else '',
-        'only while the node is not configured' if parameter.change is Change.UNCONFIGURED else '')
-    return '; '.join(filter(None, facts))
+        f'unit: {parameter.unit}' if parameter.unit != '' else '', 'only while the node is not '
+        'configured' if parameter.change is Change.UNCONFIGURED else '')))
 
 
 def _yaml(value: Value) -> str:

@@ -88,16 +88,15 @@ class Player(Node):
 
     def _record(self, output: str, topic: str, type_name: str, raw: bytes) -> None:
         received = topic, type_name, time.time_ns(), raw
+        own = [status for status in deserialize_message(raw, DiagnosticArray).status
+               if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME
+               ] if output == 'diagnostics' else []
+        if len(own) > 0:
+            self.diagnostics = {value.key: value.value for value in own[0].values}
         if output in KEPT:
             self._newest[output] = received
-            return
-        if output == 'diagnostics':
-            own = [status for status in deserialize_message(raw, DiagnosticArray).status
-                   if status.name.partition(':')[0].rpartition('/')[2] == NODE_NAME]
-            if len(own) == 0:
-                return
-            self.diagnostics = {value.key: value.value for value in own[0].values}
-        self._recorded.append(received)
+        elif output != 'diagnostics' or len(own) > 0:
+            self._recorded.append(received)
 
     @property
     def processed(self) -> int:
@@ -203,8 +202,8 @@ class Player(Node):
         if not answer.success:
             raise PoseGraphError(f'~/save_graph: {answer.message}')
         newest = list(self._newest.values())
-        latched = [each[0] for each in newest]
-        with bag_writer.BagWriter(folder, overwrite=True, latched=latched) as writer:
+        with bag_writer.BagWriter(folder, overwrite=True, latched=[
+                topic for topic, *_ in newest]) as writer:
             for message in (*self._recorded, *newest):
                 writer.write(*message)
         return len(deserialize_message(self._newest['path'][-1], PathMessage).poses)
