@@ -109,9 +109,8 @@ def path_cdr(path: Trajectory, stamp_ns: StampNs, frame_id: str) -> bytes:
     head += bytes(-len(head) % 4) + _LENGTH.pack(len(path))
     name = _text(8, frame_id)
     end = 8 + len(name)     # of the header of a pose, from where it begins
-    rows = np.zeros(len(path), np.dtype({
-        'names': ('stamp', 'frame', 'pose'), 'formats': ('(2,)<u4', f'V{len(name)}', '(7,)<f8'),
-        'offsets': (0, 8, end + -end % 8)}))
+    rows = np.zeros(len(path), np.dtype({'names': ('stamp', 'frame', 'pose'), 'formats': (
+        '(2,)<u4', f'V{len(name)}', '(7,)<f8'), 'offsets': (0, 8, end + -end % 8)}))
     rows['stamp'] = np.column_stack(np.divmod(path.stamps_ns, NANOSECONDS))
     rows['frame'], half = np.void(name), path.poses[:, 2] / 2.0
     rows['pose'][:, :2] = path.poses[:, :2]

@@ -190,9 +190,8 @@ def backend_config(values: Values) -> config.BackendConfig:
         raise ConfigError('parameter sources: expected at least one of type odometry or '
                           f'twist, got {values["sources"]}')
     return config.BackendConfig(
-        nodes=config.NodePolicy(**_same(values, config.NodePolicy)),
-        odometry=odometry, measurements=measurements, gyros=gyros,
-        window=config.WindowConfig(
+        nodes=config.NodePolicy(**_same(values, config.NodePolicy)), odometry=odometry,
+        measurements=measurements, gyros=gyros, window=config.WindowConfig(
             values['window.seconds'], values['window.metres'], math.ceil(values['window.nodes']),
             config.WindowPrior(values['window.prior'])),
         thinning=config.ThinningConfig(cell=values['thinning.cell']))

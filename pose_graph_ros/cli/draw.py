@@ -135,8 +135,8 @@ def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> d
                 'name': data['name'], 'role': data['role'].name.lower(),
                 'sort': None if term is None else term.sort.name.lower(),
                 'fixed': data.get('fixed', False), 'used': term is None or term.used,
-                'nodes': [panel.view.nodes[each]['name']
-                          for each in ([node] if term is None else term.nodes)],
+                'nodes': [panel.view.nodes[each]['name'] for each in (
+                    [node] if term is None else term.nodes)],
                 'at': np.round(panel.at[node], 3).tolist()})
         diagrams.append({'title': panel.title, 'vertices': vertices, 'arcs': [
             {'start': place[start], 'end': place[end], 'directed': arc['directed'],

@@ -22,7 +22,7 @@ from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
@@ -32,15 +32,13 @@ from pose_graph_ros.adapters import bag_writer, bags, parameter_table
 from pose_graph_ros.adapters.bags import MessageError, open_bag
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.quantities import NANOSECONDS
-from pose_graph_ros.ros.topics import message_class, TF_TYPE, TFMessage
+from pose_graph_ros.ros.topics import LATCHED_QOS, message_class, STATIC_QOS, TF_TYPE, TFMessage
 
 NODE_NAME = 'pose_graph'  # name of the node, for its service and its diagnostics
 RECORDED, KEPT = ('pose', 'filtered_odometry', 'diagnostics'), ('path', 'verdicts')
 """Outputs that are recorded, and those of which only the newest message is."""
 # Profiles are reliable if they do not say otherwise.
 RELIABLE = QoSProfile(depth=1000)
-LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-STATIC = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Patience(NamedTuple):
@@ -70,7 +68,7 @@ class Player(Node):
             message_class(kind.message_type), topics[source], RELIABLE)
             for source, kind in inputs.kinds.items()}
         self._static = None if TFMessage is None else self.create_publisher(
-            TFMessage, bags.STATIC_FRAMES[0], STATIC)
+            TFMessage, bags.STATIC_FRAMES[0], STATIC_QOS)
         # topic, type, time of arrival [ns] and bytes of the node's messages
         self._recorded: list[tuple[str, str, int, bytes]] = []
         self._newest: dict[str, tuple[str, str, int, bytes]] = {}  # on the latched topics
@@ -82,7 +80,7 @@ class Player(Node):
             topic = self.resolve_topic_name(relative.replace('~', NODE_NAME))
             self.create_subscription(
                 message_class(type_name), topic, partial(self._record, name, topic, type_name),
-                LATCHED if name in KEPT else RELIABLE, raw=True)
+                LATCHED_QOS if name in KEPT else RELIABLE, raw=True)
         self._optimize, self._save = (self.create_client(Trigger, f'{NODE_NAME}/{name}')
                                       for name in ('optimize', 'save_graph'))
 

@@ -22,7 +22,7 @@ from nav_msgs.msg import Path
 import numpy as np
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import NavSatFix, NavSatStatus
@@ -44,8 +44,6 @@ from pose_graph_ros.ros.topics import TFMessage, TOPIC
 from pose_graph_ros.ros.worker import Worker
 
 OUTPUT_QOS = QoSProfile(depth=10)  # reliable, as profiles are by default
-# Late subscribers receive the newest path and graph at once.
-LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 # The profile of tf2_ros, which is reliable.
 TF_QOS = QoSProfile(depth=100)
@@ -87,7 +85,7 @@ class Publishers:
         self.map_frame, self.odom_frame, self.base_frame = self.frames
         self._publishers = {name: node.create_publisher(
             topics.message_class(type_name), values[f'outputs.{name}'],
-            **topics.overridable(LATCHED_QOS if name in LATCHED else OUTPUT_QOS))
+            **topics.overridable(topics.LATCHED_QOS if name in LATCHED else OUTPUT_QOS))
             for name, (_, type_name, _) in parameter_table.OUTPUTS.items()}
         self._pose, self._odometry, self._fix = (
             self._publishers[name] for name in ('pose', 'filtered_odometry', 'filtered_fix'))

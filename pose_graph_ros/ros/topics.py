@@ -57,14 +57,16 @@ def other_publishers(node: Node, topic: str) -> list[str]:
 # best-effort writers.
 SENSOR_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 CLOSURE_QOS = QoSProfile(depth=100)     # a loop closure is rare and must not get lost
+# Late subscribers receive the newest message at once, of static frames that of every broadcaster.
+LATCHED_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+STATIC_QOS = QoSProfile(depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 JUDGE_TOPIC = '~/judge'
 INPUTS = {'initialpose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
           'set_pose': (GLOBAL_POSE.message_type, QoSProfile(depth=1)),
           JUDGE_TOPIC: ('diagnostic_msgs/msg/KeyValue', QoSProfile(depth=100))}
 """Messages and quality of service by topic, but for the sources."""
-if TFMessage is not None:   # late subscribers receive the newest message of every broadcaster
-    INPUTS[STATIC_TOPIC] = TF_TYPE, QoSProfile(
-        depth=100, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+if TFMessage is not None:
+    INPUTS[STATIC_TOPIC] = TF_TYPE, STATIC_QOS
 
 OVERRIDES = 'qos_overrides.'  # prefix of the parameters for the quality of service
 CHOICES = {

@@ -161,11 +161,9 @@ class FalseClosures:
 
         Raises `ConfigError` if the groups alone are more than the share.
         """
-        grouped = self.groups * self.size
-        if self.share is None:
-            return [self.size] * self.groups + [1] * self.singles
-        total = round(self.share / (1.0 - self.share) * true)
-        if grouped > total:
+        grouped, total = self.groups * self.size, self.groups * self.size + self.singles
+        if self.share is not None and (
+                total := round(self.share / (1.0 - self.share) * true)) < grouped:
             raise ConfigError(f'{self.groups} groups of {self.size} false closures are {grouped}, '
                               f'but a share of {self.share:g} beside {true} true ones is {total}')
         return [self.size] * self.groups + [1] * (total - grouped)
@@ -322,9 +320,9 @@ class Setup:
     @property
     def sensors(self) -> dict[str, Any]:
         """The sensors that are there, by topic."""
-        every = zip(TOPICS, (self.wheels, self.gyro, self.fixes, self.poses, self.closures),
-                    strict=True)
-        return {topic: sensor for topic, sensor in every if sensor is not None}
+        return {topic: sensor for topic, sensor in zip(TOPICS, (
+            self.wheels, self.gyro, self.fixes, self.poses, self.closures), strict=True)
+            if sensor is not None}
 
     def claimed(self, topic: str) -> float:
         """Return the factor on the sigmas that a topic claims."""
