@@ -10,6 +10,7 @@ module imports no ROS.
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 from pose_graph_ros.core import config
 
@@ -50,6 +51,10 @@ class Parameter:
     change: Change = Change.ALWAYS
 
 
+Early = partial(Parameter, change=Change.UNCONFIGURED)
+"""One that the node reads when it is configured."""
+
+
 def _values(choices: type[Enum]) -> tuple[str, ...]:
     return tuple(str(choice.value) for choice in choices)
 
@@ -66,11 +71,9 @@ PARAMETERS: tuple[Parameter, ...] = (
               change=Change.START),
     Parameter('autostart', True, '', 'Whether the node configures and activates itself. If false, '
               'a lifecycle manager must do so.', change=Change.START),
-    Parameter('map_frame', 'map', '', 'Frame of the corrected path.', change=Change.UNCONFIGURED),
-    Parameter('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.',
-              change=Change.UNCONFIGURED),
-    Parameter('base_link_frame', 'base_link', '', 'Frame of the robot base.',
-              change=Change.UNCONFIGURED),
+    Early('map_frame', 'map', '', 'Frame of the corrected path.'),
+    Early('odom_frame', 'odom', '', 'Frame of the odometry, child of `map_frame` in TF.'),
+    Early('base_link_frame', 'base_link', '', 'Frame of the robot base.'),
     Parameter('publish_tf', True, '', 'Whether to publish the transform from `map_frame` to '
               '`odom_frame` on /tf.'),
     Parameter('wait_for_map', False, '', 'Whether pose, odometry, path and transform are held '
@@ -91,14 +94,13 @@ PARAMETERS: tuple[Parameter, ...] = (
               'is optimised until convergence. If 0, it never is.', 0.0, 3600.0),
     Parameter('graph_file', '', '', 'File that `~/save_graph` writes and `~/load_graph` reads, '
               'such as graph.g2o. Files with the suffixes .json and .tum are stored next to it.'),
-    Parameter('load_graph_on_start', False, '', 'Whether to continue with '
-              'the graph in `graph_file`, once there is one. If it cannot be loaded, the node is '
-              'not configured.', change=Change.UNCONFIGURED),
-    Parameter('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
-              'optionally, the angle from east to its x axis. If unset, the first fix is the '
-              'origin and the x axis points east.', sizes=(0, 2, 3), change=Change.UNCONFIGURED),
-    Parameter('wait_for_datum', False, '', 'Whether to refuse fixes until `~/set_datum` is '
-              'called, if `datum` is unset.', change=Change.UNCONFIGURED),
+    Early('load_graph_on_start', False, '', 'Whether to continue with the graph in `graph_file`, '
+          'once there is one. If it cannot be loaded, the node is not configured.'),
+    Early('datum', [], 'deg, deg, rad', 'Latitude and longitude of the origin of the map and, '
+          'optionally, the angle from east to its x axis. If unset, the first fix is the origin '
+          'and the x axis points east.', sizes=(0, 2, 3)),
+    Early('wait_for_datum', False, '',
+          'Whether to refuse fixes until `~/set_datum` is called, if `datum` is unset.'),
     Parameter('minimum_travel_distance', _NODES.minimum_travel_distance, 'm',
               'Distance from the last hidden node at which a new one is added.', 0.0, 1000.0),
     Parameter('minimum_travel_heading', _NODES.minimum_travel_heading, 'rad',
@@ -119,22 +121,22 @@ PARAMETERS: tuple[Parameter, ...] = (
               'hidden nodes stay in the graph: one leaves it if an older one stays within this '
               'distance and its position relative to that is certain. If 0, all stay. Twice the '
               'distance between hidden nodes is a good value.', 0.0, 1000.0),
-    *(Parameter(f'outputs.{name}', topic, '', f'Topic of the {content}.',
-                change=Change.UNCONFIGURED) for name, (topic, _, content) in OUTPUTS.items()),
+    *(Early(f'outputs.{name}', topic, '', f'Topic of the {content}.')
+      for name, (topic, _, content) in OUTPUTS.items()),
 )
 
 # --- groups of parameters of sources
 
 OF_ALL = (
-    Parameter('topic', '', '', 'Topic of the messages. By default the name of the source, unless '
-              'the source is predefined.', change=Change.UNCONFIGURED),
+    Early('topic', '', '', 'Topic of the messages. By default the name of the source, unless the '
+          'source is predefined.'),
     Parameter('time_offset', 0.0, 's', 'Time added to the stamps of the messages.', -3.6e3, 3.6e3),
     Parameter('covariance_scale', 1.0, '', 'Factor applied to all covariances.', 1e-6, 1e6))
 
 OF_WHEELS = (
-    Parameter('noise', _ODOMETRY.noise_from.value, '', 'Origin of the odometry noise: `model` '
-              'uses distance and rotation, `twist` the twist covariance times the time step.',
-              choices=_values(config.NoiseFrom), change=Change.UNCONFIGURED),
+    Early('noise', _ODOMETRY.noise_from.value, '', 'Origin of the odometry noise: `model` uses '
+          'distance and rotation, `twist` the twist covariance times the time step.',
+          choices=_values(config.NoiseFrom)),
     Parameter('sigma_distance', _NOISE.sigma_distance, 'm/sqrt(m)', 'Odometry noise along the '
               'path, per square root of the distance.', 0.0, 10.0),
     Parameter('sigma_lateral', _NOISE.sigma_lateral, 'm/sqrt(m)', 'Odometry noise across the '
@@ -149,20 +151,18 @@ OF_WHEELS = (
               'primary odometry. If 0, it is 1, but more or less where global poses or fixes '
               'with a `correlation_time` of -1 show that odometry drifts more or less than it '
               'claims.', 0.0, 1e3),
-    Parameter('calibrate', _ODOMETRY.calibrate, '', 'Whether a bias of the yaw rate and an error '
-              'of the scale of the distance are estimated all the time, while this is the primary '
-              'odometry. Fixes or global poses show them; they matter where these are missing.',
-              change=Change.UNCONFIGURED),
-    Parameter('calibration_sigma', [*_ODOMETRY.calibration_sigma], 'rad/s, 1', 'Standard '
-              'deviations of the bias and of the error of the scale, before anything shows them.',
-              1e-9, 10.0, sizes=(2,), change=Change.UNCONFIGURED),
-    Parameter('calibration_walk', [*_ODOMETRY.calibration_walk], 'rad/s/sqrt(h), 1/sqrt(h)',
-              'Random walk of both, per square root of an hour.', 1e-9, 10.0, sizes=(2,),
-              change=Change.UNCONFIGURED))
+    Early('calibrate', _ODOMETRY.calibrate, '', 'Whether a bias of the yaw rate and an error of '
+          'the scale of the distance are estimated all the time, while this is the primary '
+          'odometry. Fixes or global poses show them; they matter where these are missing.'),
+    Early('calibration_sigma', [*_ODOMETRY.calibration_sigma], 'rad/s, 1', 'Standard deviations '
+          'of the bias and of the error of the scale, before anything shows them.', 1e-9, 10.0,
+          sizes=(2,)),
+    Early('calibration_walk', [*_ODOMETRY.calibration_walk], 'rad/s/sqrt(h), 1/sqrt(h)',
+          'Random walk of both, per square root of an hour.', 1e-9, 10.0, sizes=(2,)))
 
-INTEGRATE = Parameter('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the '
-                      '`pose` in the messages, or their `twist`, integrated between messages.',
-                      choices=_values(config.Integrate), change=Change.UNCONFIGURED)
+INTEGRATE = Early('integrate', _ODOMETRY.integrate.value, '', 'Origin of the motion: the `pose` '
+                  'in the messages, or their `twist`, integrated between messages.',
+                  choices=_values(config.Integrate))
 
 OF_GYROS = (
     Parameter('mounting', 'tf', '', 'Whether the z axis of the gyroscope points `up` or `down`. '
@@ -175,13 +175,13 @@ OF_GYROS = (
               'random walk).', 1e-9, 10.0),
     Parameter('sigma_turn', _RATES.sigma_turn, 'rad/sqrt(rad)', 'Noise of the rotation, per '
               'square root of the rotation; stands for the error of the scale.', 0.0, 10.0),
-    Parameter('sigma_bias', _RATES.sigma_bias, 'rad/s', 'Standard deviation of the bias when the '
-              'sensor is switched on. At rest by the wheels, a mean rate of up to five of these '
-              'is a measurement of the bias.', 1e-9, 10.0, change=Change.UNCONFIGURED),
-    Parameter('sigma_bias_walk', _RATES.sigma_bias_walk, 'rad/s/sqrt(s)', 'Random walk of the '
-              'bias.', 1e-12, 1.0, change=Change.UNCONFIGURED),
-    Parameter('bias_period', _RATES.bias_period, 's', 'Time between two states of the bias.', 0.1,
-              3600.0, change=Change.UNCONFIGURED),
+    Early('sigma_bias', _RATES.sigma_bias, 'rad/s',
+          'Standard deviation of the bias when the sensor is switched on. At rest by the wheels, '
+          'a mean rate of up to five of these is a measurement of the bias.', 1e-9, 10.0),
+    Early('sigma_bias_walk', _RATES.sigma_bias_walk, 'rad/s/sqrt(s)', 'Random walk of the bias.',
+          1e-12, 1.0),
+    Early('bias_period', _RATES.bias_period, 's', 'Time between two states of the bias.', 0.1,
+          3600.0),
     Parameter('maximum_gap', _RATES.maximum_gap, 's', 'Longest time between two messages over '
               'which the rate is integrated. A longer one leaves the rotation between two hidden '
               'nodes out.', 1e-3, 10.0))
@@ -192,9 +192,8 @@ HEADING = Parameter('heading', _COVARIANCE.heading.value, '', 'Whether to use th
 LEVER_ARM = Parameter('lever_arm', [0.0, 0.0], 'm', 'Position of the antenna in the robot base '
                       'frame, x and y. If zero, it is taken from /tf_static if available.', -1e3,
                       1e3, sizes=(2,))
-BEACONS = Parameter(
-    'beacons', [], '', 'Beacons at known places: name, x and y in the map [m] of each, such as '
-    '"anchor_1 12.5 -3.0". Others are located by their ranges.', change=Change.UNCONFIGURED)
+BEACONS = Early('beacons', [], '', 'Beacons at known places: name, x and y in the map [m] of '
+                'each, such as "anchor_1 12.5 -3.0". Others are located by their ranges.')
 YAW_OFFSET = Parameter(
     'yaw_offset', 0.0, 'rad', 'Angle added to the yaw, such that zero is east.', -6.3, 6.3)
 
@@ -223,7 +222,6 @@ def in_the_map(defaults: config.MeasurementSource) -> tuple[Parameter, ...]:
         *of_measurements(defaults),
         Parameter('sigma_floor', [_COVARIANCE.position_floor, _COVARIANCE.heading_floor], 'm, rad',
                   'Minimum standard deviation of position and heading.', 1e-6, 100.0, sizes=(2,)),
-        Parameter('correlation_time', defaults.correlation_time, 's', 'Time constant of '
-                  'time-correlated errors. If 0, errors are white noise. If -1, the errors '
-                  'themselves show whether they are correlated and for how long.', config.FOUND,
-                  1e5, change=Change.UNCONFIGURED))
+        Early('correlation_time', defaults.correlation_time, 's', 'Time constant of '
+              'time-correlated errors. If 0, errors are white noise. If -1, the errors '
+              'themselves show whether they are correlated and for how long.', config.FOUND, 1e5))
