@@ -227,8 +227,9 @@ class Forgetting:
         parts.smoother.linearize(leaving)
         # anchors of thinned nodes that leave have a place in others
         poses, thinned = nodes.recent_poses(graph), nodes.thinned.places()
-        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
-        kept = np.setdiff1d(np.arange(first, len(nodes)), thinned.numbers)
+        anchors, numbers = thinned['anchors'], thinned['numbers']
+        leave = np.unique(anchors[(anchors < first) & (numbers >= first)])
+        kept = np.setdiff1d(np.arange(first, len(nodes)), numbers)
         ends, starts = graph.poses_of(nodes.ids[leave]), graph.poses_of(nodes.ids[kept])
         nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
         places = th.Places.now(parts.smoother, nodes.ids[leave], nodes.ids[kept[nearest]])

@@ -25,11 +25,10 @@ from pose_graph_ros.adapters.sources import GYRO, KNOWN_SOURCES, Source
 from pose_graph_ros.core.alignment import AlignmentState
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.disagreement import Disagreement
+from pose_graph_ros.core.disagreement import ConstraintEnergy, Disagreement
 from pose_graph_ros.core.judgement.texts import short, total_values
-from pose_graph_ros.core.odometry.gyro import CONTRADICTORY, MOST_BIAS
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED
-from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
+from pose_graph_ros.core.sources.gyro import CONTRADICTORY, MOST_BIAS
 from pose_graph_ros.core.sources.settings import SOURCES
 from pose_graph_ros.ros.input import EXPECTED
 from pose_graph_ros.ros.topics import moved, other_publishers

@@ -23,8 +23,13 @@ from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph
-from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
+from pose_graph_ros.core.io.graph_files import (
+    datum_refusal,
+    graph_paths,
+    read_datum,
+    read_graph,
+    SavedGraph,
+)
 from pose_graph_ros.core.judgement.verdicts import Decision
 from pose_graph_ros.core.measurements import Answer, AnswerStatus, GlobalPose, rejected
 from pose_graph_ros.ros.log import ANSWER

@@ -26,7 +26,7 @@ from pose_graph_ros.adapters.conversions import Message
 from pose_graph_ros.adapters.sources import backend_config, CLOCK_JUMP_NS, SET_POSE, Source
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.core.measurements import OdometrySample
 from pose_graph_ros.core.quantities import NANOSECONDS
 from pose_graph_ros.ros import diagnostics, publishers, topics

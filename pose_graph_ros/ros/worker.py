@@ -24,8 +24,8 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import PoseGraphError
 from pose_graph_ros.core.judgement.verdicts import SourceVerdicts
 from pose_graph_ros.core.measurements import OdometrySample
-from pose_graph_ros.core.odometry.gyro import Difference
 from pose_graph_ros.core.sources.bias import Calibration
+from pose_graph_ros.core.sources.gyro import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.log import verdict_lines
 

@@ -176,38 +176,39 @@ def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
     rows, n_loops, loops = dict(text.rows), 0, tuple[str, ...]()
     for tag, table in text.rows.items():
         if gt.TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
-            rows[tag] = table.rows(np.flatnonzero(table.ids[:, 0] != table.ids[:, 1]))
+            rows[tag] = table[table['ids'][:, 0] != table['ids'][:, 1]]
             n_loops += len(table) - len(rows[tag])
     if n_loops > 0:
         loops = (f'{n_loops} edges from a node to itself are skipped',)
     rows['LANDMARK'], notes = _numbered(text, rows)
-    points = rows['VERTEX_XY']
-    vertices = gt.Lines.joined((rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'], gt.Lines(
-        points.ids, np.pad(points.numbers, ((0, 0), (0, 1))), points.lines)))
+    vertices = [rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX', 'VERTEX_XY')]
+    names, lines = (np.concatenate([table[name].ravel() for table in vertices])
+                    for name in ('ids', 'line'))
     # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
     ids, _ = np.unique(np.concatenate([
-        table.ids.ravel() for tag, table in rows.items() if tag != 'FIX']), return_index=True)
+        table['ids'].ravel() for tag, table in rows.items() if tag != 'FIX']), return_index=True)
     if len(ids) == 0:
         raise FileFormatError(
             f'{text.path}: all edges lead from a vertex to itself, and no vertex is given')
-    given, first = np.unique(vertices.ids.ravel(), return_index=True)
-    if len(given) < len(vertices):
-        again = np.setdiff1d(np.arange(len(vertices)), first)[0]
-        raise FileFormatError(f'{text.where(vertices.lines[again])}: vertex '
-                              f'{vertices.ids[again, 0]} is in the file twice')
+    given, first = np.unique(names, return_index=True)
+    if len(given) < len(names):
+        again = np.setdiff1d(np.arange(len(names)), first)[0]
+        raise FileFormatError(
+            f'{text.where(lines[again])}: vertex {names[again]} is in the file twice')
     factors = Factors.joined([
         factors_of(tag, rows[tag], edge2_order if tag in gt.AMBIGUOUS else None, ids)
         for tag in gt.MEASURED])
-    is_landmark = np.isin(ids, points.ids)
+    is_landmark = np.isin(ids, rows['VERTEX_XY']['ids'])
     is_landmark[factors.j[np.isin(factors.kind, _TO_LANDMARKS)]] = True
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
     try:
         check(factors, kind)
     except RowError as error:
-        line = np.concatenate([rows[tag].lines for tag in gt.MEASURED])[error.row]
+        line = np.concatenate([rows[tag]['line'] for tag in gt.MEASURED])[error.row]
         raise FileFormatError(f'{text.where(line)}: {error}') from error
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
-    poses[known] = vertices.numbers[first]
+    poses[known] = np.concatenate([np.pad(table['numbers'], (
+        (0, 0), (0, 3 - table['numbers'].shape[1]))) for table in vertices])[first]
     if not np.all(known):
         compose_missing(poses, known, factors)
         poses[is_landmark, 2] = 0.0
@@ -229,16 +230,18 @@ def _numbered(text: gt.GraphText, rows: dict[str, gt.Lines]) -> tuple[gt.Lines, 
     seen = rows['LANDMARK']
     if len(seen) == 0:
         return seen, ()
-    poses = [seen.ids[:, 0], *(table.ids.ravel() for tag, table in rows.items()
-                               if tag != 'LANDMARK')]
-    others, names = np.unique(np.concatenate(poses)), seen.ids[:, 1]
+    others = np.unique(np.concatenate([
+        (table['ids'][:, 0] if tag == 'LANDMARK' else table['ids']).ravel()
+        for tag, table in rows.items()]))
+    names = seen['ids'][:, 1]
     if not np.any(np.isin(names, others)):
         return seen, ()
     first = max(int(np.max(others)), 0) + 1 - min(int(np.min(names)), 0)
     if first + int(np.max(names)) > np.iinfo(np.int64).max:
-        raise FileFormatError(f'{text.where(seen.lines[0])}: LANDMARK: the ids are too large')
-    moved = np.column_stack((seen.ids[:, 0], names + first))
-    return gt.Lines(moved, seen.numbers, seen.lines), (
+        raise FileFormatError(f'{text.where(seen[0]["line"])}: LANDMARK: the ids are too large')
+    moved = seen.copy()
+    moved['ids'][:, 1] += first
+    return moved, (
         f'landmark 0 of iSAM is node {first} here, 1 is {first + 1} and so on, as poses have the '
         f'same numbers',)
 
@@ -254,22 +257,23 @@ def factors_of(
     layout, n, size = gt.TAGS[tag], len(lines), gt.TAGS[tag].rows
     order, begin = order or layout.order, 3 * layout.has_offset
     mean, information, constants = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 4))
-    constants[:, :begin] = lines.numbers[:, :begin]
-    mean[:, :size] = lines.numbers[:, begin:begin + size]
+    constants[:, :begin] = lines['numbers'][:, :begin]
+    mean[:, :size] = lines['numbers'][:, begin:begin + size]
     row, column = _TORO if order == 'toro' else np.triu_indices(size)
-    information[:, row, column] = lines.numbers[:, begin + size:]
+    information[:, row, column] = lines['numbers'][:, begin + size:]
     if order == 'isam':
         information = np.swapaxes(information, 1, 2) @ information
     else:
         information[:, column, row] = information[:, row, column]
-    ends = lines.ids if nodes is None else np.searchsorted(nodes, lines.ids).astype(np.int64)
+    ids = lines['ids']
+    ends = ids if nodes is None else np.searchsorted(nodes, ids).astype(np.int64)
     if layout.n_ids == 1:
         i, j, kind = ends[:, 0], np.full(n, -1), np.where(
             information[:, 2, 2] == 0.0, FactorKind.POSITION, FactorKind.GLOBAL_POSE)
     else:
         # the next id; a difference could overflow
         i, j, kind = *ends.T, np.where(
-            lines.ids[:, 1] == lines.ids[:, 0] + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
+            ids[:, 1] == ids[:, 0] + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     if layout.kind is not None:
         kind[:] = layout.kind
     return Factors(i, j, mean if nodes is None else se2.wrapped(mean), information, kind,
@@ -309,13 +313,12 @@ def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> No
 
 def _fixed(text: gt.GraphText, ids: IntArray) -> BoolArray:
     """Return which nodes are fixed."""
-    fixed, names = np.zeros(len(ids), dtype=bool), text.rows['FIX'].ids.ravel()
+    fixed, names = np.zeros(len(ids), dtype=bool), text.rows['FIX']['ids'].ravel()
     rows = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
     missing = np.flatnonzero(ids[rows] != names)
     if len(missing) > 0:
-        line = text.rows['FIX'].lines[missing[0]]
-        raise FileFormatError(f'{text.where(line)}: FIX {names[missing[0]]}: there is no such '
-                              f'vertex')
+        where = text.where(text.rows['FIX']['line'][missing[0]])
+        raise FileFormatError(f'{where}: FIX {names[missing[0]]}: there is no such vertex')
     fixed[rows] = True
     return fixed
 

@@ -7,16 +7,15 @@ All lines of a tag are converted together. Only if that fails are they checked o
 number of the first line that is wrong and the reason.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS
 
 
@@ -59,28 +58,9 @@ _SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
 _GZIP = b'\x1f\x8b'
 
 
-@dataclass(slots=True)
-class Lines:
-    """The lines with one tag."""
-
-    ids: IntArray  # shape (K, number of ids)
-    numbers: FloatArray  # shape (K, number of values)
-    lines: IntArray  # numbers of the lines in the file, from 1 on
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def rows(self, rows: IntArray | slice) -> 'Lines':
-        """Return some of the lines."""
-        return Lines(self.ids[rows], self.numbers[rows], self.lines[rows])
-
-    @classmethod
-    def joined(cls, tables: Iterable['Lines']) -> 'Lines':
-        """Return the lines of several tags with the same layout."""
-        tables = list(tables)
-        return cls(np.concatenate([each.ids for each in tables]),
-                   np.concatenate([each.numbers for each in tables]),
-                   np.concatenate([each.lines for each in tables]))
+# Records of the lines with one tag: ids, numbers behind them, and the number of the line in the
+# file, from 1 on.
+Lines = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,9 +110,9 @@ def lines_of(path: Path, text: str) -> GraphText:
     # without those of vertices that were skipped
     names = {words[1] for tag, some in skipped.items() if tag.startswith('VERTEX')
              for words in some if len(words) > 1}
-    fixes = [*zip(*found['FIX'], strict=True)]
-    found['FIX'] = ([words for words, _ in fixes if words[1] not in names],
-                    [line for words, line in fixes if words[1] not in names])
+    fixes = [(words, line) for words, line in zip(*found['FIX'], strict=True)
+             if words[1] not in names]
+    found['FIX'] = [words for words, _ in fixes], [line for _, line in fixes]
     if not any(lines for tag, (_, lines) in found.items() if tag != 'FIX'):
         _raise_empty(path, skipped)
     try:
@@ -148,13 +128,15 @@ def _lines(words: list[list[str]], lines: list[int], tag: Tag) -> Lines:
     if any(len(each) != 1 + n_ids + n_numbers for each in words):
         raise ValueError
     columns = [*zip(*words, strict=True)] if n > 0 else [()] * (1 + n_ids + n_numbers)
-    ids = np.array([[*map(int, column)] for column in columns[1:1 + n_ids]], dtype=np.int64)
-    numbers = np.fromiter(map(float, chain.from_iterable(columns[1 + n_ids:])), np.float64,
-                          n * n_numbers)
-    if not np.all(np.isfinite(numbers)):
+    table = np.empty(n, [('ids', 'i8', (n_ids,)), ('numbers', 'f8', (n_numbers,)), ('line', 'i8')])
+    table['ids'] = np.array([[*map(int, column)] for column in columns[1:1 + n_ids]], np.int64).T
+    table['numbers'] = np.fromiter(
+        map(float, chain.from_iterable(columns[1 + n_ids:])), np.float64,
+        n * n_numbers).reshape(n_numbers, n).T
+    table['line'] = lines
+    if not np.all(np.isfinite(table['numbers'])):
         raise ValueError
-    return Lines(np.ascontiguousarray(ids.T), np.ascontiguousarray(
-        numbers.reshape(n_numbers, n).T), np.array(lines, dtype=np.int64))
+    return table
 
 
 def _raise_first(path: Path, found: dict[str, tuple[list[list[str]], list[int]]]) -> NoReturn:

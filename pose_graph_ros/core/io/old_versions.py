@@ -15,14 +15,15 @@ before, measurements for the next check of the alignment.
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from itertools import count
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors, full
-from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.saved_columns import encoded
-from pose_graph_ros.core.sources.queued import SavedQueue, turn
+from pose_graph_ros.core.sources.gyro import turn
+from pose_graph_ros.core.sources.queued import SavedQueue
 
 LOSSES = ('none', 'huber', 'cauchy')
 EDGES = ('odometry', 'loop_closure', 'bias')
@@ -32,17 +33,13 @@ NUMBERED = {
     ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES}
-TURN = ('source', 'i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate',
-        'rest_variance')
+TURN = ('i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate', 'rest_variance')
 _EDGES_IN_G2O = ('odometry', 'loop_closure', 'prior')
 # Columns of the graph that version 5 has as well.
 _KEPT = ('fixed', 'biases', 'bias_values', 'node_ids', 'priors', 'bias_dimensions', 'landmarks')
 _NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
-_NOTHING: dict[str, Any] = {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
-    'sources', 'scales', 'left', 'held', 'added', 'source', 'number', 'stamps_ns', 'since_ns',
-    'distance')}}
-_NOT_JUDGED: dict[str, Any] = {
-    'closures': _NOTHING, 'fixes': _NOTHING, 'loosened': [], 'weights': [], 'odometry_left': {}}
+# Closures and fixes of versions 3 to 5, where none were judged.
+_NONE = defaultdict[str, Any](list, state=_NO_NAMES, decision=_NO_NAMES)
 
 
 def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
@@ -51,7 +48,8 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
         column = {'names': list(NUMBERED[member, name]), 'of': members[member][name]}
         members[member] = {**members[member], name: column}
     if version < 3:
-        members = {'judgement': _NOT_JUDGED, 'verdicts': {}, **members}
+        members = {'judgement': {'closures': _NONE, 'fixes': _NONE, 'odometry': {}},
+                   'verdicts': {}, **members}
         for name in ('waiting', 'set_aside'):
             members[name] = {'stamps_ns': [[-1, -1]] * len(members[name]['sources']),
                              **members[name]}
@@ -60,18 +58,18 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
         members['nodes'] = {'ids' if name == 'rows' else name: nodes[name] for name in nodes}
     for stream in members['nodes']['streams'].values() if version < 6 else ():
         _list_samples(stream)
-    for name, gyro in members.get('gyros', {}).items() if version < 6 else ():
+    for gyro in members.get('gyros', {}).values() if version < 6 else ():
         rates = gyro['rates']
         gyro['rates'] = [
             {'stamp_ns': stamp_ns, 'rate': rate, 'variance': variance}
             for stamp_ns, (rate, variance) in zip(
                 rates['stamps_ns'], rates['rates'], strict=True)]
         gyro['waiting'] = [
-            dict(zip(TURN, (name, *ends, stamp_ns, *numbers), strict=True))
+            dict(zip(TURN, (*ends, stamp_ns, *numbers), strict=True))
             for stamp_ns, ends, numbers in zip(
                 gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
     if version < 6:
-        members = _with_one_table(members, judged=version >= 3)
+        members = _with_one_table(members)
     if version < 7:
         members = _with_states(members)
     # measurements for the next check of the alignment, which the judge's bank has now
@@ -137,7 +135,7 @@ def _common(old: dict[str, Any], left: list[list[int]]) -> dict[str, Any]:
         'number': old.get('numbers') or [next(counted[source]) for source in old['source']]}
 
 
-def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
+def _with_one_table(members: dict[str, Any]) -> dict[str, Any]:
     """Return members in which edges and observed nodes have the same ids."""
     rows = members['graph']
     n_edges, n_observed = (len(rows[f'{name}_weight']) for name in ('edge', 'observed'))
@@ -177,8 +175,7 @@ def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
             'rows': members['edge_losses']['rows'] + moved(losses['rows']),
             **{name: members['edge_losses'][name] + losses[name]
                for name in ('thresholds', 'shares')}, 'cursor': 0},
-        'judgement': _judgement(moved, **members['judgement']) if judged else (
-            members['judgement']),
+        'judgement': _judgement(moved, **members['judgement']),
         'sources': {name: _of_source(source, moved)
                     for name, source in members['sources'].items()}}
     if end['node'] is not None:
@@ -206,32 +203,23 @@ def _joined(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 def _with_states(members: dict[str, Any]) -> dict[str, Any]:
     """Return members with one state of each source, and queues as tables of factors."""
     sources, gyros = members.pop('sources'), members.pop('gyro_biases', {})
-    rotations = [queued for gyro in members.get('gyros', {}).values()
-                 for each in gyro.pop('waiting') for queued in turn(Turn(**each))]
-    for name in ('waiting', 'set_aside'):
+    rotations = [queued for name, gyro in members.get('gyros', {}).items()
+                 for i, j, stamp_ns, *numbers in map(itemgetter(*TURN), gyro.pop('waiting'))
+                 for queued in turn(name, (i, j), stamp_ns, numbers[:3], numbers[3:])]
+    for name, more in ('waiting', rotations), ('set_aside', []):
         old = members[name]
-        members[name] = _queue(old['sources'], old['stamps_ns'], Factors(
-            old['i'], old['j'], *_measured(old)))
-    members['waiting'] = encoded(SavedQueue.of([*members['waiting'].queue(), *rotations]))
-    members['set_aside'] = encoded(members['set_aside'])
+        n, kinds = len(old['sources']), old['kind']
+        queue = SavedQueue(tuple(old['sources']), Factors(
+            old['i'], old['j'], np.reshape(old['mean'], (-1, 3)),
+            full(np.reshape(old['information'], (-1, 6))),
+            np.array([FactorKind[kinds['names'][k].upper()] for k in kinds['of']], np.uint8)),
+            np.reshape(np.array(old['stamps_ns'], np.int64), (n, 2)), np.zeros((n, 2)))
+        members[name] = encoded(SavedQueue.of([*queue.queue(), *more]))
     return {**members, 'seen': {name: {
         'stamps_ns': each['seen_ns'], 'references': each['seen_references']}
         for name, each in sources.items()}, 'sources': {
         **{name: _state(**each) for name, each in sources.items()},
         **{name: _state_of_gyro(**each) for name, each in gyros.items()}}}
-
-
-def _queue(sources: list[str], stamps_ns: list[list[int]], factors: Factors) -> SavedQueue:
-    n = len(sources)
-    return SavedQueue(tuple(sources), factors, np.reshape(np.array(stamps_ns, np.int64), (n, 2)),
-                      np.zeros((n, 2)))
-
-
-def _measured(old: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """Return mean, information and kind of factors."""
-    kind = old['kind']
-    return (np.reshape(old['mean'], (-1, 3)), full(np.reshape(old['information'], (-1, 6))),
-            np.array([FactorKind[kind['names'][k].upper()] for k in kind['of']], np.uint8))
 
 
 def _state(

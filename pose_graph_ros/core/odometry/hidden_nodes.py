@@ -23,9 +23,8 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses, 
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
-from pose_graph_ros.core.odometry.jumps import gap_motion
 from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
-from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, Span
+from pose_graph_ros.core.odometry.node_table import NodeTable, SavedNodes, Span
 from pose_graph_ros.core.odometry.stream import find_silence, OdometryStream
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 from pose_graph_ros.core.saved_columns import as_pose
@@ -206,9 +205,8 @@ class HiddenNodes(NodeTable):
                 old, old.timeline.motion(self._base_ns, min(begin_ns, last_ns)))
             self._base_ns = begin_ns
             if begin_ns > last_ns:
-                mean, noise = gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns)
-                self._span = Span(se2.compose(self._span.mean, mean),
-                                  passed_on(mean, self._span.covariance, noise))
+                self._span = self._span.continued(
+                    *old.timeline.gap_motion(last_ns, begin_ns, old.saved_ns))
         self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
         self._catch_up()
 
@@ -239,17 +237,11 @@ class HiddenNodes(NodeTable):
 
     def _catch_up(self) -> None:
         """Make the nodes that are due at the settled samples of a new primary source."""
-        source = self.primary
-        timeline = self.streams[source].timeline
+        timeline = self.streams[self.primary].timeline
         begin = int(np.searchsorted(timeline.stamps_ns, self.covered_ns, side='right'))
-        samples = zip(timeline.stamps_ns[begin:].tolist(), timeline.poses[begin:].tolist(),
-                      strict=True)
-        for stamp_ns, (x, y, theta) in list(samples):
-            if stamp_ns - self.covered_ns > self._patience_ns:
-                self._replace_silent_primary(source, stamp_ns)
-            if self.primary != source:
-                return  # the nodes of the source that replaced it are made
-            self._extend(stamp_ns, (x, y, theta))
+        self._process(self.primary, list(zip(
+            timeline.stamps_ns[begin:].tolist(), map(as_pose, timeline.poses[begin:]),
+            strict=True)))
 
     def _append(self, stamp_ns: int, node: int, base: Pose, odometry: FloatArray) -> None:
         self.append(stamp_ns, node, odometry)
@@ -291,19 +283,14 @@ class HiddenNodes(NodeTable):
         """Return a motion from the newest node to a stamp [ns] that knows of its errors."""
         if self.errors == AS_CLAIMED:
             return mean, noise
-        seconds = np.array([(stamp_ns - int(self.stamps_ns[-1])) * 1e-9])
-        return (self.errors.motions(mean[None], seconds)[0],
-                self.errors.covariances(noise[None])[0])
+        known, since_ns = self.errors, stamp_ns - int(self.stamps_ns[-1])
+        return (known.motions(mean[None], np.array([since_ns * 1e-9]))[0],
+                known.covariances(noise[None])[0])
 
-    def _since_node(
-        self, stream: OdometryStream, motion: Motion, *, floor: bool = True,
-    ) -> Span:
+    def _since_node(self, stream: OdometryStream, motion: Motion, *, floor: bool = True) -> Span:
         """Return a motion from `_base_ns` on as one from the newest node, and its covariance."""
-        mean, noise = motion.increment, stream.covariance(motion, floor=floor)
-        if self._span is None:
-            return Span(mean, noise)
-        return Span(se2.compose(self._span.mean, mean),
-                    passed_on(mean, self._span.covariance, noise))
+        then = Span(motion.increment, stream.covariance(motion, floor=floor))
+        return then if self._span is None else self._span.continued(*then)
 
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:
@@ -390,8 +377,8 @@ class HiddenNodes(NodeTable):
         Third comes the newest pose of the primary source as received, shape (3,) [m, m, rad].
         `calibration` has the constant errors that the graph knows of beside `errors`.
         """
-        stream, newest_ns = self.streams[self.primary], max(
-            self.newest_ns, int(self.stamps_ns[-1]))
+        stream = self.streams[self.primary]
+        newest_ns = max(self.newest_ns, int(self.stamps_ns[-1]))
         motion, raw = stream.newest(self._base_ns)
         mean, noise = self._corrected(*self._since_node(stream, motion, floor=False), newest_ns)
         moving = self._moving(motion, newest_ns)

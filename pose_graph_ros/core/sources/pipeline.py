@@ -7,7 +7,6 @@ import bisect
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,14 +14,14 @@ import numpy as np
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph.constraints import FactorKind
-from pose_graph_ros.core.odometry.gyro import Gyros
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer
+from pose_graph_ros.core.odometry.stream import ReorderBuffer
 from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.beacons import Beacons
+from pose_graph_ros.core.sources.gyro import Gyros
 from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, observed, validate
-from pose_graph_ros.core.sources.queued import Queued, turn
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
 
 
@@ -136,7 +135,7 @@ class MeasurementPipeline:
 
     def _take_turns(self) -> None:
         """Make the rotations that are due, and count what happened to the rates."""
-        self.queue += itertools.chain.from_iterable(map(turn, self.gyros.extend()))
+        self.queue += self.gyros.extend()
         self.count_sorted(self.gyros.streams)
 
     def _add(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:

@@ -11,7 +11,6 @@ import numpy as np
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.saved_columns import Pairs, Rows2
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
@@ -80,24 +79,3 @@ class SavedQueue:
         return [Queued(source, self.factors.rows(slice(k, k + 1)), stamp_ns, reference_ns, noise)
                 for k, (source, (stamp_ns, reference_ns), noise) in enumerate(zip(
                     self.sources, self.stamps_ns.tolist(), self.noise, strict=True))]
-
-
-def turn(given: Turn) -> list[Queued]:
-    """
-    Return the constraints of a rotation by a gyroscope.
-
-    These are an edge with three ends, two hidden nodes and the bias, and, of rates at rest, an
-    observation of the bias.
-    """
-    information = np.zeros((1, 3, 3))
-    information[0, 2, 2] = 1.0 / given.variance
-    queued = [Queued(given.source, Factors(
-        [given.i], [given.j], [(0.0, 0.0, given.angle)], information, [FactorKind.TURN],
-        constants=[(0.0, 0.0, 0.0, given.seconds)]), given.stamp_ns)]
-    if given.rest_variance > 0.0:
-        information = np.zeros((1, 3, 3))
-        information[0, 0, 0] = 1.0 / given.rest_variance
-        queued.append(Queued(given.source, Factors.on(
-            [-1], None, [(given.rest_rate, 0.0, 0.0)], information, [FactorKind.GLOBAL_POSE]),
-            given.stamp_ns))
-    return queued

@@ -28,8 +28,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
-from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
+from pose_graph_ros.core.io.graph_files import read_graph, SavedGraph, site_refusal, write_graph
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,

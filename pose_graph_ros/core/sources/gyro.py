@@ -20,7 +20,7 @@ that both claim.
 
 import bisect
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -30,11 +30,13 @@ import numpy as np
 from pose_graph_ros.core.config import BackendConfig, GyroSource, RateNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
+from pose_graph_ros.core.odometry.stream import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import STANDING_NS
 from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.core.sources.queued import Queued
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
 LARGEST_RATE = 1000.0
@@ -161,18 +163,27 @@ class Agreement:
 STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
 
 
-class Turn(NamedTuple):
-    """The rotation from one hidden node to the next."""
+def turn(
+    source: str, ends: Sequence[int], stamp_ns: int, rotation: Sequence[float],
+    rest: Sequence[float],
+) -> list[Queued]:
+    """
+    Return the constraints of a rotation from one hidden node to the next.
 
-    source: str
-    i: int  # id of the node that it begins at
-    j: int  # id of the node that it leads to
-    stamp_ns: int  # middle of the time in between [ns]
-    angle: float  # rotation, with the bias during `seconds`, not wrapped [rad]
-    variance: float  # [rad^2]
-    seconds: float  # time for which the robot was not at rest, during which the bias acted [s]
-    rest_rate: float = 0.0  # mean rate at rest, which is the bias [rad/s]
-    rest_variance: float = 0.0  # of that rate [rad^2/s^2]; 0 if the robot was not at rest
+    These are an edge with three ends, two nodes, given by their ids, and the bias, and, of rates
+    at rest, an observation of the bias. The rotation is that of the time for which the robot was
+    not at rest; `rest` has the mean rate at rest and its variance, 0 if it was not at rest. The
+    stamp is the middle of the time in between [ns].
+    """
+    (i, j), (angle, variance, seconds), (rate, rate_variance) = ends, rotation, rest
+    queued = [Queued(source, Factors(
+        [i], [j], [(0.0, 0.0, angle)], [np.diag((0.0, 0.0, 1.0 / variance))], [FactorKind.TURN],
+        constants=[(0.0, 0.0, 0.0, seconds)]), stamp_ns)]
+    if rate_variance > 0.0:
+        queued.append(Queued(source, Factors.on(
+            [-1], None, [(rate, 0.0, 0.0)], [np.diag((1.0 / rate_variance, 0.0, 0.0))],
+            [FactorKind.GLOBAL_POSE]), stamp_ns))
+    return queued
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,11 +208,6 @@ class GyroStream(ReorderBuffer[YawRate]):
         """Set the settings for samples that are not integrated yet."""
         self._source = source
         self._window_ns = round(source.reorder_window * 1e9)
-
-    @property
-    def samples(self) -> tuple[YawRate, ...]:
-        """The samples that are still here."""
-        return (*self._settled, *self._waiting)
 
     @property
     def first_ns(self) -> int:
@@ -257,6 +263,10 @@ class GyroStream(ReorderBuffer[YawRate]):
         rates = np.array([(each.rate, each.variance) for each in samples])
         return RateIntegral(stamps_ns, rates, self._source)
 
+    def saved(self) -> SavedGyro:
+        """Return the state."""
+        return SavedGyro((*self._settled, *self._waiting), self.next_node)
+
     def restore(self, saved: SavedGyro) -> None:
         """Fill this empty stream with what was saved."""
         self._waiting, self.next_node = [*saved.rates], saved.next_node
@@ -292,8 +302,9 @@ class Gyros:
         for stream in self.streams.values():
             stream.settle(stream.newest_ns)
 
-    def extend(self) -> Iterator[Turn]:
-        """Make the rotations up to the newest node that settled rates have reached."""
+    def extend(self) -> list[Queued]:
+        """Return the rotations up to the newest node that settled rates have reached."""
+        made: list[Queued] = []
         for source, stream in self.streams.items():
             stamps_ns = self._nodes.stamps_ns
             end = int(np.searchsorted(stamps_ns, stream.settled_ns, side='right'))
@@ -302,68 +313,54 @@ class Gyros:
             # before the first sample there is nothing to integrate
             begin = max(stream.next_node, int(np.searchsorted(stamps_ns, stream.first_ns)))
             for node in range(begin, end):
-                yield from self._extend(source, stream, node)
+                made += self._extend(source, stream, node)
             stream.next_node = max(begin, end)
             stream.forget_before(int(stamps_ns[stream.next_node - 1]))
+        return made
 
-    def _extend(self, source: str, stream: GyroStream, node: int) -> Iterator[Turn]:
-        """Make the rotation to a node, given by its number."""
+    def _extend(self, source: str, stream: GyroStream, node: int) -> list[Queued]:
+        """Return the rotation to a node, given by its number."""
         nodes = self._nodes
         start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
         # closer nodes have no rotation between them: a robot was put elsewhere
         if end_ns - start_ns < 1_000_000 or node in nodes.relocated:
-            return
+            return []
         integral = stream.integral(start_ns, end_ns)
         if integral is None:
             if stream.first_ns <= start_ns:
                 self._counts[source, 'gap'] += 1
-            return
+            return []
         if nodes.has_left(node - 1) or nodes.has_left(node):
             self._counts[source, 'before_window'] += 1
-            return
-        rotation = integral.between(start_ns, end_ns)
-        at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
+            return []
         self._counts[source, 'rotations'] += 1
-        odometry = nodes.streams[nodes.primary_at(end_ns)]
+        angle, variance, seconds = integral.between(start_ns, end_ns)
+        primary = nodes.primary_at(end_ns)
+        odometry = nodes.streams[primary]
         if odometry.timeline.covers(start_ns) and odometry.timeline.covers(end_ns):
             motion = odometry.timeline.motion(start_ns, end_ns)
             stream.agreement.add(
-                float(se2.wrap(rotation.angle - motion.increment[2])), rotation.seconds,
-                integral.rate(end_ns) - integral.rate(start_ns), rotation.angle,
-                rotation.variance + float(odometry.covariance(motion)[2, 2]))
-        i, j = nodes.ids[node - 1:node + 1].tolist()
-        middle_ns = (start_ns + end_ns) // 2
-        if at_rest.seconds == 0.0:
-            yield Turn(source, i, j, middle_ns, *rotation)
-            return
-        yield Turn(
-            source, i, j, middle_ns, rotation.angle - at_rest.angle + creep,
-            rotation.variance - at_rest.variance + creep_variance,
-            rotation.seconds - at_rest.seconds, (at_rest.angle - creep) / at_rest.seconds,
-            (at_rest.variance + creep_variance) / at_rest.seconds**2)
-
-    def _at_rest(
-        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
-    ) -> tuple[Rotation, float, float]:
-        """Return the rotation by rates at rest, that by the wheels [rad] and its variance."""
-        total, creep, variance = Rotation(0.0, 0.0, 0.0), 0.0, 0.0
-        if end_ns - start_ns < STOPPING_NS + STARTING_NS + STANDING_NS:
-            return total, creep, variance
-        primary = self._nodes.primary_at(end_ns)
-        timeline = self._nodes.streams[primary].timeline
+                float(se2.wrap(angle - motion.increment[2])), seconds,
+                integral.rate(end_ns) - integral.rate(start_ns), angle,
+                variance + float(odometry.covariance(motion)[2, 2]))
+        # by rates at rest, and by the wheels meanwhile
+        rest, creep = np.zeros(3), np.zeros(2)
         most = MOST_BIAS * self._config.gyro(source).sigma_bias
-        for first_ns, last_ns in timeline.rests(start_ns, end_ns):
+        floor = self._config.odometry_source(primary).noise.sigma_floor_heading
+        for first_ns, last_ns in odometry.timeline.rests(start_ns, end_ns):
             begin_ns, until_ns = first_ns + STOPPING_NS, last_ns - STARTING_NS
             if until_ns - begin_ns < STANDING_NS:
                 continue
-            rest = integral.between(begin_ns, until_ns)
-            if abs(rest.angle) > most * rest.seconds:
-                continue
-            total = Rotation(total.angle + rest.angle, total.variance + rest.variance,
-                             total.seconds + rest.seconds)
-            creep += float(timeline.motion(begin_ns, until_ns).increment[2])
-            variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
-        return total, creep, variance
+            part = integral.between(begin_ns, until_ns)
+            if abs(part.angle) <= most * part.seconds:
+                wheels = odometry.timeline.motion(begin_ns, until_ns).increment[2]
+                rest, creep = rest + part, creep + np.array((wheels, floor**2))
+        at_rest = float(rest[2])
+        return turn(
+            source, nodes.ids[node - 1:node + 1].tolist(), (start_ns + end_ns) // 2,
+            (angle - rest[0] + creep[0], variance - rest[1] + creep[1], seconds - at_rest),
+            (0.0, 0.0) if at_rest == 0.0 else (
+                (rest[0] - creep[0]) / at_rest, (rest[1] + creep[1]) / at_rest**2))
 
     def stream(self, source: str) -> GyroStream:
         """Return the stream of a gyroscope, a new one if there was none."""
@@ -392,8 +389,3 @@ class Gyros:
                 angle, variance, seconds = integral.between(start_ns, end_ns)
                 return angle - bias * seconds, variance
         return None
-
-    def saved(self) -> dict[str, SavedGyro]:
-        """Return the state of each gyroscope."""
-        return {source: SavedGyro(stream.samples, stream.next_node)
-                for source, stream in self.streams.items()}
