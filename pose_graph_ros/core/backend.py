@@ -27,10 +27,11 @@ from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
+from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, Refinement
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.kinds import attach, validate
+from pose_graph_ros.core.sources.kinds import attach, observed, validate
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -71,17 +72,19 @@ class PoseGraphBackend:
         self.calibrations = partial(factors.calibrations, self.graph, self._smoother.covariance)
         self._tuner = ErrorTuner(
             self._smoother, self._nodes, factors, self._reweighting, self._judge)
-        self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
         pipeline = self._pipeline = MeasurementPipeline(self._nodes, self._config)
         self.gyro_differences = pipeline.gyros.differences
         self.counts = pipeline.counts  # of answers by source and 'accepted' or the reason
         self.refusals = pipeline.refusals  # details of the newest ones by source and reason
+        # source and both stamps [ns] of the newest loop closures that were refused
+        self.refused_closures = pipeline.refused_closures
         self._quarantine: list[Queued] = []
         self._alignment = Alignment(self._nodes, self._judge.fixes)
         self.parts = parts.Parts(  # what it is made of, for tools
             self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
             pipeline, self._quarantine, self._judge, self._smoother)
         self.disagreement = partial(dg.find, self.parts)
+        self._refiner = Refiner(self.parts, self._tuner)
         self._forgetting = Forgetting(self._tuner, self.parts)
         self._settled, self._chi2 = True, 0.0
         self._waits = False  # whether the queue waits until the graph is solved
@@ -90,13 +93,8 @@ class PoseGraphBackend:
         """Change the settings for later input; raises as `BackendConfig.changed_to` does."""
         self._config = self._config.changed_to(config)
         self._nodes.configure(config)
-        self._pipeline.configure(config)
-        self._factors.config = config
-
-    @property
-    def refused_closures(self) -> list[tuple[str, int, int | None]]:
-        """Source and both stamps [ns] of the newest loop closures that were refused."""
-        return list(self._pipeline.refused_closures)
+        self._pipeline.gyros.configure(config)
+        self._pipeline.config = self._factors.config = config
 
     @property
     def node_stamps_ns(self) -> IntArray:
@@ -115,7 +113,7 @@ class PoseGraphBackend:
 
     def set_aside(self, n: int) -> list[str]:
         """Return the names of the newest n constraints that were set aside."""
-        return dg.queued(self._quarantine[-n:], self._nodes)
+        return dg.queued(self._quarantine[-n:], self.parts)
 
     @property
     def revision(self) -> int:
@@ -238,7 +236,9 @@ class PoseGraphBackend:
         if node < 0:
             return ms.rejected('failed', 'the solver failed')
         self._collect()
-        self._pipeline.attach_to_node(replace(given, stamp_ns=last_ns + 1, pose=now), source, node)
+        self._pipeline.queue.append(observed(
+            source, replace(given, stamp_ns=last_ns + 1, pose=now),
+            Attachment(node, np.zeros(3), np.zeros((3, 3)))))
         return ms.ACCEPTED
 
     def update(self) -> UpdateReport:
@@ -255,9 +255,7 @@ class PoseGraphBackend:
 
     def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, list[Queued]]:
         """Return the report of an update, and the constraints for which it had no time."""
-        return tr.update_isolated(
-            partial(self._add_queue, at_once=at_once), self._settle, self._pipeline,
-            self._quarantine, lambda one: dg.queued(one, self._nodes)[0])
+        return tr.update_isolated(partial(self._add_queue, at_once=at_once), self.parts)
 
     def _settle(self) -> bool:
         """Tell whether an update without new constraints succeeds."""
@@ -309,9 +307,8 @@ class PoseGraphBackend:
         self._tuner.step(1000)
         self._recheck_alignment()
         self._evaluate()
-        return UpdateReport(
-            result.status, '', len(queue), result.iterations, self._chi2, result.relinearized,
-            result.eliminated, result.visited), []
+        return UpdateReport(result.status, '', len(queue), result.iterations,
+                            self._chi2, result.relinearized, result.eliminated, result.visited), []
 
     def refine(self) -> Refinement:
         """Do an iteration from the estimate of an update to the optimum; `optimize` needs none."""
@@ -360,8 +357,7 @@ class PoseGraphBackend:
     def optimize(self) -> UpdateReport:
         """Optimise the whole graph with all quarantined constraints; for the end of a stream."""
         self.finish()
-        report = tr.update_with_all(
-            partial(self._update, at_once=True), self._pipeline, self._quarantine)
+        report = tr.update_with_all(partial(self._update, at_once=True), self.parts)
         if self.graph.n_nodes == 0:
             return report
         self._forgetting.step(self._config)
@@ -398,8 +394,7 @@ class PoseGraphBackend:
         if self.graph.n_nodes == 0:
             return None
         return parts.estimate(
-            self.parts, self._config.odometry_source(self._nodes.primary),
-            self._newest_node_covariance, self._chi2, with_path=with_path)
+            self.parts, self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
         """Return those at the path of the present estimate; see `core.parts`."""

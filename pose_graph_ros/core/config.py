@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 import math
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -269,10 +269,9 @@ LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False), rob
 RANGES = MeasurementSource(covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
 
 
-class HasDefaults(Protocol):
-    """A kind of measurements."""
-
-    defaults: ClassVar[MeasurementSource]  # settings of a source that is not configured
+# settings of a source that is not configured, by the class of its measurements
+DEFAULTS = {'GlobalPose': POSITIONS, 'Position': POSITIONS, 'Fix': POSITIONS,
+            'HeadingOnly': HEADINGS, 'LoopClosure': LOOP_CLOSURES, 'Range': RANGES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,9 +390,9 @@ class BackendConfig(Settings):
         """Factor on the sigmas of odometry of the preferred source; 0 for one that is found."""
         return next((source.sigma_scale for source in self.odometry.values()), 0.0)
 
-    def measurement_source(self, name: str, kind: type[HasDefaults]) -> MeasurementSource:
+    def measurement_source(self, name: str, kind: type) -> MeasurementSource:
         """Return the settings of a source, by default those of its kind of measurement."""
-        return self.measurements.get(name, kind.defaults)
+        return self.measurements.get(name, DEFAULTS[kind.__name__])
 
     def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
         """

@@ -23,9 +23,7 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.graph_view import DIAGONAL, factor_table, FactorTable
 from pose_graph_ros.core.measurements import Range
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.parts import Parts
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
 
@@ -66,25 +64,24 @@ def _named(row: int, energy: float, table: FactorTable, parts: Parts) -> Constra
     ends = ends[ends >= 0]
     places = np.searchsorted(nodes.ids, graph.node_ids[ends[graph.is_pose[ends]]]).tolist()
     kind = FactorKind(int(factor['kind'])).name.lower()
-    origin, of_bias = factors.origin(number), factors.bias_origin(int(graph.node_ids[ends[0]]))
-    known = origin or of_bias
-    source = '' if origin is None else origin.source
+    source, stamp_ns = factors.origin(number)
+    of_bias, begin_ns = factors.bias_origin(int(graph.node_ids[ends[0]]))
     if len(places) == 2:
-        if origin is None and kind == 'odometry':
+        if source == '' and kind == 'odometry':
             source = nodes.primary_at(int(nodes.stamps_ns[places[1]]))
         name = _name(source or kind, places)
     elif len(places) == 1:
         position, _, heading = factor['information'][DIAGONAL] > 0.0
         if len(ends) == 1 or kind == 'bias':
             kind = 'heading' if not position else 'global_pose' if heading else 'position'
-        name = _name(source or kind, places, -1 if origin is None else origin.stamp_ns)
+        name = _name(source or kind, places, stamp_ns)
     else:
         # one on a bias alone comes from no measurement and is named after the bias
-        kind, source = 'bias', '' if of_bias is None else of_bias.source
-        name = kind if of_bias is None else _name(f'error of {source}', (), of_bias.stamp_ns)
+        kind, source = 'bias', of_bias
+        name = kind if source == '' else _name(f'error of {source}', (), begin_ns)
     return ConstraintEnergy(
         energy, float(table.energies[row]), int(table.freedom[row]), source, kind, name,
-        number, tuple(places), -1 if known is None else known.stamp_ns)
+        number, tuple(places), begin_ns if stamp_ns < 0 else stamp_ns)
 
 
 def _name(what: str, places: Sequence[int], stamp_ns: int = -1) -> str:
@@ -95,11 +92,11 @@ def _name(what: str, places: Sequence[int], stamp_ns: int = -1) -> str:
                     *(f' near x{place}' for place in places)))
 
 
-def queued(queue: Sequence[Queued], nodes: HiddenNodes) -> list[str]:
+def queued(queue: Sequence[Queued], parts: Parts) -> list[str]:
     """Return the names of constraints that are not in the graph, as in `ConstraintEnergy`."""
     # a landmark is no node of the path
     places = [each.nodes[:1 if each.measured is Range else 2] for each in queue]
-    return [_name(each.source, np.searchsorted(nodes.ids, of).tolist(), each.stamp_ns)
+    return [_name(each.source, np.searchsorted(parts.nodes.ids, of).tolist(), each.stamp_ns)
             for each, of in zip(queue, places, strict=True)]
 
 
@@ -124,9 +121,8 @@ def find(parts: Parts) -> Disagreement | None:
     What is set wrongly most often is tried first: directions before positions. It takes a full
     optimisation for each source that is tried.
     """
-    graph, factors, primary = parts.graph, parts.factors, parts.nodes.primary
-    sources = _sources(parts)
-    before = _strains(graph, factors, sources)
+    graph, primary, sources = parts.graph, parts.nodes.primary, _sources(parts)
+    before = _strains(graph, parts, sources)
     others = [source for source in sources if source != primary]
     if max((before[source] for source in others), default=0.0) <= SOURCES.far:
         return None
@@ -136,8 +132,8 @@ def find(parts: Parts) -> Disagreement | None:
         copy = _solved_without(graph, sources, source)
         if copy is None:
             continue
-        rest = _strains(copy, factors, {
-            name: part for name, part in sources.items() if name != source})
+        others_of = {name: part for name, part in sources.items() if name != source}
+        rest = _strains(copy, parts, others_of)
         if max(rest.values()) <= SOURCES.far and rest.get(worst, 0.0) <= 0.25 * before[worst]:
             whom = ('the other sources, which agree without it' if len(rest) > 1 else
                     f'{primary}, and no third source tells who is wrong')
@@ -182,12 +178,12 @@ def edges_by_source(parts: Parts) -> Mapping[tuple[str, str], IntArray]:
     return found
 
 
-def _strains(graph: Graph, factors: FactorBuilder, parts: Mapping[str, _Part]) -> dict[str, float]:
+def _strains(graph: Graph, parts: Parts, sources: Mapping[str, _Part]) -> dict[str, float]:
     """Return the mean squared residual of each source, in units of what is known of its errors."""
     table, strains = factor_table(graph), {}
-    for source, part in parts.items():
+    for source, part in sources.items():
         if part.kind in ('map', 'heading'):
-            strains[source] = factors.report(source, graph).strain
+            strains[source] = parts.factors.report(source, graph).strain
         else:
             rows = graph.factor_rows(part.factors)
             used = rows[table.weights[rows] > 0.0]

@@ -203,10 +203,8 @@ class Forgetting:
 
     def _held(self) -> IntArray:
         """Return the ids of nodes that do not leave, as something is to be added to them."""
-        parts, found = self._parts, list[int]()
-        for queue in (parts.pipeline.queue, parts.quarantine):
-            found += [node for each in queue for node in each.nodes]
-        return np.array(found, dtype=np.int64)
+        waiting = (*self._parts.pipeline.queue, *self._parts.quarantine)
+        return np.array([node for each in waiting for node in each.nodes], dtype=np.int64)
 
     def _freeze(self, n: int, prior: WindowPrior) -> None:
         """Let the n oldest nodes leave, with a dense or a sparse prior instead."""

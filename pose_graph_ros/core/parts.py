@@ -12,7 +12,6 @@ If odometry continues without interruption, later estimates are therefore the sa
 saving. Measurements that wait for odometry are not saved; they can be sent again.
 """
 
-from collections.abc import Sequence
 from itertools import combinations
 import math
 from typing import NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 
 from pose_graph_ros.core.alignment import Alignment, AlignmentState, guess
 from pose_graph_ros.core.batch.truncated import LIMITS
-from pose_graph_ros.core.config import Loss, OdometrySource, Robust
+from pose_graph_ros.core.config import Loss, Robust
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.exceptions import FileFormatError, NothingToSaveError
 from pose_graph_ros.core.geometry import covariance, se2
@@ -63,9 +62,7 @@ class Parts(NamedTuple):
     smoother: IncrementalSmoother
 
 
-def capture(
-    parts: Parts, newest_covariance: FloatArray, chi2: float, datum: MapOrigin | None,
-) -> SavedGraph:
+def capture(parts: Parts, cov: FloatArray, chi2: float, datum: MapOrigin | None) -> SavedGraph:
     """
     Return the state of an engine as a value; NothingToSaveError if there is no hidden node.
 
@@ -83,7 +80,7 @@ def capture(
         set_aside=SavedQueue.of(parts.quarantine), judgement=parts.judge.saved(),
         verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
                   if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
-        newest_covariance=newest_covariance.copy(), chi2=chi2, n_left_out=len(left_out),
+        newest_covariance=cov.copy(), chi2=chi2, n_left_out=len(left_out),
         datum=datum, beacons=dict(pipeline.beacons.ids),
         gyros={name: gyro.saved() for name, gyro in pipeline.gyros.streams.items()})
 
@@ -113,14 +110,11 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
 
 
-def estimate(
-    parts: Parts, source: OdometrySource, newest_covariance: FloatArray, chi2: float, *,
-    with_path: bool,
-) -> Estimate:
-    """Return the present estimate; there must be a hidden node."""
+def estimate(parts: Parts, cov: FloatArray, chi2: float, *, with_path: bool) -> Estimate:
+    """Return the present estimate, given the covariance of the newest hidden node."""
     graph, nodes, factors = parts.graph, parts.nodes, parts.factors
     state, sigma = parts.alignment.state, parts.alignment.sigma
-    pose, cov = graph.poses_of(nodes.ids[-1]), newest_covariance
+    pose = graph.poses_of(nodes.ids[-1])
     if state is AlignmentState.ALIGNED:
         pose, cov = corrected(parts, pose, cov)
     errors = factors.calibration(nodes.primary, graph)
@@ -155,7 +149,7 @@ def estimate(
         n_priors=graph.n_priors, n_edges=graph.n_edges,
         n_observed=sum(len(each) + each.n_otherwise for each in factors.sources.values()),
         n_biases=int(np.count_nonzero(graph.is_bias)),
-        primary=nodes.primary, odometry=source,
+        primary=nodes.primary, odometry=factors.config.odometry_source(nodes.primary),
         odometry_errors=nodes.errors if errors == AS_CLAIMED else nodes.errors._replace(
             rate=errors.rate, scale=errors.scale),
         trajectory=None if not with_path else Trajectory(
@@ -202,9 +196,7 @@ def _turned(parts: Parts, motion: FloatArray, noise: FloatArray) -> tuple[FloatA
             noise - total * np.outer(gain, gain))
 
 
-def corrected(
-    parts: Parts, pose: FloatArray, noise: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def corrected(parts: Parts, pose: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the newest node of an aligned graph and its covariance, by what odometry passed."""
     if parts.graph.has_touched:
         return pose, noise     # an update has failed
@@ -238,13 +230,12 @@ def _passed(parts: Parts) -> list[tuple[Factors, bool]]:
         if measurement is None:
             continue
         settings = parts.factors.config.measurement_source(source, type(measurement))
-        found.append((
-            parts.factors.preview(observed(source, measurement, attachment)),
-            settings.robust is Robust.JUDGED or settings.applied_loss is not Loss.NONE))
+        found.append((parts.factors.preview(observed(source, measurement, attachment)),
+                      settings.robust is Robust.JUDGED or settings.applied_loss is not Loss.NONE))
     return found
 
 
-def _joint(smoother: IncrementalSmoother, ids: Sequence[int]) -> FloatArray:
+def _joint(smoother: IncrementalSmoother, ids: list[int]) -> FloatArray:
     """Return the joint covariance of a few nodes, shape (3 N, 3 N)."""
     joint = np.empty((len(ids), 3, len(ids), 3))
     joint[0, :, 0] = smoother.covariance(ids[0])
@@ -255,7 +246,7 @@ def _joint(smoother: IncrementalSmoother, ids: Sequence[int]) -> FloatArray:
 
 
 def _linearized(
-    edge: Factors, state: FloatArray, ids: Sequence[int],
+    edge: Factors, state: FloatArray, ids: list[int],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what was measured less what is expected, its Jacobian, and its covariance."""
     information = edge.weighted_information[0]

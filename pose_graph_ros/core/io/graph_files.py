@@ -206,7 +206,27 @@ def _verified(path: Path) -> tuple[Path, Path, dict[str, Any], bytes]:
     if path.name == '':
         raise FileFormatError(f'{path}: expected the name of a file')
     g2o_path, path, _ = graph_paths(path)
-    members = _checked_members(path, _content(path))
+    content = _content(path)
+    begin = len(_OPENING) + _DIGITS
+    body = content[begin + len(_MIDDLE):]
+    if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
+        raise FileFormatError(f'{path}: does not begin as a saved graph does, with its SHA-256')
+    if hashlib.sha256(body).hexdigest().encode('ascii') != content[len(_OPENING):begin]:
+        raise FileFormatError(f'{path}: is damaged, cut off or was edited: its SHA-256 is not '
+                              'the one that it begins with')
+    try:
+        members = json.loads(b'{' + body)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f'{path}: expected JSON ({error})') from error
+    version = members.pop('version', None)
+    if members.pop('format', None) != FORMAT or version not in range(1, VERSION + 1):
+        raise FileFormatError(
+            f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
+            f'this one is of version {version!r}, created by {members.get("created_by")!r}')
+    try:
+        members = upgraded(members, version)
+    except sc.MISMATCHES as error:
+        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
     g2o = _content(g2o_path)
     if hashlib.sha256(g2o).hexdigest() != members.pop('g2o_sha256', None):
         raise FileFormatError(
@@ -232,39 +252,14 @@ def _content(path: Path) -> bytes:
         raise FileFormatError(f'{path}: cannot be read ({error})') from error
 
 
-def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
-    """Return the members of a JSON file after verifying its checksum and version."""
-    begin = len(_OPENING) + _DIGITS
-    body = content[begin + len(_MIDDLE):]
-    if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
-        raise FileFormatError(f'{path}: does not begin as a saved graph does, with its SHA-256')
-    if hashlib.sha256(body).hexdigest().encode('ascii') != content[len(_OPENING):begin]:
-        raise FileFormatError(f'{path}: is damaged, cut off or was edited: its SHA-256 is not '
-                              'the one that it begins with')
-    try:
-        members = json.loads(b'{' + body)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f'{path}: expected JSON ({error})') from error
-    version = members.pop('version', None)
-    if members.pop('format', None) != FORMAT or version not in range(1, VERSION + 1):
-        raise FileFormatError(
-            f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
-            f'this one is of version {version!r}, created by {members.get("created_by")!r}')
-    try:
-        return upgraded(members, version)
-    except sc.MISMATCHES as error:
-        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
-
-
 def _saved_rows(rows: GraphRows) -> SavedRows:
     factors, others = rows.factors, ~rows.is_pose
     in_json = np.flatnonzero(np.where(
         factors.j < 0, np.isin(factors.i, rows.node_ids[rows.is_bias]),
         ~np.isin(factors.kind, IN_G2O) | (factors.k >= 0)))
     given = factors.rows(in_json)
-    node_ids, factor_ids = (
-        None if len(ids) == end else ids for ids, end in zip(
-            (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
+    node_ids, factor_ids = (None if len(ids) == end else ids for ids, end in zip(
+        (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
     dimensions = None if rows.dimension is None else rows.dimension[others].astype(np.int64)
     landmarks = rows.node_ids[rows.node_kind == ct.NodeKind.LANDMARK]
     return SavedRows(
@@ -316,29 +311,23 @@ def _factors(rows: SavedRows, text: GraphText) -> ct.Factors:
 
 def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:
     """Return priors as columns."""
-    if len(priors) == 0:
-        return SavedPriors()
-    return SavedPriors(
-        np.array([len(prior.nodes) for prior in priors], dtype=np.int64),
-        np.array([prior.anchored for prior in priors], dtype=np.bool_),
-        np.concatenate([prior.nodes for prior in priors]).astype(np.int64),
-        np.concatenate([packed(prior) for prior in priors]))
+    return SavedPriors(np.array([len(prior.nodes) for prior in priors], dtype=np.int64),
+                       np.array([prior.anchored for prior in priors], dtype=np.bool_),
+                       np.concatenate([np.empty(0, np.int64), *(prior.nodes for prior in priors)]),
+                       np.concatenate([np.empty(0), *map(packed, priors)]))
 
 
 def _restored_priors(saved: SavedPriors) -> tuple[Prior, ...]:
     """Return saved priors."""
     sizes = saved.sizes
-    if len(sizes) == 0:
-        return ()
     counts = 3 * sizes * (3 * sizes + 3) // 2 + 3 * sizes + 1
+    # behind the last ones is nothing
     return tuple(unpacked(nodes, numbers, anchored=anchored) for nodes, numbers, anchored in zip(
-        np.split(saved.nodes, np.cumsum(sizes)[:-1]),
-        np.split(saved.numbers, np.cumsum(counts)[:-1]), saved.anchored.tolist(), strict=True))
+        np.split(saved.nodes, np.cumsum(sizes)), np.split(saved.numbers, np.cumsum(counts)),
+        saved.anchored.tolist(), strict=False))
 
 
-def site_refusal(
-    saved: SavedGraph, datum: MapOrigin | None = None, fix: MapOrigin | None = None,
-) -> str | None:
+def site_refusal(saved: SavedGraph, datum: MapOrigin | None, fix: MapOrigin | None) -> str | None:
     """
     Return why a saved graph cannot belong to the site of the robot; None if it can.
 

@@ -17,9 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pose_graph_ros.core.config import NoiseFrom, OdometryNoise, OdometrySource
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.covariance import UNKNOWN_HEADING_VARIANCE
 from pose_graph_ros.core.geometry.se2 import between_one, exp_one, FloatArray, Pose
 from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.saved_columns import Numbers, Rows3
 
 Variances = tuple[float, float, float]  # of (x, y, theta) [m^2, m^2, rad^2], or of a twist
 NO_VARIANCE: FloatArray = np.zeros(3)
@@ -36,6 +38,19 @@ class Motion(NamedTuple):
     # variance of (x, y, theta) in addition to the noise by path and turns, shape (3,): noise by
     # the twist, jumps, interpolation [m^2, m^2, rad^2]
     variance: FloatArray = NO_VARIANCE
+
+
+class Span(NamedTuple):
+    """A motion, such as from the newest node to the first stamp of a new primary source."""
+
+    mean: Numbers  # shape (3,)
+    covariance: Rows3  # in the frame at its end
+
+    def continued(self, mean: FloatArray, covariance: FloatArray) -> 'Span':
+        """Return this motion and another one after it; or several, each and one after it."""
+        adjoint = se2.adjoint(se2.inverse(mean))
+        return Span(se2.compose(self.mean, mean),
+                    adjoint @ self.covariance @ np.swapaxes(adjoint, -1, -2) + covariance)
 
 
 NO_MOTION = Motion(np.zeros(3), 0.0, 0.0)

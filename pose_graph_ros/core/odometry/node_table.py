@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple
 
@@ -12,7 +11,7 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses
 from pose_graph_ros.core.graph.constraints import full, upper
-from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.motion import Attachment, Span
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Records, Rows3
@@ -68,10 +67,10 @@ class ThinnedNodes:
         self._size += len(rows)
         passed = np.flatnonzero(np.isin(table['anchors'], numbers))
         own, before = table[passed], table[table['anchors'][passed] - self._first]
-        mean = own['relative'].astype(float)
-        table['noise'][passed] = upper(passed_on(
-            mean, full(before['noise'].astype(float)), full(own['noise'].astype(float))))
-        table['relative'][passed] = se2.compose(before['relative'].astype(float), mean)
+        first, then = (Span(each['relative'].astype(float), full(each['noise'].astype(float)))
+                       for each in (before, own))
+        both = first.continued(*then)
+        table['relative'][passed], table['noise'][passed] = both.mean, upper(both.covariance)
         table['anchors'][passed] = before['anchors']
 
     def place(self, number: int) -> Place | None:
@@ -102,27 +101,6 @@ class ThinnedNodes:
         self._first = number
 
 
-def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
-    """
-    Return the covariances of motions to some places and on from there, in the frames at the end.
-
-    `mean` are the second motions, `first` and `then` the covariances of both.
-    """
-    adjoint = se2.adjoint(se2.inverse(mean))
-    return np.asarray(adjoint @ first @ np.swapaxes(adjoint, -1, -2) + then)
-
-
-class Span(NamedTuple):
-    """A motion from the newest node on, such as to the first stamp of a new primary source."""
-
-    mean: Numbers  # shape (3,)
-    covariance: Rows3  # in the frame at its end
-
-    def continued(self, mean: FloatArray, covariance: FloatArray) -> 'Span':
-        """Return this motion and another one after it."""
-        return Span(se2.compose(self.mean, mean), passed_on(mean, self.covariance, covariance))
-
-
 @dataclass(frozen=True, slots=True)
 class SavedNodes:
     """Saved hidden nodes, and the state of the odometry sources."""
@@ -137,7 +115,7 @@ class SavedNodes:
     base: Pose  # pose of the primary source at `base_ns`
     # motion from the newest node to `base_ns`; None if that is the stamp of the node
     bridge: Span | None
-    streams: Mapping[str, SavedStream]  # by the name of the source
+    streams: dict[str, SavedStream]  # by the name of the source
     # poses of the first nodes, which have left the graph
     frozen: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
     travelled: float = 0.0  # path length up to the first node in the graph [m]
@@ -168,10 +146,8 @@ class NodeTable:
     """
 
     def __init__(self) -> None:
-        self._stamps = GrowingArray((), np.int64)
-        self._ids = GrowingArray((), np.int64)
-        self._frozen = GrowingArray((3,), np.float64)
-        self._odometry = GrowingArray((3,), np.float64)
+        self._stamps, self._ids = GrowingArray((), np.int64), GrowingArray((), np.int64)
+        self._frozen, self._odometry = GrowingArray((3,), float), GrowingArray((3,), float)
         self._travelled = 0.0  # path length up to the first node that is not frozen [m]
         self.thinned = ThinnedNodes()
 
@@ -240,8 +216,8 @@ class NodeTable:
         place = self.thinned.place(number)
         if place is None:
             return Attachment(int(self.ids[number]), mean, noise)
-        return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
-                          passed_on(mean, place.noise, noise))
+        return Attachment(
+            int(self.ids[place.anchor]), *Span(place.mean, place.noise).continued(mean, noise))
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""
@@ -258,10 +234,8 @@ class NodeTable:
 
     def fill(self, saved: SavedNodes) -> None:
         """Fill this empty table."""
-        self._stamps.append(saved.stamps_ns)
-        self._ids.append(saved.ids)
-        self._odometry.append(saved.odometry)
-        self._frozen.append(saved.frozen)
+        self._stamps, self._ids, self._odometry, self._frozen = map(
+            GrowingArray.of, (saved.stamps_ns, saved.ids, saved.odometry, saved.frozen))
         self._travelled, thinned = saved.travelled, saved.thinned
         self.thinned = ThinnedNodes(self.n_frozen)
         self.thinned.add(thinned['numbers'], thinned['anchors'], thinned['relative'],

@@ -21,6 +21,7 @@ from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTim
 from pose_graph_ros.core.quantities import StampNs, StampsNs
 from pose_graph_ros.core.saved_columns import Flags, Integers, Rows8
 
+NEVER = 1 << 63  # after all stamps [ns]
 NO_TWIST: Pose = (0.0, 0.0, 0.0)
 # A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
 # stamps of this number of consecutive samples that came after it.
@@ -81,8 +82,12 @@ class ReorderBuffer(Generic[Sample]):
             self.settled_ns = sample.stamp_ns
             yield sample
 
-    def _insert(self, sample: Sample) -> ms.Answer | int:
-        """Return the index of a sample that was added, or why it was not."""
+    def _follow(self, begin: int) -> None:
+        """Do what is to be done after samples that wait have changed, from one on."""
+        raise NotImplementedError
+
+    def _insert(self, sample: Sample) -> ms.Answer:
+        """Return the answer to a sample, which is sorted in if it is accepted."""
         samples, stamp_ns, at = self._waiting, sample.stamp_ns, len(self._waiting)
         if not 0 < stamp_ns <= ms.LARGEST_STAMP:
             return ms.rejected('zero_stamp' if stamp_ns <= 0 else 'no_stamp',
@@ -105,7 +110,8 @@ class ReorderBuffer(Generic[Sample]):
             self.n_dropped += len(samples) - kept
             del samples[kept:]
             self._n_behind = 0
-        return at
+        self._follow(at)
+        return ms.ACCEPTED
 
 
 class Instant(NamedTuple):
@@ -192,15 +198,11 @@ class OdometryStream(ReorderBuffer[Received]):
             if not all(abs(number) <= largest for number in numbers):
                 reason = 'too_large' if all(map(math.isfinite, numbers)) else 'not_finite'
                 return ms.rejected(reason, f'{what} {numbers}')
-        at = self._insert(Received(
+        return self._insert(Received(
             sample.stamp_ns, (x, y, se2.wrap_one(theta)),
             sample.speed if math.isfinite(sample.speed) else 0.0,
             None if variance is None else tuple(
                 np.nan_to_num(variance, posinf=0.0, neginf=0.0).tolist()), twist))
-        if isinstance(at, ms.Answer):
-            return at
-        self._follow(at)
-        return ms.ACCEPTED
 
     def _was_settled(self, stamp_ns: int) -> bool:
         stamps = self.timeline.stamps_ns
@@ -237,9 +239,9 @@ class OdometryStream(ReorderBuffer[Received]):
         """Drop settled samples that motions from an instant [ns] on do not depend on."""
         self.timeline.drop_before(min(before_ns, self.settled_ns - mo.SPEED_TIME_NS))
 
-    def first_after(self, stamp_ns: int) -> int | None:
+    def first_after(self, stamp_ns: int) -> int:
         """
-        Return the stamp of the first sample after an instant [ns], settled or not; None without.
+        Return the stamp of the first sample after an instant [ns], settled or not, or `NEVER`.
 
         Between samples at rest, of which the timeline keeps two, it is `stamp_ns + 1`.
         """
@@ -249,7 +251,7 @@ class OdometryStream(ReorderBuffer[Received]):
             # samples at rest that the timeline left out lie in between
             return stamp_ns + 1 if self.timeline.dense(at) and at > 0 else int(stamps[at])
         at = bisect.bisect_right(self._waiting, stamp_ns, key=stamp_of)
-        return self._waiting[at].stamp_ns if at < len(self._waiting) else None
+        return self._waiting[at].stamp_ns if at < len(self._waiting) else NEVER
 
     def tie_from(self, node: int, *, reached: bool) -> None:
         """
@@ -333,7 +335,11 @@ class OdometryStream(ReorderBuffer[Received]):
         ends = OdometryTimeline(rows[after - 1:after + 1])
         if not ends.covers(stamp_ns, closely=True):
             return None
-        return self.timeline.motion_to(since_ns, *ends.at(stamp_ns))
+        first = self.timeline.motion_to(since_ns, rows[after - 1].numbers)
+        last = ends.motion(rows[after - 1].stamp_ns, stamp_ns)
+        return mo.Motion(
+            se2.compose(first.increment, last.increment), first.distance + last.distance,
+            first.turn + last.turn, first.variance + last.variance)
 
     def _follow(self, begin: int = 0) -> None:
         """Compute the states at the samples that are not settled, from one on."""
@@ -359,15 +365,13 @@ class OdometryStream(ReorderBuffer[Received]):
             before.window.speeds, step, elapsed, sample.speed, self._source.maximum_speed)
         if before.row.stamp_ns <= self.saved_ns < stamp_ns and (
                 jump or elapsed > mo.RESUMED_WITHIN):
-            return _elsewhere(
-                before, sample, before.row.pose, mo.RESTART_VARIANCE, restarted=True)
+            return _elsewhere(before, sample, before.row.pose, mo.RESTART_VARIANCE, restarted=True)
         if jump:
             time, speeds = min(elapsed, mo.MEMORY_TIME), before.window.speeds
             x, y, theta = speeds.velocity
             pose = compose_one(before.row.pose, (x * time, y * time, se2.wrap_one(theta * time)))
-            position, heading = (
-                (sigma + (0.0 if speeds == mo.UNKNOWN else rate * elapsed))**2
-                for sigma, rate in zip(mo.JUMP_SIGMA, speeds.recent, strict=True))
+            position, heading = ((sigma + (0.0 if speeds == mo.UNKNOWN else rate * elapsed))**2
+                                 for sigma, rate in zip(mo.JUMP_SIGMA, speeds.recent, strict=True))
             return _elsewhere(before, sample, pose, (position, position, heading), speeds)
         if integrates:
             pose = compose_one(before.row.pose, motion)
@@ -407,11 +411,10 @@ def find_silence(
     while True:
         # the next sample of the primary source ends its silence
         next_ns = settled_ns if source == primary else streams[primary].first_after(last_ns)
-        until_ns = settled_ns + 1 if next_ns is None else min(next_ns, settled_ns + 1)
-        after = (streams[name].first_after(last_ns + patience_ns) for name in others)
-        known = [stamp_ns for stamp_ns in after if stamp_ns is not None and stamp_ns < until_ns]
-        if len(known) > 0:
-            return last_ns, min(known)
-        if next_ns is None or next_ns >= settled_ns:
+        known_ns = min((streams[name].first_after(last_ns + patience_ns) for name in others),
+                       default=NEVER)
+        if known_ns < min(next_ns, settled_ns + 1):
+            return last_ns, known_ns
+        if next_ns >= settled_ns:
             return None
         last_ns = next_ns

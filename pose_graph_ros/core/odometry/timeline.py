@@ -12,7 +12,7 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Pose, wrap_one
 from pose_graph_ros.core.odometry import motion as mo
-from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, NO_VARIANCE, Variances
+from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, NO_VARIANCE, Span, Variances
 from pose_graph_ros.core.quantities import StampNs, StampsNs
 
 # Motions below both of these are not added to path length and turns: odometry jitters at rest,
@@ -190,11 +190,10 @@ class OdometryTimeline:
         resting: bool,
     ) -> None:
         """Fill this empty timeline with the result of `thinned`."""
-        self._stamps.append(stamps_ns)
-        self._samples.append(rows[:, :5])
+        self._stamps, self._samples, self._dense = map(
+            GrowingArray.of, (stamps_ns, rows[:, :5], dense))
         if np.any(rows[:, 5:]):
             self._variances.append(rows[:, 5:])
-        self._dense.append(dense)
         self._last, self.resting = last, resting
 
     def motion(self, start_ns: StampNs, end_ns: StampNs) -> Motion:
@@ -204,25 +203,21 @@ class OdometryTimeline:
         motion = self.motion_to(start_ns, *self.at(end_ns))
         return NO_MOTION if start_ns == end_ns else motion
 
-    def motion_to(
-        self, start_ns: StampNs, end: FloatArray, variance: FloatArray = NO_VARIANCE,
-    ) -> Motion:
+    def motion_to(self, start_ns: int, end: FloatArray, more: FloatArray = NO_VARIANCE) -> Motion:
         """Return the motion from an instant to `Row.numbers` that may not be in the timeline."""
         start, start_variance = self.at(start_ns)
         return Motion(se2.between(start[:3], end[:3]), float(end[3] - start[3]),
-                      float(end[4] - start[4]), end[5:] - start[5:] + start_variance + variance)
+                      float(end[4] - start[4]), end[5:] - start[5:] + start_variance + more)
 
-    def gap_motion(
-        self, last_ns: StampNs, until_ns: StampNs, saved_ns: StampNs,
-    ) -> tuple[FloatArray, FloatArray]:
+    def gap_motion(self, last_ns: StampNs, until_ns: StampNs, saved_ns: StampNs) -> Span:
         """
-        Return the estimated motion during a gap in odometry, and its covariance at the end.
+        Return the estimated motion during a gap in odometry.
 
         The robot is assumed to keep its mean speed, for at most `MEMORY_TIME`. After a long gap at
         the end of a loaded graph it is assumed to stand where it was.
         """
         if last_ns <= saved_ns and until_ns - last_ns > mo.RESUMED_WITHIN * 1e9:
-            return np.zeros(3), np.diag(mo.RESTART_VARIANCE)
+            return Span(np.zeros(3), np.diag(mo.RESTART_VARIANCE))
         begin_ns = max(int(self.stamps_ns[0]), last_ns - mo.SPEED_TIME_NS)
         motion, time = self.motion(begin_ns, last_ns), (last_ns - begin_ns) * 1e-9
         elapsed = (until_ns - last_ns) * 1e-9
@@ -231,7 +226,7 @@ class OdometryTimeline:
         position += motion.distance * ratio
         sigma = np.array((position, position, heading + motion.turn * ratio))
         mean = motion.increment * min(ratio, mo.MEMORY_TIME / time if time > 0.0 else 0.0)
-        return se2.wrapped(mean), np.diag(sigma**2)
+        return Span(se2.wrapped(mean), np.diag(sigma**2))
 
     def rests(self, start_ns: StampNs, end_ns: StampNs) -> list[tuple[int, int]]:
         """

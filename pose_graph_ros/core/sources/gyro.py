@@ -31,11 +31,10 @@ from pose_graph_ros.core.config import BackendConfig, GyroSource, RateNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
+from pose_graph_ros.core.measurements import Answer, rejected, YawRate
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.stream import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import STANDING_NS
-from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.queued import Queued
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
@@ -74,7 +73,7 @@ class RateIntegral:
         """Return the rate at an instant [rad/s]."""
         return float(np.interp((stamp_ns - self._begin_ns) * 1e-9, self._times, self.rates))
 
-    def between(self, start_ns: StampNs, end_ns: StampNs) -> Rotation:
+    def between(self, start_ns: int, end_ns: int) -> Rotation:
         """Return the rotation between two instants that the samples cover."""
         begin, end = ((stamp_ns - self._begin_ns) * 1e-9 for stamp_ns in (start_ns, end_ns))
         times = np.clip(self._times, begin, end)
@@ -102,8 +101,9 @@ class Agreement:
     """The sums over the newest rotations of one gyroscope."""
 
     def __init__(self) -> None:
-        self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
-        self._squares = self._n = self._turned = 0.0
+        # of seconds, change of the rate, angle by odometry, and difference
+        self._products = np.zeros((4, 4))
+        self._n = self._turned = 0.0
 
     def add(
         self, difference: float, seconds: float, change: float, angle: float, variance: float,
@@ -114,32 +114,29 @@ class Agreement:
         `variance` is that of the difference, `change` how much the rate changes meanwhile [rad/s].
         """
         by_odometry, fade = angle - difference, 1.0 - 1.0 / 1000.0  # the fit forgets
-        row = np.array((seconds, change, by_odometry))
-        left = difference
-        if self._n >= LEAST:
-            left -= float(row @ self._fit()[0])
+        row = np.array((seconds, change, by_odometry, difference))
+        left = difference - (float(row[:3] @ self._fit()[0]) if self._n >= LEAST else 0.0)
         # differences beyond 5 sigma do not count, as those of wheels that slip
         weight = min(25.0 / (left * left + 1e-300), 1.0 / variance)
-        self._normal = fade * self._normal + weight * np.outer(row, row)
-        self._right = fade * self._right + weight * difference * row
-        self._squares = fade * self._squares + weight * difference * difference
+        self._products = fade * self._products + weight * np.outer(row, row)
         self._n = fade * self._n + 1.0
         self._turned = fade * self._turned + max(abs(angle), abs(by_odometry))
 
     def _fit(self) -> tuple[FloatArray, FloatArray]:
         """Return bias, time and scale, and their covariance."""
         # weak priors: 0.1 rad/s, 10 s, 10
-        covariance = np.linalg.inv(self._normal + np.diag((1e2, 1e-2, 1e-2)))
-        return np.asarray(covariance @ self._right), np.asarray(covariance, dtype=np.float64)
+        covariance = np.linalg.inv(self._products[:3, :3] + np.diag((1e2, 1e-2, 1e-2)))
+        return np.asarray(covariance @ self._products[:3, 3]), np.asarray(covariance)
 
     def difference(self) -> Difference | None:
         """Return the difference by now; None as long as too little is known."""
         if self._n < LEAST or self._turned < 2.0 * math.pi:
             return None
-        explained = self._right[0]**2 / self._normal[0, 0]
-        sigmas = math.sqrt(max(self._squares - explained, 0.0) / self._n)
+        squares, right = self._products[3, 3], self._products[:3, 3]
+        explained = right[0]**2 / self._products[0, 0]
+        sigmas = math.sqrt(max(squares - explained, 0.0) / self._n)
         found, covariance = self._fit()
-        rest = max((self._squares - float(found @ self._right)) / self._n, 1.0)
+        rest = max((squares - float(found @ right)) / self._n, 1.0)
         shown = np.abs(found) > 5.0 * np.sqrt(rest * np.diagonal(covariance))
         early, turns, reason = float(found[1]), 1.0 + float(found[2]), ''
         if sigmas < 0.1:
@@ -225,11 +222,10 @@ class GyroStream(ReorderBuffer[YawRate]):
                             f'yaw rate {sample.rate} rad/s')
         if not 0.0 < sample.variance < LARGEST_RATE**2:
             sample = replace(sample, variance=0.0)
-        answer = self._insert(sample)
-        if isinstance(answer, Answer):
-            return answer
+        return self._insert(sample)
+
+    def _follow(self, begin: int) -> None:
         self.settle()
-        return ACCEPTED
 
     def settle(self, until_ns: int | None = None) -> None:
         """Settle samples, by default those that no older ones can come before any more."""
@@ -241,9 +237,7 @@ class GyroStream(ReorderBuffer[YawRate]):
         n = bisect.bisect_right(self._settled, stamp_ns, key=stamp_of) - 1
         del self._settled[:max(n, 0)]
 
-    def integral(
-        self, start_ns: StampNs, end_ns: StampNs, *, to_come: bool = False,
-    ) -> RateIntegral | None:
+    def integral(self, start_ns: int, end_ns: int, *, ahead: bool = False) -> RateIntegral | None:
         """
         Return the integral of the rate; None if samples do not cover the time without a gap.
 
@@ -254,7 +248,7 @@ class GyroStream(ReorderBuffer[YawRate]):
         if begin < 0:
             return None
         samples = every[begin:bisect.bisect_left(every, end_ns, key=stamp_of) + 1]
-        if to_come and samples[-1].stamp_ns < end_ns:
+        if ahead and samples[-1].stamp_ns < end_ns:
             samples.append(replace(samples[-1], stamp_ns=end_ns))
         stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
         if (len(stamps_ns) < 2 or stamps_ns[-1] < end_ns
@@ -339,10 +333,9 @@ class Gyros:
         odometry = nodes.streams[primary]
         if odometry.timeline.covers(start_ns) and odometry.timeline.covers(end_ns):
             motion = odometry.timeline.motion(start_ns, end_ns)
-            stream.agreement.add(
-                float(se2.wrap(angle - motion.increment[2])), seconds,
-                integral.rate(end_ns) - integral.rate(start_ns), angle,
-                variance + float(odometry.covariance(motion)[2, 2]))
+            stream.agreement.add(float(se2.wrap(angle - motion.increment[2])),
+                                 seconds, integral.rate(end_ns) - integral.rate(start_ns), angle,
+                                 variance + float(odometry.covariance(motion)[2, 2]))
         # by rates at rest, and by the wheels meanwhile
         rest, creep = np.zeros(3), np.zeros(2)
         most = MOST_BIAS * self._config.gyro(source).sigma_bias
@@ -364,10 +357,9 @@ class Gyros:
 
     def stream(self, source: str) -> GyroStream:
         """Return the stream of a gyroscope, a new one if there was none."""
-        stream = self.streams.get(source)
-        if stream is None:
-            stream = self.streams[source] = GyroStream(self._config.gyro(source))
-        return stream
+        if source not in self.streams:
+            self.streams[source] = GyroStream(self._config.gyro(source))
+        return self.streams[source]
 
     def differences(self) -> dict[str, Difference]:
         """Return how much each gyroscope differs from odometry, where enough is known."""
@@ -384,7 +376,7 @@ class Gyros:
         """
         for source, bias in biases.items() if start_ns < end_ns else ():
             stream = self.streams.get(source)
-            integral = None if stream is None else stream.integral(start_ns, end_ns, to_come=True)
+            integral = None if stream is None else stream.integral(start_ns, end_ns, ahead=True)
             if integral is not None:
                 angle, variance, seconds = integral.between(start_ns, end_ns)
                 return angle - bias * seconds, variance
