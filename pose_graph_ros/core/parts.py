@@ -27,7 +27,7 @@ from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.constraints import Factors, full
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.graph_files import SavedGraph
@@ -163,16 +163,14 @@ def path_covariances(parts: Parts, of: Estimate) -> FloatArray:
     They are NaN where they are unknown: at nodes that have left the graph by its window, and at
     all but the newest pose while the angle between odometry and map is unknown.
     """
-    nodes, thinned, covariances = parts.nodes, parts.nodes.thinned, parts.smoother.covariances()
+    nodes, covariances = parts.nodes, parts.smoother.covariances()
     rows = parts.graph.node_rows(nodes.ids)
     found = np.full((len(of.path), 3, 3), np.nan)
     inside = np.flatnonzero(rows >= 0)
     found[inside] = covariances[rows[inside]]
-    for number in thinned.places()['numbers'].tolist():
-        place = thinned.place(number)
-        assert place is not None, 'it is among them'
+    for number, anchor, mean, noise in nodes.thinned.places().values:
         found[number] = covariance.propagated(
-            of.path.poses[place.anchor], found[place.anchor], place.mean, place.noise)
+            of.path.poses[anchor], found[anchor], mean, full(noise[None])[0])
     if of.alignment is AlignmentState.UNALIGNED:
         found[:] = np.nan
     found[-1] = of.covariance

@@ -104,8 +104,7 @@ def update_isolated(add_queue: Update, parts: Parts) -> tuple[UpdateReport, list
     bad, untried = isolate(failed, report.reason, attempt)
     for one, _ in bad:
         parts.quarantine.extend(one)
-    reasons = [f'{queued(one, parts)[0]}: {reason}' for one, reason in bad[:5]] or [
-        report.reason]
+    reasons = [f'{queued(one, parts)[0]}: {reason}' for one, reason in bad[:5]] or [report.reason]
     if len(bad) > 5:
         reasons.append(f'and {len(bad) - 5} more')
     return replace(added[-1], status=Status.FAILED, reason='; '.join(reasons),
