@@ -62,7 +62,7 @@ OFFLINE = {
 }
 # The modules on top of the packages: the facade, what it hands out, and who drives it.
 TOP = {'core.backend', 'core.disagreement', 'core.error_tuner', 'core.estimate',
-       'core.forgetting', 'core.newest_estimate', 'core.parts', 'core.refiner',
+       'core.forgetting', 'core.parts', 'core.refiner',
        'core.transaction', 'core.warm_up'}
 # Third-party libraries of `core`.
 LIBRARIES = {'numpy', 'scipy', 'numba', 'pyproj'}

@@ -8,12 +8,11 @@ from typing import Self
 
 import numpy as np
 
-from pose_graph_ros.core import measurements as ms, newest_estimate, transaction as tr
+from pose_graph_ros.core import disagreement as dg, measurements as ms, parts, transaction as tr
 from pose_graph_ros.core.alignment import Alignment
 from pose_graph_ros.core.batch import final_optimization
 from pose_graph_ros.core.batch.optimizer import Status
-from pose_graph_ros.core.config import BackendConfig, CovariancePolicy
-from pose_graph_ros.core.disagreement import find as find_disagreement
+from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
@@ -24,16 +23,15 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph import graph_view
 from pose_graph_ros.core.graph.graph import GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.judge import Judge
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes, NewNode
-from pose_graph_ros.core.parts import capture, Parts, restore
+from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.refiner import Refiner
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, Refinement
-from pose_graph_ros.core.sources import constraint_names as cn
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.kinds import attach, validate
+from pose_graph_ros.core.sources.kinds import attach, observed, validate
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.source_report import SourceReport
@@ -66,26 +64,27 @@ class PoseGraphBackend:
         self.odometry = self._nodes.streams  # by source, to be read only
         self._newest_node_covariance = np.zeros((3, 3))  # in map axes
         self._reweighting = Reweighting()
-        self._factors = FactorBuilder(self._config, self._reweighting)
-        self._judge = Judge(self._smoother, self._reweighting, self._nodes, self._factors)
+        factors = self._factors = FactorBuilder(self._config, self._reweighting)
+        self._judge = Judge(self._smoother, self._reweighting, self._nodes, factors)
         self.verdicts, self.verdict_totals = self._judge.verdicts, self._judge.totals
         self.verdict_changes = self._judge.changes
-        self.gyro_biases = self._factors.gyro_rates
-        self.calibrations = partial(
-            self._factors.calibrations, self.graph, self._smoother.covariance)
-        self.disagreement = lambda: find_disagreement(self._smoother, self._nodes, self._factors)
+        self.gyro_biases = factors.gyro_rates
+        self.calibrations = partial(factors.calibrations, self.graph, self._smoother.covariance)
         self._tuner = ErrorTuner(
-            self._smoother, self._nodes, self._factors, self._reweighting, self._judge)
-        self._refiner = Refiner(self._smoother, self._reweighting, self._judge, self._tuner)
-        self._pipeline = MeasurementPipeline(self._nodes, self._config)
-        self.gyro_differences = self._pipeline.gyros.differences
-        self.counts = self._pipeline.counts  # of answers by source and 'accepted' or the reason
-        self.refusals = self._pipeline.refusals  # details of the newest ones by source and reason
+            self._smoother, self._nodes, factors, self._reweighting, self._judge)
+        pipeline = self._pipeline = MeasurementPipeline(self._nodes, self._config)
+        self.gyro_differences = pipeline.gyros.differences
+        self.counts = pipeline.counts  # of answers by source and 'accepted' or the reason
+        self.refusals = pipeline.refusals  # details of the newest ones by source and reason
+        # source and both stamps [ns] of the newest loop closures that were refused
+        self.refused_closures = pipeline.refused_closures
         self._quarantine: list[Queued] = []
         self._alignment = Alignment(self._nodes, self._judge.fixes)
-        self.parts = Parts(  # what it is made of, for tools
+        self.parts = parts.Parts(  # what it is made of, for tools
             self.graph, self._nodes, self._factors, self._reweighting, self._alignment,
-            self._pipeline, self._quarantine, self._judge, self._smoother)
+            pipeline, self._quarantine, self._judge, self._smoother)
+        self.disagreement = partial(dg.find, self.parts)
+        self._refiner = Refiner(self.parts, self._tuner)
         self._forgetting = Forgetting(self._tuner, self.parts)
         self._settled, self._chi2 = True, 0.0
         self._waits = False  # whether the queue waits until the graph is solved
@@ -94,13 +93,8 @@ class PoseGraphBackend:
         """Change the settings for later input; raises as `BackendConfig.changed_to` does."""
         self._config = self._config.changed_to(config)
         self._nodes.configure(config)
-        self._pipeline.configure(config)
-        self._factors.config = config
-
-    @property
-    def refused_closures(self) -> list[tuple[str, int, int | None]]:
-        """Source and both stamps [ns] of the newest loop closures that were refused."""
-        return list(self._pipeline.refused_closures)
+        self._pipeline.gyros.configure(config)
+        self._pipeline.config = self._factors.config = config
 
     @property
     def node_stamps_ns(self) -> IntArray:
@@ -119,7 +113,7 @@ class PoseGraphBackend:
 
     def set_aside(self, n: int) -> list[str]:
         """Return the names of the newest n constraints that were set aside."""
-        return cn.queued(self._quarantine[-n:], self._nodes)
+        return dg.queued(self._quarantine[-n:], self.parts)
 
     @property
     def revision(self) -> int:
@@ -139,9 +133,9 @@ class PoseGraphBackend:
         """Return the stamps of all measurements in the map in the graph [ns], by source."""
         return {source: stamps for source, (stamps, _) in self._factors.held().items()}
 
-    def largest_energies(self, n: int) -> list[cn.ConstraintEnergy]:
+    def largest_energies(self, n: int) -> list[dg.ConstraintEnergy]:
         """Return the n constraints with the largest energies, with names, in descending order."""
-        return cn.largest(self.graph, self._nodes, self._factors, n)
+        return dg.largest(self.parts, n)
 
     def decide(self, name: str, decision: vd.Decision) -> ms.Answer:
         """Return the answer to a decision on a `Verdict.id`; the next update applies it."""
@@ -220,34 +214,32 @@ class PoseGraphBackend:
         pose = replace(pose, stamp_ns=min(max(pose.stamp_ns, first_ns), self._nodes.covered_ns))
         if not self._alignment.is_aligned:
             return self.add_measurement(pose, source)
-        moved = self._relocate(
-            pose, self._config.measurement_source(source, ms.GlobalPose).covariance)
-        if isinstance(moved, ms.Answer):
-            return self._pipeline.count(source, moved)
-        self._collect()
-        self._pipeline.attach_to_node(moved, source, int(self._nodes.ids[-1]))
-        return self._pipeline.count(source, ms.ACCEPTED)
+        return self._pipeline.count(source, self._relocate(pose, source))
 
-    def _relocate(
-        self, pose: ms.GlobalPose, policy: CovariancePolicy,
-    ) -> ms.GlobalPose | ms.Answer:
-        """Return the pose of a new hidden node after the newest odometry; or why there is none."""
+    def _relocate(self, pose: ms.GlobalPose, source: str) -> ms.Answer:
+        """Return the answer to a pose at which a new hidden node is made after all odometry."""
+        policy = self._config.measurement_source(source, ms.GlobalPose).covariance
         validated, last_ns = validate(pose, policy), self._nodes.covered_ns
         if isinstance(validated, ms.Answer):
             return validated
-        measurement = validated.measurement
+        given = validated.measurement
         begin, end = attach(self._nodes, pose.stamp_ns), attach(self._nodes, last_ns)
         if isinstance(begin, ms.Answer) or isinstance(end, ms.Answer) or not isinstance(
-                measurement, ms.GlobalPose):
+                given, ms.GlobalPose):
             return ms.rejected('no_odometry', 'none at that time')
         first, last, newest = self.graph.poses_of([begin.node, end.node, int(self._nodes.ids[-1])])
         moved = se2.between(se2.compose(first, begin.motion), se2.compose(last, end.motion))
-        now = se2.compose(measurement.pose, moved)
+        now = se2.compose(given.pose, moved)
         # the motion to the new node is unknown [m, m, rad]
         noise = np.diag((1000.0, 1000.0, 3.0)) ** 2
-        if self._nodes.relocate(se2.between(newest, now), noise) < 0:
+        node = self._nodes.relocate(se2.between(newest, now), noise)
+        if node < 0:
             return ms.rejected('failed', 'the solver failed')
-        return replace(measurement, stamp_ns=last_ns + 1, pose=now)
+        self._collect()
+        self._pipeline.queue.append(observed(
+            source, replace(given, stamp_ns=last_ns + 1, pose=now),
+            Attachment(node, np.zeros(3), np.zeros((3, 3)))))
+        return ms.ACCEPTED
 
     def update(self) -> UpdateReport:
         """
@@ -263,9 +255,7 @@ class PoseGraphBackend:
 
     def _update(self, *, at_once: bool = False) -> tuple[UpdateReport, list[Queued]]:
         """Return the report of an update, and the constraints for which it had no time."""
-        return tr.update_isolated(
-            partial(self._add_queue, at_once=at_once), self._settle, self._pipeline,
-            self._quarantine, lambda one: cn.queued(one, self._nodes)[0])
+        return tr.update_isolated(partial(self._add_queue, at_once=at_once), self.parts)
 
     def _settle(self) -> bool:
         """Tell whether an update without new constraints succeeds."""
@@ -317,9 +307,8 @@ class PoseGraphBackend:
         self._tuner.step(1000)
         self._recheck_alignment()
         self._evaluate()
-        return UpdateReport(
-            result.status, '', len(queue), result.iterations, self._chi2, result.relinearized,
-            result.eliminated, result.visited), []
+        return UpdateReport(result.status, '', len(queue), result.iterations,
+                            self._chi2, result.relinearized, result.eliminated, result.visited), []
 
     def refine(self) -> Refinement:
         """Do an iteration from the estimate of an update to the optimum; `optimize` needs none."""
@@ -368,8 +357,7 @@ class PoseGraphBackend:
     def optimize(self) -> UpdateReport:
         """Optimise the whole graph with all quarantined constraints; for the end of a stream."""
         self.finish()
-        report = tr.update_with_all(
-            partial(self._update, at_once=True), self._pipeline, self._quarantine)
+        report = tr.update_with_all(partial(self._update, at_once=True), self.parts)
         if self.graph.n_nodes == 0:
             return report
         self._forgetting.step(self._config)
@@ -405,24 +393,23 @@ class PoseGraphBackend:
         """Return the estimate, None before the first odometry; its path takes linear time."""
         if self.graph.n_nodes == 0:
             return None
-        return newest_estimate.estimate(
-            self.parts, self._config.odometry_source(self._nodes.primary),
-            self._newest_node_covariance, self._chi2, with_path=with_path)
+        return parts.estimate(
+            self.parts, self._newest_node_covariance, self._chi2, with_path=with_path)
 
     def path_covariances(self, estimate: Estimate) -> FloatArray:
-        """Return those at the path of the present estimate; see `newest_estimate`."""
-        return newest_estimate.path_covariances(self.parts, estimate)
+        """Return those at the path of the present estimate; see `core.parts`."""
+        return parts.path_covariances(self.parts, estimate)
 
     def saved(self, datum: MapOrigin | None = None) -> SavedGraph:
         """Return the graph with its state since the last update; see `parts.capture`."""
         self._tuner.finish_change()
-        return capture(self.parts, self._newest_node_covariance, self._chi2, datum)
+        return parts.capture(self.parts, self._newest_node_covariance, self._chi2, datum)
 
     @classmethod
     def restored(cls, config: BackendConfig | None, saved: SavedGraph) -> Self:
         """Return a back end that continues a saved graph; see `parts.restore`."""
         backend = cls(config)
-        restore(backend.parts, saved)
+        parts.restore(backend.parts, saved)
         backend._tuner.restored(knows_errors=len(saved.nodes.errors) > 0)
         backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)

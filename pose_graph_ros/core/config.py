@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
 import math
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from pose_graph_ros.core.exceptions import ConfigError
 
@@ -26,9 +26,8 @@ def require(settings: object, *names: str, positive: bool = False) -> None:
     for name in names:
         value = getattr(settings, name)
         if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
-            expected = 'a positive number' if positive else 'a number that is not negative'
-            raise ConfigError(
-                f'{type(settings).__name__}.{name}: expected {expected}, got {value!r}')
+            what = 'a positive number' if positive else 'a number that is not negative'
+            raise ConfigError(f'{type(settings).__name__}.{name}: expected {what}, got {value!r}')
 
 
 def require_same(what: str, present: object, wanted: object, *names: str) -> None:
@@ -55,6 +54,16 @@ def check(settings: Any, *positive: str, but: str = '') -> None:
                               f'{", ".join(map(str, type(default)))}, got {value!r}')
         if isinstance(default, float | int) and name != but:
             require(settings, name, positive=name in positive)
+
+
+class Settings:
+    """Settings that are checked by `check` when they are made."""
+
+    __slots__ = ()
+    POSITIVE: ClassVar[tuple[str, ...]] = ()  # names of the numbers that cannot be 0
+
+    def __post_init__(self) -> None:
+        check(self, *self.POSITIVE)
 
 
 class Loss(Enum):
@@ -106,13 +115,15 @@ class Integrate(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class OdometryNoise:
+class OdometryNoise(Settings):
     """
     Random-walk noise of odometry: variances grow with the path length and the turns.
 
     The noise of an increment is the sum of the noise of its parts. Except for the small floors,
     the spacing of the hidden nodes therefore does not change the covariance of the estimate.
     """
+
+    POSITIVE = 'sigma_floor_position', 'sigma_floor_heading'
 
     sigma_distance: float = 0.05  # sigma along the direction of travel [m per sqrt(m) travelled]
     sigma_lateral: float = 0.03  # sigma across the direction of travel [m per sqrt(m) travelled]
@@ -122,9 +133,6 @@ class OdometryNoise:
     # sigma of the position added per increment [m]; keeps the information finite at rest
     sigma_floor_position: float = 0.002
     sigma_floor_heading: float = 0.0005  # sigma of the heading added per increment [rad]
-
-    def __post_init__(self) -> None:
-        check(self, 'sigma_floor_position', 'sigma_floor_heading')
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,12 +172,15 @@ class RateNoise(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class GyroSource:
+class GyroSource(Settings):
     """
     Settings of a gyroscope, whose yaw rate is integrated between hidden nodes.
 
     Its error is white noise and a bias, which is a random walk.
     """
+
+    POSITIVE = ('sigma_rate', 'sigma_bias', 'sigma_bias_walk', 'bias_period', 'maximum_gap',
+                'covariance_scale')
 
     noise_from: RateNoise = RateNoise.MESSAGE
     # white noise of the rate, as the angle random walk that it integrates to [rad/sqrt(s)]
@@ -183,10 +194,6 @@ class GyroSource:
     covariance_scale: float = 1.0  # factor on the variance of every integrated angle
     # a sample that is older by stamp than the newest one by up to this is still used [s]
     reorder_window: float = 0.25
-
-    def __post_init__(self) -> None:
-        check(self, 'sigma_rate', 'sigma_bias', 'sigma_bias_walk', 'bias_period', 'maximum_gap',
-              'covariance_scale')
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,15 +269,16 @@ LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False), rob
 RANGES = MeasurementSource(covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
 
 
-class HasDefaults(Protocol):
-    """A kind of measurements."""
-
-    defaults: ClassVar[MeasurementSource]  # settings of a source that is not configured
+# settings of a source that is not configured, by the class of its measurements
+DEFAULTS = {'GlobalPose': POSITIONS, 'Position': POSITIONS, 'Fix': POSITIONS,
+            'HeadingOnly': HEADINGS, 'LoopClosure': LOOP_CLOSURES, 'Range': RANGES}
 
 
 @dataclass(frozen=True, slots=True)
-class NodePolicy:
+class NodePolicy(Settings):
     """Conditions for a new hidden node: enough motion, or a maximum time."""
+
+    POSITIVE = 'moving_interval', 'heartbeat'
 
     # distance from the last hidden node at which the next one is created [m]
     minimum_travel_distance: float = 1.0
@@ -281,9 +289,6 @@ class NodePolicy:
     moving_interval: float = 1.0  # maximum time between hidden nodes while the robot moves [s]
     heartbeat: float = 10.0  # maximum time between hidden nodes at standstill [s]
 
-    def __post_init__(self) -> None:
-        check(self, 'moving_interval', 'heartbeat')
-
     def due(self, distance: float, turned: float, elapsed: float) -> bool:
         """Tell whether a node is due this far [m, rad] and long [s] after the last one."""
         far = distance >= self.minimum_travel_distance or turned >= self.minimum_travel_heading
@@ -293,20 +298,21 @@ class NodePolicy:
 
 
 @dataclass(frozen=True, slots=True)
-class SolverConfig:
+class SolverConfig(Settings):
     """Settings of Gauss-Newton with Levenberg-Marquardt damping, for a whole graph."""
+
+    POSITIVE = 'max_iterations', 'step_tolerance'
 
     max_iterations: int = 50
     # converged if no coordinate of the next step is larger than this [m, rad]
     step_tolerance: float = 1e-8
 
-    def __post_init__(self) -> None:
-        check(self, 'max_iterations', 'step_tolerance')
-
 
 @dataclass(frozen=True, slots=True)
-class SmootherConfig:
+class SmootherConfig(Settings):
     """Accuracy of the incremental smoother, and the work per update."""
+
+    POSITIVE = ('max_iterations',)
 
     alpha: float = 0.02  # back-substitution stops at nodes that move by less than this [sigma]
     # upper limit of the squared linearisation error that a step may leave [sigma^2]
@@ -314,9 +320,6 @@ class SmootherConfig:
     # the same limit per node that the step has moved; the smaller limit applies [sigma^2]
     budget_share: float = 6e-6
     max_iterations: int = 5  # maximum number of iterations per update; the next update continues
-
-    def __post_init__(self) -> None:
-        check(self, 'max_iterations')
 
 
 class WindowPrior(Enum):
@@ -328,7 +331,7 @@ class WindowPrior(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class WindowConfig:
+class WindowConfig(Settings):
     """How much of the past the graph keeps: the smallest limit that is not 0; see `window`."""
 
     seconds: float = 0.0  # time before the newest hidden node [s]; 0 for no limit
@@ -336,26 +339,24 @@ class WindowConfig:
     nodes: int = 0  # number of hidden nodes; 0 for no limit
     prior: WindowPrior = WindowPrior.DENSE
 
-    def __post_init__(self) -> None:
-        check(self)
-
 
 @dataclass(frozen=True, slots=True)
-class ThinningConfig:
+class ThinningConfig(Settings):
     """Which hidden nodes leave where a place is driven often; see `window.thinning`."""
+
+    POSITIVE = 'angle', 'poses', 'newest'
 
     cell: float = 0.0  # distance within which a node stands for others [m]; 0 for no thinning
     angle: float = math.pi / 2.0  # difference of headings below which it does [rad]
     poses: int = 1  # so many must stay near one that leaves
     newest: int = 50  # number of newest hidden nodes that stay in any case
 
-    def __post_init__(self) -> None:
-        check(self, 'angle', 'poses', 'newest')
-
 
 @dataclass(frozen=True, slots=True)
-class BackendConfig:
+class BackendConfig(Settings):
     """Settings of `PoseGraphBackend`."""
+
+    POSITIVE = ('odometry_patience',)
 
     nodes: NodePolicy = field(default_factory=NodePolicy)
     # of the update at each tick of the timer
@@ -376,9 +377,6 @@ class BackendConfig:
     # which hidden nodes leave where a place is driven often
     thinning: ThinningConfig = field(default_factory=ThinningConfig)
 
-    def __post_init__(self) -> None:
-        check(self, 'odometry_patience')
-
     def odometry_source(self, name: str) -> OdometrySource:
         """Return the settings of a source of odometry."""
         return self.odometry.get(name, OdometrySource())
@@ -392,9 +390,9 @@ class BackendConfig:
         """Factor on the sigmas of odometry of the preferred source; 0 for one that is found."""
         return next((source.sigma_scale for source in self.odometry.values()), 0.0)
 
-    def measurement_source(self, name: str, kind: type[HasDefaults]) -> MeasurementSource:
+    def measurement_source(self, name: str, kind: type) -> MeasurementSource:
         """Return the settings of a source, by default those of its kind of measurement."""
-        return self.measurements.get(name, kind.defaults)
+        return self.measurements.get(name, DEFAULTS[kind.__name__])
 
     def changed_to(self, wanted: 'BackendConfig') -> 'BackendConfig':
         """
@@ -405,15 +403,15 @@ class BackendConfig:
         smoother. Raises ConfigError if one of these differs; it names it with both values.
         """
         require_same(type(self).__name__, self, wanted, 'smoother')
-        for name in sorted({*self.odometry, *wanted.odometry}):
-            require_same(f'{name}: OdometrySource', self.odometry_source(name),
-                         wanted.odometry_source(name), 'noise_from', 'integrate', 'calibrate',
-                         'calibration_sigma', 'calibration_walk')
-        for name in sorted({*self.gyros, *wanted.gyros}):
-            require_same(f'{name}: GyroSource', self.gyro(name), wanted.gyro(name),
-                         'sigma_bias', 'sigma_bias_walk', 'bias_period')
-        default = MeasurementSource()
-        for name in sorted({*self.measurements, *wanted.measurements}):
-            require_same(f'{name}: MeasurementSource', self.measurements.get(name, default),
-                         wanted.measurements.get(name, default), 'correlation_time')
+        for settings, names in (
+                ('odometry', ('noise_from', 'integrate', 'calibrate', 'calibration_sigma',
+                              'calibration_walk')),
+                ('gyros', ('sigma_bias', 'sigma_bias_walk', 'bias_period')),
+                ('measurements', ('correlation_time',))):
+            present, later = getattr(self, settings), getattr(wanted, settings)
+            for source in sorted({*present, *later}):
+                # of a source that is not configured, the defaults
+                kind = type(later.get(source) or present[source])
+                old, new = (each.get(source, kind()) for each in (present, later))
+                require_same(f'{source}: {kind.__name__}', old, new, *names)
         return wanted

@@ -1,13 +1,15 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The source without which all others agree, where measurements contradict one another.
+What constraints contradict one another, in words for people.
 
-A source that is mounted or set wrongly bends the path, so that others have large residuals, and
-not necessarily itself. So a copy of the graph is solved without each of them in turn.
+The constraints with the largest energies are named by source, stamp and hidden nodes. And where
+measurements contradict one another, there may be a source without which all others agree. One that
+is mounted or set wrongly bends the path, so that others have large residuals, and not necessarily
+itself. So a copy of the graph is solved without each of them in turn.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import math
 from typing import NamedTuple
 
@@ -19,11 +21,83 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.graph.graph_view import factor_table
-from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.graph.graph_view import DIAGONAL, factor_table, FactorTable
+from pose_graph_ros.core.measurements import Range
+from pose_graph_ros.core.parts import Parts
+from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
+
+
+class ConstraintEnergy(NamedTuple):
+    """A constraint, and how much of chi2 it is."""
+
+    energy: float  # weighted energy, its part of chi2
+    unweighted: float  # energy without the weight, by the covariance alone
+    freedom: int  # degrees of freedom, which is the expected value of the unweighted energy
+    source: str  # source of the measurement; empty if unknown
+    kind: str  # such as `odometry`, `loop_closure`, `global_pose`, `position`, `range` or `bias`
+    name: str  # readable name, such as `odom x12 - x13` or `fix at 1695.250 s near x812`
+    number: int = -1  # its id in the graph
+    # numbers of the hidden nodes of the path that it has, in the order of the name
+    nodes: tuple[int, ...] = ()
+    # of the measurement, or when the bin of a bias begins [ns]; -1 for edges between poses
+    stamp_ns: int = -1
+
+
+def largest(parts: Parts, n: int) -> list[ConstraintEnergy]:
+    """Return the constraints with the largest weighted energies, in descending order."""
+    table = factor_table(parts.graph)
+    energies = table.weights * table.energies
+    n = min(n, int(np.count_nonzero(energies > 0.0)))
+    if n <= 0:
+        return []
+    rows = np.flatnonzero(energies >= np.partition(energies, len(energies) - n)[-n])
+    rows = rows[np.argsort(-energies[rows], kind='stable')][:n]
+    return [_named(row, float(energies[row]), table, parts) for row in rows.tolist()]
+
+
+def _named(row: int, energy: float, table: FactorTable, parts: Parts) -> ConstraintEnergy:
+    """Return a constraint by its row."""
+    graph, nodes, factors = parts.graph, parts.nodes, parts.factors
+    number, factor = int(graph.factor_ids[row]), table.records[row]
+    ends = factor['ends'][:2]
+    ends = ends[ends >= 0]
+    places = np.searchsorted(nodes.ids, graph.node_ids[ends[graph.is_pose[ends]]]).tolist()
+    kind = FactorKind(int(factor['kind'])).name.lower()
+    source, stamp_ns = factors.origin(number)
+    of_bias, begin_ns = factors.bias_origin(int(graph.node_ids[ends[0]]))
+    if len(places) == 2:
+        if source == '' and kind == 'odometry':
+            source = nodes.primary_at(int(nodes.stamps_ns[places[1]]))
+        name = _name(source or kind, places)
+    elif len(places) == 1:
+        position, _, heading = factor['information'][DIAGONAL] > 0.0
+        if len(ends) == 1 or kind == 'bias':
+            kind = 'heading' if not position else 'global_pose' if heading else 'position'
+        name = _name(source or kind, places, stamp_ns)
+    else:
+        # one on a bias alone comes from no measurement and is named after the bias
+        kind, source = 'bias', of_bias
+        name = kind if source == '' else _name(f'error of {source}', (), begin_ns)
+    return ConstraintEnergy(
+        energy, float(table.energies[row]), int(table.freedom[row]), source, kind, name,
+        number, tuple(places), begin_ns if stamp_ns < 0 else stamp_ns)
+
+
+def _name(what: str, places: Sequence[int], stamp_ns: int = -1) -> str:
+    """Return a readable name, as `ConstraintEnergy` has it."""
+    if len(places) == 2:
+        return '{} x{} - x{}'.format(what, *places)
+    return ''.join((what, f' at {stamp_ns * 1e-9:.3f} s' if stamp_ns >= 0 else '',
+                    *(f' near x{place}' for place in places)))
+
+
+def queued(queue: Sequence[Queued], parts: Parts) -> list[str]:
+    """Return the names of constraints that are not in the graph, as in `ConstraintEnergy`."""
+    # a landmark is no node of the path
+    places = [each.nodes[:1 if each.measured is Range else 2] for each in queue]
+    return [_name(each.source, np.searchsorted(parts.nodes.ids, of).tolist(), each.stamp_ns)
+            for each, of in zip(queue, places, strict=True)]
 
 
 class Disagreement(NamedTuple):
@@ -40,58 +114,53 @@ class _Part(NamedTuple):
     factors: IntArray
 
 
-def find(
-    smoother: IncrementalSmoother, nodes: HiddenNodes, factors: FactorBuilder,
-) -> Disagreement | None:
+def find(parts: Parts) -> Disagreement | None:
     """
     Return the source that contradicts the others, None if they agree or it cannot be told.
 
     What is set wrongly most often is tried first: directions before positions. It takes a full
     optimisation for each source that is tried.
     """
-    graph = smoother.graph
-    parts = _parts(graph, nodes, factors)
-    before = _strains(graph, factors, parts)
-    others = [source for source, part in parts.items() if source != nodes.primary]
+    graph, primary, sources = parts.graph, parts.nodes.primary, _sources(parts)
+    before = _strains(graph, parts, sources)
+    others = [source for source in sources if source != primary]
     if max((before[source] for source in others), default=0.0) <= SOURCES.far:
         return None
     worst = max(others, key=lambda source: before[source])
     order = 'turn', 'heading', 'odometry', 'map', 'loop_closure'
-    for source in sorted(others, key=lambda source: order.index(parts[source].kind)):
-        copy = _solved_without(graph, parts, source)
+    for source in sorted(others, key=lambda source: order.index(sources[source].kind)):
+        copy = _solved_without(graph, sources, source)
         if copy is None:
             continue
-        rest = _strains(copy, factors, {
-            name: part for name, part in parts.items() if name != source})
+        others_of = {name: part for name, part in sources.items() if name != source}
+        rest = _strains(copy, parts, others_of)
         if max(rest.values()) <= SOURCES.far and rest.get(worst, 0.0) <= 0.25 * before[worst]:
             whom = ('the other sources, which agree without it' if len(rest) > 1 else
-                    f'{nodes.primary}, and no third source tells who is wrong')
+                    f'{primary}, and no third source tells who is wrong')
             return Disagreement(source, (
                 f'{source} contradicts {whom} (the squared residual of {worst} is '
-                f'{before[worst]:.2g}){_reason(copy, source, parts[source])}'))
-    return Disagreement(nodes.primary, (
+                f'{before[worst]:.2g}){_reason(copy, source, sources[source])}'))
+    return Disagreement(primary, (
         f'{worst} has a squared residual of {before[worst]:.2g}, and no other source alone is to '
-        f'blame: several are wrong, or {nodes.primary} is'))
+        f'blame: several are wrong, or {primary} is'))
 
 
-def _parts(graph: Graph, nodes: HiddenNodes, factors: FactorBuilder) -> dict[str, _Part]:
-    parts = {}
-    for source, (_, held) in factors.held().items():
-        some = graph.factors_at(held)
+def _sources(parts: Parts) -> dict[str, _Part]:
+    found = {}
+    for source, (_, held) in parts.factors.held().items():
+        some = parts.graph.factors_at(held)
         tells_position = (some.j >= 0) | (some.information[:, 0, 0] > 0.0)
-        parts[source] = _Part('map' if np.any(tells_position) else 'heading', held)
-    for (source, kind), ids in edges_by_source(graph, nodes, factors).items():
+        found[source] = _Part('map' if np.any(tells_position) else 'heading', held)
+    for (source, kind), ids in edges_by_source(parts).items():
         if len(ids) > 0:
-            parts.setdefault(source, _Part(kind, ids))
-    return parts
+            found.setdefault(source, _Part(kind, ids))
+    return found
 
 
-def edges_by_source(
-    graph: Graph, nodes: HiddenNodes, factors: FactorBuilder,
-) -> Mapping[tuple[str, str], IntArray]:
+def edges_by_source(parts: Parts) -> Mapping[tuple[str, str], IntArray]:
     """Return the ids of the edges between poses by source and kind."""
+    graph, nodes, others = parts.graph, parts.nodes, parts.factors.edges()
     ids, edges = graph.factor_ids, graph.factors
-    others = factors.edges()
     found: dict[tuple[str, str], IntArray] = {}
     known = np.concatenate([np.empty(0, dtype=np.int64), *others.values()])
     primary = np.flatnonzero((edges.kind == FactorKind.ODOMETRY) & ~np.isin(ids, known))
@@ -109,12 +178,12 @@ def edges_by_source(
     return found
 
 
-def _strains(graph: Graph, factors: FactorBuilder, parts: Mapping[str, _Part]) -> dict[str, float]:
+def _strains(graph: Graph, parts: Parts, sources: Mapping[str, _Part]) -> dict[str, float]:
     """Return the mean squared residual of each source, in units of what is known of its errors."""
     table, strains = factor_table(graph), {}
-    for source, part in parts.items():
+    for source, part in sources.items():
         if part.kind in ('map', 'heading'):
-            strains[source] = factors.report(source, graph).strain
+            strains[source] = parts.factors.report(source, graph).strain
         else:
             rows = graph.factor_rows(part.factors)
             used = rows[table.weights[rows] > 0.0]

@@ -39,9 +39,8 @@ class UpdateReport:
     def after(self, solved: 'UpdateReport') -> 'UpdateReport':
         """Return one report of this update and the optimisation of the whole graph after it."""
         failed = next((part for part in (self, solved) if part.status is Status.FAILED), solved)
-        return replace(
-            self, status=failed.status, reason=failed.reason,
-            iterations=self.iterations + solved.iterations, chi2=solved.chi2)
+        return replace(self, status=failed.status, reason=failed.reason,
+                       iterations=self.iterations + solved.iterations, chi2=solved.chi2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -203,10 +203,8 @@ class Forgetting:
 
     def _held(self) -> IntArray:
         """Return the ids of nodes that do not leave, as something is to be added to them."""
-        parts, found = self._parts, list[int]()
-        for queue in (parts.pipeline.queue, parts.quarantine):
-            found += [node for each in queue for node in each.nodes]
-        return np.array(found, dtype=np.int64)
+        waiting = (*self._parts.pipeline.queue, *self._parts.quarantine)
+        return np.array([node for each in waiting for node in each.nodes], dtype=np.int64)
 
     def _freeze(self, n: int, prior: WindowPrior) -> None:
         """Let the n oldest nodes leave, with a dense or a sparse prior instead."""
@@ -227,8 +225,9 @@ class Forgetting:
         parts.smoother.linearize(leaving)
         # anchors of thinned nodes that leave have a place in others
         poses, thinned = nodes.recent_poses(graph), nodes.thinned.places()
-        leave = np.unique(thinned.anchors[(thinned.anchors < first) & (thinned.numbers >= first)])
-        kept = np.setdiff1d(np.arange(first, len(nodes)), thinned.numbers)
+        anchors, numbers = thinned['anchors'], thinned['numbers']
+        leave = np.unique(anchors[(anchors < first) & (numbers >= first)])
+        kept = np.setdiff1d(np.arange(first, len(nodes)), numbers)
         ends, starts = graph.poses_of(nodes.ids[leave]), graph.poses_of(nodes.ids[kept])
         nearest = [int(np.argmin(np.hypot(*(starts[:, :2] - end[:2]).T))) for end in ends]
         places = th.Places.now(parts.smoother, nodes.ids[leave], nodes.ids[kept[nearest]])

@@ -10,12 +10,9 @@ docs/conventions.md, section "Covariances".
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar
 
 import numpy as np
 
-from pose_graph_ros.core import config
-from pose_graph_ros.core.config import MeasurementSource
 from pose_graph_ros.core.geometry.se2 import FloatArray, Pose
 
 # Largest valid coordinate in a map or in odometry [m, rad]; a larger one is a faulty number.
@@ -55,8 +52,6 @@ class GlobalPose:
     pose: FloatArray  # `T_map_base`, shape (3,) [m, m, rad]
     covariance: FloatArray  # of (x, y, theta) in map axes, shape (3, 3)
 
-    defaults: ClassVar[MeasurementSource] = config.POSITIONS
-
 
 @dataclass(frozen=True, slots=True)
 class Position:
@@ -66,8 +61,6 @@ class Position:
     position: FloatArray  # in the map, shape (2,) [m]
     covariance: FloatArray  # in map axes, shape (2, 2)
     lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
-
-    defaults: ClassVar[MeasurementSource] = config.POSITIONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +77,6 @@ class Fix:
     covariance: FloatArray  # in map axes, shape (2, 2)
     lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
 
-    defaults: ClassVar[MeasurementSource] = config.POSITIONS
-
     def placed(self) -> Position:
         """Return the position in the map."""
         return Position(self.stamp_ns, self.place(), self.covariance, self.lever_arm)
@@ -98,8 +89,6 @@ class HeadingOnly:
     stamp_ns: int
     heading: float  # [rad]
     variance: float  # [rad^2]
-
-    defaults: ClassVar[MeasurementSource] = config.HEADINGS
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +105,6 @@ class LoopClosure:
     # index of the reference's hidden node; None if `reference_ns` is given
     reference_node: int | None = None
 
-    defaults: ClassVar[MeasurementSource] = config.LOOP_CLOSURES
-
 
 @dataclass(frozen=True, slots=True)
 class Range:
@@ -129,8 +116,6 @@ class Range:
     variance: float  # [m^2]; 0 if unknown
     lever_arm: FloatArray  # the point in the robot's frame, shape (2,) [m]
     place: FloatArray | None = None  # of the beacon in the map, shape (2,) [m]; None if unknown
-
-    defaults: ClassVar[MeasurementSource] = config.RANGES
 
 
 Absolute = GlobalPose | Position | HeadingOnly  # measurements relative to the map

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The weights of robust losses, and the refinement of the estimate between two updates."""
 
+
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,8 +10,8 @@ import numpy as np
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.error_tuner import ErrorTuner
 from pose_graph_ros.core.graph.graph import GraphUpdate
-from pose_graph_ros.core.graph.reweighting import Reweighting, TUNING
-from pose_graph_ros.core.judgement.judge import Judge
+from pose_graph_ros.core.graph.reweighting import TUNING
+from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother import incremental as inc
 from pose_graph_ros.core.transaction import checked, Transaction
 
@@ -21,12 +22,9 @@ LOOKED_AT = 2 * TUNING.part
 class Refiner:
     """Takes the estimate from that of an update to the minimum, one bounded part at each call."""
 
-    def __init__(
-        self, smoother: inc.IncrementalSmoother, reweighting: Reweighting, judge: Judge,
-        tuner: ErrorTuner,
-    ) -> None:
-        self._smoother, self._reweighting = smoother, reweighting
-        self._judge, self._tuner = judge, tuner
+    def __init__(self, parts: Parts, tuner: ErrorTuner) -> None:
+        self._smoother, self._reweighting = parts.smoother, parts.reweighting
+        self._judge, self._tuner = parts.judge, tuner
         self.finished = True  # whether there is nothing to refine until the next update
         self._tests = False  # whether closures may wait for a test since the last update
         self._cursor = self._unchanged = self._reweightings = 0

@@ -11,15 +11,15 @@ takes about log2 n attempts, and all halves that pass are added on the way.
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pose_graph_ros.core.batch.optimizer import Status
+from pose_graph_ros.core.disagreement import queued
 from pose_graph_ros.core.estimate import UpdateReport
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.graph.graph import GraphUpdate
+from pose_graph_ros.core.parts import Parts
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
 from pose_graph_ros.core.sources.queued import Queued
 
 Solved = TypeVar('Solved', UpdateResult, UpdateReport)
@@ -50,10 +50,7 @@ class Transaction(ExitStack[bool]):
         for name in names:
             self.callback(setattr, owner, name, getattr(owner, name))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> bool:
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> bool:
         if error is None:
             self.pop_all()
             return False
@@ -79,21 +76,18 @@ MOST_ATTEMPTS = 32
 Update = Callable[[], tuple[UpdateReport, list[Queued]]]
 
 
-def update_isolated(
-    add_queue: Update, can_solve: Callable[[], bool], pipeline: MeasurementPipeline,
-    quarantine: list[Queued], name: Callable[[list[Queued]], str],
-) -> tuple[UpdateReport, list[Queued]]:
+def update_isolated(add_queue: Update, parts: Parts) -> tuple[UpdateReport, list[Queued]]:
     """
     Return the report of an update, and the constraints that were not tried in it.
 
     If it sets constraints aside, it has the status FAILED, and the reason names them.
     """
-    report, failed = add_queue()
+    (report, failed), pipeline = add_queue(), parts.pipeline
     if report.status is not Status.FAILED:
         return report, failed
     pipeline.counts['solver', 'failed'] += 1
-    if len(failed) == 0 or (len(failed) > 1 and not can_solve()):
-        quarantine.extend(failed)
+    if len(failed) == 0 or (len(failed) > 1 and not succeeds(parts.smoother, GraphUpdate())):
+        parts.quarantine.extend(failed)
         return report, []
     added = [report]
 
@@ -109,22 +103,19 @@ def update_isolated(
 
     bad, untried = isolate(failed, report.reason, attempt)
     for one, _ in bad:
-        quarantine.extend(one)
-    reasons = [f'{name(one)}: {reason}' for one, reason in bad[:5]] or [report.reason]
+        parts.quarantine.extend(one)
+    reasons = [f'{queued(one, parts)[0]}: {reason}' for one, reason in bad[:5]] or [report.reason]
     if len(bad) > 5:
         reasons.append(f'and {len(bad) - 5} more')
-    return replace(
-        added[-1], status=Status.FAILED, reason='; '.join(reasons),
-        new_constraints=sum(each.new_constraints for each in added)), untried
+    return replace(added[-1], status=Status.FAILED, reason='; '.join(reasons),
+                   new_constraints=sum(each.new_constraints for each in added)), untried
 
 
-def update_with_all(
-    update: Update, pipeline: MeasurementPipeline, quarantine: list[Queued],
-) -> UpdateReport:
+def update_with_all(update: Update, parts: Parts) -> UpdateReport:
     """
     Return one report of updates with all constraints in the queue, then with those set aside.
     """
-    report, untried = update()
+    (report, untried), pipeline, quarantine = update(), parts.pipeline, parts.quarantine
     while len(untried) > 0:     # each update sets at least one aside
         pipeline.queue = untried + pipeline.queue
         again, untried = update()

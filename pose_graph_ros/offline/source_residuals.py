@@ -144,7 +144,7 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
         total = 1.0 if errors is None else errors.correlated + errors.white
         found[source] = residuals._replace(taken=J @ covariances[rows] @ np.swapaxes(
             J, 1, 2), scale=np.where(table.j >= 0, np.sqrt(total), 1.0) * residuals.scale)
-    for name, ids in edges_by_source(graph, nodes, factors).items():
+    for name, ids in edges_by_source(parts).items():
         if name[0] not in found:
             edges = graph.factors_at(ids)
             later = np.searchsorted(nodes.ids, np.maximum(edges.i, edges.j))

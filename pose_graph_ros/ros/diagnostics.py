@@ -25,8 +25,8 @@ from pose_graph_ros.core import alignment, disagreement
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.judgement.texts import short, total_values
-from pose_graph_ros.core.odometry import gyro, motion
-from pose_graph_ros.core.sources import constraint_names, settings
+from pose_graph_ros.core.odometry import motion
+from pose_graph_ros.core.sources import gyro, settings
 from pose_graph_ros.ros.input import EXPECTED
 from pose_graph_ros.ros.topics import moved, other_publishers
 from pose_graph_ros.ros.worker import Worker
@@ -83,7 +83,7 @@ class Searches:
     """The constraints with the largest energies, and a source that contradicts the others."""
 
     def __init__(self) -> None:
-        self.energies: Sequence[constraint_names.ConstraintEnergy] = ()
+        self.energies: Sequence[disagreement.ConstraintEnergy] = ()
         self.contradiction: disagreement.Disagreement | None = None
         self.due = 0.0  # time from which on the worker is asked again [s]
         self._n = 0     # number of measurements from which on a contradiction is searched again

@@ -23,7 +23,7 @@ from pose_graph_ros.adapters.sources import Measured, MessageReader
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry.se2 import between_one
 from pose_graph_ros.core.measurements import Answer, OdometrySample, rejected
-from pose_graph_ros.core.odometry.jumps import is_jump, SpeedWindow, UNKNOWN
+from pose_graph_ros.core.odometry.motion import is_jump, SpeedWindow, UNKNOWN
 from pose_graph_ros.core.odometry.time_keeper import EVIDENCE, EVIDENCE_NS, LATEST_NS, TimeKeeper
 from pose_graph_ros.core.quantities import Seconds, StampNs
 

@@ -26,7 +26,7 @@ from pose_graph_ros.adapters.sources import backend_config, CLOCK_JUMP_NS, SET_P
 from pose_graph_ros.core import measurements, quantities
 from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.estimate import UpdateReport
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.ros import diagnostics, log, publishers, spinning, topics
 from pose_graph_ros.ros.input import Input, PAUSED, PoseContinuity, ReceivedMessage
 from pose_graph_ros.ros.worker import continued, initial_graph, SetPoseInput, Worker

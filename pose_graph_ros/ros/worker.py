@@ -31,11 +31,11 @@ from pose_graph_ros.core.estimate import Estimate, UpdateReport
 from pose_graph_ros.core.exceptions import ConfigError, FileFormatError, PoseGraphError
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin
-from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph
-from pose_graph_ros.core.io.saved_graph import datum_refusal, SavedGraph
+from pose_graph_ros.core.io import graph_files
+from pose_graph_ros.core.io.graph_files import datum_refusal, SavedGraph
 from pose_graph_ros.core.judgement.verdicts import Decision, SourceVerdicts
-from pose_graph_ros.core.odometry.gyro import Difference
 from pose_graph_ros.core.sources.bias import Calibration
+from pose_graph_ros.core.sources.gyro import Difference
 from pose_graph_ros.core.sources.source_report import SourceReport
 from pose_graph_ros.ros.log import ANSWER, verdict_lines
 
@@ -386,11 +386,11 @@ def initial_graph(values: Mapping[str, Any]) -> tuple[Path | None, MapOrigin | N
         return None, None
     path, plane = graph_path(values), datum_of(values).plane
     try:
-        if not path.is_dir() and not any(map(Path.exists, graph_paths(path))):
+        if not path.is_dir() and not any(map(Path.exists, graph_files.graph_paths(path))):
             logger.warning('there is no graph in %s yet: starting with an empty one, which '
                            '~/save_graph writes there', path)
             return None, None
-        datum = read_datum(path)
+        datum = graph_files.read_datum(path)
     except (FileFormatError, OSError) as error:
         raise ConfigError(f'parameter load_graph_on_start: {error}') from error
     if datum is not None and plane is not None and (
@@ -412,7 +412,7 @@ def continued(path: Path, config: BackendConfig) -> PoseGraphBackend | None:
 
 def restored(path: Path, config: BackendConfig) -> tuple[SavedGraph, PoseGraphBackend]:
     """Return a saved graph and an engine that continues it; raises `FileFormatError`."""
-    saved = read_graph(path)
+    saved = graph_files.read_graph(path)
     backend = PoseGraphBackend.restored(config, saved)
     backend.update()
     return saved, backend

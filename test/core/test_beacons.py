@@ -13,7 +13,7 @@ from pose_graph_ros.core.config import BackendConfig, RANGES, WindowConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import GlobalPose, OdometrySample, Range
-from pose_graph_ros.core.sources.beacons import located
+from pose_graph_ros.core.sources.queued import located
 
 SECOND = 1_000_000_000
 BEACONS = {'a': (-4.0, 3.0), 'b': (22.0, -2.0), 'c': (18.0, 20.0), 'd': (-3.0, 16.0)}

@@ -12,7 +12,7 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.config import BackendConfig, Loss, MeasurementSource, OdometrySource
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.graph_files import SavedGraph
 from pose_graph_ros.core.measurements import (
     GlobalPose,
     LoopClosure,

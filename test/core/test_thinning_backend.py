@@ -100,9 +100,9 @@ def test_with_a_window_nodes_that_were_thinned_out_leave_with_it_and_lose_their_
     estimate, saved = backend.estimate(), backend.saved()
     thinned, n_frozen = saved.nodes.thinned, len(saved.nodes.frozen)
     assert n_frozen > 2 * PER_LAP
-    assert len(thinned.numbers) > 20
-    assert np.min(thinned.numbers) >= n_frozen
-    assert np.all(backend.graph.node_rows(saved.nodes.ids[thinned.anchors]) >= 0)
+    assert len(thinned['numbers']) > 20
+    assert np.min(thinned['numbers']) >= n_frozen
+    assert np.all(backend.graph.node_rows(saved.nodes.ids[thinned['anchors']]) >= 0)
     assert backend.graph.n_nodes < PER_LAP + 30
     n = len(truth) - 1
     assert estimate is not None
@@ -110,7 +110,7 @@ def test_with_a_window_nodes_that_were_thinned_out_leave_with_it_and_lose_their_
     error = estimate.path.poses[:n] - truth[:n]
     assert np.max(np.hypot(*error[:, :2].T)) < 0.5
     # the places of those whose anchors have changed are as certain as the graph
-    for number in thinned.numbers.tolist():
+    for number in thinned['numbers'].tolist():
         place = backend._nodes.thinned.place(number)
         assert place is not None
         assert np.max(np.abs(place.mean[:2])) < 4.0

@@ -22,8 +22,8 @@ from pose_graph_ros.core.batch.optimizer import Status
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import number_of, sentence, short
 from pose_graph_ros.core.judgement.verdicts import Judged, State, Verdict
-from pose_graph_ros.core.odometry.gyro import CONTRADICTORY
 from pose_graph_ros.core.quantities import Seconds, StampNs
+from pose_graph_ros.core.sources.gyro import CONTRADICTORY
 
 LEVELS = ('warning', 'notice', 'good')
 MOST_SILENCES = 20  # of a source that are looked at

@@ -9,11 +9,11 @@ import numpy as np
 
 from pose_graph_ros.adapters.sources import GLOBAL_POSE, GYRO, Kind, LOOP_CLOSURE, ODOMETRY
 from pose_graph_ros.cli.run import Frame, number, rounded, Run
+from pose_graph_ros.core.disagreement import ConstraintEnergy
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.judgement.texts import short
 from pose_graph_ros.core.quantities import StampNs
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
-from pose_graph_ros.core.sources.constraint_names import ConstraintEnergy
 from pose_graph_ros.offline import source_residuals
 from pose_graph_ros.offline.source_residuals import ScaleFit, SourceResiduals, Whiteness
 from pose_graph_ros.offline.variance_components import Analysis

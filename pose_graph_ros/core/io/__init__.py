@@ -3,7 +3,7 @@
 """
 Files of the engine: saved graphs, g2o graphs, and paths (TUM, KITTI, CSV, GPX, KML, GeoJSON).
 
-`saved_graph` is the module to read first: its `SavedGraph` is the whole state of a back end as a
-value, which `core.parts` makes and restores. `graph_files` writes it as three text files and reads
-it back bit for bit.
+`graph_files` is the module to read first: its `SavedGraph` is the whole state of a back end as a
+value, which `core.parts` makes and restores, and which is written as three text files and read
+back bit for bit.
 """

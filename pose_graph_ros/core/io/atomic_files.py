@@ -9,7 +9,6 @@ during the renaming may new files lie beside old ones. A reader can detect that 
 the checksums of the others comes last.
 """
 
-from collections.abc import Mapping
 import contextlib
 import os
 from pathlib import Path
@@ -18,7 +17,7 @@ from tempfile import TemporaryDirectory
 from pose_graph_ros.core.exceptions import FileWriteError
 
 
-def write_files(contents: Mapping[Path, bytes]) -> None:
+def write_files(contents: dict[Path, bytes]) -> None:
     """
     Write files of one folder, all of them or none; missing folders are created.
 
@@ -47,7 +46,12 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 for path in contents:
                     os.replace(fresh / path.name, path)
                     renamed.append(path)
-                _sync_folder(folder)
+                with contextlib.suppress(OSError):      # where folders can be opened
+                    handle = os.open(folder, os.O_RDONLY)
+                    try:
+                        os.fsync(handle)
+                    finally:
+                        os.close(handle)
             except BaseException:
                 # new files are replaced by the previous ones; those without one are removed
                 for path in renamed:
@@ -67,13 +71,3 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    """Synchronise the names in a folder to the disk, where folders can be opened."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

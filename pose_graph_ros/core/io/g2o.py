@@ -44,7 +44,6 @@ are the lines `EQUIV i j` of TORO: they allow it to merge two nodes that an edge
 connects, and add nothing to that edge. A file may be compressed by gzip.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -89,7 +88,7 @@ class GraphFile:
     # whether the file has the poses of all nodes; else missing ones were composed
     has_start: bool = True
     # number of lines that were skipped, by their tag
-    skipped: Mapping[str, int] = field(default_factory=dict)
+    skipped: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # sentences about what was read otherwise than it is in the file
     edge2_order: str | None = None  # of `EDGE2_ORDERS`, as it was said or found out
     found_by: str = ''  # why this order, if it was found out
@@ -139,7 +138,7 @@ def read_g2o(path: Path, edge2_order: str | None = None) -> GraphFile:
     return replace(files[order], found_by=why)
 
 
-def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
+def _likelier(files: dict[str, GraphFile]) -> tuple[str, str]:
     """Return in which order the numbers of a file make more sense, and why."""
     # by the smallest eigenvalue of a matrix, its diagonal scaled to 1
     definite = [order for order, file in files.items() if np.min(np.linalg.eigvalsh(
@@ -150,76 +149,81 @@ def _likelier(files: Mapping[str, GraphFile]) -> tuple[str, str]:
             f'in the order of {other} not all information matrices are positive definite')
     if len(files) == 1:
         return next(iter(files)), 'the other order is refused'
-    spread = {order: _spread(file.rows) for order, file in files.items()}
+    spread = {order: _spread(file) for order, file in files.items()}
     order, other = sorted(EDGE2_ORDERS, key=lambda each: spread[each])
     return order, (f'at the optimum the mean energy of an edge is {spread[order]:.3g} times the '
                    f'median, in the order of {other} {spread[other]:.3g} times')
 
 
-def _spread(rows: GraphRows) -> float:
+def _spread(file: GraphFile) -> float:
     """Return the mean over the median of the energies of edges at the optimum."""
     # loads the compiled kernels
     from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start  # noqa: PLC0415
-    from pose_graph_ros.core.graph.graph import Graph  # noqa: PLC0415
 
-    copy = Graph()
-    copy.fill(rows)
-    optimize_from_linear_start(copy, SolverConfig())
-    energies = copy.energies().factors[rows.factors.j >= 0]
+    # another graph than the one that is returned, with the rows as they were read
+    optimize_from_linear_start(file.graph, SolverConfig())
+    energies = file.graph.energies().factors[file.rows.factors.j >= 0]
     median = float(np.median(energies))
     return float(np.mean(energies)) / median if median > 0.0 else np.inf
 
 
 def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
     """Return the graph in the lines of a file."""
+    rows, order = dict(text.rows), edge2_order or ''
     # edges from a node to itself tell nothing
-    rows, n_loops, loops = dict(text.rows), 0, tuple[str, ...]()
+    n_loops, loops = 0, tuple[str, ...]()
     for tag, table in text.rows.items():
         if gt.TAGS[tag].n_ids == 2 and tag != 'LANDMARK':
-            rows[tag] = table.rows(np.flatnonzero(table.ids[:, 0] != table.ids[:, 1]))
+            rows[tag] = table[table['ids'][:, 0] != table['ids'][:, 1]]
             n_loops += len(table) - len(rows[tag])
     if n_loops > 0:
         loops = (f'{n_loops} edges from a node to itself are skipped',)
     rows['LANDMARK'], notes = _numbered(text, rows)
-    points = rows['VERTEX_XY']
-    vertices = gt.Lines.joined((rows['VERTEX_SE2'], rows['VERTEX2'], rows['VERTEX'], gt.Lines(
-        points.ids, np.pad(points.numbers, ((0, 0), (0, 1))), points.lines)))
+    vertices = [rows[tag] for tag in ('VERTEX_SE2', 'VERTEX2', 'VERTEX', 'VERTEX_XY')]
+    names, lines = (np.concatenate([table[name].ravel() for table in vertices])
+                    for name in ('ids', 'line'))
     # with an index, as NumPy loads its masked arrays otherwise, which takes 7 ms
     ids, _ = np.unique(np.concatenate([
-        table.ids.ravel() for tag, table in rows.items() if tag != 'FIX']), return_index=True)
+        table['ids'].ravel() for tag, table in rows.items() if tag != 'FIX']), return_index=True)
     if len(ids) == 0:
         raise FileFormatError(
             f'{text.path}: all edges lead from a vertex to itself, and no vertex is given')
-    given, first = np.unique(vertices.ids.ravel(), return_index=True)
-    if len(given) < len(vertices):
-        again = np.setdiff1d(np.arange(len(vertices)), first)[0]
-        raise FileFormatError(f'{text.where(vertices.lines[again])}: vertex '
-                              f'{vertices.ids[again, 0]} is in the file twice')
+    given, first = np.unique(names, return_index=True)
+    if len(given) < len(names):
+        again = np.setdiff1d(np.arange(len(names)), first)[0]
+        raise FileFormatError(
+            f'{text.where(lines[again])}: vertex {names[again]} is in the file twice')
     factors = Factors.joined([
-        factors_of(tag, rows[tag], edge2_order if tag in gt.AMBIGUOUS else None, ids)
+        factors_of(tag, rows[tag], order if tag in gt.AMBIGUOUS else '', ids)
         for tag in gt.MEASURED])
-    is_landmark = np.isin(ids, points.ids)
+    is_landmark = np.isin(ids, rows['VERTEX_XY']['ids'])
     is_landmark[factors.j[np.isin(factors.kind, _TO_LANDMARKS)]] = True
     kind = np.where(is_landmark, NodeKind.LANDMARK, NodeKind.POSE)
     try:
         check(factors, kind)
     except RowError as error:
-        line = np.concatenate([rows[tag].lines for tag in gt.MEASURED])[error.row]
+        line = np.concatenate([rows[tag]['line'] for tag in gt.MEASURED])[error.row]
         raise FileFormatError(f'{text.where(line)}: {error}') from error
     poses, known = np.zeros((len(ids), 3)), np.isin(ids, given)
-    poses[known] = vertices.numbers[first]
+    poses[known] = np.concatenate([np.pad(table['numbers'], (
+        (0, 0), (0, 3 - table['numbers'].shape[1]))) for table in vertices])[first]
     if not np.all(known):
         compose_missing(poses, known, factors)
         poses[is_landmark, 2] = 0.0
     if not np.all(np.isfinite(poses)):
         raise FileFormatError(f'{text.path}: poses composed from edges are not finite')
-    fixed = _fixed(text, ids)
+    fixed, held = np.zeros(len(ids), dtype=bool), text.rows['FIX']['ids'].ravel()
+    places = np.minimum(np.searchsorted(ids, held), len(ids) - 1)
+    missing = np.flatnonzero(ids[places] != held)
+    if len(missing) > 0:
+        where = text.where(text.rows['FIX']['line'][missing[0]])
+        raise FileFormatError(f'{where}: FIX {held[missing[0]]}: there is no such vertex')
+    fixed[places] = True
     if len(ids) > 0 and not np.any(fixed) and np.all(factors.j >= 0):
         fixed[np.argmin(is_landmark)] = True
     n = len(ids)
-    graph = GraphRows(
-        se2.wrapped(poses), kind, fixed, factors, np.arange(n), np.arange(len(factors)),
-        NextIds(n, len(factors)))
+    graph = GraphRows(se2.wrapped(poses), kind, fixed,
+                      factors, np.arange(n), np.arange(len(factors)), NextIds(n, len(factors)))
     return GraphFile(
         graph, ids, bool(len(given) == n), text.skipped, (*loops, *notes), edge2_order)
 
@@ -229,23 +233,23 @@ def _numbered(text: gt.GraphText, rows: dict[str, gt.Lines]) -> tuple[gt.Lines, 
     seen = rows['LANDMARK']
     if len(seen) == 0:
         return seen, ()
-    poses = [seen.ids[:, 0], *(table.ids.ravel() for tag, table in rows.items()
-                               if tag != 'LANDMARK')]
-    others, names = np.unique(np.concatenate(poses)), seen.ids[:, 1]
+    others = np.unique(np.concatenate([
+        (table['ids'][:, 0] if tag == 'LANDMARK' else table['ids']).ravel()
+        for tag, table in rows.items()]))
+    names = seen['ids'][:, 1]
     if not np.any(np.isin(names, others)):
         return seen, ()
     first = max(int(np.max(others)), 0) + 1 - min(int(np.min(names)), 0)
     if first + int(np.max(names)) > np.iinfo(np.int64).max:
-        raise FileFormatError(f'{text.where(seen.lines[0])}: LANDMARK: the ids are too large')
-    moved = np.column_stack((seen.ids[:, 0], names + first))
-    return gt.Lines(moved, seen.numbers, seen.lines), (
+        raise FileFormatError(f'{text.where(seen[0]["line"])}: LANDMARK: the ids are too large')
+    moved = seen.copy()
+    moved['ids'][:, 1] += first
+    return moved, (
         f'landmark 0 of iSAM is node {first} here, 1 is {first + 1} and so on, as poses have the '
         f'same numbers',)
 
 
-def factors_of(
-    tag: str, lines: gt.Lines, order: str | None = None, nodes: IntArray | None = None,
-) -> Factors:
+def factors_of(tag: str, lines: gt.Lines, order: str = '', ids: IntArray | None = None) -> Factors:
     """
     Return the factors in the lines of a tag.
 
@@ -254,25 +258,26 @@ def factors_of(
     layout, n, size = gt.TAGS[tag], len(lines), gt.TAGS[tag].rows
     order, begin = order or layout.order, 3 * layout.has_offset
     mean, information, constants = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 4))
-    constants[:, :begin] = lines.numbers[:, :begin]
-    mean[:, :size] = lines.numbers[:, begin:begin + size]
+    constants[:, :begin] = lines['numbers'][:, :begin]
+    mean[:, :size] = lines['numbers'][:, begin:begin + size]
     row, column = _TORO if order == 'toro' else np.triu_indices(size)
-    information[:, row, column] = lines.numbers[:, begin + size:]
+    information[:, row, column] = lines['numbers'][:, begin + size:]
     if order == 'isam':
         information = np.swapaxes(information, 1, 2) @ information
     else:
         information[:, column, row] = information[:, row, column]
-    ends = lines.ids if nodes is None else np.searchsorted(nodes, lines.ids).astype(np.int64)
+    names = lines['ids']
+    ends = names if ids is None else np.searchsorted(ids, names).astype(np.int64)
     if layout.n_ids == 1:
         i, j, kind = ends[:, 0], np.full(n, -1), np.where(
             information[:, 2, 2] == 0.0, FactorKind.POSITION, FactorKind.GLOBAL_POSE)
     else:
         # the next id; a difference could overflow
         i, j, kind = *ends.T, np.where(
-            lines.ids[:, 1] == lines.ids[:, 0] + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
+            names[:, 1] == names[:, 0] + 1, FactorKind.ODOMETRY, FactorKind.LOOP_CLOSURE)
     if layout.kind is not None:
         kind[:] = layout.kind
-    return Factors(i, j, mean if nodes is None else se2.wrapped(mean), information, kind,
+    return Factors(i, j, mean if ids is None else se2.wrapped(mean), information, kind,
                    constants=constants)
 
 
@@ -305,19 +310,6 @@ def compose_missing(poses: FloatArray, known: BoolArray, factors: Factors) -> No
                         further.append(neighbour)
             frontier = further
     poses[:] = found
-
-
-def _fixed(text: gt.GraphText, ids: IntArray) -> BoolArray:
-    """Return which nodes are fixed."""
-    fixed, names = np.zeros(len(ids), dtype=bool), text.rows['FIX'].ids.ravel()
-    rows = np.minimum(np.searchsorted(ids, names), len(ids) - 1)
-    missing = np.flatnonzero(ids[rows] != names)
-    if len(missing) > 0:
-        line = text.rows['FIX'].lines[missing[0]]
-        raise FileFormatError(f'{text.where(line)}: FIX {names[missing[0]]}: there is no such '
-                              f'vertex')
-    fixed[rows] = True
-    return fixed
 
 
 def write_g2o(graph: 'Graph | PlainGraph', path: Path, ids: IntArray | None = None) -> None:

@@ -7,16 +7,16 @@ All lines of a tag are converted together. Only if that fails are they checked o
 number of the first line that is wrong and the reason.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import FileFormatError
-from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS
 
 
@@ -59,28 +59,9 @@ _SWITCHES = ('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR')
 _GZIP = b'\x1f\x8b'
 
 
-@dataclass(slots=True)
-class Lines:
-    """The lines with one tag."""
-
-    ids: IntArray  # shape (K, number of ids)
-    numbers: FloatArray  # shape (K, number of values)
-    lines: IntArray  # numbers of the lines in the file, from 1 on
-
-    def __len__(self) -> int:
-        return len(self.lines)
-
-    def rows(self, rows: IntArray | slice) -> 'Lines':
-        """Return some of the lines."""
-        return Lines(self.ids[rows], self.numbers[rows], self.lines[rows])
-
-    @classmethod
-    def joined(cls, tables: Iterable['Lines']) -> 'Lines':
-        """Return the lines of several tags with the same layout."""
-        tables = list(tables)
-        return cls(np.concatenate([each.ids for each in tables]),
-                   np.concatenate([each.numbers for each in tables]),
-                   np.concatenate([each.lines for each in tables]))
+# Records of the lines with one tag: ids, numbers behind them, and the number of the line in the
+# file, from 1 on.
+Lines = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +92,8 @@ def read_text(path: Path) -> str:
 
 def lines_of(path: Path, text: str) -> GraphText:
     """Return what is in the text of a file; FileFormatError with the line if one is malformed."""
-    found: dict[str, tuple[list[list[str]], list[int]]] = {tag: ([], []) for tag in TAGS}
+    # of each line the words, and its number behind them
+    found: dict[str, list[list[Any]]] = {tag: [] for tag in TAGS}
     skipped: dict[str, list[list[str]]] = {}
     for line, content in enumerate(text.splitlines(), 1):
         words = content.split()
@@ -121,55 +103,50 @@ def lines_of(path: Path, text: str) -> GraphText:
         if tag == 'EDGE_SE2_SWITCHABLE':
             tag, words = 'EDGE_SE2', ['EDGE_SE2', *words[1:3], *words[4:]]
         if tag in found:
-            rows, lines = found[tag]
-            several = [words] if tag != 'FIX' else [[tag, word] for word in words[1:]]
-            rows += several
-            lines += [line] * len(several)
+            found[tag] += ([[*words, line]] if tag != 'FIX' else
+                           [[tag, word, line] for word in words[1:]])
         elif tag not in _SWITCHES:
             skipped.setdefault(tag, []).append([str(line), *words[1:2]])
     # without those of vertices that were skipped
     names = {words[1] for tag, some in skipped.items() if tag.startswith('VERTEX')
              for words in some if len(words) > 1}
-    fixes = [*zip(*found['FIX'], strict=True)]
-    found['FIX'] = ([words for words, _ in fixes if words[1] not in names],
-                    [line for words, line in fixes if words[1] not in names])
-    if not any(lines for tag, (_, lines) in found.items() if tag != 'FIX'):
+    found['FIX'] = [words for words in found['FIX'] if words[1] not in names]
+    if not any(some for tag, some in found.items() if tag != 'FIX'):
         _raise_empty(path, skipped)
     try:
-        tables = {tag: _lines(*each, TAGS[tag]) for tag, each in found.items()}
+        tables = {tag: _lines(some, TAGS[tag]) for tag, some in found.items()}
     except (ValueError, OverflowError):
         _raise_first(path, found)
     return GraphText(path, tables, {tag: len(each) for tag, each in skipped.items()})
 
 
-def _lines(words: list[list[str]], lines: list[int], tag: Tag) -> Lines:
+def _lines(words: list[list[Any]], tag: Tag) -> Lines:
     """Return lines as arrays; raise ValueError or OverflowError if one is malformed."""
     n, n_ids, n_numbers = len(words), tag.n_ids, tag.n_numbers
-    if any(len(each) != 1 + n_ids + n_numbers for each in words):
+    if any(len(each) != 2 + n_ids + n_numbers for each in words):
         raise ValueError
-    columns = [*zip(*words, strict=True)] if n > 0 else [()] * (1 + n_ids + n_numbers)
-    ids = np.array([[*map(int, column)] for column in columns[1:1 + n_ids]], dtype=np.int64)
-    numbers = np.fromiter(map(float, chain.from_iterable(columns[1 + n_ids:])), np.float64,
-                          n * n_numbers)
-    if not np.all(np.isfinite(numbers)):
+    columns = [*zip(*words, strict=True)] if n > 0 else [()] * (2 + n_ids + n_numbers)
+    table = np.empty(n, [('ids', 'i8', (n_ids,)), ('numbers', 'f8', (n_numbers,)), ('line', 'i8')])
+    table['ids'] = np.array([[*map(int, column)] for column in columns[1:1 + n_ids]], np.int64).T
+    table['numbers'] = np.fromiter(map(float, chain.from_iterable(columns[1 + n_ids:-1])),
+                                   np.float64, n * n_numbers).reshape(n_numbers, n).T
+    table['line'] = columns[-1]
+    if not np.all(np.isfinite(table['numbers'])):
         raise ValueError
-    return Lines(np.ascontiguousarray(ids.T), np.ascontiguousarray(
-        numbers.reshape(n_numbers, n).T), np.array(lines, dtype=np.int64))
+    return table
 
 
-def _raise_first(path: Path, found: dict[str, tuple[list[list[str]], list[int]]]) -> NoReturn:
+def _raise_first(path: Path, found: dict[str, list[list[Any]]]) -> NoReturn:
     """Raise FileFormatError for the first line that is malformed."""
-    for line, words in sorted((line, words) for rows, lines in found.values()
-                              for line, words in zip(lines, rows, strict=True)):
+    for words in sorted(chain.from_iterable(found.values()), key=itemgetter(-1)):
         tag = TAGS[words[0]]
         try:
-            _lines([words], [line], tag)
+            _lines([words], tag)
         except (ValueError, OverflowError) as error:
             raise FileFormatError(
-                f'{path}:{line}: {words[0]} is followed by {tag.n_ids + tag.n_numbers} numbers, '
-                f'got {len(words) - 1}: {" ".join(words[1:])}; ids are integers of 64 bits, the '
-                f'others finite'
-            ) from error
+                f'{path}:{words[-1]}: {words[0]} is followed by {tag.n_ids + tag.n_numbers} '
+                f'numbers, got {len(words) - 2}: {" ".join(words[1:-1])}; ids are integers of 64 '
+                'bits, the others finite') from error
     raise AssertionError('no line is malformed')
 
 

@@ -3,13 +3,17 @@
 """
 A saved graph as three files of plain text: `map.g2o`, `map.json` and `map.tum`.
 
+`SavedGraph` is the whole state of an engine as a value. `core.parts` makes it from the parts of
+the engine and restores them from it. Settings are not part of it: a loaded graph has those of the
+engine that loads it.
+
 The g2o file holds the hidden nodes, edges and observed nodes that other programs can read. The
 JSON file holds the remaining state and the SHA-256 of the g2o file; its first member is the
 SHA-256 of all that follows in it. Both are read back bit for bit, or refused. The TUM file holds
 the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 import hashlib
 import json
@@ -21,18 +25,26 @@ import numpy as np
 
 from pose_graph_ros import __version__
 from pose_graph_ros.core import saved_columns as sc
+from pose_graph_ros.core.alignment import AlignmentState, SavedAlignment
 from pose_graph_ros.core.exceptions import FileFormatError, FileWriteError
-from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
+from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPlane
+from pose_graph_ros.core.geometry.se2 import FloatArray, wrap
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph import constraints as ct
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
+from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import factors_of, g2o_text, NOT_USED, STANDING_FOR
 from pose_graph_ros.core.io.g2o_text import GraphText, lines_of, MEASURED, TAGS
 from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.judgement.judge import SavedJudgement
+from pose_graph_ros.core.odometry.node_table import SavedNodes
+from pose_graph_ros.core.sources.factor_builder import SourceState
+from pose_graph_ros.core.sources.gyro import SavedGyro
+from pose_graph_ros.core.sources.pipeline import SavedStamps
+from pose_graph_ros.core.sources.queued import SavedQueue
 
 FORMAT = 'pose_graph_ros graph'
 VERSION = 7
@@ -40,8 +52,43 @@ VERSION = 7
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
 _DIGITS = 64
-MEMBERS = [item.name for item in fields(SavedGraph) if item.name != 'rows']
+# Tolerances within which a datum equals that of the saved graph [m], [rad].
+SAME_PLACE = 0.01
+SAME_YAW = 1e-6
+# Maximum distance of a fix from the nearest node of a saved graph of the same site [m].
+SAME_SITE = 10_000.0
 IN_G2O = [kind for kind, factor in ct.FACTORS.items() if factor.tag == 'EDGE_SE2']
+
+
+@dataclass(frozen=True, slots=True)
+class SavedGraph:
+    """The state of an engine; a copy that does not change with it."""
+
+    rows: GraphRows
+    nodes: SavedNodes
+    sources: Mapping[str, SourceState]
+    seen: Mapping[str, SavedStamps]
+    losses: SavedLosses
+    alignment: SavedAlignment
+    waiting: SavedQueue  # constraints for the next update
+    set_aside: SavedQueue  # after a failed solve, for the next full optimisation
+    judgement: SavedJudgement  # what is believed, and who has decided so
+    # the same for people, of all closures and all that is not believed: a sentence by id
+    verdicts: Mapping[str, str]
+    newest_covariance: sc.Rows3  # of the newest hidden node, in map axes
+    chi2: float
+    n_left_out: int  # received measurements that are neither in the graph nor saved
+    datum: MapOrigin | None  # of the map, if it has one
+    gyros: Mapping[str, SavedGyro] = field(default_factory=dict)
+    beacons: Mapping[str, int] = field(default_factory=dict)  # ids of their landmarks, by name
+
+    @property
+    def path(self) -> FloatArray:
+        """Poses of all nodes that are no biases, those that have left included, shape (H, 3)."""
+        return self.nodes.poses(self.rows.node_ids, self.rows.poses)
+
+
+MEMBERS = [item.name for item in fields(SavedGraph) if item.name != 'rows']
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +206,27 @@ def _verified(path: Path) -> tuple[Path, Path, dict[str, Any], bytes]:
     if path.name == '':
         raise FileFormatError(f'{path}: expected the name of a file')
     g2o_path, path, _ = graph_paths(path)
-    members = _checked_members(path, _content(path))
+    content = _content(path)
+    begin = len(_OPENING) + _DIGITS
+    body = content[begin + len(_MIDDLE):]
+    if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
+        raise FileFormatError(f'{path}: does not begin as a saved graph does, with its SHA-256')
+    if hashlib.sha256(body).hexdigest().encode('ascii') != content[len(_OPENING):begin]:
+        raise FileFormatError(f'{path}: is damaged, cut off or was edited: its SHA-256 is not '
+                              'the one that it begins with')
+    try:
+        members = json.loads(b'{' + body)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f'{path}: expected JSON ({error})') from error
+    version = members.pop('version', None)
+    if members.pop('format', None) != FORMAT or version not in range(1, VERSION + 1):
+        raise FileFormatError(
+            f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
+            f'this one is of version {version!r}, created by {members.get("created_by")!r}')
+    try:
+        members = upgraded(members, version)
+    except sc.MISMATCHES as error:
+        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
     g2o = _content(g2o_path)
     if hashlib.sha256(g2o).hexdigest() != members.pop('g2o_sha256', None):
         raise FileFormatError(
@@ -185,39 +252,14 @@ def _content(path: Path) -> bytes:
         raise FileFormatError(f'{path}: cannot be read ({error})') from error
 
 
-def _checked_members(path: Path, content: bytes) -> dict[str, Any]:
-    """Return the members of a JSON file after verifying its checksum and version."""
-    begin = len(_OPENING) + _DIGITS
-    body = content[begin + len(_MIDDLE):]
-    if not content.startswith(_OPENING) or content[begin:begin + len(_MIDDLE)] != _MIDDLE:
-        raise FileFormatError(f'{path}: does not begin as a saved graph does, with its SHA-256')
-    if hashlib.sha256(body).hexdigest().encode('ascii') != content[len(_OPENING):begin]:
-        raise FileFormatError(f'{path}: is damaged, cut off or was edited: its SHA-256 is not '
-                              'the one that it begins with')
-    try:
-        members = json.loads(b'{' + body)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f'{path}: expected JSON ({error})') from error
-    version = members.pop('version', None)
-    if members.pop('format', None) != FORMAT or version not in range(1, VERSION + 1):
-        raise FileFormatError(
-            f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
-            f'this one is of version {version!r}, created by {members.get("created_by")!r}')
-    try:
-        return upgraded(members, version)
-    except sc.MISMATCHES as error:
-        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
-
-
 def _saved_rows(rows: GraphRows) -> SavedRows:
     factors, others = rows.factors, ~rows.is_pose
     in_json = np.flatnonzero(np.where(
         factors.j < 0, np.isin(factors.i, rows.node_ids[rows.is_bias]),
         ~np.isin(factors.kind, IN_G2O) | (factors.k >= 0)))
     given = factors.rows(in_json)
-    node_ids, factor_ids = (
-        None if len(ids) == end else ids for ids, end in zip(
-            (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
+    node_ids, factor_ids = (None if len(ids) == end else ids for ids, end in zip(
+        (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
     dimensions = None if rows.dimension is None else rows.dimension[others].astype(np.int64)
     landmarks = rows.node_ids[rows.node_kind == ct.NodeKind.LANDMARK]
     return SavedRows(
@@ -237,7 +279,7 @@ def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
         n, (rows.node_ids, rows.factor_ids), strict=True))
     is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
     poses = np.zeros((len(node_ids), 3))
-    poses[is_pose], poses[~is_pose] = vertices.numbers, rows.bias_values
+    poses[is_pose], poses[~is_pose] = vertices['numbers'], rows.bias_values
     kind = np.where(is_pose, ct.NodeKind.POSE, ct.NodeKind.BIAS).astype(np.uint8)
     if rows.landmarks is not None:
         kind[np.isin(node_ids, rows.landmarks)] = ct.NodeKind.LANDMARK
@@ -259,7 +301,7 @@ def _factors(rows: SavedRows, text: GraphText) -> ct.Factors:
     tags = [tag for tag in MEASURED if TAGS[tag].kind is None]
     in_g2o = ct.Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
     # in which those of edges come first
-    lines = np.concatenate([text.rows[tag].lines for tag in tags])
+    lines = np.concatenate([text.rows[tag]['line'] for tag in tags])
     table = ct.Factors.joined([in_g2o.rows(np.argsort(lines)), in_json])
     others = np.delete(np.arange(len(table)), rows.others)
     is_edge = np.isin(rows.factor_kind[others], IN_G2O)
@@ -269,21 +311,50 @@ def _factors(rows: SavedRows, text: GraphText) -> ct.Factors:
 
 def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:
     """Return priors as columns."""
-    if len(priors) == 0:
-        return SavedPriors()
-    return SavedPriors(
-        np.array([len(prior.nodes) for prior in priors], dtype=np.int64),
-        np.array([prior.anchored for prior in priors], dtype=np.bool_),
-        np.concatenate([prior.nodes for prior in priors]).astype(np.int64),
-        np.concatenate([packed(prior) for prior in priors]))
+    return SavedPriors(np.array([len(prior.nodes) for prior in priors], dtype=np.int64),
+                       np.array([prior.anchored for prior in priors], dtype=np.bool_),
+                       np.concatenate([np.empty(0, np.int64), *(prior.nodes for prior in priors)]),
+                       np.concatenate([np.empty(0), *map(packed, priors)]))
 
 
 def _restored_priors(saved: SavedPriors) -> tuple[Prior, ...]:
     """Return saved priors."""
     sizes = saved.sizes
-    if len(sizes) == 0:
-        return ()
     counts = 3 * sizes * (3 * sizes + 3) // 2 + 3 * sizes + 1
+    # behind the last ones is nothing
     return tuple(unpacked(nodes, numbers, anchored=anchored) for nodes, numbers, anchored in zip(
-        np.split(saved.nodes, np.cumsum(sizes)[:-1]),
-        np.split(saved.numbers, np.cumsum(counts)[:-1]), saved.anchored.tolist(), strict=True))
+        np.split(saved.nodes, np.cumsum(sizes)), np.split(saved.numbers, np.cumsum(counts)),
+        saved.anchored.tolist(), strict=False))
+
+
+def site_refusal(saved: SavedGraph, datum: MapOrigin | None, fix: MapOrigin | None) -> str | None:
+    """
+    Return why a saved graph cannot belong to the site of the robot; None if it can.
+
+    A datum that the user has set must equal that of the saved graph, except for the altitude. A
+    fix, the one that the current datum comes from or any other, must be near the saved graph.
+    """
+    if saved.datum is None:
+        return None
+    if datum is not None and (refusal := datum_refusal(saved.datum, datum)) is not None:
+        return refusal
+    if fix is not None:
+        # of the datum or the nearest node, whichever is nearer
+        metres = float(distances(fix, saved.datum.latitude, saved.datum.longitude)[0])
+        if saved.alignment.state == AlignmentState.ALIGNED.value:   # the nodes are in the map
+            points = TangentPlane(*saved.datum).to_geodetic(saved.path[:, :2])
+            metres = min(metres, float(np.min(distances(fix, points[:, 0], points[:, 1]))))
+        if not metres <= SAME_SITE:
+            return (f'the saved graph is of another site: its datum is {saved.datum}, the present '
+                    f'one {fix}, which is {metres / 1000.0:.1f} km from the nearest node')
+    return None
+
+
+def datum_refusal(saved: MapOrigin, datum: MapOrigin) -> str | None:
+    """Return why the datum of a saved graph is not the one that was set; None if it is."""
+    metres = float(distances(saved, datum.latitude, datum.longitude)[0])
+    turned = abs(wrap(datum.yaw - saved.yaw))
+    if metres <= SAME_PLACE and turned <= SAME_YAW:
+        return None
+    return (f'the saved graph is of another site: its datum is {saved}, the present one {datum}; '
+            f'they are {metres:.2f} m and {turned:.6f} rad apart')

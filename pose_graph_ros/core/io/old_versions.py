@@ -15,15 +15,18 @@ before, measurements for the next check of the alignment.
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from itertools import count
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors, full
-from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.saved_columns import encoded
-from pose_graph_ros.core.sources.queued import SavedQueue, turn
+from pose_graph_ros.core.sources.gyro import turn
+from pose_graph_ros.core.sources.queued import SavedQueue
 
+Json = dict[str, Any]
+Moved = Callable[[list[int]], list[int]]  # from ids to new ones
 LOSSES = ('none', 'huber', 'cauchy')
 EDGES = ('odometry', 'loop_closure', 'bias')
 OBSERVED = ('global_pose', 'position', 'heading')
@@ -32,46 +35,40 @@ NUMBERED = {
     ('edge_losses', 'losses'): LOSSES, ('observed_losses', 'losses'): LOSSES,
     ('graph', 'edge_kind'): EDGES, ('graph', 'observed_kind'): OBSERVED,
     ('waiting', 'kind'): EDGES, ('set_aside', 'kind'): EDGES}
-TURN = ('source', 'i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate',
-        'rest_variance')
+TURN = ('i', 'j', 'stamp_ns', 'angle', 'variance', 'seconds', 'rest_rate', 'rest_variance')
 _EDGES_IN_G2O = ('odometry', 'loop_closure', 'prior')
 # Columns of the graph that version 5 has as well.
 _KEPT = ('fixed', 'biases', 'bias_values', 'node_ids', 'priors', 'bias_dimensions', 'landmarks')
-_NO_NAMES: dict[str, list[Any]] = {'names': [], 'of': []}
-_NOTHING: dict[str, Any] = {'state': _NO_NAMES, 'decision': _NO_NAMES, **{name: [] for name in (
-    'sources', 'scales', 'left', 'held', 'added', 'source', 'number', 'stamps_ns', 'since_ns',
-    'distance')}}
-_NOT_JUDGED: dict[str, Any] = {
-    'closures': _NOTHING, 'fixes': _NOTHING, 'loosened': [], 'weights': [], 'odometry_left': {}}
+_NO_NAMES: Json = {'names': [], 'of': []}
+# Closures and fixes of versions 3 to 5, where none were judged.
+_NONE = defaultdict[str, Any](list, state=_NO_NAMES, decision=_NO_NAMES)
 
 
-def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
+def upgraded(members: Json, version: int) -> Json:
     """Return the members of a file of an older version as those of version 7."""
     for member, name in NUMBERED if version < 2 else ():
         column = {'names': list(NUMBERED[member, name]), 'of': members[member][name]}
         members[member] = {**members[member], name: column}
     if version < 3:
-        members = {'judgement': _NOT_JUDGED, 'verdicts': {}, **members}
-        for name in ('waiting', 'set_aside'):
-            members[name] = {'stamps_ns': [[-1, -1]] * len(members[name]['sources']),
-                             **members[name]}
+        members = {'judgement': {'closures': _NONE, 'fixes': _NONE, 'odometry': {}},
+                   'verdicts': {}, **members}
     if version < 4:
         nodes = members['nodes']
         members['nodes'] = {'ids' if name == 'rows' else name: nodes[name] for name in nodes}
     for stream in members['nodes']['streams'].values() if version < 6 else ():
         _list_samples(stream)
-    for name, gyro in members.get('gyros', {}).items() if version < 6 else ():
+    for gyro in members.get('gyros', {}).values() if version < 6 else ():
         rates = gyro['rates']
         gyro['rates'] = [
             {'stamp_ns': stamp_ns, 'rate': rate, 'variance': variance}
             for stamp_ns, (rate, variance) in zip(
                 rates['stamps_ns'], rates['rates'], strict=True)]
         gyro['waiting'] = [
-            dict(zip(TURN, (name, *ends, stamp_ns, *numbers), strict=True))
+            dict(zip(TURN, (*ends, stamp_ns, *numbers), strict=True))
             for stamp_ns, ends, numbers in zip(
                 gyro.pop('waiting_ns'), gyro.pop('waiting_ends'), gyro['waiting'], strict=True)]
     if version < 6:
-        members = _with_one_table(members, judged=version >= 3)
+        members = _with_one_table(members)
     if version < 7:
         members = _with_states(members)
     # measurements for the next check of the alignment, which the judge's bank has now
@@ -80,7 +77,7 @@ def upgraded(members: dict[str, Any], version: int) -> dict[str, Any]:
     return members
 
 
-def _list_samples(stream: dict[str, Any]) -> None:
+def _list_samples(stream: Json) -> None:
     """Make one value of the state of odometry at its newest sample, and of each that waits."""
     twists = stream.pop('waiting_twists', ())
     stream['waiting'] = [
@@ -101,10 +98,7 @@ def _list_samples(stream: dict[str, Any]) -> None:
         **{name: last.pop(name) for name in ('counted', 'counted_ns', 'held')}}
 
 
-def _judgement(
-    moved: Callable[[list[int]], list[int]], closures: dict[str, Any], fixes: dict[str, Any],
-    odometry: dict[str, Any],
-) -> dict[str, Any]:
+def _judgement(moved: Moved, closures: Json, fixes: Json, odometry: Json) -> Json:
     """Return judgements as one table of each kind, with the new ids of observed nodes."""
     # odometry that closures had doubted keeps the weight that it has in the file
     held = [number if is_edge else moved([number])[0]
@@ -127,7 +121,7 @@ def _judgement(
             odometry.get('left_sources', ()), odometry.get('left', ()), strict=True))}
 
 
-def _common(old: dict[str, Any], left: list[list[int]]) -> dict[str, Any]:
+def _common(old: Json, left: list[list[int]]) -> Json:
     """Return the columns that closures and fixes had in common."""
     # without numbers they are counted from 0 in each source
     counted = defaultdict[int, Iterator[int]](count)
@@ -137,7 +131,7 @@ def _common(old: dict[str, Any], left: list[list[int]]) -> dict[str, Any]:
         'number': old.get('numbers') or [next(counted[source]) for source in old['source']]}
 
 
-def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
+def _with_one_table(members: Json) -> Json:
     """Return members in which edges and observed nodes have the same ids."""
     rows = members['graph']
     n_edges, n_observed = (len(rows[f'{name}_weight']) for name in ('edge', 'observed'))
@@ -166,8 +160,7 @@ def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
             'other_i': rows['bias_edge_i'] + rows['bias_observed_node'],
             'other_j': rows['bias_edge_j'] + [-1] * n_on_bias,
             'other_mean': rows['bias_edge_mean'] + rows['bias_observed_mean'],
-            'other_information':
-                rows['bias_edge_information'] + rows['bias_observed_information'],
+            'other_information': rows['bias_edge_information'] + rows['bias_observed_information'],
             'other_constants': rows['bias_edge_bias'] + [
                 [*offset, 0.0] for offset in rows['bias_observed_offset']],
             'other_k': (rows.get('bias_edge_k') or [-1] * n_given) + [-1] * n_on_bias,
@@ -177,8 +170,7 @@ def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
             'rows': members['edge_losses']['rows'] + moved(losses['rows']),
             **{name: members['edge_losses'][name] + losses[name]
                for name in ('thresholds', 'shares')}, 'cursor': 0},
-        'judgement': _judgement(moved, **members['judgement']) if judged else (
-            members['judgement']),
+        'judgement': _judgement(moved, **members['judgement']),
         'sources': {name: _of_source(source, moved)
                     for name, source in members['sources'].items()}}
     if end['node'] is not None:
@@ -186,7 +178,7 @@ def _with_one_table(members: dict[str, Any], *, judged: bool) -> dict[str, Any]:
     return members
 
 
-def _of_source(source: dict[str, Any], moved: Callable[[list[int]], list[int]]) -> dict[str, Any]:
+def _of_source(source: Json, moved: Moved) -> Json:
     """Return the saved state of a source with the new ids of its observed nodes."""
     bins, stamps_and_ids = source['bins'], source['rows']
     # with a given correlation time measurements are edges
@@ -197,23 +189,28 @@ def _of_source(source: dict[str, Any], moved: Callable[[list[int]], list[int]]) 
     return {**source, 'rows': stamps_and_ids, 'bins': bins}
 
 
-def _joined(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+def _joined(one: Json, other: Json) -> Json:
     """Return one column of names for two."""
     n = len(one['names'])
     return {'names': one['names'] + other['names'], 'of': one['of'] + [n + k for k in other['of']]}
 
 
-def _with_states(members: dict[str, Any]) -> dict[str, Any]:
+def _with_states(members: Json) -> Json:
     """Return members with one state of each source, and queues as tables of factors."""
     sources, gyros = members.pop('sources'), members.pop('gyro_biases', {})
-    rotations = [queued for gyro in members.get('gyros', {}).values()
-                 for each in gyro.pop('waiting') for queued in turn(Turn(**each))]
-    for name in ('waiting', 'set_aside'):
+    rotations = [queued for name, gyro in members.get('gyros', {}).items()
+                 for i, j, stamp_ns, *numbers in map(itemgetter(*TURN), gyro.pop('waiting'))
+                 for queued in turn(name, (i, j), stamp_ns, numbers[:3], numbers[3:])]
+    for name, more in ('waiting', rotations), ('set_aside', []):
         old = members[name]
-        members[name] = _queue(old['sources'], old['stamps_ns'], Factors(
-            old['i'], old['j'], *_measured(old)))
-    members['waiting'] = encoded(SavedQueue.of([*members['waiting'].queue(), *rotations]))
-    members['set_aside'] = encoded(members['set_aside'])
+        n, kinds = len(old['sources']), old['kind']
+        queue = SavedQueue(tuple(old['sources']), Factors(
+            old['i'], old['j'], np.reshape(old['mean'], (-1, 3)),
+            full(np.reshape(old['information'], (-1, 6))),
+            np.array([FactorKind[kinds['names'][k].upper()] for k in kinds['of']], np.uint8)),
+            np.reshape(np.array(old.get('stamps_ns', n * [[-1, -1]]), np.int64), (n, 2)),
+            np.zeros((n, 2)))
+        members[name] = encoded(SavedQueue.of([*queue.queue(), *more]))
     return {**members, 'seen': {name: {
         'stamps_ns': each['seen_ns'], 'references': each['seen_references']}
         for name, each in sources.items()}, 'sources': {
@@ -221,22 +218,7 @@ def _with_states(members: dict[str, Any]) -> dict[str, Any]:
         **{name: _state_of_gyro(**each) for name, each in gyros.items()}}}
 
 
-def _queue(sources: list[str], stamps_ns: list[list[int]], factors: Factors) -> SavedQueue:
-    n = len(sources)
-    return SavedQueue(tuple(sources), factors, np.reshape(np.array(stamps_ns, np.int64), (n, 2)),
-                      np.zeros((n, 2)))
-
-
-def _measured(old: dict[str, Any]) -> tuple[Any, Any, Any]:
-    """Return mean, information and kind of factors."""
-    kind = old['kind']
-    return (np.reshape(old['mean'], (-1, 3)), full(np.reshape(old['information'], (-1, 6))),
-            np.array([FactorKind[kind['names'][k].upper()] for k in kind['of']], np.uint8))
-
-
-def _state(
-    *, rows: list[list[int]], ties: list[int], bins: dict[str, Any] | None, **others: Any,
-) -> dict[str, Any]:
+def _state(*, rows: list[list[int]], ties: list[int], bins: Json | None, **others: Any) -> Json:
     """Return the state of a source of measurements or closures."""
     n, noise, bias = len(rows), others.get('noise', ()), None
     if bins is not None:
@@ -249,22 +231,20 @@ def _state(
             'held_by': others.get('edges') or n * [-1],
             'noise': noise if len(noise) == n else n * [[0.0, 0.0]]},
         'edges': {'stamp_ns': len(ties) * [-1], 'id': ties}, 'bias': bias,
-        **{name: others[name] for name in ('errors', 'n_otherwise', 'n_gone')
-           if name in others}}
+        **{name: others[name] for name in ('errors', 'n_otherwise', 'n_gone') if name in others}}
 
 
-def _state_of_gyro(
-    *, width_ns: int, numbers: list[int], ids: list[int], edges: list[list[int]],
-) -> dict[str, Any]:
-    begins_ns = {node: number * width_ns for node, number in zip(ids, numbers, strict=True)}
+def _state_of_gyro(*, ids: list[int], edges: list[list[int]], **bins: Any) -> Json:
+    chain = _chain(bins, ids, len(ids) * [-1], 0)
+    begins_ns = dict(zip(ids, chain['begins_ns'], strict=True))
     return {
         **_state(rows=[], ties=[], bins=None),
         'edges': {'stamp_ns': [begins_ns[node] for _, node in edges],
                   'id': [number for number, _ in edges]},
-        'bias': _chain({'width_ns': width_ns, 'numbers': numbers}, ids, len(ids) * [-1], 0)}
+        'bias': chain}
 
 
-def _chain(bins: dict[str, Any], nodes: list[int], ties: list[int], anchor: int) -> dict[str, Any]:
+def _chain(bins: Json, nodes: list[int], ties: list[int], anchor: int) -> Json:
     return {'begins_ns': [number * bins['width_ns'] for number in bins['numbers']],
             'nodes': nodes, 'ties': ties[:len(nodes)], 'bin_ns': bins['width_ns'],
             'anchor': nodes[anchor] if len(nodes) > 0 else -1}

@@ -30,7 +30,7 @@ from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.smoother.trial import continued
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.queued import Queued
 
 
 class ClosureJudge:
@@ -48,7 +48,7 @@ class ClosureJudge:
 
     # --- new closures ----------------------------------------------------------------------------
 
-    def before(self, new: Sequence[NewConstraint], edges: Factors, now_ns: int) -> FloatArray:
+    def before(self, new: Sequence[Queued], edges: Factors, now_ns: int) -> FloatArray:
         """Return the weights with which closures are to be added, shape (M,)."""
         begin, n = len(self.states), len(new)
         self._now_ns, self._n_staged = now_ns, n

@@ -32,7 +32,8 @@ from pose_graph_ros.core.measurements import GlobalPose, PoseMeasurement, Positi
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.bias import CorrelatedErrors
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder, NewConstraint
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.queued import Queued
 
 # Up to so many measurements it is asked whether those that are believed tell where the map is,
 # which at least so many are needed for. If they do not, nothing is doubted yet.
@@ -73,12 +74,10 @@ class FixJudge:
         self._now_ns = -1   # newest stamp of odometry
         self._is_restored = False  # whether the bank does not know the records yet
 
-    def before(
-        self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
-    ) -> GraphUpdate:
+    def before(self, new: Sequence[Queued], change: GraphUpdate, now_ns: int) -> GraphUpdate:
         """Return an update in which all rows have the weights that the new ones make right."""
-        by_id = {one.number: one for one in new if one.kind in (GlobalPose, Position)
-                 and self._is_judged(one.source, one.kind) is not None}
+        by_id = {one.number: one for one in new if one.measured in (GlobalPose, Position)
+                 and self._is_judged(one.source, one.measured) is not None}
         if len(by_id) == 0:
             return change
         self._now_ns, before, graph = now_ns, self._begin(), self._smoother.graph
@@ -92,7 +91,7 @@ class FixJudge:
         for row in rows:
             one = by_id[int(row['id'])]
             row['source'] = self._number(one.source)
-            row['judged'] = self._is_judged(one.source, one.kind)
+            row['judged'] = self._is_judged(one.source, one.measured)
             if row['judged']:
                 self.states.append(one, now_ns, BELIEVED)
         if len(self.bank) == 0 and not np.any(graph.fixed) and not graph.has_touched:

@@ -36,7 +36,8 @@ from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import OdometryErrors
 from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3
 from pose_graph_ros.core.smoother.incremental import DIVERGED, IncrementalSmoother, UpdateResult
-from pose_graph_ros.core.sources.factor_builder import FactorBuilder, NewConstraint
+from pose_graph_ros.core.sources.factor_builder import FactorBuilder
+from pose_graph_ros.core.sources.queued import Queued
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +71,11 @@ class Judge:
         self.moved = self.fixes.states.moved
         # the judged closures of the last `before`, by their numbers among its factors
         self._staged = np.empty(0, dtype=np.int64)
-        self._new: Sequence[NewConstraint] = ()  # all constraints of the last `before`
+        self._new: Sequence[Queued] = ()  # all constraints of the last `before`
         # on the newest constraints that have left the graph unused
         self._left: deque[vd.Verdict] = deque(maxlen=MOST_OTHERS)
 
-    def before(
-        self, new: Sequence[NewConstraint], change: GraphUpdate, now_ns: int,
-    ) -> GraphUpdate:
+    def before(self, new: Sequence[Queued], change: GraphUpdate, now_ns: int) -> GraphUpdate:
         """Return an update in which the new rows have the weights that they begin with."""
         self._new = new
         change = self.fixes.before(new, change, now_ns)
@@ -130,8 +129,8 @@ class Judge:
         begin, weights = self._smoother.graph.next_ids.factor, change.factors.weight.copy()
         later, wanted = dict[int, float](), dict(change.weigh)
         for one in self._new:
-            if one.kind is LoopClosure or self._factors.config.measurement_source(
-                    one.source, one.kind).applied_loss is Loss.NONE:
+            if one.measured is LoopClosure or self._factors.config.measurement_source(
+                    one.source, one.measured).applied_loss is Loss.NONE:
                 continue
             row = one.held - begin
             later[one.held] = wanted.pop(one.held, float(weights[row]))

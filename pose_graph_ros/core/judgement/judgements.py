@@ -20,7 +20,7 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
 from pose_graph_ros.core.judgement import verdicts as vd
 from pose_graph_ros.core.judgement.settings import BELIEF
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.queued import Queued
 
 # State of a constraint before it came.
 NEW = -1
@@ -106,7 +106,7 @@ class Judgements:
             self._next.append(0)
         return self.sources.index(source)
 
-    def append(self, one: NewConstraint, now_ns: int, state: int, **more: float) -> None:
+    def append(self, one: Queued, now_ns: int, state: int, **more: float) -> None:
         record, source = np.zeros((), self.records.dtype), self.index_of(one.source)
         for name, value in {
                 'held': one.held, 'added': one.number, 'source': source,

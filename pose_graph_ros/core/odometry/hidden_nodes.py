@@ -23,10 +23,9 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses, 
 from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.graph.graph import Graph
 from pose_graph_ros.core.measurements import Answer, OdometrySample
-from pose_graph_ros.core.odometry.jumps import gap_motion
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED, Attachment, Motion, OdometryErrors
-from pose_graph_ros.core.odometry.node_table import NodeTable, passed_on, SavedNodes, Span
-from pose_graph_ros.core.odometry.stream import find_silence, OdometryStream
+from pose_graph_ros.core.odometry.motion import Attachment, Motion, OdometryErrors, Span
+from pose_graph_ros.core.odometry.node_table import NodeTable, SavedNodes
+from pose_graph_ros.core.odometry.stream import find_silence, NEVER, OdometryStream
 from pose_graph_ros.core.odometry.timeline import next_row, OdometryTimeline
 from pose_graph_ros.core.saved_columns import as_pose
 
@@ -70,7 +69,8 @@ class HiddenNodes(NodeTable):
         self._secondary: list[tuple[str, Factors]] = []  # edges not yet taken, with their sources
         # stamp before which samples may have been dropped as nodes were thinned out [ns]
         self._samples_since_ns = -1
-        self.errors = AS_CLAIMED  # of the primary odometry, which the edges to new nodes know of
+        # of the primary odometry, which the edges to new nodes know of
+        self.errors = OdometryErrors()
         self.relocated: set[int] = set()  # numbers of the nodes at which the robot was put by hand
         self.configure(config)
 
@@ -122,13 +122,13 @@ class HiddenNodes(NodeTable):
         """Settle all samples, and make the nodes and edges that are due."""
         for source, stream in list(self.streams.items()):
             self._process(source, stream.settle(stream.newest_ns))
-        ready = [name for name in self._names if self.streams[name].first_after(-1) is not None]
+        ready = [name for name in self._names if self.streams[name].first_after(-1) < NEVER]
         if not self._primaries and len(ready) > 0:
             self._make_first_node(ready[0])
-            self._add_secondary_edges()
 
     def take_secondary_edges(self) -> list[tuple[str, Factors]]:
         """Return the new edges of the other sources with their sources' names; forget them."""
+        self._add_secondary_edges()
         edges, self._secondary = self._secondary, []
         return edges
 
@@ -141,38 +141,33 @@ class HiddenNodes(NodeTable):
                 self._replace_silent_primary(source, stamp_ns)
             if self._primaries and source == self.primary and stamp_ns > self.covered_ns:
                 self._extend(stamp_ns, pose)
-        self._add_secondary_edges()
 
     def _choose_first(self, settled_ns: int) -> None:
         """Choose the first primary source, and make the first node, unless it is too early."""
-        names, ready_ns = self._names, []
+        names, ready_ns = self._names, NEVER
         preferred = next(iter(self._config.odometry), names[0])
         for name in names:
             begin_ns = self.streams[name].first_after(-1)
-            if begin_ns is not None and name != preferred:
+            if name != preferred:
                 begin_ns = self.streams[name].first_after(begin_ns + self._patience_ns - 1)
-            if begin_ns is not None and begin_ns <= settled_ns:
-                ready_ns.append(begin_ns)
-        if len(ready_ns) > 0:
-            self._make_first_node(self._first_with_sample(names, -1, min(ready_ns)))
+            ready_ns = min(ready_ns, begin_ns)
+        if ready_ns <= settled_ns:
+            self._make_first_node(self._first_with_sample(names, -1, ready_ns))
 
     def _first_with_sample(self, names: list[str], after_ns: int, until_ns: int) -> str:
         """Return the first source with a sample in (after_ns, until_ns]; one at least has one."""
-        return next(name for name in names if (
-            self.streams[name].first_after(after_ns) or until_ns + 1) <= until_ns)
+        return next(name for name in names if self.streams[name].first_after(after_ns) <= until_ns)
 
     def _make_first_node(self, source: str) -> None:
         """Make a source the primary one, and the first node at its first sample."""
         stream = self.streams[source]
         first_ns = stream.first_after(-1)
-        assert first_ns is not None
         stream.settle_all(first_ns)
         pose = stream.timeline.poses[0]
         self._set_primary(-1, source)
         self.covered_ns = self._base_ns = first_ns
-        self._append(
-            first_ns, self._make_node(NewNode(pose.copy(), None, source)), as_pose(pose),
-            pose.copy())
+        self._append(first_ns, self._make_node(NewNode(pose.copy(), None, source)),
+                     as_pose(pose), pose.copy())
         self._catch_up()
 
     def _set_primary(self, after_ns: int, source: str) -> None:
@@ -182,9 +177,8 @@ class HiddenNodes(NodeTable):
     def _replace_silent_primary(self, source: str, settled_ns: int) -> None:
         """Replace the primary source if it was silent before a settled sample of a source."""
         others = [name for name in self._names if name != self.primary]
-        silence = find_silence(
-            self.streams, [self.primary, *others], self.covered_ns, (source, settled_ns),
-            self._patience_ns)
+        silence = find_silence(self.streams, [self.primary, *others],
+                               self.covered_ns, (source, settled_ns), self._patience_ns)
         if silence is None:
             return
         # another source makes the nodes after the last sample before the silence
@@ -206,9 +200,8 @@ class HiddenNodes(NodeTable):
                 old, old.timeline.motion(self._base_ns, min(begin_ns, last_ns)))
             self._base_ns = begin_ns
             if begin_ns > last_ns:
-                mean, noise = gap_motion(old.timeline, last_ns, begin_ns, old.saved_ns)
-                self._span = Span(se2.compose(self._span.mean, mean),
-                                  passed_on(mean, self._span.covariance, noise))
+                self._span = self._span.continued(
+                    *old.timeline.gap_motion(last_ns, begin_ns, old.saved_ns))
         self._base, self.covered_ns = as_pose(timeline.pose(self._base_ns)), last_ns
         self._catch_up()
 
@@ -239,17 +232,10 @@ class HiddenNodes(NodeTable):
 
     def _catch_up(self) -> None:
         """Make the nodes that are due at the settled samples of a new primary source."""
-        source = self.primary
-        timeline = self.streams[source].timeline
+        timeline = self.streams[self.primary].timeline
         begin = int(np.searchsorted(timeline.stamps_ns, self.covered_ns, side='right'))
-        samples = zip(timeline.stamps_ns[begin:].tolist(), timeline.poses[begin:].tolist(),
-                      strict=True)
-        for stamp_ns, (x, y, theta) in list(samples):
-            if stamp_ns - self.covered_ns > self._patience_ns:
-                self._replace_silent_primary(source, stamp_ns)
-            if self.primary != source:
-                return  # the nodes of the source that replaced it are made
-            self._extend(stamp_ns, (x, y, theta))
+        self._process(self.primary, list(zip(timeline.stamps_ns[begin:].tolist(),
+                                             map(as_pose, timeline.poses[begin:]), strict=True)))
 
     def _append(self, stamp_ns: int, node: int, base: Pose, odometry: FloatArray) -> None:
         self.append(stamp_ns, node, odometry)
@@ -265,13 +251,12 @@ class HiddenNodes(NodeTable):
             return
         stream = self.streams[self.primary]
         motion = stream.timeline.motion(self._base_ns, stamp_ns)
-        mean, noise = self._since_node(stream, motion)
-        known, noise = self._corrected(mean, noise, stamp_ns)
-        node = self._make_node(NewNode(
-            known, covariance.information(noise), self.primary, stamp_ns,
-            self._moving(motion, stamp_ns)))
+        by_odometry = self._since_node(stream, motion)
+        mean, noise = self._corrected(by_odometry, stamp_ns)
+        node = self._make_node(NewNode(mean, covariance.information(noise),
+                                       self.primary, stamp_ns, self._moving(motion, stamp_ns)))
         if node >= 0:
-            self._append(stamp_ns, node, pose, se2.compose(self.odometry[-1], mean))
+            self._append(stamp_ns, node, pose, se2.compose(self.odometry[-1], by_odometry.mean))
 
     def _moving(self, motion: Motion, stamp_ns: int) -> float:
         """
@@ -285,25 +270,18 @@ class HiddenNodes(NodeTable):
             return 0.0
         return self.streams[self.primary].timeline.moving(self._base_ns, stamp_ns)
 
-    def _corrected(
-        self, mean: FloatArray, noise: FloatArray, stamp_ns: int,
-    ) -> tuple[FloatArray, FloatArray]:
+    def _corrected(self, motion: Span, stamp_ns: int) -> Span:
         """Return a motion from the newest node to a stamp [ns] that knows of its errors."""
-        if self.errors == AS_CLAIMED:
-            return mean, noise
+        if self.errors == OdometryErrors():
+            return motion
         seconds = np.array([(stamp_ns - int(self.stamps_ns[-1])) * 1e-9])
-        return (self.errors.motions(mean[None], seconds)[0],
-                self.errors.covariances(noise[None])[0])
+        return Span(self.errors.motions(motion.mean[None], seconds)[0],
+                    self.errors.covariances(motion.covariance[None])[0])
 
-    def _since_node(
-        self, stream: OdometryStream, motion: Motion, *, floor: bool = True,
-    ) -> Span:
+    def _since_node(self, stream: OdometryStream, motion: Motion, *, floor: bool = True) -> Span:
         """Return a motion from `_base_ns` on as one from the newest node, and its covariance."""
-        mean, noise = motion.increment, stream.covariance(motion, floor=floor)
-        if self._span is None:
-            return Span(mean, noise)
-        return Span(se2.compose(self._span.mean, mean),
-                    passed_on(mean, self._span.covariance, noise))
+        then = Span(motion.increment, stream.covariance(motion, floor=floor))
+        return then if self._span is None else self._span.continued(*then)
 
     def _add_secondary_edges(self) -> None:
         if len(self.streams) == 1 or not self._primaries:
@@ -381,19 +359,17 @@ class HiddenNodes(NodeTable):
         n_old = sum(after_ns < last_ns for after_ns, _ in self._primaries) - 1
         del self._primaries[:max(n_old, 0)]
 
-    def newest(
-        self, calibration: OdometryErrors = AS_CLAIMED,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def newest(self, calibration: OdometryErrors) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
         Return the motion from the newest node to the newest sample, and its covariance at its end.
 
         Third comes the newest pose of the primary source as received, shape (3,) [m, m, rad].
         `calibration` has the constant errors that the graph knows of beside `errors`.
         """
-        stream, newest_ns = self.streams[self.primary], max(
-            self.newest_ns, int(self.stamps_ns[-1]))
+        stream = self.streams[self.primary]
+        newest_ns = max(self.newest_ns, int(self.stamps_ns[-1]))
         motion, raw = stream.newest(self._base_ns)
-        mean, noise = self._corrected(*self._since_node(stream, motion, floor=False), newest_ns)
+        mean, noise = self._corrected(self._since_node(stream, motion, floor=False), newest_ns)
         moving = self._moving(motion, newest_ns)
         if moving > 0.0:
             mean = calibration.motions(mean[None], np.array([moving]))[0]

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -12,10 +11,10 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses
 from pose_graph_ros.core.graph.constraints import full, upper
-from pose_graph_ros.core.odometry.motion import Attachment
+from pose_graph_ros.core.odometry.motion import Attachment, Span
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
-from pose_graph_ros.core.saved_columns import Integers, Numbers, Rows3, Rows6
+from pose_graph_ros.core.saved_columns import Integers, Numbers, Records, Rows3
 
 
 class Place(NamedTuple):
@@ -26,19 +25,12 @@ class Place(NamedTuple):
     noise: se2.Covariance  # of that pose, in the frame of the node
 
 
-@dataclass(frozen=True, slots=True)
-class ThinnedPlaces:
-    """Nodes that have left although older ones stay, each with its place relative to another."""
-
-    # numbers of the nodes, ascending, and of those beside them
-    numbers: Integers = field(default_factory=lambda: np.empty(0, np.int64))
-    anchors: Integers = field(default_factory=lambda: np.empty(0, np.int64))
-    relative: Rows3 = field(default_factory=lambda: np.empty((0, 3)))  # poses in the anchors
-    # upper triangles of the covariances of these poses, in the frames of the nodes
-    noise: Rows6 = field(default_factory=lambda: np.empty((0, 6)))
-
-
-THINNED = np.dtype([('anchor', np.int32), ('relative', np.float32, 3), ('noise', np.float32, 6)])
+# Nodes that have left although older ones stay: their numbers, ascending, those of nodes beside
+# them, their poses in these, and the upper triangles of the covariances of these poses, in the
+# frames of the nodes.
+PLACES = np.dtype(
+    [('numbers', 'i8'), ('anchors', 'i8'), ('relative', 'f8', 3), ('noise', 'f8', 6)])
+THINNED = np.dtype([('anchors', 'i4'), ('relative', 'f4', 3), ('noise', 'f4', 6)])
 
 
 class ThinnedNodes:
@@ -68,33 +60,34 @@ class ThinnedNodes:
         more = int(np.max(rows)) + 1 - len(self._rows)
         if more > 0:
             self._rows.append(np.zeros(more, THINNED))
-            self._rows.values['anchor'][-more:] = -1
+            self._rows['anchors'][-more:] = -1
         table = self._rows.values
-        table['anchor'][rows], table['relative'][rows] = anchors, relative
+        table['anchors'][rows], table['relative'][rows] = anchors, relative
         table['noise'][rows] = upper(noise)
         self._size += len(rows)
-        passed = np.flatnonzero(np.isin(table['anchor'], numbers))
-        own, before = table[passed], table[table['anchor'][passed] - self._first]
-        mean = own['relative'].astype(float)
-        table['noise'][passed] = upper(passed_on(
-            mean, full(before['noise'].astype(float)), full(own['noise'].astype(float))))
-        table['relative'][passed] = se2.compose(before['relative'].astype(float), mean)
-        table['anchor'][passed] = before['anchor']
+        passed = np.flatnonzero(np.isin(table['anchors'], numbers))
+        own, before = table[passed], table[table['anchors'][passed] - self._first]
+        first, then = (Span(each['relative'].astype(float), full(each['noise'].astype(float)))
+                       for each in (before, own))
+        both = first.continued(*then)
+        table['relative'][passed], table['noise'][passed] = both.mean, upper(both.covariance)
+        table['anchors'][passed] = before['anchors']
 
     def place(self, number: int) -> Place | None:
         """Return the place of a node; None if it is not among these."""
         row = number - self._first
-        if not 0 <= row < len(self._rows) or self._rows.values['anchor'][row] < 0:
+        if not 0 <= row < len(self._rows) or self._rows['anchors'][row] < 0:
             return None
         anchor, mean, noise = self._rows.values[row]
         return Place(int(anchor), mean.astype(float), full(noise[None].astype(float))[0])
 
-    def places(self) -> ThinnedPlaces:
-        """Return the places of all nodes."""
-        rows = np.flatnonzero(self._rows.values['anchor'] >= 0)
-        table = self._rows.values[rows]
-        return ThinnedPlaces(rows + self._first, table['anchor'].astype(np.int64),
-                             table['relative'].astype(float), table['noise'].astype(float))
+    def places(self) -> GrowingArray:
+        """Return the places of all nodes, records of `PLACES`."""
+        rows = np.flatnonzero(self._rows['anchors'] >= 0)
+        places = np.empty(len(rows), PLACES)
+        places['numbers'] = rows + self._first
+        places[['anchors', 'relative', 'noise']] = self._rows.values[rows]
+        return GrowingArray.of(places)
 
     def drop_before(self, number: int) -> None:
         """
@@ -103,26 +96,9 @@ class ThinnedNodes:
         The anchors of the others must not be before it.
         """
         n = min(number - self._first, len(self._rows))
-        self._size -= int(np.count_nonzero(self._rows.values['anchor'][:n] >= 0))
+        self._size -= int(np.count_nonzero(self._rows['anchors'][:n] >= 0))
         self._rows.drop_first(n)
         self._first = number
-
-
-def passed_on(mean: FloatArray, first: FloatArray, then: FloatArray) -> FloatArray:
-    """
-    Return the covariances of motions to some places and on from there, in the frames at the end.
-
-    `mean` are the second motions, `first` and `then` the covariances of both.
-    """
-    adjoint = se2.adjoint(se2.inverse(mean))
-    return np.asarray(adjoint @ first @ np.swapaxes(adjoint, -1, -2) + then)
-
-
-class Span(NamedTuple):
-    """A motion from the newest node on, such as to the first stamp of a new primary source."""
-
-    mean: Numbers  # shape (3,)
-    covariance: Rows3  # in the frame at its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,11 +115,12 @@ class SavedNodes:
     base: Pose  # pose of the primary source at `base_ns`
     # motion from the newest node to `base_ns`; None if that is the stamp of the node
     bridge: Span | None
-    streams: Mapping[str, SavedStream]  # by the name of the source
+    streams: dict[str, SavedStream]  # by the name of the source
     # poses of the first nodes, which have left the graph
     frozen: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
     travelled: float = 0.0  # path length up to the first node in the graph [m]
-    thinned: ThinnedPlaces = field(default_factory=ThinnedPlaces)
+    thinned: Annotated[GrowingArray, Records(PLACES)] = field(
+        default_factory=lambda: GrowingArray((), PLACES))
     # `OdometryErrors` that the edges know of; empty in files of older versions, in which weights
     # of the edges stand for them
     errors: Numbers = field(default_factory=lambda: np.empty(0))
@@ -169,10 +146,8 @@ class NodeTable:
     """
 
     def __init__(self) -> None:
-        self._stamps = GrowingArray((), np.int64)
-        self._ids = GrowingArray((), np.int64)
-        self._frozen = GrowingArray((3,), np.float64)
-        self._odometry = GrowingArray((3,), np.float64)
+        self._stamps, self._ids = GrowingArray((), np.int64), GrowingArray((), np.int64)
+        self._frozen, self._odometry = GrowingArray((3,), float), GrowingArray((3,), float)
         self._travelled = 0.0  # path length up to the first node that is not frozen [m]
         self.thinned = ThinnedNodes()
 
@@ -232,8 +207,8 @@ class NodeTable:
         """Return poses of the nodes that are not frozen, overwritten where one was thinned out."""
         if len(self.thinned) > 0:
             thinned, first = self.thinned.places(), self.n_frozen
-            present[thinned.numbers - first] = se2.compose(
-                present[thinned.anchors - first], thinned.relative)
+            present[thinned['numbers'] - first] = se2.compose(
+                present[thinned['anchors'] - first], thinned['relative'])
         return present
 
     def attachment(self, number: int, mean: se2.PoseVector, noise: se2.Covariance) -> Attachment:
@@ -241,19 +216,16 @@ class NodeTable:
         place = self.thinned.place(number)
         if place is None:
             return Attachment(int(self.ids[number]), mean, noise)
-        return Attachment(int(self.ids[place.anchor]), se2.compose(place.mean, mean),
-                          passed_on(mean, place.noise, noise))
+        return Attachment(
+            int(self.ids[place.anchor]), *Span(place.mean, place.noise).continued(mean, noise))
 
     def has_left(self, number: int) -> bool:
         """Return whether a node has left the graph, by its number."""
         return number < self.n_frozen or self.thinned.place(number) is not None
 
-    def thin(
-        self, ids: IntArray, anchors: IntArray, relative: Poses, noise: se2.Covariances,
-    ) -> None:
-        """Let nodes leave, each with its place relative to a node that stays."""
-        self.thinned.add(np.searchsorted(self.ids, ids), np.searchsorted(self.ids, anchors),
-                         relative, noise)
+    def thin(self, ids: IntArray, anchors: IntArray, *places: FloatArray) -> None:
+        """Let nodes leave, each with its place, and its noise, relative to a node that stays."""
+        self.thinned.add(*np.searchsorted(self.ids, (ids, anchors)), *places)
 
     def move_frozen(self, T: se2.PoseVector) -> None:
         """Move the frozen poses by a rigid motion of the map."""
@@ -262,10 +234,9 @@ class NodeTable:
 
     def fill(self, saved: SavedNodes) -> None:
         """Fill this empty table."""
-        self._stamps.append(saved.stamps_ns)
-        self._ids.append(saved.ids)
-        self._odometry.append(saved.odometry)
-        self._frozen.append(saved.frozen)
+        self._stamps, self._ids, self._odometry, self._frozen = map(
+            GrowingArray.of, (saved.stamps_ns, saved.ids, saved.odometry, saved.frozen))
         self._travelled, thinned = saved.travelled, saved.thinned
         self.thinned = ThinnedNodes(self.n_frozen)
-        self.thinned.add(thinned.numbers, thinned.anchors, thinned.relative, full(thinned.noise))
+        self.thinned.add(thinned['numbers'], thinned['anchors'], thinned['relative'],
+                         full(thinned['noise']))

@@ -6,7 +6,8 @@ import bisect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
+import operator
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,13 +16,17 @@ from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometrySource
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import between_one, compose_one, FloatArray, IntArray, Pose
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.odometry import jumps, motion as mo
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
+from pose_graph_ros.core.odometry import motion as mo
 from pose_graph_ros.core.odometry.timeline import next_row, NOTHING, OdometryTimeline, Row
-from pose_graph_ros.core.quantities import StampsNs
+from pose_graph_ros.core.quantities import StampNs, StampsNs
 from pose_graph_ros.core.saved_columns import Flags, Integers, Rows8
 
+NEVER = 1 << 63  # after all stamps [ns]
 NO_TWIST: Pose = (0.0, 0.0, 0.0)
+# A sample is dropped if its stamp is farther ahead, by this and the reorder window [ns], than the
+# stamps of this number of consecutive samples that came after it.
+FAR_AHEAD_NS = 10_000_000_000
+MANY_BEHIND = 5
 LARGEST_SPEED = 1e4  # of a twist [m/s, rad/s]; a larger one is a faulty number
 
 
@@ -35,6 +40,80 @@ class Received(NamedTuple):
     twist: Pose = NO_TWIST  # (v_x, v_y, yaw rate) [m/s, m/s, rad/s], if twists are integrated
 
 
+Sample = TypeVar('Sample', Received, ms.YawRate)
+stamp_of = operator.attrgetter('stamp_ns')
+
+
+class ReorderBuffer(Generic[Sample]):
+    """
+    The samples that are not settled.
+
+    A sample is settled when it is older than the newest one by the reorder window; older samples
+    are rejected then.
+    """
+
+    def __init__(self, what: str) -> None:
+        self.n_sorted = 0  # samples that were received after newer ones and sorted in before them
+        self.n_dropped = 0  # accepted samples that were dropped later, as they were far ahead
+        self.settled_ns = -1  # stamp of the newest settled sample; -1 before the first [ns]
+        self._waiting: list[Sample] = []
+        self._what, self._window_ns = what, 0  # [ns]
+        self._n_behind = 0  # consecutive received samples that are far behind the newest one
+
+    @property
+    def newest_ns(self) -> StampNs:
+        """Stamp of the newest sample, settled or not; -1 before the first."""
+        return self._waiting[-1].stamp_ns if self._waiting else self.settled_ns
+
+    def _was_settled(self, stamp_ns: StampNs) -> bool:
+        """Tell whether there was a settled sample with a stamp."""
+        raise NotImplementedError
+
+    def _settle(self, until_ns: StampNs | None = None) -> Iterator[Sample]:
+        """
+        Settle samples one by one, and yield each.
+
+        The newest stamp to settle is by default that of the newest sample minus the window.
+        """
+        if until_ns is None:
+            until_ns = self.newest_ns - self._window_ns
+        while self._waiting and self._waiting[0].stamp_ns <= until_ns:
+            sample = self._waiting.pop(0)
+            self.settled_ns = sample.stamp_ns
+            yield sample
+
+    def _follow(self, begin: int) -> None:
+        """Do what is to be done after samples that wait have changed, from one on."""
+        raise NotImplementedError
+
+    def _insert(self, sample: Sample) -> ms.Answer:
+        """Return the answer to a sample, which is sorted in if it is accepted."""
+        samples, stamp_ns, at = self._waiting, sample.stamp_ns, len(self._waiting)
+        if not 0 < stamp_ns <= ms.LARGEST_STAMP:
+            return ms.rejected('zero_stamp' if stamp_ns <= 0 else 'no_stamp',
+                            f'expected a stamp above 0, got {stamp_ns} ns')
+        if stamp_ns <= self.settled_ns:
+            return ms.rejected(
+                'duplicate_stamp' if self._was_settled(stamp_ns) else 'out_of_order',
+                f'{self._what} at {1e-9 * stamp_ns:.3f} s after {1e-9 * self.settled_ns:.3f} s')
+        if at > 0 and stamp_ns <= samples[-1].stamp_ns:
+            at = bisect.bisect_left(samples, stamp_ns, key=stamp_of)
+            if samples[at].stamp_ns == stamp_ns:
+                return ms.rejected('duplicate_stamp',
+                                f'{self._what} at {1e-9 * stamp_ns:.3f} s came before')
+            self.n_sorted += 1
+        samples.insert(at, sample)
+        latest_ns = stamp_ns + FAR_AHEAD_NS + self._window_ns
+        self._n_behind = self._n_behind + 1 if samples[-1].stamp_ns > latest_ns else 0
+        if self._n_behind >= MANY_BEHIND:
+            kept = bisect.bisect_right(samples, latest_ns, key=stamp_of)
+            self.n_dropped += len(samples) - kept
+            del samples[kept:]
+            self._n_behind = 0
+        self._follow(at)
+        return ms.ACCEPTED
+
+
 class Instant(NamedTuple):
     """The state of a source at a sample."""
 
@@ -42,7 +121,7 @@ class Instant(NamedTuple):
     row: Row  # the sample in a frame without jumps, with its sums
     # pose of the odometry frame in the frame without jumps; None before the first jump
     offset: Pose | None
-    window: jumps.SpeedWindow  # speeds of the robot by this odometry
+    window: mo.SpeedWindow  # speeds of the robot by this odometry
     jumped: bool  # whether odometry jumped to this sample
     restarted: bool = False  # whether odometry restarted at this sample, after a graph was loaded
     twist: Pose = NO_TWIST  # as `Received.twist`
@@ -78,7 +157,7 @@ class OdometryStream(ReorderBuffer[Received]):
         self.timeline = OdometryTimeline()  # settled samples, in a frame without jumps
         self.n_jumps = 0  # number of jumps among the settled samples
         self.jump = ''  # when and how far odometry jumped last, in words
-        self._ahead: list[Instant] = []  # states at the first samples that wait
+        self._ahead: list[Instant] = []  # states at the samples that wait
         self._last: Instant | None = None  # state at the newest settled sample
         # stamp of the newest sample of a graph that was loaded; -1 if none was [ns]
         self.saved_ns = -1
@@ -103,12 +182,11 @@ class OdometryStream(ReorderBuffer[Received]):
                                   sigma_heading_distance=0.0, sigma_heading_turn=0.0)
         self._window_ns = round(source.reorder_window * 1e9)
         # samples not settled yet get the new settings, even if their states were computed before
-        self._ahead.clear()
+        self._follow()
 
     @property
     def n_jumps_seen(self) -> int:
         """Number of jumps among all samples, settled or not."""
-        self._compute_ahead()
         return self.n_jumps + sum(instant.jumped for instant in self._ahead)
 
     def add(self, sample: ms.OdometrySample) -> ms.Answer:
@@ -120,15 +198,11 @@ class OdometryStream(ReorderBuffer[Received]):
             if not all(abs(number) <= largest for number in numbers):
                 reason = 'too_large' if all(map(math.isfinite, numbers)) else 'not_finite'
                 return ms.rejected(reason, f'{what} {numbers}')
-        at = self._insert(Received(
+        return self._insert(Received(
             sample.stamp_ns, (x, y, se2.wrap_one(theta)),
             sample.speed if math.isfinite(sample.speed) else 0.0,
             None if variance is None else tuple(
                 np.nan_to_num(variance, posinf=0.0, neginf=0.0).tolist()), twist))
-        if isinstance(at, ms.Answer):
-            return at
-        del self._ahead[at:], self._ahead[len(self._waiting):]
-        return ms.ACCEPTED
 
     def _was_settled(self, stamp_ns: int) -> bool:
         stamps = self.timeline.stamps_ns
@@ -142,9 +216,8 @@ class OdometryStream(ReorderBuffer[Received]):
         What is yielded are its stamp [ns] and its pose in a frame without jumps. The newest stamp
         to settle [ns] is by default that of the newest sample minus the reorder window.
         """
-        for sample in self._settle(until_ns):
-            ahead = self._ahead.pop(0) if self._ahead else None
-            before, self._last = self._last, ahead or self._next_instant(self._last, sample)
+        for _ in self._settle(until_ns):
+            before, self._last = self._last, self._ahead.pop(0)
             if self._last.jumped and before is not None:
                 x, y, turn = between_one(before.raw, self._last.raw)
                 begin_ns, end_ns = before.row.stamp_ns, self._last.row.stamp_ns
@@ -164,11 +237,11 @@ class OdometryStream(ReorderBuffer[Received]):
 
     def forget(self, before_ns: int) -> None:
         """Drop settled samples that motions from an instant [ns] on do not depend on."""
-        self.timeline.drop_before(min(before_ns, self.settled_ns - jumps.SPEED_TIME_NS))
+        self.timeline.drop_before(min(before_ns, self.settled_ns - mo.SPEED_TIME_NS))
 
-    def first_after(self, stamp_ns: int) -> int | None:
+    def first_after(self, stamp_ns: int) -> int:
         """
-        Return the stamp of the first sample after an instant [ns], settled or not; None without.
+        Return the stamp of the first sample after an instant [ns], settled or not, or `NEVER`.
 
         Between samples at rest, of which the timeline keeps two, it is `stamp_ns + 1`.
         """
@@ -178,7 +251,7 @@ class OdometryStream(ReorderBuffer[Received]):
             # samples at rest that the timeline left out lie in between
             return stamp_ns + 1 if self.timeline.dense(at) and at > 0 else int(stamps[at])
         at = bisect.bisect_right(self._waiting, stamp_ns, key=stamp_of)
-        return self._waiting[at].stamp_ns if at < len(self._waiting) else None
+        return self._waiting[at].stamp_ns if at < len(self._waiting) else NEVER
 
     def tie_from(self, node: int, *, reached: bool) -> None:
         """
@@ -228,6 +301,7 @@ class OdometryStream(ReorderBuffer[Received]):
         self.restarted_ns = saved.restarted_ns
         self.tied, self.next_to_tie = saved.tied, saved.next_to_tie
         self.saved_ns = self.newest_ns
+        self._follow()
 
     def covariance(self, motion: mo.Motion, *, floor: bool = True) -> FloatArray:
         """
@@ -243,11 +317,10 @@ class OdometryStream(ReorderBuffer[Received]):
         With it comes the pose of that sample as received, shape (3,) [m, m, rad]. Raises
         ValueError if there are no samples, or they do not cover the instant.
         """
-        self._compute_ahead()
         last = self._ahead[-1] if self._ahead else self._last
         if last is None:
             raise ValueError('there is no odometry')
-        return self.timeline.motion_to(since_ns, last.row), np.array(last.raw)
+        return self.timeline.motion_to(since_ns, last.row.numbers), np.array(last.raw)
 
     def motion_ahead(self, since_ns: int, stamp_ns: int) -> mo.Motion | None:
         """
@@ -255,7 +328,6 @@ class OdometryStream(ReorderBuffer[Received]):
 
         None if samples do not cover that instant closely.
         """
-        self._compute_ahead()
         rows = [each.row for each in (*filter(None, [self._last]), *self._ahead)]
         after = bisect.bisect_left(rows, stamp_ns, key=lambda row: row.stamp_ns)
         if not 0 < after < len(rows):
@@ -263,15 +335,16 @@ class OdometryStream(ReorderBuffer[Received]):
         ends = OdometryTimeline(rows[after - 1:after + 1])
         if not ends.covers(stamp_ns, closely=True):
             return None
-        first = self.timeline.motion_to(since_ns, rows[after - 1])
+        first = self.timeline.motion_to(since_ns, rows[after - 1].numbers)
         last = ends.motion(rows[after - 1].stamp_ns, stamp_ns)
         return mo.Motion(
             se2.compose(first.increment, last.increment), first.distance + last.distance,
             first.turn + last.turn, first.variance + last.variance)
 
-    def _compute_ahead(self) -> None:
-        """Compute the states at all samples that are not settled."""
-        for sample in self._waiting[len(self._ahead):]:
+    def _follow(self, begin: int = 0) -> None:
+        """Compute the states at the samples that are not settled, from one on."""
+        del self._ahead[begin:]
+        for sample in self._waiting[begin:]:
             self._ahead.append(self._next_instant(
                 self._ahead[-1] if self._ahead else self._last, sample))
 
@@ -279,7 +352,7 @@ class OdometryStream(ReorderBuffer[Received]):
         """Return the state at a sample from the state at the sample before."""
         stamp_ns, raw, twist = sample.stamp_ns, sample.pose, sample.twist
         if before is None:
-            window = jumps.SpeedWindow(jumps.UNKNOWN, stamp_ns, raw)
+            window = mo.SpeedWindow(mo.UNKNOWN, stamp_ns, raw)
             return Instant(
                 raw, next_row(None, stamp_ns, raw), None, window, jumped=False, twist=twist)
         elapsed = (stamp_ns - before.row.stamp_ns) * 1e-9
@@ -288,19 +361,17 @@ class OdometryStream(ReorderBuffer[Received]):
                   else between_one(before.raw, raw))
         step = math.hypot(motion[0], motion[1]), abs(motion[2])
         # twists are not integrated over a longer gap [s]
-        jump = (integrates and elapsed > 1.0) or jumps.is_jump(
+        jump = (integrates and elapsed > 1.0) or mo.is_jump(
             before.window.speeds, step, elapsed, sample.speed, self._source.maximum_speed)
         if before.row.stamp_ns <= self.saved_ns < stamp_ns and (
-                jump or elapsed > jumps.RESUMED_WITHIN):
-            return _elsewhere(
-                before, sample, before.row.pose, jumps.RESTART_VARIANCE, restarted=True)
+                jump or elapsed > mo.RESUMED_WITHIN):
+            return _elsewhere(before, sample, before.row.pose, mo.RESTART_VARIANCE, restarted=True)
         if jump:
-            time, speeds = min(elapsed, jumps.MEMORY_TIME), before.window.speeds
+            time, speeds = min(elapsed, mo.MEMORY_TIME), before.window.speeds
             x, y, theta = speeds.velocity
             pose = compose_one(before.row.pose, (x * time, y * time, se2.wrap_one(theta * time)))
-            position, heading = (
-                (sigma + (0.0 if speeds == jumps.UNKNOWN else rate * elapsed))**2
-                for sigma, rate in zip(jumps.JUMP_SIGMA, speeds.recent, strict=True))
+            position, heading = ((sigma + (0.0 if speeds == mo.UNKNOWN else rate * elapsed))**2
+                                 for sigma, rate in zip(mo.JUMP_SIGMA, speeds.recent, strict=True))
             return _elsewhere(before, sample, pose, (position, position, heading), speeds)
         if integrates:
             pose = compose_one(before.row.pose, motion)
@@ -315,12 +386,12 @@ class OdometryStream(ReorderBuffer[Received]):
 
 def _elsewhere(
     before: Instant, sample: Received, pose: Pose, variance: mo.Variances,
-    speeds: jumps.Speeds = jumps.UNKNOWN, *, restarted: bool = False,
+    speeds: mo.Speeds = mo.UNKNOWN, *, restarted: bool = False,
 ) -> Instant:
     """Return the state at a sample from which on odometry has another origin."""
     row = next_row(before.row, sample.stamp_ns, pose, loose=variance)
     offset = compose_one(pose, between_one(sample.pose, (0.0, 0.0, 0.0)))
-    return Instant(sample.pose, row, offset, jumps.SpeedWindow(speeds, sample.stamp_ns, pose),
+    return Instant(sample.pose, row, offset, mo.SpeedWindow(speeds, sample.stamp_ns, pose),
                    jumped=True, restarted=restarted, twist=sample.twist)
 
 
@@ -340,11 +411,10 @@ def find_silence(
     while True:
         # the next sample of the primary source ends its silence
         next_ns = settled_ns if source == primary else streams[primary].first_after(last_ns)
-        until_ns = settled_ns + 1 if next_ns is None else min(next_ns, settled_ns + 1)
-        after = (streams[name].first_after(last_ns + patience_ns) for name in others)
-        known = [stamp_ns for stamp_ns in after if stamp_ns is not None and stamp_ns < until_ns]
-        if len(known) > 0:
-            return last_ns, min(known)
-        if next_ns is None or next_ns >= settled_ns:
+        known_ns = min((streams[name].first_after(last_ns + patience_ns) for name in others),
+                       default=NEVER)
+        if known_ns < min(next_ns, settled_ns + 1):
+            return last_ns, known_ns
+        if next_ns >= settled_ns:
             return None
         last_ns = next_ns

@@ -9,7 +9,7 @@ on. Time has moved on then (a silence has ended), or begins again (a bag that is
 a simulation that is reset). Only messages that are usable otherwise are shown to it.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,10 +59,10 @@ class _Watch:
 class TimeKeeper:
     """Keeps the time of the robot."""
 
-    def __init__(self, odometry: Sequence[str], threshold_ns: StampNs) -> None:
+    def __init__(self, odometry: list[str], threshold_ns: StampNs) -> None:
         self.threshold_ns = threshold_ns
         self._odometry = list(odometry)
-        self._watches: dict[str, _Watch] = {}
+        self._watches = defaultdict[str, _Watch](_Watch)
         self._since_ns = 0
 
     @property
@@ -74,7 +74,7 @@ class TimeKeeper:
     def clock(self) -> tuple[str, int]:
         """The odometry that others are compared with, and its newest stamp [ns]; 0 for none."""
         return next(((name, self._watches[name].newest_ns) for name in self._odometry
-                     if name in self._watches and self._watches[name].newest_ns > 0), ('', 0))
+                     if self._watches[name].newest_ns > 0), ('', 0))
 
     @property
     def in_doubt(self) -> bool:
@@ -88,8 +88,8 @@ class TimeKeeper:
 
     def shift(self, source: str, by_ns: int) -> None:
         """Add an offset [ns] to the stamps of a source, as all from now on have it."""
-        watch = self._watches.get(source)
-        if watch is not None and watch.newest_ns > 0:
+        watch = self._watches[source]
+        if watch.newest_ns > 0:
             watch.set_present(max(watch.newest_ns + by_ns, 1))
 
     def judge(self, source: str, measurement: OdometrySample | Measurement) -> Judgement:
@@ -97,7 +97,7 @@ class TimeKeeper:
         stamp_ns = measurement.stamp_ns
         if stamp_ns <= 0 or not isinstance(measurement, OdometrySample | YawRate):
             return PRESENT  # the engine refuses stamps of zero, and waits for odometry
-        watch, now_ns = self._watches.setdefault(source, _Watch()), self.now_ns
+        watch, now_ns = self._watches[source], self.now_ns
         if source not in self._odometry:
             # it tells no time, and is judged by odometry and by what it sent before
             known = [each for each in (now_ns, watch.newest_ns) if each > 0]
@@ -105,7 +105,7 @@ class TimeKeeper:
                 return Judgement(self._refusal(source, stamp_ns))
             watch.newest_ns = stamp_ns
             return PRESENT
-        if self._is_ahead(source, watch, stamp_ns):
+        if self._is_ahead(source, stamp_ns):
             return Judgement(self._refusal(source, stamp_ns))
         own_ns = watch.newest_ns
         earliest_ns = own_ns - self.threshold_ns if own_ns > 0 else now_ns - LATEST_NS
@@ -114,13 +114,11 @@ class TimeKeeper:
             self._since_ns = stamp_ns if now_ns == 0 else self._since_ns
             watch.set_present(max(own_ns, stamp_ns))
             return PRESENT
-        return self._judge_other_time(source, watch, stamp_ns, earliest_ns, now_ns)
+        return self._judge_other_time(source, stamp_ns, earliest_ns)
 
-    def _judge_other_time(
-        self, source: str, watch: _Watch, stamp_ns: int, earliest_ns: int, now_ns: int,
-    ) -> Judgement:
+    def _judge_other_time(self, source: str, stamp_ns: int, earliest_ns: int) -> Judgement:
         """Judge a stamp of odometry that is before the earliest one of the present, or ahead."""
-        others_ns = self._newest_but(source)
+        watch, now_ns, others_ns = self._watches[source], self.now_ns, self._newest_but(source)
         if watch.n_apart == 0 or not 0 < stamp_ns - watch.last_ns <= APART_NS:
             watch.n_apart, watch.first_ns, watch.others_ns = 0, stamp_ns, others_ns
         watch.n_apart, watch.last_ns = watch.n_apart + 1, stamp_ns
@@ -135,7 +133,8 @@ class TimeKeeper:
         if is_evidence and (decides or watch.newest_ns > 0):
             begins_again = stamp_ns < earliest_ns
             if decides or begins_again:
-                self._watches, self._since_ns = {source: watch}, watch.first_ns
+                self._watches.clear()
+                self._watches[source], self._since_ns = watch, watch.first_ns
             watch.set_present(stamp_ns)
             return Judgement(jump_ns=now_ns - watch.first_ns) if begins_again else PRESENT
         watch.in_doubt = stamp_ns < earliest_ns and (decides or watch.newest_ns > 0)
@@ -144,9 +143,9 @@ class TimeKeeper:
         watch.passed_ns = max(watch.passed_ns, stamp_ns)
         return PRESENT
 
-    def _is_ahead(self, source: str, watch: _Watch, stamp_ns: int) -> bool:
+    def _is_ahead(self, source: str, stamp_ns: int) -> bool:
         """Tell whether a stamp is ahead of preferred odometry while that is not silent."""
-        clock, clock_ns = self.clock
+        watch, (clock, clock_ns) = self._watches[source], self.clock
         if clock == '' or self._odometry.index(clock) >= self._odometry.index(source):
             return False
         if clock_ns != watch.clock_ns:
@@ -154,8 +153,8 @@ class TimeKeeper:
         return stamp_ns - clock_ns > LATEST_NS >= stamp_ns - watch.since_ns
 
     def _newest_but(self, source: str) -> int:
-        return max((self._watches[name].newest_ns for name in self._odometry
-                    if name in self._watches and name != source), default=0)
+        return max((self._watches[name].newest_ns for name in self._odometry if name != source),
+                   default=0)
 
     def _refusal(self, source: str, stamp_ns: int) -> Answer:
         other, clock_ns = self.clock

@@ -11,7 +11,8 @@ import numpy as np
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Pose, wrap_one
-from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, Variances
+from pose_graph_ros.core.odometry import motion as mo
+from pose_graph_ros.core.odometry.motion import Motion, NO_MOTION, NO_VARIANCE, Span, Variances
 from pose_graph_ros.core.quantities import StampNs, StampsNs
 
 # Motions below both of these are not added to path length and turns: odometry jitters at rest,
@@ -40,6 +41,11 @@ class Row(NamedTuple):
     counted_ns: int  # stamp of `counted`, or a later one up to which the robot stood still [ns]
     # sums of the variances since then; they are added to `variance` once the robot moves
     held: Variances
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Pose and sums, shape (8,)."""
+        return np.array((*self.pose, self.distance, self.turn, *self.variance))
 
 
 def next_row(
@@ -184,31 +190,43 @@ class OdometryTimeline:
         resting: bool,
     ) -> None:
         """Fill this empty timeline with the result of `thinned`."""
-        self._stamps.append(stamps_ns)
-        self._samples.append(rows[:, :5])
+        self._stamps, self._samples, self._dense = map(
+            GrowingArray.of, (stamps_ns, rows[:, :5], dense))
         if np.any(rows[:, 5:]):
             self._variances.append(rows[:, 5:])
-        self._dense.append(dense)
         self._last, self.resting = last, resting
 
     def motion(self, start_ns: StampNs, end_ns: StampNs) -> Motion:
         """Return the motion between two instants; raise ValueError if one is not covered."""
         if start_ns > end_ns:
             raise ValueError(f'expected start <= end, got {start_ns} and {end_ns}')
-        start, start_variance = self._at(start_ns)
-        if start_ns == end_ns:
-            return NO_MOTION
-        end, end_variance = self._at(end_ns)
-        return Motion(se2.between(start[:3], end[:3]), float(end[3] - start[3]),
-                      float(end[4] - start[4]),
-                      end[5:] - start[5:] + start_variance + end_variance)
+        motion = self.motion_to(start_ns, *self.at(end_ns))
+        return NO_MOTION if start_ns == end_ns else motion
 
-    def motion_to(self, start_ns: StampNs, end: Row) -> Motion:
-        """Return the motion from an instant to a row that may not be in the timeline yet."""
-        start, start_variance = self._at(start_ns)
-        return Motion(se2.between(start[:3], np.array(end.pose)), float(end.distance - start[3]),
-                      float(end.turn - start[4]),
-                      np.array(end.variance) - start[5:] + start_variance)
+    def motion_to(self, start_ns: int, end: FloatArray, more: FloatArray = NO_VARIANCE) -> Motion:
+        """Return the motion from an instant to `Row.numbers` that may not be in the timeline."""
+        start, start_variance = self.at(start_ns)
+        return Motion(se2.between(start[:3], end[:3]), float(end[3] - start[3]),
+                      float(end[4] - start[4]), end[5:] - start[5:] + start_variance + more)
+
+    def gap_motion(self, last_ns: StampNs, until_ns: StampNs, saved_ns: StampNs) -> Span:
+        """
+        Return the estimated motion during a gap in odometry.
+
+        The robot is assumed to keep its mean speed, for at most `MEMORY_TIME`. After a long gap at
+        the end of a loaded graph it is assumed to stand where it was.
+        """
+        if last_ns <= saved_ns and until_ns - last_ns > mo.RESUMED_WITHIN * 1e9:
+            return Span(np.zeros(3), np.diag(mo.RESTART_VARIANCE))
+        begin_ns = max(int(self.stamps_ns[0]), last_ns - mo.SPEED_TIME_NS)
+        motion, time = self.motion(begin_ns, last_ns), (last_ns - begin_ns) * 1e-9
+        elapsed = (until_ns - last_ns) * 1e-9
+        ratio = elapsed / time if time > 0.0 else 0.0
+        position, heading = mo.JUMP_SIGMA
+        position += motion.distance * ratio
+        sigma = np.array((position, position, heading + motion.turn * ratio))
+        mean = motion.increment * min(ratio, mo.MEMORY_TIME / time if time > 0.0 else 0.0)
+        return Span(se2.wrapped(mean), np.diag(sigma**2))
 
     def rests(self, start_ns: StampNs, end_ns: StampNs) -> list[tuple[int, int]]:
         """
@@ -239,7 +257,7 @@ class OdometryTimeline:
 
         Raises ValueError if the instant is not covered.
         """
-        return self._at(stamp_ns)[0][:3]
+        return self.at(stamp_ns)[0][:3]
 
     def _rows(self, which: int | slice | BoolArray) -> FloatArray:
         """Return some samples with their sums, shape (..., 8)."""
@@ -250,14 +268,14 @@ class OdometryTimeline:
             rows[..., 5:] = self._variances.values[which]
         return rows
 
-    def _at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Return the interpolated row at an instant, and the variance of interpolation, (3,)."""
+    def at(self, stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return interpolated `Row.numbers`, and the variance of the interpolation, shape (3,)."""
         if not self.covers(stamp_ns):
             raise ValueError(f'no odometry at {stamp_ns}')
         stamps = self._stamps.values
         after = int(np.searchsorted(stamps, stamp_ns))
         if stamps[after] == stamp_ns:
-            return self._rows(after), np.zeros(3)
+            return self._rows(after), NO_VARIANCE
         before = after - 1
         start, end = int(stamps[before]), int(stamps[after])
         fraction = (stamp_ns - start) / (end - start)

@@ -18,7 +18,6 @@ the graph, its prior holds what is known of the first one that stays.
 A chain is a value: an update that fails leaves the old one.
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass, field
 import math
 from typing import Final, NamedTuple, Self
@@ -29,9 +28,7 @@ from pose_graph_ros.core.config import GyroSource, OdometrySource
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
-from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
-from pose_graph_ros.core.odometry.hidden_nodes import NewNode
-from pose_graph_ros.core.odometry.motion import as_calibrated
+from pose_graph_ros.core.graph.graph import GraphUpdate, NextIds
 from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -138,9 +135,8 @@ class Additions:
     n_factors: int = 0
 
     def update(self) -> GraphUpdate:
-        return GraphUpdate(
-            biases=np.array(self.biases).reshape(-1, 3), dimensions=self.dimensions,
-            factors=Factors.joined(self.factors), remove=self.remove)
+        return GraphUpdate(biases=np.array(self.biases).reshape(-1, 3), dimensions=self.dimensions,
+                           factors=Factors.joined(self.factors), remove=self.remove)
 
     def add(self, factors: Factors) -> IntArray:
         """Add factors; return their ids."""
@@ -216,9 +212,9 @@ class BiasChain:
         end = len(self) - 1 if oldest_ns is None else self.at(oldest_ns)
         return self.nodes[:max(end, 0)].tolist()
 
-    def without(self, nodes: Collection[int]) -> 'BiasChain':
+    def without(self, nodes: IntArray) -> 'BiasChain':
         """Return the chain without states that have left the graph, the oldest ones."""
-        kept = ~np.isin(self.nodes, [*nodes])
+        kept = ~np.isin(self.nodes, nodes)
         if np.all(kept):
             return self
         left, ties = self.nodes[kept], self.ties[kept]
@@ -227,38 +223,24 @@ class BiasChain:
         return BiasChain(self.begins_ns[kept], left, ties, anchor, self.bin_ns)
 
 
-def next_node(
-    made: NewNode, chain: BiasChain, process: Process, graph: Graph,
-) -> tuple[GraphUpdate, BiasChain]:
+def held_by_bias(queued: Queued, chain: BiasChain, errors: CorrelatedErrors | None) -> Factors:
     """
-    Return an update with a node behind the newest one by calibrated odometry, and the chain then.
+    Return the edge from a hidden node x to the state of the bias that holds a measurement.
 
-    The edge to the node is its last factor.
-    """
-    assert made.information is not None, 'it is not the first one'
-    first, last = graph.next_ids, graph.newest_pose
-    additions = Additions(first._replace(node=first.node + 1))  # the pose is before them
-    value = graph.poses_of(chain.nodes[-1]) if len(chain) > 0 else np.zeros(3)
-    chain = chain.with_bins(np.array([made.stamp_ns]), process, additions, value)
-    edge = Factors([last], [first.node], made.mean[None], made.information[None],
-                   [FactorKind.ODOMETRY], constants=[(0.0, 0.0, 0.0, -made.moving)], k=[0])
-    motion = as_calibrated(edge, value[None]).mean
-    additions.add(edge.replaced(k=[chain.state(made.stamp_ns)]))
-    return additions.update()._replace(hidden=se2.compose(graph.poses_of(last), motion)), chain
-
-
-def biased_constraint(
-    observed: Factors, noise: FloatArray, bias: int, phi: float, errors: CorrelatedErrors,
-) -> Factors:
-    """
-    Return the edge from a hidden node x to a state of the bias that holds a measurement.
+    That is the last one before it; where there is none, the edge leads to -1.
 
     The error of the edge in map axes is `f m + z - x * o`. o is the motion since the node and the
     lever arm; z is the measured pose; f is the standard deviation of the correlated part, from the
     mean of the variances of x and y. m is phi times the state plus a white rest of variance
-    1 - phi^2. `observed` is the measurement if its error were white, `noise` what the motion since
-    the node adds to the variances of its position and heading [m^2, rad^2].
+    1 - phi^2. What is queued is the measurement if its error were white.
     """
+    observed, noise, bias, phi = queued.factor, queued.noise, -1, 1.0
+    at = chain.at(queued.stamp_ns)
+    if errors is None or at < 0:
+        errors = WHITE
+    else:
+        gap_ns = abs(queued.stamp_ns - int(chain.begins_ns[at]) - chain.bin_ns / 2)
+        bias, phi = int(chain.nodes[at]), math.exp(-gap_ns * 1e-9 / errors.tau)
     mean, offset = observed.mean[0].copy(), observed.offset[0]
     kind, given, information = observed.kind[0], observed.information[0], np.zeros((3, 3))
     rows = np.flatnonzero(np.diagonal(given) > 0.0)  # what is measured: position, heading or both
@@ -282,15 +264,3 @@ def biased_constraint(
         mean[2] = se2.wrap(mean[2] - offset[2])
     return Factors([observed.i[0]], [bias], [mean], [information], [FactorKind.BIAS],
                    weight=observed.weight, constants=[(offset[0], offset[1], *factors)])
-
-
-def held_by_bias(
-    queued: Queued, chain: BiasChain | None, errors: CorrelatedErrors | None,
-) -> Factors:
-    """Return the edge of a measurement to the last state before it; to -1 if there is none."""
-    at = -1 if chain is None else chain.at(queued.stamp_ns)
-    if chain is None or errors is None or at < 0:
-        return biased_constraint(queued.factor, queued.noise, -1, 1.0, WHITE)
-    gap_ns = abs(queued.stamp_ns - int(chain.begins_ns[at]) - chain.bin_ns / 2)
-    return biased_constraint(queued.factor, queued.noise, int(chain.nodes[at]),
-                             math.exp(-gap_ns * 1e-9 / errors.tau), errors)

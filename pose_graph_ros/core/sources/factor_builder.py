@@ -5,19 +5,20 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.config import BackendConfig, MeasurementSource, OdometrySource
+from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import Covariance, IntArray
-from pose_graph_ros.core.graph.constraints import Factors
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
 from pose_graph_ros.core.graph.reweighting import Reweighting
-from pose_graph_ros.core.measurements import GlobalPose, LoopClosure, PoseMeasurement
+from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import NewNode
-from pose_graph_ros.core.odometry.motion import AS_CLAIMED, OdometryErrors
+from pose_graph_ros.core.odometry.motion import as_calibrated, AS_CLAIMED, OdometryErrors
 from pose_graph_ros.core.saved_columns import Records
 from pose_graph_ros.core.sources import bias as bs, source_report
 from pose_graph_ros.core.sources.queued import Queued
@@ -77,29 +78,6 @@ class SourceState:
         return np.where(some['held_by'] >= 0, some['held_by'], some['id'])
 
 
-class Origin(NamedTuple):
-    """The measurement that a constraint was made from, or the bin of a bias."""
-
-    source: str
-    stamp_ns: int  # [ns]; -1 for an edge between poses
-
-
-class NewConstraint(NamedTuple):
-    """A constraint in the update that was built last."""
-
-    number: int  # its id
-    source: str
-    stamp_ns: int  # of the measurement [ns]; -1 for an edge of odometry
-    kind: type[PoseMeasurement]  # `LoopClosure` for all edges between poses
-    reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
-    held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
-
-    @property
-    def held(self) -> int:
-        """Id of the factor that holds it."""
-        return self.held_by if self.held_by >= 0 else self.number
-
-
 class FactorBuilder:
     """
     Builds updates of the graph from queues of constraints.
@@ -114,9 +92,9 @@ class FactorBuilder:
         self.config = config    # for later updates; error models keep their own settings
         self._reweighting = reweighting
         self.sources: dict[str, SourceState] = {}
-        self.new: list[NewConstraint] = []  # constraints of the update that was built last
-        # what it was built from, as far as a source keeps it, and the chains that it makes
-        self._queued: list[Queued] = []
+        # constraints of the update that was built last, as far as a source keeps them, and the
+        # chains that it makes
+        self.new: list[Queued] = []
         self._chains: dict[str, bs.BiasChain] = {}
         self._abandoned: list[int] = []  # ids of biases that hold no measurement any more
         # of each source the newest report, and the number of measurements when it was made, 0 if
@@ -127,8 +105,8 @@ class FactorBuilder:
         """Return the update that adds a queue to the graph, to be followed by `commit`."""
         additions = bs.Additions(graph.next_ids)
         queue = sorted(queue, key=_order)
-        self._chains = self._with_bins(queue, graph, additions)
-        self.new, self._queued = [], []
+        self._extend_chains(queue, graph, additions)
+        self.new = []
         for queued in queue:
             source, factor, edge = queued.source, queued.factor, None
             errors = self._errors(queued) if queued.is_in_map else None
@@ -142,16 +120,12 @@ class FactorBuilder:
             number = int(additions.add(factor if edge is None else factor.replaced(weight=0.0))[0])
             if len(queued.nodes) == 0:
                 continue    # it has a say on the bias alone
-            self._queued.append(queued)
-            self.new.append(NewConstraint(
-                number, source, queued.stamp_ns, queued.measured, queued.reference_ns,
-                -1 if edge is None else int(additions.add(edge)[0])))
+            self.new.append(queued._replace(
+                number=number, held_by=-1 if edge is None else int(additions.add(edge)[0])))
         return additions.update()
 
-    def _with_bins(
-        self, queue: Sequence[Queued], graph: Graph, additions: bs.Additions,
-    ) -> dict[str, bs.BiasChain]:
-        """Return the chains of sources with the states that a queue needs, which are added."""
+    def _extend_chains(self, queue: list[Queued], graph: Graph, additions: bs.Additions) -> None:
+        """Make the chains of sources with the states that a queue needs, which are added."""
         needed: dict[tuple[str, bs.Process], list[Queued]] = {}
         for queued in queue:
             errors = self._errors(queued) if queued.is_in_map else None
@@ -162,39 +136,54 @@ class FactorBuilder:
             else:
                 continue
             needed.setdefault((queued.source, process), []).append(queued)
-        chains = dict[str, bs.BiasChain]()
+        chains = self._chains = {}
         for (source, process), some in needed.items():
-            known, value = chains.get(source, self._state(source).bias), np.zeros(3)
-            chain = bs.BiasChain() if known is None else known
+            chain = chains.get(source) or self._state(source).bias or bs.BiasChain()
+            value = np.zeros(3)
             if len(process.growth) > 0 and len(chain) > 0:
                 value = graph.poses_of(chain.nodes[-1])
             elif len(process.growth) > 0:
                 value = next((each.factor.mean[0] for each in some if len(each.nodes) == 0), value)
             stamps_ns = np.array([each.stamp_ns for each in some])
             chains[source] = chain.with_bins(stamps_ns, process, additions, value)
-        return chains
 
     def next_node(self, made: NewNode, graph: Graph) -> tuple[GraphUpdate, bs.BiasChain]:
-        """Return an update with a node by calibrated odometry, and the chain, for `keep`."""
+        """
+        Return an update with a node behind the newest one by calibrated odometry.
+
+        The edge to the node is its last factor. With it comes the chain, for `keep`.
+        """
+        assert made.information is not None, 'it is not the first one'
+        first, last = graph.next_ids, graph.newest_pose
+        additions = bs.Additions(first._replace(node=first.node + 1))  # the pose is before them
+        chain, value = self._state(made.source).bias or bs.BiasChain(), np.zeros(3)
+        if len(chain) > 0:
+            value = graph.poses_of(chain.nodes[-1])
         process = bs.Process.of_odometry(self.config.odometry_source(made.source))
-        return bs.next_node(made, self._state(made.source).bias or bs.BiasChain(), process, graph)
+        chain = chain.with_bins(np.array([made.stamp_ns]), process, additions, value)
+        edge = Factors([last], [first.node], made.mean[None], made.information[None],
+                       [FactorKind.ODOMETRY], constants=[(0.0, 0.0, 0.0, -made.moving)], k=[0])
+        motion = as_calibrated(edge, value[None]).mean
+        additions.add(edge.replaced(k=[chain.state(made.stamp_ns)]))
+        hidden = se2.compose(graph.poses_of(last), motion)
+        return additions.update()._replace(hidden=hidden), chain
 
     def keep(self, source: str, chain: bs.BiasChain) -> None:
         """Keep the chain of an update that the graph has taken."""
         self.sources.setdefault(source, SourceState()).bias = chain
 
     def commit(self) -> None:
-        for queued, new in zip(self._queued, self.new, strict=True):
+        for new in self.new:
             state = self.sources.setdefault(new.source, SourceState())
-            if new.kind is LoopClosure:
+            if new.measured is LoopClosure:
                 state.edges.append_one((new.stamp_ns, new.number))
             else:
                 state.measured.append_one(
-                    (new.stamp_ns, new.number, new.held_by, queued.noise.tolist()))
-            if queued.needs_bias:
+                    (new.stamp_ns, new.number, new.held_by, new.noise.tolist()))
+            if new.needs_bias:
                 continue    # a rotation has no loss
             odometry = self.config.odometry.get(new.source) if new.stamp_ns < 0 else None
-            settings = odometry or self._settings(new.source, new.kind)
+            settings = odometry or self._settings(new.source, new.measured)
             loss = (settings.loss if isinstance(settings, OdometrySource)
                     else settings.applied_loss)
             threshold = settings.rejection_threshold
@@ -205,9 +194,7 @@ class FactorBuilder:
         for source, chain in self._chains.items():
             self.keep(source, chain)
 
-    def _settings(
-        self, source: str, kind: type[PoseMeasurement] = GlobalPose,
-    ) -> MeasurementSource:
+    def _settings(self, source: str, kind: type = GlobalPose) -> MeasurementSource:
         return self.config.measurement_source(source, kind)
 
     def _state(self, source: str) -> SourceState:
@@ -226,7 +213,8 @@ class FactorBuilder:
 
     def preview(self, queued: Queued) -> Factors:
         """Return a measurement as an edge to the last state of the bias before it, or to -1."""
-        return bs.held_by_bias(queued, self._state(queued.source).bias, self._errors(queued))
+        chain = self._state(queued.source).bias or bs.BiasChain()
+        return bs.held_by_bias(queued, chain, self._errors(queued))
 
     def errors_in_use(self, source: str) -> bs.CorrelatedErrors | None:
         """Return the statistics of the errors of a source in use; None for white errors."""
@@ -319,23 +307,23 @@ class FactorBuilder:
         self._abandoned = [node for node in self._abandoned if node not in gone]
         return {source: state.forget(nodes, factors) for source, state in self.sources.items()}
 
-    def origin(self, number: int) -> Origin | None:
-        """Return where a constraint comes from; None if this builder has not added it."""
+    def origin(self, number: int) -> tuple[str, int]:
+        """Return the source of a constraint, '' if unknown, and the stamp of its measurement."""
         for source, state in self.sources.items():
             some = state.measured.values
             for row in some[(some['id'] == number) | (some['held_by'] == number)]:
-                return Origin(source, int(row['stamp_ns']))
+                return source, int(row['stamp_ns'])
             if number in state.edges['id']:
-                return Origin(source, -1)
-        return None
+                return source, -1
+        return '', -1
 
-    def bias_origin(self, node: int) -> Origin | None:
-        """Return the source of a bias, by its id, and when its bin begins."""
+    def bias_origin(self, node: int) -> tuple[str, int]:
+        """Return the source of a bias, by its id, '' if unknown, and when its bin begins."""
         for source, state in self.sources.items():
             if state.bias is not None and node in state.bias.nodes:
                 at = np.flatnonzero(state.bias.nodes == node)[0]
-                return Origin(source, int(state.bias.begins_ns[at]))
-        return None
+                return source, int(state.bias.begins_ns[at])
+        return '', -1
 
     def saved(self) -> dict[str, SourceState]:
         """Return a copy of the state of each source."""
@@ -354,9 +342,8 @@ class FactorBuilder:
                 continue
             settings = self._settings(source)
             errors = state.errors if settings.finds_correlation else _given(settings)
-            wanted_ns, bin_ns = (
-                0 if errors is None else bs.Process.correlated(errors).bin_ns,
-                0 if state.bias is None else state.bias.bin_ns)
+            wanted_ns, bin_ns = (0 if errors is None else bs.Process.correlated(errors).bin_ns,
+                                 0 if state.bias is None else state.bias.bin_ns)
             found = state.errors is not None
             if bin_ns != wanted_ns or found > settings.finds_correlation:
                 self.sources[source] = SourceState(

@@ -10,7 +10,7 @@ make no hidden nodes, and a constraint depends neither on the order of arrival n
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 import zlib
 
 import numpy as np
@@ -23,16 +23,7 @@ from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.motion import Attachment
 from pose_graph_ros.core.sources import validation
-from pose_graph_ros.core.sources.beacons import Beacons, WaitingRange
 from pose_graph_ros.core.sources.queued import Queued
-
-
-class Target(Protocol):
-    """Where constraints go, and what they are attached to."""
-
-    nodes: HiddenNodes
-    queue: list[Queued]
-    beacons: Beacons
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,9 +36,9 @@ class MeasurementKind:
 
     numbers: Callable[[Any], FloatArray]  # that must be valid coordinates
     # what is left of it with a valid covariance, or why it is rejected
-    check: Callable[[Any, CovariancePolicy], validation.Validated | ms.Answer]
-    # hands its constraint over, given its source and how its stamp is attached
-    attach: Callable[[Any, str, Attachment, Target], ms.Answer]
+    check: Callable[[Any, CovariancePolicy], validation.Checked]
+    # its constraint, given its source, how its stamp is attached, and the nodes
+    constraint: Callable[[Any, str, Attachment, HiddenNodes], Queued | ms.Answer]
     # what it says of the robot in the map; None if that is nothing, or not valid
     in_map: Callable[[Any], ms.Absolute | None] = lambda measurement: measurement
     # of those in the map, the observed node, and the variances of position and heading that the
@@ -57,9 +48,7 @@ class MeasurementKind:
     key: Callable[[Any], int] = lambda _: 0
 
 
-def validate(
-    measurement: ms.PoseMeasurement, policy: CovariancePolicy,
-) -> validation.Validated | ms.Answer:
+def validate(measurement: ms.PoseMeasurement, policy: CovariancePolicy) -> validation.Checked:
     """Return a measurement without what it has no information on, or why it is rejected."""
     kind, name = KINDS[type(measurement)], type(measurement).__name__
     numbers = kind.numbers(measurement)
@@ -105,21 +94,22 @@ def _before_window(stamp_ns: int, nodes: HiddenNodes) -> ms.Answer:
                        f'{1e-9 * nodes.last_frozen_ns:.3f} s')
 
 
-def _observe(given: ms.Absolute, source: str, at: Attachment, to: Target) -> ms.Answer:
-    to.queue.append(observed(source, given, at))
-    return ms.ACCEPTED
+def _observe(given: ms.Absolute, source: str, at: Attachment, _: HiddenNodes) -> Queued:
+    return observed(source, given, at)
 
 
-def _observe_fix(fix: ms.Fix, source: str, at: Attachment, to: Target) -> ms.Answer:
+def _observe_fix(fix: ms.Fix, source: str, at: Attachment, _: HiddenNodes) -> Queued | ms.Answer:
     # the last step: only a fix that nothing else is wrong with may become the datum
     position = fix.placed()
     if (defect := ms.value_defect(position.position)) is not None:
         return ms.rejected(defect, f'Fix: {position.position.tolist()} m from the datum')
-    return _observe(position, source, at, to)
+    return observed(source, position, at)
 
 
-def _join(closure: ms.LoopClosure, source: str, at: Attachment, to: Target) -> ms.Answer:
-    nodes, node, reference_ns = to.nodes, closure.reference_node, closure.reference_ns
+def _join(
+    closure: ms.LoopClosure, source: str, at: Attachment, nodes: HiddenNodes,
+) -> Queued | ms.Answer:
+    node, reference_ns = closure.reference_node, closure.reference_ns
     if reference_ns is not None:
         reference = attach(nodes, reference_ns)
     elif node is None or not 0 <= node < len(nodes):
@@ -132,21 +122,18 @@ def _join(closure: ms.LoopClosure, source: str, at: Attachment, to: Target) -> m
         return reference
     if reference.node == at.node:
         return ms.rejected('same_node', f'both ends are attached to hidden node {at.node}')
-    to.queue.append(Queued(
-        source, loop_closure_constraint(closure, reference, at), closure.stamp_ns,
-        reference_ns))
-    return ms.ACCEPTED
+    edge = loop_closure_constraint(closure, reference, at)
+    return Queued(source, edge, closure.stamp_ns, reference_ns)
 
 
-def _reach(given: ms.Range, source: str, at: Attachment, to: Target) -> ms.Answer:
+def _reach(given: ms.Range, source: str, at: Attachment, _: HiddenNodes) -> Queued:
     variance = given.variance + swept_variance(given, at)
     antenna = se2.compose(at.motion, np.append(given.lever_arm, 0.0))
     edge = Factors(     # to a landmark that there need not be yet
         [at.node], [-1], [(given.distance, 0.0, 0.0)],
         [np.diag((1.0 / variance, 0.0, 0.0))], [FactorKind.RANGE],
         constants=[(antenna[0], antenna[1], 0.0, 0.0)])
-    to.beacons.add(WaitingRange(Queued(source, edge, given.stamp_ns), given))
-    return ms.ACCEPTED
+    return Queued(source, edge, given.stamp_ns)
 
 
 # --- their constraints
@@ -164,26 +151,23 @@ def _observed_position(given: ms.Position, at: Attachment) -> tuple[Factors, Flo
     variance, information = swept_variance(given, at), np.zeros((3, 3))
     information[:2, :2] = covariance.information(given.covariance + variance * np.eye(2))
     offset = se2.compose(at.motion, np.append(given.lever_arm, 0.0))
-    return Factors.on(
-        [at.node], [offset], [np.append(given.position, 0.0)], [information],
-        [FactorKind.POSITION]), np.array((variance, 0.0))
+    return Factors.on([at.node], [offset], [np.append(given.position, 0.0)],
+                      [information], [FactorKind.POSITION]), np.array((variance, 0.0))
 
 
 def _observed_heading(given: ms.HeadingOnly, at: Attachment) -> tuple[Factors, FloatArray]:
     variance, information = float(at.noise[2, 2]), np.zeros((3, 3))
     information[2, 2] = 1.0 / (given.variance + variance)
-    return Factors.on(
-        [at.node], [at.motion], [(0.0, 0.0, given.heading)], [information],
-        [FactorKind.HEADING]), np.array((0.0, variance))
+    return Factors.on([at.node], [at.motion], [(0.0, 0.0, given.heading)],
+                      [information], [FactorKind.HEADING]), np.array((0.0, variance))
 
 
 def _observed_pose(given: ms.GlobalPose, at: Attachment) -> tuple[Factors, FloatArray]:
     noise, pose = at.noise, given.pose
     information = covariance.information(    # (3.51)-(3.53)
         covariance.turned(given.covariance, float(pose[2])) + noise)
-    return Factors.on(
-        [at.node], [at.motion], [pose], [information], [FactorKind.GLOBAL_POSE],
-        ), np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
+    return Factors.on([at.node], [at.motion], [pose], [information], [
+        FactorKind.GLOBAL_POSE]), np.array((np.linalg.eigvalsh(noise[:2, :2])[-1], noise[2, 2]))
 
 
 def swept_variance(measurement: ms.Position | ms.Range, attachment: Attachment) -> float:
@@ -199,9 +183,7 @@ def swept_variance(measurement: ms.Position | ms.Range, attachment: Attachment) 
     return float(np.linalg.eigvalsh(jacobian @ attachment.noise @ jacobian.T)[-1])
 
 
-def loop_closure_constraint(
-    measurement: ms.LoopClosure, reference: Attachment, attachment: Attachment,
-) -> Factors:
+def loop_closure_constraint(given: ms.LoopClosure, first: Attachment, at: Attachment) -> Factors:
     """
     Return the edge of a loop closure between the hidden nodes before its two stamps.
 
@@ -210,17 +192,16 @@ def loop_closure_constraint(
     T_j, an error at its start by that of T_j z^-1. If the variances of x and y are infinite, the
     edge constrains the headings alone.
     """
-    z = measurement.pose
-    mean = se2.compose(se2.compose(reference.motion, z), se2.inverse(attachment.motion))
-    if not np.isfinite(measurement.covariance[0, 0]):
+    z = given.pose
+    mean = se2.compose(se2.compose(first.motion, z), se2.inverse(at.motion))
+    if not np.isfinite(given.covariance[0, 0]):
         information = np.zeros((3, 3))
         information[2, 2] = 1.0 / float(
-            measurement.covariance[2, 2] + attachment.noise[2, 2] + reference.noise[2, 2])
+            given.covariance[2, 2] + at.noise[2, 2] + first.noise[2, 2])
     else:
         information = covariance.information(closure_covariance(
-            covariance.turned(measurement.covariance, float(z[2])), z, reference, attachment))
-    return Factors([reference.node], [attachment.node], [mean], [information],
-                   [FactorKind.LOOP_CLOSURE])
+            covariance.turned(given.covariance, float(z[2])), z, first, at))
+    return Factors([first.node], [at.node], [mean], [information], [FactorKind.LOOP_CLOSURE])
 
 
 def closure_covariance(

@@ -6,8 +6,8 @@ from array import array
 import bisect
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
-import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,14 +15,12 @@ import numpy as np
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import BackendConfig
 from pose_graph_ros.core.graph.constraints import FactorKind
-from pose_graph_ros.core.odometry.gyro import Gyros
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.motion import Attachment
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer
+from pose_graph_ros.core.odometry.stream import ReorderBuffer
 from pose_graph_ros.core.saved_columns import Integers
-from pose_graph_ros.core.sources.beacons import Beacons
-from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, observed, validate
-from pose_graph_ros.core.sources.queued import Queued, turn
+from pose_graph_ros.core.sources.gyro import Gyros
+from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, validate
+from pose_graph_ros.core.sources.queued import Beacons, Queued, WaitingRange
 from pose_graph_ros.core.sources.settings import SOURCES
 
 
@@ -45,7 +43,7 @@ class SeenStamps:
 
     def __init__(self) -> None:
         # sorted stamps [ns], and a reference for each
-        self._seen = defaultdict[str, tuple['array[int]', 'array[int]']](
+        self.columns = defaultdict[str, tuple['array[int]', 'array[int]']](
             lambda: (array('q'), array('q')))
 
     def has(self, source: str, measurement: ms.PoseMeasurement) -> bool:
@@ -54,44 +52,42 @@ class SeenStamps:
 
     def near(self, source: str, stamp_ns: int, period_ns: int) -> bool:
         """Tell whether the source has a stamp closer than a period to a given one."""
-        stamps, _ = self._seen[source]
+        stamps, _ = self.columns[source]
         at = bisect.bisect_right(stamps, stamp_ns - period_ns)
         return at < len(stamps) and stamps[at] < stamp_ns + period_ns
 
     def add(self, source: str, measurement: ms.PoseMeasurement) -> None:
-        stamps, references = self._seen[source]
+        stamps, references = self.columns[source]
         at = bisect.bisect_right(stamps, measurement.stamp_ns)
         stamps.insert(at, measurement.stamp_ns)
         references.insert(at, key(measurement))
 
     def remove(self, source: str, measurement: ms.PoseMeasurement) -> None:
         at = self._find(source, measurement)
-        for column in self._seen[source] if at >= 0 else ():
+        for column in self.columns[source] if at >= 0 else ():
             del column[at]
 
     def forget(self, before_ns: int) -> None:
         """Forget all stamps before one [ns]: such measurements are refused for another reason."""
-        for stamps, references in self._seen.values():
+        for stamps, references in self.columns.values():
             n = bisect.bisect_left(stamps, before_ns)
             del stamps[:n], references[:n]
 
     def saved(self, without: list[tuple[str, ms.PoseMeasurement]]) -> dict[str, SavedStamps]:
         """Return stamps and references, by source, without some measurements."""
-        rows = defaultdict[str, list[int]](list)
+        rest = deepcopy(self)
         for source, measurement in without:
-            if (at := self._find(source, measurement)) >= 0:
-                rows[source].append(at)
-        return {source: SavedStamps(*(
-            np.delete(np.array(column, dtype=np.int64), rows[source]) for column in columns))
-            for source, columns in self._seen.items()}
+            rest.remove(source, measurement)
+        return {source: SavedStamps(*(np.array(column, dtype=np.int64) for column in columns))
+                for source, columns in rest.columns.items()}
 
     def restore(self, saved: Mapping[str, SavedStamps]) -> None:
         for source, each in saved.items():
-            self._seen[source] = (
+            self.columns[source] = (
                 array('q', each.stamps_ns.tolist()), array('q', each.references.tolist()))
 
     def _find(self, source: str, measurement: ms.PoseMeasurement) -> int:
-        stamps, references = self._seen[source]
+        stamps, references = self.columns[source]
         same = range(bisect.bisect_left(stamps, measurement.stamp_ns),
                      bisect.bisect_right(stamps, measurement.stamp_ns))
         own = key(measurement)
@@ -102,7 +98,7 @@ class MeasurementPipeline:
     """Measurements between their arrival and the update that adds them to the graph."""
 
     def __init__(self, nodes: HiddenNodes, config: BackendConfig) -> None:
-        self.nodes, self._config = nodes, config
+        self.nodes, self.config = nodes, config
         # measurements that wait for odometry to reach their stamps, in the order of these, then of
         # their arrival
         self.waiting: list[WaitingMeasurement] = []
@@ -118,10 +114,6 @@ class MeasurementPipeline:
         # source and stamps [ns] of the newest loop closures that could not be attached
         self.refused_closures = deque[tuple[str, int, int | None]](maxlen=SOURCES.most_refused)
 
-    def configure(self, config: BackendConfig) -> None:
-        self._config = config
-        self.gyros.configure(config)
-
     def add(self, measurement: ms.Measurement, source: str) -> ms.Answer:
         if isinstance(measurement, ms.YawRate):
             answer = self.count(source, self.gyros.stream(source).add(measurement))
@@ -136,11 +128,11 @@ class MeasurementPipeline:
 
     def _take_turns(self) -> None:
         """Make the rotations that are due, and count what happened to the rates."""
-        self.queue += itertools.chain.from_iterable(map(turn, self.gyros.extend()))
+        self.queue += self.gyros.extend()
         self.count_sorted(self.gyros.streams)
 
     def _add(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
-        settings = self._config.measurement_source(source, type(measurement))
+        settings = self.config.measurement_source(source, type(measurement))
         validated = validate(measurement, settings.covariance)
         if isinstance(validated, ms.Answer):
             return validated
@@ -190,16 +182,18 @@ class MeasurementPipeline:
 
     def _attach(self, measurement: ms.PoseMeasurement, source: str) -> ms.Answer:
         attachment = attach(self.nodes, measurement.stamp_ns)
-        answer = attachment if isinstance(attachment, ms.Answer) else KINDS[
-            type(measurement)].attach(measurement, source, attachment, self)
-        if answer.status is ms.AnswerStatus.REJECTED and isinstance(measurement, ms.LoopClosure):
-            self.refused_closures.append((source, measurement.stamp_ns, measurement.reference_ns))
-        return answer
-
-    def attach_to_node(self, measurement: ms.Absolute, source: str, node: int) -> None:
-        """Attach a measurement to a hidden node, with no motion in between."""
-        self.queue.append(observed(
-            source, measurement, Attachment(node, np.zeros(3), np.zeros((3, 3)))))
+        made = attachment if isinstance(attachment, ms.Answer) else KINDS[
+            type(measurement)].constraint(measurement, source, attachment, self.nodes)
+        if isinstance(made, ms.Answer):
+            if isinstance(measurement, ms.LoopClosure):
+                self.refused_closures.append(
+                    (source, measurement.stamp_ns, measurement.reference_ns))
+            return made
+        if isinstance(measurement, ms.Range):
+            self.beacons.add(WaitingRange(made, measurement))
+        else:
+            self.queue.append(made)
+        return ms.ACCEPTED
 
     def take_ready(self, *, aligned: bool) -> list[Queued]:
         """
@@ -238,8 +232,7 @@ class MeasurementPipeline:
     def count_sorted(self, streams: Mapping[str, ReorderBuffer[Any]]) -> None:
         """Count what was sorted in late or dropped of some streams, by source."""
         for source, stream in streams.items():
-            for reason, count in (('sorted', stream.n_sorted),
-                                  ('stamp_ahead', stream.n_dropped)):
+            for reason, count in (('sorted', stream.n_sorted), ('stamp_ahead', stream.n_dropped)):
                 if count > 0:
                     self.counts[source, reason] = count
 

@@ -27,14 +27,15 @@ class Validated(NamedTuple):
     repairs: tuple[str, ...]  # keys for counting, such as `default_covariance`
 
 
-def check_position(
-    measurement: ms.Position | ms.Fix, policy: CovariancePolicy,
-) -> Validated | ms.Answer:
+Checked = Validated | ms.Answer  # what is left of a measurement, or why it is rejected
+
+
+def check_position(measurement: ms.Position | ms.Fix, policy: CovariancePolicy) -> Checked:
     """Return a position with a valid covariance, or why it is rejected."""
     return _finished(measurement, *_given(measurement.covariance, policy), policy)
 
 
-def check_pose(measurement: ms.GlobalPose, policy: CovariancePolicy) -> Validated | ms.Answer:
+def check_pose(measurement: ms.GlobalPose, policy: CovariancePolicy) -> Checked:
     """Return a pose, or its position or heading if it has no information on the other."""
     never = policy.heading is Heading.NEVER
     if np.all(_is_uninformative(measurement.covariance)[:2]):
@@ -55,7 +56,7 @@ def check_pose(measurement: ms.GlobalPose, policy: CovariancePolicy) -> Validate
     return _finished(measurement, cov, repairs, policy)
 
 
-def check_closure(measurement: ms.LoopClosure, policy: CovariancePolicy) -> Validated | ms.Answer:
+def check_closure(measurement: ms.LoopClosure, policy: CovariancePolicy) -> Checked:
     """Return a loop closure; without information on the position, that is infinite."""
     if not np.all(_is_uninformative(measurement.covariance)[:2]):
         return _finished(measurement, *_given(measurement.covariance, policy), policy)
@@ -64,7 +65,7 @@ def check_closure(measurement: ms.LoopClosure, policy: CovariancePolicy) -> Vali
         replace(measurement, covariance=np.diag((np.inf, np.inf, variance))), ())
 
 
-def check_heading(measurement: ms.HeadingOnly, policy: CovariancePolicy) -> Validated | ms.Answer:
+def check_heading(measurement: ms.HeadingOnly, policy: CovariancePolicy) -> Checked:
     """Return a heading with a valid variance, or why it is rejected."""
     variance, repairs = measurement.variance, list[str]()
     if not variance > 0.0 and len(policy.override) < 2:
@@ -78,7 +79,7 @@ def check_heading(measurement: ms.HeadingOnly, policy: CovariancePolicy) -> Vali
     return Validated(replace(measurement, variance=valid), tuple(repairs))
 
 
-def check_range(measurement: ms.Range, policy: CovariancePolicy) -> Validated | ms.Answer:
+def check_range(measurement: ms.Range, policy: CovariancePolicy) -> Checked:
     """Return a range with a valid variance, or why it is rejected."""
     if measurement.distance <= 0.0:
         return ms.rejected('no_information', f'a range of {measurement.distance} m')
@@ -107,7 +108,7 @@ def _given(given: FloatArray, policy: CovariancePolicy) -> tuple[FloatArray, lis
 def _finished(
     measurement: ms.GlobalPose | ms.Position | ms.LoopClosure | ms.Fix, cov: FloatArray,
     repairs: list[str], policy: CovariancePolicy,
-) -> Validated | ms.Answer:
+) -> Checked:
     """Return a measurement with a covariance that is repaired, scaled and within the bounds."""
     defect = covariance.defect(cov)
     if defect is not None:

@@ -26,8 +26,13 @@ from pose_graph_ros.core.geometry.geodesy import MapOrigin
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate, NextIds
 from pose_graph_ros.core.io.g2o import read_g2o
-from pose_graph_ros.core.io.graph_files import graph_paths, read_datum, read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.graph_files import (
+    graph_paths,
+    read_datum,
+    read_graph,
+    SavedGraph,
+    write_graph,
+)
 
 DATA = Path(__file__).parents[2] / 'data'
 

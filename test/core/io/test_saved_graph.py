@@ -28,8 +28,7 @@ from pose_graph_ros.core.config import (
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import covariance, se2
 from pose_graph_ros.core.geometry.geodesy import MapOrigin, TangentPlane
-from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import SavedGraph, site_refusal
+from pose_graph_ros.core.io.graph_files import read_graph, SavedGraph, site_refusal, write_graph
 from pose_graph_ros.core.measurements import (
     AnswerStatus,
     GlobalPose,
@@ -317,7 +316,7 @@ def saved_here(datum: MapOrigin | None = HERE) -> SavedGraph:
 
 def test_no_site_is_refused_if_the_graph_or_the_robot_has_no_datum() -> None:
     assert site_refusal(saved_here(None), datum=HERE, fix=HERE) is None
-    assert site_refusal(saved_here()) is None
+    assert site_refusal(saved_here(), None, None) is None
 
 
 @pytest.mark.parametrize(('datum', 'same'), [
@@ -327,7 +326,7 @@ def test_no_site_is_refused_if_the_graph_or_the_robot_has_no_datum() -> None:
     (HERE._replace(yaw=0.1 - 2.0 * np.pi), True), (HERE._replace(longitude=11.6 - 360.0), True),
     (MapOrigin(-48.1, -168.4, 0.0, 0.1), False)])
 def test_a_datum_that_was_set_must_be_that_of_the_graph(datum: MapOrigin, same: bool) -> None:
-    refusal = site_refusal(saved_here(), datum=datum)
+    refusal = site_refusal(saved_here(), datum, None)
     assert (refusal is None) is same
     if refusal is not None:
         assert str(HERE) in refusal
@@ -340,9 +339,9 @@ def test_a_first_fix_must_be_near_a_node() -> None:
     end = saved.rows.poses[-1, 0]
     for beyond, same in ((9_900.0, True), (10_100.0, False)):
         latitude, longitude, _ = plane.to_geodetic(np.array([end + beyond, 0.0])).tolist()
-        assert (site_refusal(saved, fix=MapOrigin(latitude, longitude)) is None) is same
+        assert (site_refusal(saved, None, fix=MapOrigin(latitude, longitude)) is None) is same
     # of a graph that is not in the map only the datum counts
     unaligned = replace(saved, alignment=replace(saved.alignment, state='unaligned'))
     latitude, longitude, _ = plane.to_geodetic(np.array([end + 9_900.0, 0.0])).tolist()
-    assert site_refusal(unaligned, fix=MapOrigin(latitude, longitude)) is not None
-    assert site_refusal(unaligned, fix=north_of(HERE, 9_990.0)) is None
+    assert site_refusal(unaligned, None, fix=MapOrigin(latitude, longitude)) is not None
+    assert site_refusal(unaligned, None, fix=north_of(HERE, 9_990.0)) is None

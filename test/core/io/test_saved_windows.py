@@ -19,8 +19,7 @@ from pose_graph_ros.core.config import BackendConfig, OdometrySource, POSITIONS
 from pose_graph_ros.core.estimate import Estimate
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.io.g2o import read_g2o, STANDING_FOR
-from pose_graph_ros.core.io.graph_files import read_graph, write_graph
-from pose_graph_ros.core.io.saved_graph import SavedGraph
+from pose_graph_ros.core.io.graph_files import read_graph, SavedGraph, write_graph
 from pose_graph_ros.core.measurements import OdometrySample
 
 
@@ -98,7 +97,7 @@ def test_other_programs_get_the_whole_path_and_edges_instead_of_priors(tmp_path:
 def test_nodes_that_were_thinned_out_come_back_with_their_places(tmp_path: Path) -> None:
     backend, _ = driven(settings(2.0))
     saved = backend.saved()
-    assert len(saved.nodes.thinned.numbers) > 50
+    assert len(saved.nodes.thinned['numbers']) > 50
     restored = PoseGraphBackend.restored(settings(2.0), through_files(saved, tmp_path))
     path = read_tum(tmp_path / 'map.tum')
     estimate = backend.estimate()

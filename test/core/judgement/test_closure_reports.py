@@ -20,7 +20,9 @@ from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.settings import BELIEF
 from pose_graph_ros.core.judgement.verdicts import Decision, WAITING
 from pose_graph_ros.core.measurements import AnswerStatus, LoopClosure, OdometrySample
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.queued import Queued
+
+UNSEEN = Factors.joined([])  # what a record does not look at
 
 SECOND = 10**9
 LAP = 60  # duration of a round [s]
@@ -195,7 +197,7 @@ def test_neighbours_are_those_of_a_comparison_of_all(seed: int) -> None:
         if step == 0 or len(ends) < 2:
             new = np.sort(rng.integers(0, n, (int(rng.integers(1, 40)), 2)), axis=1)
             for k in range(len(new)):
-                table.append(NewConstraint(k, 'scan', k, LoopClosure, 0), 0, WAITING)
+                table.append(Queued('scan', UNSEEN, k, 0, number=k), 0, WAITING)
             table.measure(len(ends), Closures(
                 new[:, 0], new[:, 1], np.zeros((len(new), 3)),
                 np.tile(np.eye(3), (len(new), 1, 1))))

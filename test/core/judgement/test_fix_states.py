@@ -5,10 +5,12 @@
 from hypothesis import given, settings, strategies as st
 import numpy as np
 
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.judgement.fix_states import FixStates
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED
-from pose_graph_ros.core.measurements import Position
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.queued import Queued
+
+UNSEEN = Factors.joined([])  # what a record does not look at
 
 
 @settings(deadline=None, max_examples=50)
@@ -19,7 +21,7 @@ def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
         size, before, totals = len(states), states.records.copy(), states.totals()
         for k in range(size, size + int(rng.integers(5))):
             source = ('fix', 'other', 'third')[rng.integers(3)]
-            states.append(NewConstraint(k, source, k, Position), 0,
+            states.append(Queued(source, UNSEEN, k, number=k), 0,
                           (BELIEVED, DOUBTED)[rng.integers(2)], distance=0.5)
         if rng.random() < 0.4:
             states.truncate(size)
@@ -35,5 +37,5 @@ def test_new_records_can_be_taken_back_and_all_can_be_saved(seed: int) -> None:
     np.testing.assert_array_equal(again.records, states.records)
     assert again.totals() == states.totals()
     for each in (states, again):
-        each.append(NewConstraint(0, 'fix', 0, Position), 0, BELIEVED)
+        each.append(Queued('fix', UNSEEN, 0, number=0), 0, BELIEVED)
     assert again.name(len(again) - 1) == states.name(len(states) - 1)

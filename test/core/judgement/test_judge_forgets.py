@@ -6,12 +6,14 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 from test_consistency import Drive
 
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.judgement.closures import ClosureTable
 from pose_graph_ros.core.judgement.judgements import LEFT, UNKNOWN
 from pose_graph_ros.core.judgement.odometry_chain import OdometryChain
 from pose_graph_ros.core.judgement.verdicts import BELIEVED, DOUBTED, State, WAITING
-from pose_graph_ros.core.measurements import LoopClosure
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.queued import Queued
+
+UNSEEN = Factors.joined([])  # what a record does not look at
 
 SECOND = 1_000_000_000
 seeds = st.integers(0, 2**32 - 1)
@@ -46,7 +48,7 @@ def test_the_motion_between_nodes_that_stay_is_known_as_before(seed: int) -> Non
 
 def added(states: ClosureTable, edges: range) -> None:
     for edge in edges:
-        states.append(NewConstraint(edge, 'scan', edge * SECOND, LoopClosure, 0), 0, WAITING)
+        states.append(Queued('scan', UNSEEN, edge * SECOND, 0, number=edge), 0, WAITING)
 
 
 def test_closures_that_have_left_are_counted_and_keep_their_names() -> None:

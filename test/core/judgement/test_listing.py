@@ -4,11 +4,13 @@
 
 from hypothesis import given, strategies as st
 
+from pose_graph_ros.core.graph.constraints import Factors
 from pose_graph_ros.core.judgement.fix_states import FixStates
 from pose_graph_ros.core.judgement.judgements import MOST_OTHERS
 from pose_graph_ros.core.judgement.verdicts import AUTO, BELIEVED, DOUBTED, OUT
-from pose_graph_ros.core.measurements import Position
-from pose_graph_ros.core.sources.factor_builder import NewConstraint
+from pose_graph_ros.core.sources.queued import Queued
+
+UNSEEN = Factors.joined([])  # what a record does not look at
 
 constraints = st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.booleans()), max_size=40)
 
@@ -19,7 +21,7 @@ def test_the_newest_of_each_source_are_listed(
 ) -> None:
     states, expected = FixStates(), []
     for number, (own, good, by_person) in enumerate(constraints):
-        states.append(NewConstraint(number, f'fix{own}', number, Position), 0,
+        states.append(Queued(f'fix{own}', UNSEEN, number, number=number), 0,
                       BELIEVED if good else DOUBTED)
         states.decision[number] = OUT if by_person else AUTO
         later = sum(each[0] == own and each[1] == good and not each[2]

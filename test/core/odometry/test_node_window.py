@@ -135,7 +135,7 @@ def test_places_are_passed_on_from_anchor_to_anchor(seed: int) -> None:
             leaving, anchors, relative, noise, strict=True)}
     assert len(nodes) == len(steps)
     if seed % 2 == 0:   # else each place is passed on for itself
-        assert nodes.places().numbers.tolist() == sorted(steps)
+        assert nodes.places()['numbers'].tolist() == sorted(steps)
     for number in range(n):
         place = nodes.place(number)
         if number in kept:

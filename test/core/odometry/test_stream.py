@@ -13,9 +13,8 @@ from pose_graph_ros.core.config import Integrate, NoiseFrom, OdometryNoise, Odom
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import AnswerStatus, OdometrySample
-from pose_graph_ros.core.odometry.jumps import JUMP_SIGMA
-from pose_graph_ros.core.odometry.reorder_buffer import MANY_BEHIND
-from pose_graph_ros.core.odometry.stream import OdometryStream
+from pose_graph_ros.core.odometry.motion import JUMP_SIGMA
+from pose_graph_ros.core.odometry.stream import MANY_BEHIND, OdometryStream
 
 SECOND = 1_000_000_000
 # The Unix time of 2026 in nanoseconds: a double does not hold it.

@@ -23,9 +23,8 @@ from pose_graph_ros.core.measurements import (
     OdometrySample,
     YawRate,
 )
-from pose_graph_ros.core.odometry.gyro import Turn
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
-from pose_graph_ros.core.sources.queued import turn
+from pose_graph_ros.core.sources.gyro import turn
 
 Events = list[tuple[str, OdometrySample | Measurement]]
 
@@ -225,9 +224,8 @@ def test_the_newest_pose_has_the_rotation_by_the_gyroscope() -> None:
 def test_each_of_two_gyroscopes_goes_on_from_its_own_bias_within_an_update() -> None:
     graph = Graph()
     graph.apply(GraphUpdate(hidden=np.zeros((4, 3))))
-    turns = [Turn(source, k, k + 1, round((1.0 + 20.0 * k) * SECOND), 0.0, 1e-4, 1.0,
-                  rest_rate=rate, rest_variance=1e-6)
-             for k in range(3) for source, rate in (('left', 0.02), ('right', -0.01))]
-    update = FactorBuilder(BackendConfig(), Reweighting()).build(
-        [each for given in turns for each in turn(given)], graph)
+    update = FactorBuilder(BackendConfig(), Reweighting()).build([
+        queued for k in range(3) for source, rate in (('left', 0.02), ('right', -0.01))
+        for queued in turn(source, (k, k + 1), round((1.0 + 20.0 * k) * SECOND), (0.0, 1e-4, 1.0),
+                           (rate, 1e-6))], graph)
     assert update.biases[:, 0].tolist() == [0.02] * 3 + [-0.01] * 3

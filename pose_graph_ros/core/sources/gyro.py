@@ -20,7 +20,7 @@ that both claim.
 
 import bisect
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
@@ -30,11 +30,12 @@ import numpy as np
 from pose_graph_ros.core.config import BackendConfig, GyroSource, RateNoise
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
-from pose_graph_ros.core.measurements import ACCEPTED, Answer, rejected, YawRate
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.measurements import Answer, rejected, YawRate
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
-from pose_graph_ros.core.odometry.reorder_buffer import ReorderBuffer, stamp_of
+from pose_graph_ros.core.odometry.stream import ReorderBuffer, stamp_of
 from pose_graph_ros.core.odometry.timeline import STANDING_NS
-from pose_graph_ros.core.quantities import StampNs
+from pose_graph_ros.core.sources.queued import Queued
 
 # A faster rotation is a faulty number [rad/s]; sensors of robots saturate at 35 rad/s.
 LARGEST_RATE = 1000.0
@@ -72,7 +73,7 @@ class RateIntegral:
         """Return the rate at an instant [rad/s]."""
         return float(np.interp((stamp_ns - self._begin_ns) * 1e-9, self._times, self.rates))
 
-    def between(self, start_ns: StampNs, end_ns: StampNs) -> Rotation:
+    def between(self, start_ns: int, end_ns: int) -> Rotation:
         """Return the rotation between two instants that the samples cover."""
         begin, end = ((stamp_ns - self._begin_ns) * 1e-9 for stamp_ns in (start_ns, end_ns))
         times = np.clip(self._times, begin, end)
@@ -100,8 +101,9 @@ class Agreement:
     """The sums over the newest rotations of one gyroscope."""
 
     def __init__(self) -> None:
-        self._normal, self._right = np.zeros((3, 3)), np.zeros(3)
-        self._squares = self._n = self._turned = 0.0
+        # of seconds, change of the rate, angle by odometry, and difference
+        self._products = np.zeros((4, 4))
+        self._n = self._turned = 0.0
 
     def add(
         self, difference: float, seconds: float, change: float, angle: float, variance: float,
@@ -112,32 +114,29 @@ class Agreement:
         `variance` is that of the difference, `change` how much the rate changes meanwhile [rad/s].
         """
         by_odometry, fade = angle - difference, 1.0 - 1.0 / 1000.0  # the fit forgets
-        row = np.array((seconds, change, by_odometry))
-        left = difference
-        if self._n >= LEAST:
-            left -= float(row @ self._fit()[0])
+        row = np.array((seconds, change, by_odometry, difference))
+        left = difference - (float(row[:3] @ self._fit()[0]) if self._n >= LEAST else 0.0)
         # differences beyond 5 sigma do not count, as those of wheels that slip
         weight = min(25.0 / (left * left + 1e-300), 1.0 / variance)
-        self._normal = fade * self._normal + weight * np.outer(row, row)
-        self._right = fade * self._right + weight * difference * row
-        self._squares = fade * self._squares + weight * difference * difference
+        self._products = fade * self._products + weight * np.outer(row, row)
         self._n = fade * self._n + 1.0
         self._turned = fade * self._turned + max(abs(angle), abs(by_odometry))
 
     def _fit(self) -> tuple[FloatArray, FloatArray]:
         """Return bias, time and scale, and their covariance."""
         # weak priors: 0.1 rad/s, 10 s, 10
-        covariance = np.linalg.inv(self._normal + np.diag((1e2, 1e-2, 1e-2)))
-        return np.asarray(covariance @ self._right), np.asarray(covariance, dtype=np.float64)
+        covariance = np.linalg.inv(self._products[:3, :3] + np.diag((1e2, 1e-2, 1e-2)))
+        return np.asarray(covariance @ self._products[:3, 3]), np.asarray(covariance)
 
     def difference(self) -> Difference | None:
         """Return the difference by now; None as long as too little is known."""
         if self._n < LEAST or self._turned < 2.0 * math.pi:
             return None
-        explained = self._right[0]**2 / self._normal[0, 0]
-        sigmas = math.sqrt(max(self._squares - explained, 0.0) / self._n)
+        squares, right = self._products[3, 3], self._products[:3, 3]
+        explained = right[0]**2 / self._products[0, 0]
+        sigmas = math.sqrt(max(squares - explained, 0.0) / self._n)
         found, covariance = self._fit()
-        rest = max((self._squares - float(found @ self._right)) / self._n, 1.0)
+        rest = max((squares - float(found @ right)) / self._n, 1.0)
         shown = np.abs(found) > 5.0 * np.sqrt(rest * np.diagonal(covariance))
         early, turns, reason = float(found[1]), 1.0 + float(found[2]), ''
         if sigmas < 0.1:
@@ -161,18 +160,27 @@ class Agreement:
 STOPPING_NS, STARTING_NS = STANDING_NS, STANDING_NS // 3
 
 
-class Turn(NamedTuple):
-    """The rotation from one hidden node to the next."""
+def turn(
+    source: str, ends: Sequence[int], stamp_ns: int, rotation: Sequence[float],
+    rest: Sequence[float],
+) -> list[Queued]:
+    """
+    Return the constraints of a rotation from one hidden node to the next.
 
-    source: str
-    i: int  # id of the node that it begins at
-    j: int  # id of the node that it leads to
-    stamp_ns: int  # middle of the time in between [ns]
-    angle: float  # rotation, with the bias during `seconds`, not wrapped [rad]
-    variance: float  # [rad^2]
-    seconds: float  # time for which the robot was not at rest, during which the bias acted [s]
-    rest_rate: float = 0.0  # mean rate at rest, which is the bias [rad/s]
-    rest_variance: float = 0.0  # of that rate [rad^2/s^2]; 0 if the robot was not at rest
+    These are an edge with three ends, two nodes, given by their ids, and the bias, and, of rates
+    at rest, an observation of the bias. The rotation is that of the time for which the robot was
+    not at rest; `rest` has the mean rate at rest and its variance, 0 if it was not at rest. The
+    stamp is the middle of the time in between [ns].
+    """
+    (i, j), (angle, variance, seconds), (rate, rate_variance) = ends, rotation, rest
+    queued = [Queued(source, Factors(
+        [i], [j], [(0.0, 0.0, angle)], [np.diag((0.0, 0.0, 1.0 / variance))], [FactorKind.TURN],
+        constants=[(0.0, 0.0, 0.0, seconds)]), stamp_ns)]
+    if rate_variance > 0.0:
+        queued.append(Queued(source, Factors.on(
+            [-1], None, [(rate, 0.0, 0.0)], [np.diag((1.0 / rate_variance, 0.0, 0.0))],
+            [FactorKind.GLOBAL_POSE]), stamp_ns))
+    return queued
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,11 +207,6 @@ class GyroStream(ReorderBuffer[YawRate]):
         self._window_ns = round(source.reorder_window * 1e9)
 
     @property
-    def samples(self) -> tuple[YawRate, ...]:
-        """The samples that are still here."""
-        return (*self._settled, *self._waiting)
-
-    @property
     def first_ns(self) -> int:
         """Stamp of the oldest settled sample that is still here [ns]; -1 without."""
         return self._settled[0].stamp_ns if self._settled else -1
@@ -219,11 +222,10 @@ class GyroStream(ReorderBuffer[YawRate]):
                             f'yaw rate {sample.rate} rad/s')
         if not 0.0 < sample.variance < LARGEST_RATE**2:
             sample = replace(sample, variance=0.0)
-        answer = self._insert(sample)
-        if isinstance(answer, Answer):
-            return answer
+        return self._insert(sample)
+
+    def _follow(self, begin: int) -> None:
         self.settle()
-        return ACCEPTED
 
     def settle(self, until_ns: int | None = None) -> None:
         """Settle samples, by default those that no older ones can come before any more."""
@@ -235,9 +237,7 @@ class GyroStream(ReorderBuffer[YawRate]):
         n = bisect.bisect_right(self._settled, stamp_ns, key=stamp_of) - 1
         del self._settled[:max(n, 0)]
 
-    def integral(
-        self, start_ns: StampNs, end_ns: StampNs, *, to_come: bool = False,
-    ) -> RateIntegral | None:
+    def integral(self, start_ns: int, end_ns: int, *, ahead: bool = False) -> RateIntegral | None:
         """
         Return the integral of the rate; None if samples do not cover the time without a gap.
 
@@ -248,7 +248,7 @@ class GyroStream(ReorderBuffer[YawRate]):
         if begin < 0:
             return None
         samples = every[begin:bisect.bisect_left(every, end_ns, key=stamp_of) + 1]
-        if to_come and samples[-1].stamp_ns < end_ns:
+        if ahead and samples[-1].stamp_ns < end_ns:
             samples.append(replace(samples[-1], stamp_ns=end_ns))
         stamps_ns = np.array([each.stamp_ns for each in samples], dtype=np.int64)
         if (len(stamps_ns) < 2 or stamps_ns[-1] < end_ns
@@ -256,6 +256,10 @@ class GyroStream(ReorderBuffer[YawRate]):
             return None
         rates = np.array([(each.rate, each.variance) for each in samples])
         return RateIntegral(stamps_ns, rates, self._source)
+
+    def saved(self) -> SavedGyro:
+        """Return the state."""
+        return SavedGyro((*self._settled, *self._waiting), self.next_node)
 
     def restore(self, saved: SavedGyro) -> None:
         """Fill this empty stream with what was saved."""
@@ -292,8 +296,9 @@ class Gyros:
         for stream in self.streams.values():
             stream.settle(stream.newest_ns)
 
-    def extend(self) -> Iterator[Turn]:
-        """Make the rotations up to the newest node that settled rates have reached."""
+    def extend(self) -> list[Queued]:
+        """Return the rotations up to the newest node that settled rates have reached."""
+        made: list[Queued] = []
         for source, stream in self.streams.items():
             stamps_ns = self._nodes.stamps_ns
             end = int(np.searchsorted(stamps_ns, stream.settled_ns, side='right'))
@@ -302,75 +307,59 @@ class Gyros:
             # before the first sample there is nothing to integrate
             begin = max(stream.next_node, int(np.searchsorted(stamps_ns, stream.first_ns)))
             for node in range(begin, end):
-                yield from self._extend(source, stream, node)
+                made += self._extend(source, stream, node)
             stream.next_node = max(begin, end)
             stream.forget_before(int(stamps_ns[stream.next_node - 1]))
+        return made
 
-    def _extend(self, source: str, stream: GyroStream, node: int) -> Iterator[Turn]:
-        """Make the rotation to a node, given by its number."""
+    def _extend(self, source: str, stream: GyroStream, node: int) -> list[Queued]:
+        """Return the rotation to a node, given by its number."""
         nodes = self._nodes
         start_ns, end_ns = nodes.stamps_ns[node - 1:node + 1].tolist()
         # closer nodes have no rotation between them: a robot was put elsewhere
         if end_ns - start_ns < 1_000_000 or node in nodes.relocated:
-            return
+            return []
         integral = stream.integral(start_ns, end_ns)
         if integral is None:
             if stream.first_ns <= start_ns:
                 self._counts[source, 'gap'] += 1
-            return
+            return []
         if nodes.has_left(node - 1) or nodes.has_left(node):
             self._counts[source, 'before_window'] += 1
-            return
-        rotation = integral.between(start_ns, end_ns)
-        at_rest, creep, creep_variance = self._at_rest(source, integral, start_ns, end_ns)
+            return []
         self._counts[source, 'rotations'] += 1
-        odometry = nodes.streams[nodes.primary_at(end_ns)]
+        angle, variance, seconds = integral.between(start_ns, end_ns)
+        primary = nodes.primary_at(end_ns)
+        odometry = nodes.streams[primary]
         if odometry.timeline.covers(start_ns) and odometry.timeline.covers(end_ns):
             motion = odometry.timeline.motion(start_ns, end_ns)
-            stream.agreement.add(
-                float(se2.wrap(rotation.angle - motion.increment[2])), rotation.seconds,
-                integral.rate(end_ns) - integral.rate(start_ns), rotation.angle,
-                rotation.variance + float(odometry.covariance(motion)[2, 2]))
-        i, j = nodes.ids[node - 1:node + 1].tolist()
-        middle_ns = (start_ns + end_ns) // 2
-        if at_rest.seconds == 0.0:
-            yield Turn(source, i, j, middle_ns, *rotation)
-            return
-        yield Turn(
-            source, i, j, middle_ns, rotation.angle - at_rest.angle + creep,
-            rotation.variance - at_rest.variance + creep_variance,
-            rotation.seconds - at_rest.seconds, (at_rest.angle - creep) / at_rest.seconds,
-            (at_rest.variance + creep_variance) / at_rest.seconds**2)
-
-    def _at_rest(
-        self, source: str, integral: RateIntegral, start_ns: int, end_ns: int,
-    ) -> tuple[Rotation, float, float]:
-        """Return the rotation by rates at rest, that by the wheels [rad] and its variance."""
-        total, creep, variance = Rotation(0.0, 0.0, 0.0), 0.0, 0.0
-        if end_ns - start_ns < STOPPING_NS + STARTING_NS + STANDING_NS:
-            return total, creep, variance
-        primary = self._nodes.primary_at(end_ns)
-        timeline = self._nodes.streams[primary].timeline
+            stream.agreement.add(float(se2.wrap(angle - motion.increment[2])),
+                                 seconds, integral.rate(end_ns) - integral.rate(start_ns), angle,
+                                 variance + float(odometry.covariance(motion)[2, 2]))
+        # by rates at rest, and by the wheels meanwhile
+        rest, creep = np.zeros(3), np.zeros(2)
         most = MOST_BIAS * self._config.gyro(source).sigma_bias
-        for first_ns, last_ns in timeline.rests(start_ns, end_ns):
+        floor = self._config.odometry_source(primary).noise.sigma_floor_heading
+        for first_ns, last_ns in odometry.timeline.rests(start_ns, end_ns):
             begin_ns, until_ns = first_ns + STOPPING_NS, last_ns - STARTING_NS
             if until_ns - begin_ns < STANDING_NS:
                 continue
-            rest = integral.between(begin_ns, until_ns)
-            if abs(rest.angle) > most * rest.seconds:
-                continue
-            total = Rotation(total.angle + rest.angle, total.variance + rest.variance,
-                             total.seconds + rest.seconds)
-            creep += float(timeline.motion(begin_ns, until_ns).increment[2])
-            variance += self._config.odometry_source(primary).noise.sigma_floor_heading**2
-        return total, creep, variance
+            part = integral.between(begin_ns, until_ns)
+            if abs(part.angle) <= most * part.seconds:
+                wheels = odometry.timeline.motion(begin_ns, until_ns).increment[2]
+                rest, creep = rest + part, creep + np.array((wheels, floor**2))
+        at_rest = float(rest[2])
+        return turn(
+            source, nodes.ids[node - 1:node + 1].tolist(), (start_ns + end_ns) // 2,
+            (angle - rest[0] + creep[0], variance - rest[1] + creep[1], seconds - at_rest),
+            (0.0, 0.0) if at_rest == 0.0 else (
+                (rest[0] - creep[0]) / at_rest, (rest[1] + creep[1]) / at_rest**2))
 
     def stream(self, source: str) -> GyroStream:
         """Return the stream of a gyroscope, a new one if there was none."""
-        stream = self.streams.get(source)
-        if stream is None:
-            stream = self.streams[source] = GyroStream(self._config.gyro(source))
-        return stream
+        if source not in self.streams:
+            self.streams[source] = GyroStream(self._config.gyro(source))
+        return self.streams[source]
 
     def differences(self) -> dict[str, Difference]:
         """Return how much each gyroscope differs from odometry, where enough is known."""
@@ -387,13 +376,8 @@ class Gyros:
         """
         for source, bias in biases.items() if start_ns < end_ns else ():
             stream = self.streams.get(source)
-            integral = None if stream is None else stream.integral(start_ns, end_ns, to_come=True)
+            integral = None if stream is None else stream.integral(start_ns, end_ns, ahead=True)
             if integral is not None:
                 angle, variance, seconds = integral.between(start_ns, end_ns)
                 return angle - bias * seconds, variance
         return None
-
-    def saved(self) -> dict[str, SavedGyro]:
-        """Return the state of each gyroscope."""
-        return {source: SavedGyro(stream.samples, stream.next_node)
-                for source, stream in self.streams.items()}

@@ -11,7 +11,7 @@ import pytest
 from pose_graph_ros.core.config import GyroSource, RateNoise
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.measurements import AnswerStatus, YawRate
-from pose_graph_ros.core.odometry.gyro import GyroStream, UNIFORM_WITHIN
+from pose_graph_ros.core.sources.gyro import GyroStream, UNIFORM_WITHIN
 
 SECOND = 1_000_000_000
 EPOCH = 1_767_225_600_000_000_001

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pose_graph_ros.core.odometry.gyro import Agreement, Difference
+from pose_graph_ros.core.sources.gyro import Agreement, Difference
 
 
 def difference(
