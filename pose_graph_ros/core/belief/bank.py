@@ -281,7 +281,8 @@ def added_covariance(likely: FloatArray, off: FloatArray, wider: FloatArray) -> 
     covariances are larger, (N, 3, 3).
     """
     off = se2.wrapped(off)
-    variances, axes = np.linalg.eigh((off.T * likely) @ off + np.tensordot(likely, wider, 1))
+    variances, axes = np.linalg.eigh(
+        (off.T * likely) @ off + np.einsum('n,nij', likely, wider))
     return np.asarray((axes * np.maximum(variances, 0.0)) @ axes.T)
 
 

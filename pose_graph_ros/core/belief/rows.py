@@ -65,8 +65,7 @@ def measured(
     rows['offset'], rows['mean'] = given.constants[:, :3], given.mean
     rows['offset'][biased, 2] = 0.0
     has_heading = np.where(biased, information[:, 2, 2] > 0.0, given.kind != FactorKind.POSITION)
-    placed = (information[:, 0, 0] > 0.0) & np.isin(
-        given.kind, (FactorKind.GLOBAL_POSE, FactorKind.POSITION, FactorKind.BIAS))
+    placed = information[:, 1, 1] > 0.0
     # from the axes of measured poses to those of the map
     axes = se2.adjoint(given.mean * (0.0, 0.0, 1.0) * ~biased[:, None])
     for n, which in ((2, placed & ~has_heading), (3, placed & has_heading)):

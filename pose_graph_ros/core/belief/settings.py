@@ -65,7 +65,9 @@ class BankSettings:
     # --- the bank
     hypotheses: int = 96  # at least 5 for each heading that is tried
     sources: int = 4  # sources with an error of their own; further ones share that of the last
-    hopeless: float = 30.0  # a hypothesis is dropped that is less likely by so many nats
+    # a hypothesis is dropped that is less likely by so many nats, and from what noise says to be
+    # wrong that is, nothing is learnt
+    hopeless: float = 30.0
     alike: int = 4  # most hypotheses with the same faults in the same place
     same_place: float = 2.0  # that is within so many sigmas,
     alike_spread: float = 10.0  # with variances within such a factor

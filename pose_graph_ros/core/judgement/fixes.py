@@ -87,12 +87,13 @@ class FixJudge:
                         [one.stamp_ns for one in by_id.values()], ids.tolist())
         if len(rows) == 0:
             return change
-        self._new_ids = rows['id'].copy()
+        self._new_ids, judged = rows['id'].copy(), dict[int, int]()  # by ids, their numbers
         for row in rows:
             one = by_id[int(row['id'])]
             row['source'] = self._number(one.source)
             row['judged'] = self._is_judged(one.source, one.measured)
             if row['judged']:
+                judged[one.number] = len(self.states)
                 self.states.append(one, now_ns, BELIEVED)
         if len(self.bank) == 0 and not np.any(graph.fixed) and not graph.has_touched:
             node = int(rows['node'][np.argmin(rows['stamp_ns'])])
@@ -101,10 +102,10 @@ class FixJudge:
         decided = self.bank.decide()
         self._apply(self.bank.told(0) if self._is_new or len(self.bank) <= FEW else decided)
         # how far the new ones are from where they were expected
-        came = self.bank.rows['id'][decided.first:]
-        noted = np.isin(came, self._new_ids) & np.isin(came, self.states.added)
-        self.states.distance[np.searchsorted(self.states.added, came[noted])] = np.sqrt(
-            decided.d2[noted])
+        for row_id, d2 in zip(self.bank.rows['id'][decided.first:].tolist(), decided.d2.tolist(),
+                              strict=True):
+            if row_id in judged:
+                self.states.distance[judged[row_id]] = math.sqrt(d2)
         return self._with_weights(change, before)
 
     def _is_judged(self, source: str, kind: type[PoseMeasurement] = GlobalPose) -> bool | None:
@@ -224,8 +225,10 @@ class FixJudge:
         states, rows = self.states, self.bank.rows[decided.first:]
         if len(rows) == 0:
             return
-        known = np.isin(rows['id'], states.added)
-        numbers = np.searchsorted(states.added, rows['id'][known])
+        added = np.append(states.added, -1)
+        numbers = np.searchsorted(added[:-1], rows['id'])
+        known = added[numbers] == rows['id']
+        numbers = numbers[known]
         choice = decided.choice
         if decided.first == 0 and not _determines(rows[is_believed(choice)]):
             choice = np.full(len(rows), GOOD)
