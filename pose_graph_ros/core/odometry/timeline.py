@@ -124,9 +124,9 @@ class OdometryTimeline:
             return
         self.resting = same
         self._stamps.append_one(row.stamp_ns)
-        if len(self._variances) == 0 and any(row.variance):
-            self._variances.append(np.zeros((len(self._samples), 3)))
-        if len(self._variances) == len(self._samples) > 0:
+        if len(self._variances) > 0 or any(row.variance):
+            if len(self._variances) == 0:
+                self._variances.append(np.zeros((len(self._samples), 3)))
             self._variances.append_one(row.variance)
         self._samples.append_one((*row.pose, row.distance, row.turn))
         self._dense.append_one(False)

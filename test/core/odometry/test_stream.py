@@ -136,13 +136,18 @@ def test_the_newest_motion_is_what_settling_would_make_of_it(
         pass
     for start_ns in (samples[0].stamp_ns, (samples[0].stamp_ns + samples[since].stamp_ns) // 2):
         ahead, raw = stream.newest(start_ns)
+        between_ns = (samples[-2:][0].stamp_ns + samples[-1].stamp_ns) // 2
+        early = stream.motion_ahead(start_ns, between_ns)
         jumps = stream.n_jumps_seen
         for _ in stream.settle(stream.newest_ns):
             pass
         assert stream.n_jumps == stream.n_jumps_seen == jumps
         after, _ = stream.newest(start_ns)
         motion = stream.timeline.motion(start_ns, samples[-1].stamp_ns)
-        for one in (ahead, after):
+        pairs = [(ahead, motion), (after, motion)]
+        if early is not None:
+            pairs.append((early, stream.timeline.motion(start_ns, between_ns)))
+        for one, motion in pairs:
             np.testing.assert_allclose(one.increment, motion.increment, atol=ROUNDING)
             assert one.distance == pytest.approx(motion.distance, abs=ROUNDING)
             assert one.turn == pytest.approx(motion.turn, abs=ROUNDING)
