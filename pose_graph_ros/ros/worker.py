@@ -3,10 +3,9 @@
 """
 The thread that owns the engine: the single writer of the graph, and what a person asks it for.
 
-Imports no ROS.
-Callbacks post measurements and request updates or jobs; they never wait for a solver. They read
-an immutable estimate that the thread replaces as a whole. While there is nothing else to do after
-an update, the thread refines the estimate, and then waits.
+It imports no ROS. Callbacks post measurements and request updates or jobs; they never wait for a
+solver. They read an immutable estimate that the thread replaces as a whole. While there is nothing
+else to do after an update, the thread refines the estimate, and then waits.
 """
 
 from collections import Counter, deque
