@@ -323,7 +323,8 @@ def search(
         slips[~is_believed(told.choice)] = -1.0
         found[point] = Learnt(point, trial.evidence + log_prior(point, known), (
             yield from posterior(slips).shown(point))[1], *trial.newest())
-        likely = max(each.evidence for each in found.values()) - BANK.hopeless
-        if n_rounds < MOST_ROUNDS and found[point].evidence > likely:
+        # while measurements come there is no time for what is unlikely to lead to the best
+        if n_rounds < MOST_ROUNDS and (newest is None or found[point].evidence > max(
+                each.evidence for each in found.values()) - BANK.hopeless):
             waiting += [(other, n_rounds + 1) for other in (yield from learn(slips))]
     return Found(max(found.values(), key=lambda each: each.evidence), found)

@@ -65,8 +65,8 @@ class BankSettings:
     # --- the bank
     hypotheses: int = 96  # at least 5 for each heading that is tried
     sources: int = 4  # sources with an error of their own; further ones share that of the last
-    # a hypothesis is dropped that is less likely by so many nats, and from what noise says to be
-    # wrong that is, nothing is learnt
+    # a hypothesis is dropped that is less likely by so many nats, and while measurements come
+    # nothing is learnt from what such noise takes for wrong
     hopeless: float = 30.0
     alike: int = 4  # most hypotheses with the same faults in the same place
     same_place: float = 2.0  # that is within so many sigmas,
