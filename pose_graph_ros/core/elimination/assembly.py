@@ -148,9 +148,10 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     cliques, at = tb.cliques(head), tb.nodes(head)[v].factor_list
     weak_t = weak_r = 0.0
     while at >= 0:
-        t, r = normal_equations.weakest(tb.factors(head)[at >> 2])
-        weak_t, weak_r = weak_t + t, weak_r + r
-        at = tb.factors(head)[at >> 2].next[at & 3]
+        f = tb.factors(head)[at >> 2]
+        w, at = f.information, f.next[at & 3]
+        t, r = normal_equations.weakest(w[0], w[1], w[2], w[3], w[4], w[5])
+        weak_t, weak_r = weak_t + f.weight * t, weak_r + f.weight * r
     c = cliques[tb.nodes(head)[v].clique].child
     while c >= 0:
         if cliques[c].n_frontal == 0:

@@ -317,6 +317,16 @@ def linearize(head, e):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def linearize_all(head):  # type: ignore[no-untyped-def]
+    """Make the poses of all nodes the references, and linearize all factors there."""
+    for v in range(head[tb.N_NODES]):
+        refer_to_pose(tb.nodes(head)[v])
+    for e in range(head[tb.N_FACTORS]):
+        if tb.factors(head)[e].weight > 0.0:
+            linearize(head, e)
+
+
+@kernel
 def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
     """
     Set squared linearization error and energy of a factor; the caller has logged them.

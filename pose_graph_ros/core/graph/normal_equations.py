@@ -14,21 +14,13 @@ from pose_graph_ros.core.graph import factors as fc, tables as tb
 
 
 @kernel
-def weakest(f):  # type: ignore[no-untyped-def]
+def weakest(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
     """
-    Return the weighted information of a factor in its weakest direction and on its heading.
+    Return what an information matrix tells in its weakest direction, and of the heading.
 
     The first is the smaller eigenvalue of the information on the position, the second that on the
     heading if the position is unknown; both are lower bounds, to rounding.
     """
-    w = f.information
-    position, heading = weakest_of(w[0], w[1], w[2], w[3], w[4], w[5])
-    return f.weight * position, f.weight * heading
-
-
-@kernel
-def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
-    """Return what `weakest` does, of an information matrix."""
     trace, determinant = xx + yy, xx * yy - xy * xy
     if not determinant > 0.0:
         return 0.0, 0.0

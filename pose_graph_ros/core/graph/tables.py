@@ -117,8 +117,7 @@ CLIQUE: Final = np.dtype([
     ('members', 'i4'),          # index in pool_i of its nodes, frontal ones first
     # index in pool_f of its rows of R, with the update matrix behind them; see `prior_rows`
     ('values', 'i4'),
-    # stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
-    # eliminated, the number of marked children that are left
+    # stamp (FRONT_SERIAL) of the last marking for elimination
     ('marked', 'i4'),
     ('built', 'i4'),            # stamp (ITERATION) of the last elimination or solution
     # stamps (UPDATE) of taking the row, of taking the values, and of the last log of the row
@@ -194,12 +193,12 @@ ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index
 #   N_LEAVING: number of rows that `editing.compact` takes out after the update, without those that
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
-(N_NODES, N_FACTORS, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
- N_WAITING, LOG_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
- NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
- N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, NEWEST, SINCE, REFINED, LISTED, ROUND,
- INTERRUPT, NEXT_NODE, NEXT_FACTOR, N_LEAVING, N_PRIORS, LOOSE, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 40)
+# A rollback restores the first ones, up to LOOSE.
+(N_NODES, N_FACTORS, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, NEXT_NODE, NEXT_FACTOR, N_LEAVING,
+ N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END, UPDATE,
+ ITERATION, FRONT_SERIAL, NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
+ N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
+ REFINED, LISTED, ROUND, INTERRUPT, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 40)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:

@@ -18,10 +18,6 @@ from pose_graph_ros.core.graph.constraints import NodeKind
 # its kind alone behind what `begin` logs.
 NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
 _POSE = int(NodeKind.POSE)
-# Counters in the first entry.
-STARTED_WITH = (
-    tb.N_NODES, tb.N_FACTORS, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST, tb.NEXT_NODE,
-    tb.NEXT_FACTOR, tb.N_LEAVING, tb.N_PRIORS, tb.LOOSE)
 
 
 def largest(n_nodes: int, n_factors: int) -> int:
@@ -40,11 +36,17 @@ def copied(source, target):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _append_words(head, words):  # type: ignore[no-untyped-def]
+    begin = head[tb.LOG_END]
+    head[tb.LOG_END] = begin + len(words)
+    copied(words, tb.log(head)[begin:begin + len(words)])
+
+
+@kernel
 def _append(head, kind, row, words):  # type: ignore[no-untyped-def]
     """Append an entry."""
-    log, begin = tb.log(head), head[tb.LOG_END]
-    end = begin + len(words)
-    copied(words, log[begin:end])
+    _append_words(head, words)
+    log, end = tb.log(head), head[tb.LOG_END]
     log[end], log[end + 1] = row, kind
     head[tb.LOG_END] = end + 2
 
@@ -130,7 +132,7 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     row.built = head[tb.ITERATION]
     row.drift = 0.0
     row.born = row.values_born = row.logged = head[tb.UPDATE]
-    _append(head, TAKEN_CLIQUE, c, _words(head, TAKEN_CLIQUE, c))
+    _append(head, TAKEN_CLIQUE, c, tb.clique_words(head)[c, :0])
     return c
 
 
@@ -177,19 +179,14 @@ def begin(head):  # type: ignore[no-untyped-def]
 
     If they are not, `Memory.restart_stamps` is due, and `begin` again.
     """
-    log, n_touched = tb.log(head), head[tb.N_TOUCHED]
     head[tb.UPDATE] += 1
-    scalars = tb.scalar_words(head)[0]
-    copied(scalars, log[:len(scalars)])
-    lists = log[len(scalars):]
-    end = n_touched + head[tb.N_WAITING]
-    copied(tb.touched(head), lists[:n_touched])
-    copied(tb.waiting(head), lists[n_touched:end])
-    for counter in STARTED_WITH:
-        lists[end] = head[counter]
-        end += 1
-    lists[end] = START
-    head[tb.LOG_END], head[tb.N_FREED] = len(scalars) + end + 1, 0
+    head[tb.LOG_END] = head[tb.N_FREED] = 0
+    _append_words(head, head[tb.N_NODES:tb.LOOSE + 1])
+    _append_words(head, tb.scalar_words(head)[0])
+    _append_words(head, tb.touched(head)[:head[tb.N_TOUCHED]])
+    _append_words(head, tb.waiting(head)[:head[tb.N_WAITING]])
+    tb.log(head)[head[tb.LOG_END]] = START
+    head[tb.LOG_END] += 1
     return head[tb.FRONT_SERIAL] <= tb.LAST_STAMP and head[tb.UPDATE] <= tb.LAST_STAMP + 1
 
 
@@ -238,13 +235,10 @@ def rollback(head):  # type: ignore[no-untyped-def]
         if row.values != values:
             pools.give(head, pools.VALUES, values, size)
     if end > 0:
-        at = end - 1 - len(STARTED_WITH)
-        for counter in STARTED_WITH:
-            head[counter] = log[at]
-            at += 1
-        scalars, n_touched = tb.scalar_words(head)[0], head[tb.N_TOUCHED]
-        copied(log, scalars)
-        lists = log[len(scalars):]
+        counters, scalars = head[tb.N_NODES:tb.LOOSE + 1], tb.scalar_words(head)[0]
+        copied(log, counters)
+        copied(log[len(counters):], scalars)
+        lists, n_touched = log[len(counters) + len(scalars):], head[tb.N_TOUCHED]
         copied(lists, tb.touched(head)[:n_touched])
         copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
     head[tb.N_FREED] = head[tb.LOG_END] = 0

@@ -41,6 +41,7 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     pose[0] = before[0] + c * mean[0] - s * mean[1]
     pose[1] = before[1] + s * mean[0] + c * mean[1]
     pose[2] = factors.wrap(before[2] + mean[2])
+    tb.nodes(head)[v].kind, tb.nodes(head)[v].dimension = 0, 3
     rows.start_node(head, v)
     tb.node_id(head)[v] = head[tb.NEXT_NODE]
 
