@@ -45,8 +45,9 @@ def _append_words(head, words):  # type: ignore[no-untyped-def]
 @kernel
 def _append(head, kind, row, words):  # type: ignore[no-untyped-def]
     """Append an entry."""
-    _append_words(head, words)
-    log, end = tb.log(head), head[tb.LOG_END]
+    log, begin = tb.log(head), head[tb.LOG_END]
+    end = begin + len(words)
+    copied(words, log[begin:end])
     log[end], log[end + 1] = row, kind
     head[tb.LOG_END] = end + 2
 

@@ -155,11 +155,10 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
         for r in range(len(here)):
             forward_rows(values[row_start(begin, 3 * n) + begin:], 3 * n_frontal - begin,
                          3 * n - begin, here[r, begin:])
-            for s in range(r + 1):
-                for q in range(begin, 3 * n_frontal):
-                    if nodes[members[q // 3]].fixed == 0:
-                        out[s, r] += here[s, q] * here[r, q]
-                out[r, s] = out[s, r]
+        for q in range(begin, 3 * n_frontal):
+            for r in range(len(here) if nodes[members[q // 3]].fixed == 0 else 0):
+                for s in range(len(here)):
+                    out[r, s] += here[r, q] * here[s, q]
         if row.parent < 0:
             break
         # the right-hand sides of the separator are those of the parent, in its frame
