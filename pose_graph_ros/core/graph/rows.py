@@ -111,7 +111,7 @@ def start_node(head, v):  # type: ignore[no-untyped-def]
     factors.refer_to_pose(node)
     node.scale_t = node.scale_r = 0.0
     node.clique = node.factor_list = -1
-    node.index = node.front = node.changed = node.solution_logged = 0
+    node.index = node.front = node.changed = 0
     node.logged = head[tb.UPDATE]
     node.fixed = node.touched = 0
 

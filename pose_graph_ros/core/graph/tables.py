@@ -37,7 +37,6 @@ HEAD, RECORDS = INTEGERS, types.Array(from_dtype(RECORD), 1, 'C')
 # --- records ------------------------------------------------------------------------------------
 
 NODE: Final = np.dtype([
-    # a solve changes only the fields up to `checked_turn`; see SOLUTION
     ('pose', 'f8', (3,)),       # in the map, theta in [-pi, pi) [m, m, rad]
     ('delta', 'f8', (3,)),      # solution, the pose minus `reference`, theta not wrapped
     ('seen', 'f8', (3,)),       # `delta` that the cliques below were last solved with
@@ -56,9 +55,7 @@ NODE: Final = np.dtype([
     ('index', 'i4'),            # place of the node in the present front; work space
     ('front', 'i4'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
     ('changed', 'i4'),          # stamp (ITERATION) of the last move by more than alpha sigmas
-    # stamps (UPDATE) of the last log of the row, and of its solution alone
-    ('logged', 'i4'),
-    ('solution_logged', 'i4'),
+    ('logged', 'i4'),           # stamp (UPDATE) of the last log of the row
     ('kind', 'u1'),             # `NodeKind`
     ('dimension', 'u1'),        # number of its coordinates; the others are and stay 0
     ('fixed', 'u1'),            # 1 if the node keeps its pose
@@ -82,11 +79,8 @@ FACTOR: Final = np.dtype([
     ('ends', 'i4', (3,)),       # nodes i, j and k; j is -1 where it has one end, in the map
     ('next', 'i4', (3,)),       # next entries of the lists of these; LEAVES: see `factor_list`
     ('owner', 'i4'),            # row of the clique that the factor was assembled in
-    # stamps (UPDATE) of the last log of the row, and of its energy alone
-    ('logged', 'i4'),
-    ('energy_logged', 'i4'),
+    ('logged', 'i4'),           # stamp (UPDATE) of the last log of the row
     ('kind', 'i4'),             # `FactorKind`
-    # a check changes only the fields from here on; see ENERGY
     ('error2', 'f8'),           # squared linearization error, weighted [sigma^2]
     ('energy', 'f8'),           # e^T information e, weighted [sigma^2]
     ('checked', 'i4'),          # stamp (ITERATION) of the last check of the linearization
@@ -162,9 +156,6 @@ TABLES: Final[dict[str, np.dtype[Any]]] = {
     ) for name in names}}
 NAMES: Final = tuple(TABLES)
 WORD: Final = 8     # bytes; the size of a record is a multiple of it
-# Number of words of a node that a solve changes, and of a factor that a check leaves as they are.
-SOLUTION: Final[int] = NODE.fields['scale_t'][1] // WORD    # type: ignore[index]
-ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index]
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
 
@@ -213,8 +204,7 @@ HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
 LAST_STAMP: Final = 2**30
 COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LISTED)
 STAMPS: Final = {
-    'nodes': ('front', 'changed', 'logged', 'solution_logged'),
-    'factors': ('checked', 'logged', 'energy_logged'),
+    'nodes': ('front', 'changed', 'logged'), 'factors': ('checked', 'logged'),
     'cliques': ('marked', 'built', 'born', 'values_born', 'logged'),
 }
 

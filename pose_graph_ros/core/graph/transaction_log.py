@@ -16,15 +16,15 @@ from pose_graph_ros.core.graph.constraints import NodeKind
 
 # Kinds of entries of the log, which are words of a record, the row of it, and the kind; START has
 # its kind alone behind what `begin` logs.
-NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
+NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, START = range(5)
 _POSE = int(NodeKind.POSE)
 
 
 def largest(n_nodes: int, n_factors: int) -> int:
     """Return how many words the log of one update may have."""
-    # for each node also its solution, a clique, new cliques, and the lists of `begin`
-    of_node = (tb.NODE.itemsize + tb.CLIQUE.itemsize) // tb.WORD + tb.SOLUTION + 16
-    of_factor = 2 * tb.FACTOR.itemsize // tb.WORD - tb.ENERGY + 6
+    # for each node also a clique, new cliques, and the lists of `begin`
+    of_node = (tb.NODE.itemsize + tb.CLIQUE.itemsize) // tb.WORD + 16
+    of_factor = tb.FACTOR.itemsize // tb.WORD + 6
     return n_nodes * of_node + n_factors * of_factor + tb.SCALARS.itemsize
 
 
@@ -57,12 +57,8 @@ def _words(head, kind, row):  # type: ignore[no-untyped-def]
     """Return the words of a record that an entry of a kind holds."""
     if kind == NODE:
         return tb.node_words(head)[row]
-    if kind == SOLUTION:
-        return tb.node_words(head)[row, :tb.SOLUTION]
     if kind == FACTOR:
         return tb.factor_words(head)[row]
-    if kind == ENERGY:
-        return tb.factor_words(head)[row, tb.ENERGY:]
     if kind == CLIQUE:
         return tb.clique_words(head)[row]
     return tb.clique_words(head)[row, :0]
@@ -75,24 +71,6 @@ def log_node(head, v):  # type: ignore[no-untyped-def]
     if node.logged != head[tb.UPDATE]:
         _append(head, NODE, v, tb.node_words(head)[v])
         node.logged = head[tb.UPDATE]
-
-
-@kernel
-def log_solution(head, v):  # type: ignore[no-untyped-def]
-    """Log what a solve changes of a node, before it changes."""
-    node = tb.nodes(head)[v]
-    if node.logged != head[tb.UPDATE] and node.solution_logged != head[tb.UPDATE]:
-        node.solution_logged = head[tb.UPDATE]
-        _append(head, SOLUTION, v, tb.node_words(head)[v, :tb.SOLUTION])
-
-
-@kernel
-def log_energy(head, e):  # type: ignore[no-untyped-def]
-    """Log what a check changes of a factor, before it changes."""
-    f = tb.factors(head)[e]
-    if f.logged != head[tb.UPDATE] and f.energy_logged != head[tb.UPDATE]:
-        f.energy_logged = head[tb.UPDATE]
-        _append(head, ENERGY, e, tb.factor_words(head)[e, tb.ENERGY:])
 
 
 @kernel
@@ -251,7 +229,7 @@ def largest_move(head):  # type: ignore[no-untyped-def]
     nodes, log, end, largest = tb.nodes(head), tb.log(head), head[tb.LOG_END], 0.0
     while end > 0 and log[end - 1] != START:
         end, row, kind = _entry(head, end)
-        if kind in (NODE, SOLUTION) and nodes[row].kind == _POSE:
+        if kind == NODE and nodes[row].kind == _POSE:
             for k in range(2):
                 largest = max(largest, abs(nodes[row].pose[k] - tb.log_numbers(head)[end + k]))
     return largest

@@ -45,7 +45,7 @@ def _move(head, v, dx, dy, dth, phi, alpha):  # type: ignore[no-untyped-def]
     nodes, scalars = tb.nodes(head), tb.scalars(head)[0]
     work_i, room = tb.work_i(head), head[tb.NODE_ROOM]
     f = nodes[v]
-    transaction_log.log_solution(head, v)
+    transaction_log.log_node(head, v)
     f.delta[0], f.delta[1], f.delta[2] = dx, dy, dth
     f.pose[0], f.pose[1] = f.reference[0] + dx, f.reference[1] + dy
     f.pose[2] = factors.wrap(f.reference[2] + dth)
@@ -172,7 +172,7 @@ def _propagate(head, c, motion, stack, depth):  # type: ignore[no-untyped-def]
         row = cliques[stack[depth]]
         for m in range(row.members, row.members + row.n_frontal):
             v = pool_i[m]
-            transaction_log.log_solution(head, v)
+            transaction_log.log_node(head, v)
             f = nodes[v]
             x, y = f.pose[0] - pivot_x, f.pose[1] - pivot_y
             x, y = cos * x - sin * y + goal_x, sin * x + cos * y + goal_y

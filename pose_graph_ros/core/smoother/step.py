@@ -283,7 +283,7 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
                 owner = f.owner
                 phi = clique_frames.present_turn(head, owner)
                 frame = (phi, math.cos(phi), math.sin(phi))
-            transaction_log.log_energy(head, e)
+            transaction_log.log_factor(head, e)
             scalars.chi2 -= f.energy
             factors.check(head, e, frame)
             scalars.chi2 += f.energy
