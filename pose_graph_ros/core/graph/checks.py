@@ -212,12 +212,10 @@ def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
         raise GraphUpdateError(f'{name}: {what} {array[gone][0]} has left the graph')
 
 
-def check_weights(name: str, weights: Mapping[int, float], what: str, known: Ids) -> None:
-    """Raise unless ids and weights are valid."""
-    check_ids(name, weights, what, known)
+def check_weights(weights: Mapping[int, float]) -> None:
+    """Raise unless new weights are valid."""
     numbers = np.fromiter(weights.values(), np.float64, len(weights))
     if not np.all(np.isfinite(numbers) & (numbers >= 0.0)):
         number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
-        raise GraphUpdateError(
-            f'{name}: expected a finite weight that is not negative, got {weight} '
-            f'for number {number}')
+        raise GraphUpdateError(f'weigh: expected a finite weight that is not negative, got '
+                               f'{weight} for number {number}')

@@ -23,7 +23,7 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
-from pose_graph_ros.core.graph.graph_update import Gone, NOTHING_GONE
+from pose_graph_ros.core.graph.graph_update import Gone
 from pose_graph_ros.core.graph.rows import touch
 
 # Results of `add_rows`.
@@ -277,7 +277,7 @@ def compact(memory: tb.Memory) -> Gone:
     """Take out all rows that leave, and return their ids; the update must have been committed."""
     head = memory.head
     if head[tb.N_LEAVING] == 0:
-        return NOTHING_GONE
+        return Gone(*np.empty((2, 0), np.int64))
     nodes, factors = memory['nodes'][:head[tb.N_NODES]], memory['factors'][:head[tb.N_FACTORS]]
     stays = nodes['factor_list'] != tb.LEAVES
     with_ends = np.append(stays, True)  # -1: no such end
