@@ -6,14 +6,8 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.simd import add
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
-from pose_graph_ros.core.graph import (
-    factors,
-    normal_equations,
-    prior_rows,
-    tables as tb,
-    transaction_log,
-)
-from pose_graph_ros.core.graph.factors import anchors
+from pose_graph_ros.core.graph import normal_equations, prior_rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.factors import anchors, linearize
 from pose_graph_ros.core.graph.pools import row_start, separator, triangle_size, update_matrix
 
 # Where factors are stiff in one direction and weak in another, as those of a turn on the spot,
@@ -126,7 +120,7 @@ def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped
             continue
         if terms == RELINEARIZED:
             transaction_log.log_factor(head, e)
-            factors.linearize(head, e)
+            linearize(head, e)
         f.owner = c
         anchored |= anchors(f)
         normal_equations.add(head, e, (at_i, at_j, at_k), front, ld)

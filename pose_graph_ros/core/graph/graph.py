@@ -400,9 +400,7 @@ class Graph:
     def begin(self) -> None:
         """Begin an update; `rollback` reverts all edits and steps after it."""
         self._updating = True
-        if not transaction_log.begin(self.memory.head):
-            self.memory.restart_stamps()
-            transaction_log.begin(self.memory.head)
+        transaction_log.begin(self.memory.head)
 
     def commit(self) -> Gone:
         """End an update and keep its changes; return what has left, whose rows are taken out."""

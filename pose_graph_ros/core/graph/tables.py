@@ -48,14 +48,14 @@ NODE: Final = np.dtype([
     ('scale_t', 'f8'),
     ('scale_r', 'f8'),
     ('reference', 'f8', (3,)),  # constant until all nodes are linearized anew [m, m, rad]
+    ('front', 'i8'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
+    ('changed', 'i8'),          # stamp (ITERATION) of the last move by more than alpha sigmas
+    ('logged', 'i8'),           # stamp (UPDATE) of the last log of the row
     ('clique', 'i4'),           # row of the clique that the node is frontal in
     # head of the list of its factors with a weight above 0, whose entries are 4 * factor + the
     # index of the end; LEAVES if `editing.compact` takes the node out later
     ('factor_list', 'i4'),
     ('index', 'i4'),            # place of the node in the present front; work space
-    ('front', 'i4'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
-    ('changed', 'i4'),          # stamp (ITERATION) of the last move by more than alpha sigmas
-    ('logged', 'i4'),           # stamp (UPDATE) of the last log of the row
     ('kind', 'u1'),             # `NodeKind`
     ('dimension', 'u1'),        # number of its coordinates; the others are and stay 0
     ('fixed', 'u1'),            # 1 if the node keeps its pose
@@ -79,11 +79,11 @@ FACTOR: Final = np.dtype([
     ('ends', 'i4', (3,)),       # nodes i, j and k; j is -1 where it has one end, in the map
     ('next', 'i4', (3,)),       # next entries of the lists of these; LEAVES: see `factor_list`
     ('owner', 'i4'),            # row of the clique that the factor was assembled in
-    ('logged', 'i4'),           # stamp (UPDATE) of the last log of the row
     ('kind', 'i4'),             # `FactorKind`
     ('error2', 'f8'),           # squared linearization error, weighted [sigma^2]
     ('energy', 'f8'),           # e^T information e, weighted [sigma^2]
-    ('checked', 'i4'),          # stamp (ITERATION) of the last check of the linearization
+    ('checked', 'i8'),          # stamp (ITERATION) of the last check of the linearization
+    ('logged', 'i8'),           # stamp (UPDATE) of the last log of the row
     ('waits', 'i4'),            # 1 if the factor is in the table `waiting`
 ], align=True)
 # In place of a list's head or next entry: the row leaves the graph, and is in no list.
@@ -112,12 +112,12 @@ CLIQUE: Final = np.dtype([
     # index in pool_f of its rows of R, with the update matrix behind them; see `prior_rows`
     ('values', 'i4'),
     # stamp (FRONT_SERIAL) of the last marking for elimination
-    ('marked', 'i4'),
-    ('built', 'i4'),            # stamp (ITERATION) of the last elimination or solution
+    ('marked', 'i8'),
+    ('built', 'i8'),            # stamp (ITERATION) of the last elimination or solution
     # stamps (UPDATE) of taking the row, of taking the values, and of the last log of the row
-    ('born', 'i4'),
-    ('values_born', 'i4'),
-    ('logged', 'i4'),
+    ('born', 'i8'),
+    ('values_born', 'i8'),
+    ('logged', 'i8'),
     # 1 if a node at or below it is fixed or has a factor whose axes do not turn with its clique
     ('anchored', 'i4'),
 ], align=True)
@@ -198,15 +198,6 @@ N_SIZES: Final = len(SIZES)
 # Heads of the free lists of pool_f and pool_i, one for each size.
 FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
 HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
-
-# Largest counter value that rows keep as a stamp of 32 bits; `restart_stamps` is due beyond it.
-# FRONT_SERIAL reaches it after hours, UPDATE after some hundred days.
-LAST_STAMP: Final = 2**30
-COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LISTED)
-STAMPS: Final = {
-    'nodes': ('front', 'changed', 'logged'), 'factors': ('checked', 'logged'),
-    'cliques': ('marked', 'built', 'born', 'values_born', 'logged'),
-}
 
 # Capacity of a new table [rows]; rows never written to take no memory.
 FIRST_ROWS: Final = 1024
@@ -304,10 +295,3 @@ class Memory:
             as_bytes(grown)[:keep] = as_bytes(self._tables[name])[:keep]
         self._tables[name] = grown
         self.head[at], self.head[at + 1] = grown.ctypes.data, capacity
-
-    def restart_stamps(self) -> None:
-        """Set the counters of stamps and all stamps to 0; allowed between two updates only."""
-        for name, fields in STAMPS.items():
-            for field in fields:
-                self._tables[name][field] = 0
-        self.head[list(COUNTERS_OF_STAMPS)] = 0

@@ -153,11 +153,7 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD,))
 def begin(head):  # type: ignore[no-untyped-def]
-    """
-    Log counters, scalars and lists; return whether the counters of stamps are within `LAST_STAMP`.
-
-    If they are not, `Memory.restart_stamps` is due, and `begin` again.
-    """
+    """Log counters, scalars and lists."""
     head[tb.UPDATE] += 1
     head[tb.LOG_END] = head[tb.N_FREED] = 0
     _append_words(head, head[tb.N_NODES:tb.LOOSE + 1])
@@ -166,7 +162,6 @@ def begin(head):  # type: ignore[no-untyped-def]
     _append_words(head, tb.waiting(head)[:head[tb.N_WAITING]])
     tb.log(head)[head[tb.LOG_END]] = START
     head[tb.LOG_END] += 1
-    return head[tb.FRONT_SERIAL] <= tb.LAST_STAMP and head[tb.UPDATE] <= tb.LAST_STAMP + 1
 
 
 @kernel(signature=(tb.HEAD,))
