@@ -21,7 +21,7 @@ the cliques of a graph.
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
+from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -33,10 +33,8 @@ from pose_graph_ros.core.graph.constraints import FactorKind, FACTORS, Factors, 
 from pose_graph_ros.core.sparse import BlockFactors, BlockPattern, order_of
 
 if TYPE_CHECKING:
-    from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
     from pose_graph_ros.core.graph.graph import Graph
 
-Constrained: TypeAlias = 'Graph | PlainGraph'
 Blocks = npt.NDArray[Any]   # real or complex, shape (M, r, b)
 Ends = Sequence[Blocks]   # one for each end of a constraint
 ChordalSolve = Callable[[ComplexArray, ComplexArray | None], ComplexArray]
@@ -49,6 +47,21 @@ What is known of fixed nodes, and what is returned, are complex numbers, the las
 # Kinds of edges that tell where the other end is, and those that are linear in t and u.
 _PLACING = [kind for kind, factor in FACTORS.items() if factor.places]
 _LINEAR = [*_PLACING, *(kind for kind, factor in FACTORS.items() if 0 not in factor.rows)]
+
+
+class Constrained(Protocol):
+    """What is needed of a graph, a `Graph` or a `PlainGraph`."""
+
+    @property
+    def node_kind(self) -> npt.NDArray[Any]: ...
+    @property
+    def n_priors(self) -> int: ...
+    @property
+    def poses(self) -> Poses: ...
+    @property
+    def fixed(self) -> BoolArray: ...
+    @property
+    def factors_by_row(self) -> Factors: ...  # with rows for ends
 
 
 class Terms(NamedTuple):
