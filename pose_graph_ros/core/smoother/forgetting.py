@@ -69,8 +69,7 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
     leaving nodes are ordered before all others. The caller has begun an update.
     """
     cliques = tb.cliques(head)
-    nodes, pool_i, touched = tb.nodes(head), tb.pool_i(head), tb.touched(head)
-    stack = tb.work_i(head)
+    nodes, pool_i, stack = tb.nodes(head), tb.pool_i(head), tb.work_i(head)
     whole, _ = _whole(head, leaving)
     mixed = False
     for v in leaving:
@@ -78,9 +77,7 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
             continue
         mixed = True
         transaction_log.log_node(head, v)
-        if nodes[v].touched == 0:
-            touched[head[tb.N_TOUCHED]] = v
-            head[tb.N_TOUCHED] += 1
+        touch(head, v)
         nodes[v].touched = ORDERED_FIRST
         stack[0] = nodes[v].clique
         depth = 1
