@@ -30,6 +30,7 @@ from pose_graph_ros.core.graph.rows import touch
 ADDED, NO_ROOM, UNSOUND = range(3)
 # In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
+NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
 _POSE = int(NodeKind.POSE)
 
 
@@ -277,7 +278,7 @@ def compact(memory: tb.Memory) -> Gone:
     """Take out all rows that leave, and return their ids; the update must have been committed."""
     head = memory.head
     if head[tb.N_LEAVING] == 0:
-        return Gone(*np.empty((2, 0), np.int64))
+        return NOTHING_GONE
     nodes, factors = memory['nodes'][:head[tb.N_NODES]], memory['factors'][:head[tb.N_FACTORS]]
     stays = nodes['factor_list'] != tb.LEAVES
     with_ends = np.append(stays, True)  # -1: no such end
