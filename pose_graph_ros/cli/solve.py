@@ -25,7 +25,7 @@ from pose_graph_ros.cli.arguments import METHODS, STARTS
 from pose_graph_ros.cli.graph_input import read_file, rows_of
 from pose_graph_ros.core import config, sparse
 from pose_graph_ros.core.batch.levenberg_marquardt import BatchResult, Start, Status
-from pose_graph_ros.core.batch.plain_optimizer import PlainGraph, PlainOptimizer
+from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
 from pose_graph_ros.core.exceptions import ConfigError, LinearSolveError, PoseGraphError
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import constraints, graph_update
@@ -54,7 +54,7 @@ class Solution(NamedTuple):
     start: str  # poses from which it was reached
     determined: bool  # whether the constraints determine all poses
     tried: tuple[tuple[str, BatchResult], ...] = ()  # all starts, if there were several
-    optimizer: PlainOptimizer | None = None  # what found it, if no compiled kernels were used
+    optimizer: PlainGraph | None = None  # what found it, if no compiled kernels were used
 
 
 class Problem:
@@ -122,10 +122,10 @@ def resumed(problem: Problem, solution: Solution, poses: Poses) -> Solution:
 def _solve_from(problem: Problem, start: str, poses: FloatArray) -> Solution:
     if problem.plain is not None and start in {'chordal', 'present'}:
         problem.plain.set_poses(poses)
-        plain = PlainOptimizer(problem.plain, CONFIG)
-        found = plain.optimize(Start.CHORDAL if start == 'chordal' else Start.PRESENT)
+        found = problem.plain.optimize(
+            CONFIG, Start.CHORDAL if start == 'chordal' else Start.PRESENT)
         if found is not None:
-            return Solution(found, found.start.value, True, (), plain)
+            return Solution(found, found.start.value, True, (), problem.plain)
     # loads the compiled kernels
     from pose_graph_ros.core.batch import optimizer
 
@@ -225,7 +225,7 @@ def with_certificate(problem: Problem, solution: Solution, *,
     try:
         formulation, by = formulate(graph), solution.optimizer
         made = certify(formulation, graph.poses, eigenvalue=eigenvalue, hessian=(
-            None if by is None else NearHessian(by.places, by.heading_steps)))
+            None if by is None else NearHessian(by.nodes.places, by.heading_steps)))
     except (NotCoveredError, LinearSolveError) as error:
         return none(str(error))
     found = None

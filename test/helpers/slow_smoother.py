@@ -499,10 +499,13 @@ def cliques(graph: Graph) -> dict[int, Clique]:
 def state(graph: Graph) -> dict[str, bytes]:
     """Return all numbers that later steps depend on as bytes, for comparison bit by bit."""
     memory = graph.memory
-    copies = {name: memory[name][:memory.head[count]].copy() for name, count in _USED.items()}
-    for name, fields in tb.STAMPS.items():
-        for stamp in fields if name in copies else ():
-            copies[name][stamp] = 0
+    # with the bytes between the fields, which NumPy would not copy
+    copies = {name: tb.as_bytes(memory[name][:memory.head[count]]).copy().view(memory[name].dtype)
+              for name, count in _USED.items()}
+    for table in copies.values():   # all integers of eight bytes are stamps
+        for name in table.dtype.names or ():
+            if table.dtype[name] == np.int64:
+                table[name] = 0
     copies['nodes']['index'] = 0  # work space
     parts = {name: table.tobytes() for name, table in copies.items()}
     parts['cliques'] = b''.join(

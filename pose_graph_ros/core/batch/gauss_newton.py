@@ -42,11 +42,8 @@ def eliminate(head, damping, terms):  # type: ignore[no-untyped-def]
     which is `BAD_NODE` of the head.
     """
     scalars = tb.scalars(head)[0]
-    for v in range(head[tb.N_NODES] if terms == assembly.LINEARIZED else 0):
-        factors.refer_to_pose(tb.nodes(head)[v])
-    for e in range(head[tb.N_FACTORS] if terms == assembly.LINEARIZED else 0):
-        if tb.factors(head)[e].weight > 0.0:
-            factors.linearize(head, e)
+    if terms == assembly.LINEARIZED:
+        factors.linearize_all(head)
     scalars.damping = damping
     bad = -1
     for c in range(head[tb.N_PRIORS], head[tb.N_CLIQUES]):  # `symbolic.plant` puts priors first
@@ -143,40 +140,6 @@ def evaluate(head, right):  # type: ignore[no-untyped-def]
         reach = max(reach, abs(nodes[v].pose[0]), abs(nodes[v].pose[1]))
     # rounding of a sum of many numbers, and of coordinates
     return chi2, 1e-12 * max(chi2, 1.0) + 2.0**-52 * (reach * gradient_sum + cancelled)
-
-
-@kernel(signature=(tb.HEAD,))
-def settle(head):  # type: ignore[no-untyped-def]
-    """
-    Evaluate all factors and bring the tables into the state after a step of the smoother.
-
-    If the sum of the squared linearization errors exceeds the smoother's budget, the factors
-    with large errors are listed in `waiting`, to be linearized again in its next step.
-    """
-    nodes, scalars, waiting = tb.nodes(head), tb.scalars(head)[0], tb.waiting(head)
-    for v in range(head[tb.N_NODES]):
-        for k in range(3):
-            nodes[v].seen[k] = nodes[v].delta[k]
-    chi2 = error2 = 0.0
-    for e in range(head[tb.N_FACTORS]):
-        f = tb.factors(head)[e]
-        f.waits = 0
-        if f.weight > 0.0:
-            factors.check(head, e, factors.NO_TURN)
-            chi2 += f.energy
-            error2 += f.error2
-    scalars.chi2 = chi2
-    prior_rows.add_energies(head)
-    head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
-    if not 0.0 < scalars.budget < error2:
-        return
-    threshold = factors.LEAST_FRACTION * scalars.share
-    for e in range(head[tb.N_FACTORS]):
-        f = tb.factors(head)[e]
-        if f.error2 > threshold:
-            f.waits = 1
-            waiting[head[tb.N_WAITING]] = e
-            head[tb.N_WAITING] += 1
 
 
 class CompiledSystem:

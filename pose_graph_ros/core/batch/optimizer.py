@@ -194,7 +194,7 @@ def _minimize(graph: Graph, config: SolverConfig, chi2: float) -> Optimization:
     if result.status is Status.FAILED:
         node = graph.node_ids[graph.memory.head[tb.BAD_NODE]]
         return _failed(f'hidden node {node} is not determined', chi2)
-    gauss_newton.settle(graph.memory.head)
+    editing.settle(graph.memory.head)
     return result
 
 

@@ -12,14 +12,13 @@ start, and no result unless the poses converge in a few steps.
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from pose_graph_ros.core.batch import levenberg_marquardt as lm
 from pose_graph_ros.core.batch.linear_starts import chordal, NodeSystem, sparse_chordal
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.exceptions import LinearSolveError
 from pose_graph_ros.core.geometry import se2
-from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
+from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph.checks import are_definite
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors, NodeKind
 from pose_graph_ros.core.graph.graph_update import Energies, GraphRows
@@ -27,18 +26,17 @@ from pose_graph_ros.core.sparse import BlockFactors
 
 
 class PlainGraph:
-    """A graph of poses and edges between them."""
+    """A graph of poses and edges between them, a `System` of `levenberg_marquardt`."""
 
     def __init__(self, rows: GraphRows) -> None:
-        self._rows = rows
+        self._rows, self.n_nodes, self.n_priors = rows, len(rows.poses), 0
         self.poses = rows.poses.copy()
         """Of the hidden nodes in the map, shape (N, 3) [m, m, rad]."""
-        self.fixed: BoolArray = rows.fixed.copy()
-        """Whether hidden nodes keep their pose, shape (N,)."""
+        self.fixed, self.node_kind, self.is_pose = rows.fixed, rows.node_kind, rows.is_pose
         self.factors = self.factors_by_row = rows.factors
         """All edges; ids are rows."""
-        self.n_nodes, self.n_priors = len(rows.poses), 0
-        self.node_kind: npt.NDArray[np.uint8] = np.zeros(self.n_nodes, dtype=np.uint8)
+        self._nodes: NodeSystem | None = None
+        self._factors: BlockFactors | None = None
 
     @classmethod
     def is_covered(cls, rows: GraphRows) -> bool:
@@ -55,15 +53,6 @@ class PlainGraph:
                 and bool(np.all(are_definite(rows.factors.information)))
                 and np.array_equal(rows.node_ids, np.arange(len(rows.poses))))
 
-    @property
-    def is_pose(self) -> BoolArray:
-        """Whether hidden nodes are poses, shape (N,)."""
-        return np.ones(self.n_nodes, dtype=bool)
-
-    def set_poses(self, poses: FloatArray) -> None:
-        """Set the poses of all hidden nodes, shape (N, 3) [m, m, rad]."""
-        self.poses = se2.wrapped(poses)
-
     def factors_at(self, rows: IntArray) -> Factors:
         """Return some of the edges."""
         return self.factors.rows(rows)
@@ -78,7 +67,71 @@ class PlainGraph:
 
     def rows(self) -> GraphRows:
         """Return the graph with the present poses."""
-        return self._rows._replace(poses=self.poses.copy(), fixed=self.fixed.copy())
+        return self._rows._replace(poses=self.poses.copy())
+
+    def optimize(self, config: SolverConfig, start: lm.Start) -> lm.BatchResult | None:
+        """
+        Return the result of moving the poses to a minimum from a chordal start or where they are.
+
+        None, with the poses as they were, if it is not reached in a few steps, or is above chi2 of
+        the poses before.
+        """
+        before, steps, self._factors = self.poses, config.max_iterations, None
+        # what overflows has no finite chi2, and is no result
+        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
+            try:
+                first = chi2 = self.evaluate()[0]
+                if start is lm.Start.CHORDAL and first < np.inf:
+                    steps = min(steps, lm.TRUSTED_ITERATIONS)
+                    self.poses = chordal(self, sparse_chordal(self, self.nodes))
+                    chi2 = self.evaluate()[0]
+                if chi2 < np.inf:
+                    result = lm.to_the_end(lm.minimize(
+                        self, chi2, replace(config, max_iterations=steps)))
+                    if lm.is_trusted(result, first if start is lm.Start.CHORDAL else chi2):
+                        return replace(result, start=start)
+            except LinearSolveError:
+                pass
+        self.poses = before
+        return None
+
+    @property
+    def nodes(self) -> NodeSystem:
+        """The normal equations, with the place of each node that is not fixed in their order."""
+        if self._nodes is None:
+            self._nodes = NodeSystem(self.factors.i, self.factors.j, ~self.fixed)
+        return self._nodes
+
+    def heading_steps(self, derivative: FloatArray) -> FloatArray:
+        """Return a step of Gauss-Newton of the headings of nodes that are not fixed, (F,)."""
+        assert self._factors is not None
+        right = np.zeros((len(derivative), 3))
+        right[:, 2] = derivative
+        return np.asarray(self._factors.solve(right.ravel())[2::3])
+
+    def set_poses(self, poses: FloatArray) -> None:
+        """Set the poses of all hidden nodes, shape (N, 3) [m, m, rad]."""
+        self.poses = se2.wrapped(poses)
+
+    def evaluate(self) -> tuple[float, float]:
+        error, by_i, by_j = linearized(self.poses, self.factors)
+        weighted = np.einsum('mij,mj->mi', self.factors.information, error)
+        self._by = by_i, by_j
+        self._right = -self.nodes.gathered(self._by, weighted)
+        chi2 = float(np.einsum('mi,mi->', weighted, error))
+        return chi2, 1e-9 * chi2   # its rounding
+
+    def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
+        if damping > 0.0:
+            raise LinearSolveError('left to the compiled optimiser: it needs damping')
+        if not chord or self._factors is None:
+            information, (by_i, by_j) = self.factors.information, self._by
+            self._factors = self.nodes.factors(self._by, (information @ by_i, information @ by_j))
+        step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
+        poses = self.poses.copy()
+        poses[self.nodes.free] += step
+        self.set_poses(poses)
+        return float(np.max(np.abs(step), initial=0.0)), float(np.sum(self._right * step))
 
 
 def linearized(poses: Poses, edges: Factors) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -105,76 +158,3 @@ def linearized(poses: Poses, edges: Factors) -> tuple[FloatArray, FloatArray, Fl
     by_i = -by_j
     by_i[:, 0, 2], by_i[:, 1, 2] = y, -x
     return error, by_i, by_j
-
-
-class PlainOptimizer:
-    """Optimiser of one graph, whose poses it changes: a `System` of `levenberg_marquardt`."""
-
-    def __init__(self, graph: PlainGraph, config: SolverConfig) -> None:
-        self._graph, self._config = graph, config
-        self._nodes = NodeSystem(graph.factors.i, graph.factors.j, ~graph.fixed)
-        self.places = self._nodes.places
-        """Place of each node that is not fixed in the order of elimination."""
-        self._factors: BlockFactors | None = None
-
-    def optimize(self, start: lm.Start) -> lm.BatchResult | None:
-        """
-        Return the result of moving the poses to a minimum from a chordal start or where they are.
-
-        None, with the poses as they were, if it is not reached in a few steps, or is above chi2 of
-        the poses before.
-        """
-        graph, before, steps = self._graph, self._graph.poses, self._config.max_iterations
-        # what overflows has no finite chi2, and is no result
-        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
-            try:
-                first = chi2 = self.evaluate()[0]
-                if start is lm.Start.CHORDAL and first < np.inf:
-                    steps = min(steps, lm.TRUSTED_ITERATIONS)
-                    graph.poses = chordal(graph, sparse_chordal(graph, self._nodes))
-                    chi2 = self.evaluate()[0]
-                if chi2 < np.inf:
-                    result = lm.to_the_end(lm.minimize(
-                        self, chi2, replace(self._config, max_iterations=steps)))
-                    if lm.is_trusted(result, first if start is lm.Start.CHORDAL else chi2):
-                        return replace(result, start=start)
-            except LinearSolveError:
-                pass
-        graph.poses = before
-        return None
-
-    def heading_steps(self, derivative: FloatArray) -> FloatArray:
-        """Return a step of Gauss-Newton of the headings of nodes that are not fixed, (F,)."""
-        assert self._factors is not None
-        right = np.zeros((len(derivative), 3))
-        right[:, 2] = derivative
-        return np.asarray(self._factors.solve(right.ravel())[2::3])
-
-    @property
-    def poses(self) -> Poses:
-        return self._graph.poses
-
-    def set_poses(self, poses: Poses) -> None:
-        self._graph.poses = poses
-
-    def evaluate(self) -> tuple[float, float]:
-        graph = self._graph
-        error, by_i, by_j = linearized(graph.poses, graph.factors)
-        weighted = np.einsum('mij,mj->mi', graph.factors.information, error)
-        self._by = by_i, by_j
-        self._right = -self._nodes.gathered(self._by, weighted)
-        chi2 = float(np.einsum('mi,mi->', weighted, error))
-        return chi2, 1e-9 * chi2   # its rounding
-
-    def step(self, damping: float, *, chord: bool) -> tuple[float, float]:
-        if damping > 0.0:
-            raise LinearSolveError('left to the compiled optimiser: it needs damping')
-        graph, (by_i, by_j) = self._graph, self._by
-        if not chord or self._factors is None:
-            information = graph.factors.information
-            self._factors = self._nodes.factors(self._by, (information @ by_i, information @ by_j))
-        step = self._factors.solve(self._right.ravel()).reshape(-1, 3)
-        poses = graph.poses.copy()
-        poses[self._nodes.free] += step
-        graph.set_poses(poses)
-        return float(np.max(np.abs(step), initial=0.0)), float(np.sum(self._right * step))

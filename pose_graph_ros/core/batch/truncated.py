@@ -112,7 +112,7 @@ class TruncatedProblem:
         self.limits = LIMITS[np.sum(values > 1e-9, axis=1)]
         """c^2 of each, shape (M,)."""
         self._weights = self.edges.weight
-        self._choices: dict[tuple[bytes, SolverConfig], Choice] = {}
+        self._choices: dict[bytes, Choice] = {}
         """The last sets that were solved for, the newest last."""
         self.start = graph.poses.copy() if start is None else start
         if start is None and to_the_end(self.solve(np.zeros(len(self)), CONFIG)):
@@ -149,13 +149,13 @@ class TruncatedProblem:
         """Return the errors of some of the edges at the present poses, shape (K, 3)."""
         return self.graph.errors(self.edges.rows(numbers))
 
-    def choice(self, believed: BoolArray, config: SolverConfig = CONFIG) -> Choosing:
+    def choice(self, believed: BoolArray) -> Choosing:
         """Return a set with its cost; None if it leaves a node undetermined."""
         # retests of different sets often lead to the same one
-        key = believed.tobytes(), config
+        key = believed.tobytes()
         choice = self._choices.pop(key, None)
         if choice is None:
-            if not (yield from self.solve(believed.astype(np.float64), config)):
+            if not (yield from self.solve(believed.astype(np.float64), CONFIG)):
                 return None
             squares = self.energies()
             known = chi2_of(self.graph) - float(np.sum(squares[believed]))

@@ -67,31 +67,24 @@ def kernel(
     ownership = OWNS if allocates else BORROWS
     compiled = numba.njit(**{**OPTIONS, **ownership, **options})(function)
     if isinstance(compiled, Dispatcher):    # NUMBA_DISABLE_JIT=1 leaves functions as they are
-        _widen_calls(compiled)
+        # Calls from other kernels pass every integer as int64: Numba would compile one version for
+        # each width and each constant, which triples the time.
+        template = compiled.get_call_template
+        compiled.get_call_template = lambda arguments, keywords: template(
+            tuple(map(_widest, arguments)),
+            {name: _widest(argument) for name, argument in keywords.items()})
         if options.get('inline') != 'always':   # inlined kernels are compiled within their callers
             name = f'{function.__module__}.{function.__qualname__}'
             _registered[name] = compiled
             if signature is not None:
                 _signatures[name] = signature
-                _compile_at_first_call(compiled, signature)
+                # Numba calls this with arguments that it has no code for, and what it returns
+                # with them
+                compiled._compile_for_args = functools.partial(  # noqa: SLF001
+                    _compiled_at_first_call, compiled, signature)
         # as njit(cache=True) does, with our own class of cache
         compiled._cache = KernelCache(compiled)  # noqa: SLF001
     return compiled
-
-
-def _widen_calls(compiled: Dispatcher) -> None:
-    """
-    Make calls from other kernels pass every integer as int64.
-
-    Numba would compile one version for each width and each constant, which triples the time.
-    """
-    template = compiled.get_call_template
-
-    def widened(arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
-        return template(tuple(map(_widest, arguments)),
-                        {name: _widest(argument) for name, argument in keywords.items()})
-
-    compiled.get_call_template = widened
 
 
 def _widest(argument: Any) -> Any:
@@ -99,18 +92,14 @@ def _widest(argument: Any) -> Any:
     return types.int64 if isinstance(argument, types.Integer) else argument
 
 
-def _compile_at_first_call(compiled: Dispatcher, signature: Signature) -> None:
-    """Make the first call compile a kernel for its declared signature alone."""
-    def compile_for(*arguments: Any) -> Any:
-        given = tuple(map(compiled.typeof_pyval, arguments))
-        convert = compiled.typingctx.can_convert
-        if len(given) != len(signature) or None in map(convert, given, signature):
-            raise TypeError(f'{compiled.py_func.__name__} takes {signature}, not {given}')
-        _compile(compiled, signature)
-        return compiled.overloads[signature].entry_point
-
-    # Numba calls this with arguments that it has no code for, and what it returns with them
-    compiled._compile_for_args = compile_for  # noqa: SLF001
+def _compiled_at_first_call(compiled: Dispatcher, signature: Signature, *arguments: Any) -> Any:
+    """Return the code of a kernel for its declared signature alone; compile it if necessary."""
+    given = tuple(map(compiled.typeof_pyval, arguments))
+    convert = compiled.typingctx.can_convert
+    if len(given) != len(signature) or None in map(convert, given, signature):
+        raise TypeError(f'{compiled.py_func.__name__} takes {signature}, not {given}')
+    _compile(compiled, signature)
+    return compiled.overloads[signature].entry_point
 
 
 def _compile(compiled: Dispatcher, signature: Signature) -> None:

@@ -3,17 +3,10 @@
 """Numeric elimination of one clique: assemble its front, factorise it and store the result."""
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.compiled.simd import add
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
-from pose_graph_ros.core.graph import (
-    factors,
-    normal_equations,
-    prior_rows,
-    tables as tb,
-    transaction_log,
-)
-from pose_graph_ros.core.graph.factors import anchors
+from pose_graph_ros.core.graph import normal_equations, prior_rows, tables as tb, transaction_log
+from pose_graph_ros.core.graph.factors import anchors, linearize
 from pose_graph_ros.core.graph.pools import row_start, separator, triangle_size, update_matrix
 
 # Where factors are stiff in one direction and weak in another, as those of a turn on the spot,
@@ -126,7 +119,7 @@ def _add_factors(head, v, c, terms, rows, front, ld):  # type: ignore[no-untyped
             continue
         if terms == RELINEARIZED:
             transaction_log.log_factor(head, e)
-            factors.linearize(head, e)
+            linearize(head, e)
         f.owner = c
         anchored |= anchors(f)
         normal_equations.add(head, e, (at_i, at_j, at_k), front, ld)
@@ -148,9 +141,10 @@ def _lower_bounds(head, v, least):  # type: ignore[no-untyped-def]
     cliques, at = tb.cliques(head), tb.nodes(head)[v].factor_list
     weak_t = weak_r = 0.0
     while at >= 0:
-        t, r = normal_equations.weakest(tb.factors(head)[at >> 2])
-        weak_t, weak_r = weak_t + t, weak_r + r
-        at = tb.factors(head)[at >> 2].next[at & 3]
+        f = tb.factors(head)[at >> 2]
+        w, at = f.information, f.next[at & 3]
+        t, r = normal_equations.weakest(w[0], w[1], w[2], w[3], w[4], w[5])
+        weak_t, weak_r = weak_t + f.weight * t, weak_r + f.weight * r
     c = cliques[tb.nodes(head)[v].clique].child
     while c >= 0:
         if cliques[c].n_frontal == 0:
@@ -215,13 +209,20 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
         for a in range(begin):
             target = index[a] * ld + column
             for k in range(3 * a, 3 * a + 3):
-                add(update, row_start(k, size) + 3 * begin, front, target, width)
+                _add(update[row_start(k, size) + 3 * begin:], front[target:target + width])
                 target += ld
         target = column * (ld + 1)
         for k in range(3 * begin, 3 * end):
-            add(update, row_start(k, size) + k, front, target, 3 * end - k)
+            _add(update[row_start(k, size) + k:], front[target:target + 3 * end - k])
             target += ld + 1
         begin = end
+
+
+@kernel
+def _add(source, target):  # type: ignore[no-untyped-def]
+    """Add the first numbers of an array to those of another one, as many as that has."""
+    for k in range(len(target)):
+        target[k] += source[k]
 
 
 @kernel

@@ -120,16 +120,6 @@ def rotated_triangle(update, n, cos, sin, to):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def frame_slip(head, c):  # type: ignore[no-untyped-def]
-    """Return a clique's slip [rad], which is 0 if it does not turn or has no parent."""
-    cliques = tb.cliques(head)
-    f, parent = cliques[c], cliques[c].parent
-    if parent < 0 or (cliques[c].anchored != 0 and cliques[c].n_frontal > 0):
-        return 0.0
-    return present_turn(head, c) - f.turn_seen - present_turn(head, parent)
-
-
-@kernel
 def linearize_prior(head, c, phi, to, work):  # type: ignore[no-untyped-def]
     """
     Write the matrix and right-hand side of a prior whose frame has turned by phi, in map axes.
@@ -181,7 +171,9 @@ def slip_error2(head, c, work):  # type: ignore[no-untyped-def]
     """
     nodes, members, update = tb.nodes(head), pools.separator(head, c), pools.update_matrix(head, c)
     row, n = tb.cliques(head)[c], 3 * len(members)
-    beta, phi = frame_slip(head, c), present_turn(head, c)
+    beta, phi = 0.0, present_turn(head, c)
+    if row.parent >= 0 and (row.anchored == 0 or row.n_frontal == 0):   # else it does not slip
+        beta = phi - row.turn_seen - present_turn(head, row.parent)
     d, g, r = work[:n], work[n:2 * n], work[2 * n:3 * n]    # r is S p
     w, change = work[3 * n:4 * n], work[4 * n:5 * n]
     if row.n_frontal == 0:

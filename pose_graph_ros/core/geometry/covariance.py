@@ -7,6 +7,7 @@ A covariance of a pose has the order (x, y, theta); docs/conventions.md defines 
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -61,17 +62,17 @@ def floored(covariance: FloatArray, floors: FloatArray) -> FloatArray:
     return covariance + np.diag(missing)
 
 
-def turned(covariance: FloatArray, theta: float) -> FloatArray:
+def turned(covariance: FloatArray, theta: npt.ArrayLike) -> FloatArray:
     """
-    Return a covariance, shape (2, 2) or (3, 3), expressed in axes that are rotated by theta.
+    Return covariances, shape (..., 2, 2) or (..., 3, 3), in axes that are rotated by theta (...).
 
     With the heading of a measured pose as theta, it converts from the axes of the parent frame, as
     in ROS messages, to the frame of the measured pose, as in the errors (3.48) and (3.52) of
     Merfels. Footnote 4 there is the inverse conversion.
     """
-    axes = np.eye(len(covariance))
-    axes[:2, :2] = se2.rotation(theta)
-    return axes.T @ covariance @ axes
+    axes = np.zeros(covariance.shape)
+    axes[..., -1, -1], axes[..., :2, :2] = 1.0, se2.rotation(theta)
+    return np.asarray(np.swapaxes(axes, -1, -2) @ covariance @ axes)
 
 
 def information(covariance: FloatArray) -> FloatArray:

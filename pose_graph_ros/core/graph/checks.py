@@ -106,10 +106,18 @@ def check(
     of_j = np.where(table.j >= 0, dimension[ids.rows(table.j)], of_i)
     has_few = (table.kind == FactorKind.BIAS) | (table.j < 0)
     missing = missing | (np.arange(3) >= np.where(has_few, np.minimum(of_i, of_j), 3)[:, None])
-    diagonal = np.diagonal(table.information, axis1=1, axis2=2)
+    matrix = table.information
+    diagonal, correlation = np.diagonal(matrix, axis1=1, axis2=2), scaled(matrix)
     _refuse_rows(missing & (diagonal != 0.0), 'Factors.information: expected 0 in rows that the '
                  'error or the node has not', diagonal)
-    _check_information('Factors.information', table.information)
+    skew = np.max(np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
+    _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, 'Factors.information is not symmetric', matrix)
+    smallest = np.zeros(len(matrix))
+    doubtful = ~are_definite(matrix)
+    smallest[doubtful] = np.min(np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
+    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
+    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
+                 'Factors.information is not positive semidefinite, or zero', matrix)
 
 
 def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
@@ -123,19 +131,6 @@ def _check_ends(factors: Factors, kind: npt.NDArray[Any], ids: Ids) -> None:
             expected = ' or '.join(item.name.lower() for item in allowed) or 'none'
             _refuse_rows(wrong, f'Factors.{end}: expected a factor of kind {each.name} to have '
                          f'{expected} for this end', node)
-
-
-def _check_information(name: str, matrix: FloatArray) -> None:
-    """Raise unless matrices are symmetric and positive semidefinite, whatever units they have."""
-    diagonal, correlation = np.diagonal(matrix, axis1=1, axis2=2), scaled(matrix)
-    skew = np.max(np.abs(correlation - np.swapaxes(correlation, 1, 2)), axis=(1, 2), initial=0.0)
-    _refuse_rows(skew > SEMIDEFINITE_TOLERANCE, f'{name} is not symmetric', matrix)
-    smallest = np.zeros(len(matrix))
-    doubtful = ~are_definite(matrix)
-    smallest[doubtful] = np.min(np.linalg.eigvalsh(correlation[doubtful]), axis=-1, initial=np.inf)
-    negative = np.any(diagonal < 0.0, axis=-1) | (smallest < -SEMIDEFINITE_TOLERANCE)
-    _refuse_rows(negative | ~np.any(matrix, axis=(1, 2)),
-                 f'{name} is not positive semidefinite, or zero', matrix)
 
 
 def are_definite(information: FloatArray) -> BoolArray:
@@ -212,12 +207,10 @@ def check_ids(name: str, ids: Collection[int], what: str, known: Ids) -> None:
         raise GraphUpdateError(f'{name}: {what} {array[gone][0]} has left the graph')
 
 
-def check_weights(name: str, weights: Mapping[int, float], what: str, known: Ids) -> None:
-    """Raise unless ids and weights are valid."""
-    check_ids(name, weights, what, known)
+def check_weights(weights: Mapping[int, float]) -> None:
+    """Raise unless new weights are valid."""
     numbers = np.fromiter(weights.values(), np.float64, len(weights))
     if not np.all(np.isfinite(numbers) & (numbers >= 0.0)):
         number, weight = next(item for item in weights.items() if not 0.0 <= item[1] < np.inf)
-        raise GraphUpdateError(
-            f'{name}: expected a finite weight that is not negative, got {weight} '
-            f'for number {number}')
+        raise GraphUpdateError(f'weigh: expected a finite weight that is not negative, got '
+                               f'{weight} for number {number}')

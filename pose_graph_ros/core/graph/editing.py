@@ -23,13 +23,14 @@ from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.geometry.se2 import BoolArray, IntArray
 from pose_graph_ros.core.graph import factors, prior_rows, rows, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
-from pose_graph_ros.core.graph.graph_update import Gone, NOTHING_GONE
+from pose_graph_ros.core.graph.graph_update import Gone
 from pose_graph_ros.core.graph.rows import touch
 
 # Results of `add_rows`.
 ADDED, NO_ROOM, UNSOUND = range(3)
 # In place of a weight: the factor leaves the graph for good, by `compact`.
 DROPPED = -1.0
+NOTHING_GONE = Gone(*np.empty((2, 0), np.int64))
 _POSE = int(NodeKind.POSE)
 
 
@@ -160,9 +161,9 @@ def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-
     if n_nodes + head[tb.N_PRIORS] > head[tb.NODE_ROOM] or n_factors > head[tb.FACTOR_ROOM]:
         return NO_ROOM
     # rows behind the ends are not part of the graph yet
-    valid = rows.write_nodes(head, first, hidden)
-    valid = rows.write_nodes(head, first_other, others) and valid
-    valid = rows.write_rows(head, n_nodes, first_other, types, records) and valid
+    valid = rows.write_nodes(head, first, hidden, types[:0])
+    valid = rows.write_nodes(head, first_other, others, types) and valid
+    valid = rows.write_rows(head, n_nodes, records) and valid
     if not valid and not checked:
         return UNSOUND
     head[tb.N_NODES] = n_nodes
@@ -170,9 +171,6 @@ def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-
         rows.start_node(head, v)
         tb.node_id(head)[v] = head[tb.NEXT_NODE]
         head[tb.NEXT_NODE] += 1
-        if v >= first_other:
-            node, code = tb.nodes(head)[v], types[v - first_other]
-            node.kind, node.dimension = code & 3, 3 - (code >> 2)
         touch(head, v)
         head[tb.STRUCTURE] = 1
     if first_other > first:
@@ -194,24 +192,47 @@ def add_rows(head, hidden, others, types, records, checked):  # type: ignore[no-
 @kernel(signature=(tb.HEAD,), allocates=True)
 def restart(head):  # type: ignore[no-untyped-def]
     """Remove all cliques but the priors, linearize all factors anew and touch all nodes."""
-    nodes = tb.nodes(head)
     prior_rows.remove_cliques(head)
-    head[tb.N_TOUCHED] = head[tb.N_WAITING] = 0
-    tb.scalars(head)[0].chi2 = 0.0
-    head[tb.STRUCTURE] = 1
+    head[tb.N_TOUCHED], head[tb.STRUCTURE] = 0, 1
     for v in range(head[tb.N_NODES]):
-        factors.refer_to_pose(tb.nodes(head)[v])
-        nodes[v].clique = -1
-        nodes[v].touched = 0
+        tb.nodes(head)[v].clique, tb.nodes(head)[v].touched = -1, 0
         touch(head, v)
+    factors.linearize_all(head)
+    settle(head)
+
+
+@kernel(signature=(tb.HEAD,))
+def settle(head):  # type: ignore[no-untyped-def]
+    """
+    Evaluate all factors and bring the tables into the state after a step of the smoother.
+
+    If the sum of the squared linearization errors exceeds the smoother's budget, the factors
+    with large errors are listed in `waiting`, to be linearized again in its next step.
+    """
+    nodes, scalars, waiting = tb.nodes(head), tb.scalars(head)[0], tb.waiting(head)
+    for v in range(head[tb.N_NODES]):
+        for k in range(3):
+            nodes[v].seen[k] = nodes[v].delta[k]
+    chi2 = error2 = 0.0
     for e in range(head[tb.N_FACTORS]):
         f = tb.factors(head)[e]
         f.waits = 0
         if f.weight > 0.0:
-            factors.linearize(head, e)
             factors.check(head, e, factors.NO_TURN)
-            tb.scalars(head)[0].chi2 += f.energy
+            chi2 += f.energy
+            error2 += f.error2
+    scalars.chi2 = chi2
     prior_rows.add_energies(head)
+    head[tb.N_WAITING] = head[tb.N_TURNED] = head[tb.REFINED] = head[tb.LISTED] = 0
+    if not 0.0 < scalars.budget < error2:
+        return
+    threshold = factors.LEAST_FRACTION * scalars.share
+    for e in range(head[tb.N_FACTORS]):
+        f = tb.factors(head)[e]
+        if f.error2 > threshold:
+            f.waits = 1
+            waiting[head[tb.N_WAITING]] = e
+            head[tb.N_WAITING] += 1
 
 
 # --- removal for good, in two steps --------------------------------------------------------------

@@ -68,9 +68,8 @@ from pose_graph_ros.core.graph import tables as tb
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 
 # Numbers of the definitions; all kinds from OBSERVED on have one end.
-ODOMETRY, BIAS, TURN, PRIOR, RANGE, OBSERVED = (int(kind) for kind in (
-    FactorKind.ODOMETRY, FactorKind.BIAS, FactorKind.TURN, FactorKind.PRIOR, FactorKind.RANGE,
-    FactorKind.GLOBAL_POSE))
+BIAS, TURN, PRIOR, RANGE, OBSERVED = (int(kind) for kind in (
+    FactorKind.BIAS, FactorKind.TURN, FactorKind.PRIOR, FactorKind.RANGE, FactorKind.GLOBAL_POSE))
 # Smallest squared linearization error for which a factor is linearized again, as a fraction of
 # `SmootherConfig.budget_share`.
 LEAST_FRACTION = 0.01
@@ -229,10 +228,12 @@ def model(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     return ex + third[0], ey + third[1], wrap(eth), c, s, ax, ay
 
 
-@kernel(forceinline=True)
-def _linearize(f, kind, start, end, third):  # type: ignore[no-untyped-def]
-    """Linearize a factor, given its nodes i and j, and what the third one adds."""
-    by_pose, delta_k = third
+@kernel
+def linearize(head, e):  # type: ignore[no-untyped-def]
+    """Linearize a factor at the present estimate; the caller has logged its row."""
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, k = kind_and_ends(f)
+    start, end, (by_pose, delta_k) = nodes[i], nodes[j], third(nodes, f, k)
     _, _, eth, c, s, ax, ay = model(f, kind, start.pose, end.pose, by_pose)
     _, fth = factors_of_end(f, kind)
     if is_relative(kind) or kind == RANGE:
@@ -241,10 +242,19 @@ def _linearize(f, kind, start, end, third):  # type: ignore[no-untyped-def]
     f.lin_k = eth - (fth * end.delta[2] - start.delta[2] + delta_k)
 
 
-@kernel(forceinline=True)
-def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-def]
-    """Set the squared linearization error and the energy, as `check`."""
-    (phi, cos, sin), ((by_x, by_y, _), delta_k) = clique_turn, third
+@kernel
+def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
+    """
+    Set squared linearization error and energy of a factor; the caller has logged them.
+
+    `clique_turn` is the turn of its clique's frame since the linearization [rad], see
+    `clique_frames`, with its cosine and sine; `NO_TURN` at the linearization, in anchored cliques
+    and for observed nodes.
+    """
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, k = kind_and_ends(f)
+    start, end, (phi, cos, sin) = nodes[i], nodes[j], clique_turn
+    (by_x, by_y, _), delta_k = third(nodes, f, k)
     ft, fth = factors_of_end(f, kind)
     dx, dy = ft * end.pose[0] - start.pose[0], ft * end.pose[1] - start.pose[1]
     if phi != 0.0:
@@ -302,35 +312,14 @@ def _check(f, kind, start, end, third, clique_turn):  # type: ignore[no-untyped-
         longer if longer > MUCH_LONGER else 0.0)
 
 
-# Nearly all constraints have the error of odometry, and no third node. What is derived from errors
-# is compiled into its callers, once for these and once for all: this takes a fifth less time.
-
 @kernel
-def linearize(head, e):  # type: ignore[no-untyped-def]
-    """Linearize a factor at the present estimate; the caller has logged its row."""
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS and k < 0:
-        _linearize(f, ODOMETRY, nodes[i], nodes[j], NO_THIRD)
-    else:
-        _linearize(f, kind, nodes[i], nodes[j], third(nodes, f, k))
-
-
-@kernel
-def check(head, e, clique_turn):  # type: ignore[no-untyped-def]
-    """
-    Set squared linearization error and energy of a factor; the caller has logged them.
-
-    `clique_turn` is the turn of its clique's frame since the linearization [rad], see
-    `clique_frames`, with its cosine and sine; `NO_TURN` at the linearization, in anchored cliques
-    and for observed nodes.
-    """
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, k = kind_and_ends(f)
-    if kind < BIAS and k < 0:
-        _check(f, ODOMETRY, nodes[i], nodes[j], NO_THIRD, clique_turn)
-    else:
-        _check(f, kind, nodes[i], nodes[j], third(nodes, f, k), clique_turn)
+def linearize_all(head):  # type: ignore[no-untyped-def]
+    """Make the poses of all nodes the references, and linearize all factors there."""
+    for v in range(head[tb.N_NODES]):
+        refer_to_pose(tb.nodes(head)[v])
+    for e in range(head[tb.N_FACTORS]):
+        if tb.factors(head)[e].weight > 0.0:
+            linearize(head, e)
 
 
 @kernel(forceinline=True)

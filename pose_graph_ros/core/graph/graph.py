@@ -11,17 +11,11 @@ import numpy.typing as npt
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph import (
-    checks,
-    editing,
-    graph_update as gu,
-    tables as tb,
-    transaction_log,
-)
+from pose_graph_ros.core.graph import checks, editing, tables as tb, transaction_log
 from pose_graph_ros.core.graph.checks import Ids
 from pose_graph_ros.core.graph.constraints import FACTORS, Factors, full, NodeKind
 from pose_graph_ros.core.graph.factors import energies, errors
-from pose_graph_ros.core.graph.graph_update import Energies, GraphRows, GraphUpdate, NextIds
+from pose_graph_ros.core.graph.graph_update import Energies, Gone, GraphRows, GraphUpdate, NextIds
 from pose_graph_ros.core.graph.prior_rows import add_priors, priors_of
 from pose_graph_ros.core.graph.priors import model, Prior
 
@@ -265,7 +259,7 @@ class Graph:
         Between `begin` and `commit` or `rollback`, what leaves keeps its rows; `commit` takes them
         out. Otherwise they are taken out at once.
         """
-        edits = any(len(part) > 0 for part in update[gu.FIRST_EDIT:])
+        edits = update.edits
         if edits:
             self._check_edits(update)
         others = checks.other_nodes(update.biases, update.dimensions, update.landmarks)
@@ -292,10 +286,10 @@ class Graph:
             len(update.hidden) + len(update.biases) + len(update.landmarks))
         factors = self._ids('factor').extended(len(update.factors))
         for what, known, parts in (('hidden node', nodes, ('fix', 'free', 'remove_nodes')),
-                                   ('factor', factors, ('remove', 'drop'))):
+                                   ('factor', factors, ('remove', 'drop', 'weigh'))):
             for part in parts:
                 checks.check_ids(part, getattr(update, part), what, known)
-        checks.check_weights('weigh', update.weigh, 'factor', factors)
+        checks.check_weights(update.weigh)
         for measured in update.measure:
             checks.check_ids('measure', measured.ids.tolist(), 'factor', factors)
         for n, prior in enumerate(update.priors):
@@ -304,12 +298,11 @@ class Graph:
     def _edit(self, update: GraphUpdate) -> None:
         """Apply the edits of existing rows, which have been checked."""
         head = self.memory.head
-        for ids, values in ((update.remove, [0.0] * len(update.remove)),
-                            (update.weigh, update.weigh.values()),
-                            (update.drop, [editing.DROPPED] * len(update.drop))):
-            if len(ids) > 0:
-                editing.set_weights(
-                    head, _integers(ids), np.fromiter(values, np.float64, len(ids)))
+        weights = {**dict.fromkeys(update.remove, 0.0), **update.weigh,
+                   **dict.fromkeys(update.drop, editing.DROPPED)}
+        if len(weights) > 0:
+            editing.set_weights(
+                head, _integers(weights), np.fromiter(weights.values(), np.float64, len(weights)))
         for measured in update.measure:
             editing.measure(head, _integers(measured.ids), *map(
                 np.ascontiguousarray, (measured.mean, measured.information)))
@@ -337,7 +330,7 @@ class Graph:
                                (self.node_kind, 0, others[1] & 3),
                                (self.dimension, 3, 3 - (others[1] >> 2))))
         nodes = self._ids('node').extended(len(hidden) + len(others[0]))
-        factors = update.factors if len(update.factors) > 0 else gu.NO_FACTORS
+        factors = update.factors if len(update.factors) > 0 else Factors()
         checks.check(factors, kind, dimension, nodes)
         return tuple(np.array(column, order='C') for column in (hidden, *others, factors.records))
 
@@ -407,11 +400,9 @@ class Graph:
     def begin(self) -> None:
         """Begin an update; `rollback` reverts all edits and steps after it."""
         self._updating = True
-        if not transaction_log.begin(self.memory.head):
-            self.memory.restart_stamps()
-            transaction_log.begin(self.memory.head)
+        transaction_log.begin(self.memory.head)
 
-    def commit(self) -> gu.Gone:
+    def commit(self) -> Gone:
         """End an update and keep its changes; return what has left, whose rows are taken out."""
         if self.memory.head[tb.LOG_END] > 0:  # else a step has done so
             transaction_log.commit(self.memory.head)

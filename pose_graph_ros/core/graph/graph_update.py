@@ -54,19 +54,17 @@ class GraphUpdate(NamedTuple):
     priors: Sequence[Prior] = ()    # new dense ones
     measure: Sequence[Measured] = ()    # new mean and information; factors keep their weights
 
+    @property
+    def edits(self) -> bool:
+        """Whether it edits what there is, by any part from `fix` on."""
+        return any(len(part) > 0 for part in self[5:])
+
 
 class Gone(NamedTuple):
     """Ids of what has left a graph, ascending."""
 
     nodes: IntArray
     factors: IntArray   # with those that were on these nodes, whatever their weight
-
-
-NOTHING_GONE: Final = Gone(*(np.empty(0, dtype=np.int64) for _ in range(2)))
-
-# Index of the first part of an update that edits what there is.
-FIRST_EDIT: Final = GraphUpdate._fields.index('fix')
-
 
 class Energies(NamedTuple):
     """Energies of all factors: weighted squared errors [sigma^2]."""

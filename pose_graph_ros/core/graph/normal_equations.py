@@ -14,21 +14,13 @@ from pose_graph_ros.core.graph import factors as fc, tables as tb
 
 
 @kernel
-def weakest(f):  # type: ignore[no-untyped-def]
+def weakest(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
     """
-    Return the weighted information of a factor in its weakest direction and on its heading.
+    Return what an information matrix tells in its weakest direction, and of the heading.
 
     The first is the smaller eigenvalue of the information on the position, the second that on the
     heading if the position is unknown; both are lower bounds, to rounding.
     """
-    w = f.information
-    position, heading = weakest_of(w[0], w[1], w[2], w[3], w[4], w[5])
-    return f.weight * position, f.weight * heading
-
-
-@kernel
-def weakest_of(xx, xy, xt, yy, yt, tt):  # type: ignore[no-untyped-def]
-    """Return what `weakest` does, of an information matrix."""
     trace, determinant = xx + yy, xx * yy - xy * xy
     if not determinant > 0.0:
         return 0.0, 0.0
@@ -43,13 +35,19 @@ def _add_to_row(front, at, x, y, z):  # type: ignore[no-untyped-def]
     front[at + 2] += z
 
 
-@kernel(forceinline=True)
-def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-def]
+@kernel
+def add(head, e, at, front, ld):  # type: ignore[no-untyped-def]
     """
-    Add a factor to a front; `start` and `end` are its nodes i and j, others as for `add`.
+    Add a factor to a front; `at` says where the blocks of its ends i, j and k begin, -1 for none.
 
-    `third` is what the reference of the third node adds to the error.
+    The front is an upper triangle, stored by rows of `ld` numbers, the last of which is the
+    right-hand side.
     """
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, i, j, k = fc.kind_and_ends(f)
+    start, end, third = nodes[i].reference, nodes[j].reference, fc.NO_THIRD[0]
+    if k >= 0:
+        third = fc.by_state(f, nodes[k].reference[0], nodes[k].reference[1])
     a, b, k = at
     c, s = fc.frame(f, kind)
     # the weighted information, turned into map axes
@@ -60,8 +58,8 @@ def _add(f, kind, start, end, third, at, front, ld):  # type: ignore[no-untyped-
     ft, fth = fc.factors_of_end(f, kind)
     px, py = -f.lin_arm[1], f.lin_arm[0]  # S a
     kx, ky = fc.constant(f, kind, c, s, py, -px)
-    hx = ft * end.reference[0] - start.reference[0] + kx + px * f.lin_th
-    hy = ft * end.reference[1] - start.reference[1] + ky + py * f.lin_th
+    hx = ft * end[0] - start[0] + kx + px * f.lin_th
+    hy = ft * end[1] - start[1] + ky + py * f.lin_th
     hx, hy = hx + c * third[0] - s * third[1], hy + s * third[0] + c * third[1]
     hth = f.lin_k
     # W T: the third column is W (S a, 1)
@@ -136,25 +134,6 @@ def _add_third(f, turned, information, gradient, at, front, ld):  # type: ignore
 
 
 @kernel
-def add(head, e, at, front, ld):  # type: ignore[no-untyped-def]
-    """
-    Add a factor to a front; `at` says where the blocks of its ends i, j and k begin, -1 for none.
-
-    The front is an upper triangle, stored by rows of `ld` numbers, the last of which is the
-    right-hand side.
-    """
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, k = fc.kind_and_ends(f)
-    if kind < fc.BIAS and k < 0:
-        _add(f, fc.ODOMETRY, nodes[i], nodes[j], fc.NO_THIRD[0], (at[0], at[1], -1), front, ld)
-        return
-    reference = fc.NO_THIRD[0]
-    if k >= 0:
-        reference = fc.by_state(f, nodes[k].reference[0], nodes[k].reference[1])
-    _add(f, kind, nodes[i], nodes[j], reference, at, front, ld)
-
-
-@kernel
 def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-def]
     """
     Add an equation of a linear start to a front, as `add` does: of headings, or of positions.
@@ -201,14 +180,15 @@ def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-
 
 
 @kernel(forceinline=True)
-def _gradient(f, kind, ends, nodes, right):  # type: ignore[no-untyped-def]
+def gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
     Add -b of a factor to `right`, shape (N, 3); return its energy and two sums of magnitudes.
 
     These are of the gradient's coordinates of a position, and of the diagonal terms of the
     energy, which cancel each other where W is nearly singular.
     """
-    v, j, k = ends
+    nodes, f = tb.nodes(head), tb.factors(head)[e]
+    kind, v, j, k = fc.kind_and_ends(f)
     by_pose, _ = fc.third(nodes, f, k)
     ex, ey, eth, c, s, ax, ay = fc.model(f, kind, nodes[v].pose, nodes[j].pose, by_pose)
     i, w = f.information, f.weight
@@ -231,15 +211,3 @@ def _gradient(f, kind, ends, nodes, right):  # type: ignore[no-untyped-def]
         right[j, 1] -= ft * gy
         right[j, 2] -= fth * gth
     return energy, abs(gx) + abs(gy), terms
-
-
-@kernel(forceinline=True)
-def gradient(head, e, right):  # type: ignore[no-untyped-def]
-    """
-    Return energy and the sums of `_gradient` of a factor after adding -b to `right`, (N, 3).
-    """
-    nodes, f = tb.nodes(head), tb.factors(head)[e]
-    kind, i, j, k = fc.kind_and_ends(f)
-    if kind < fc.BIAS and k < 0:
-        return _gradient(f, fc.ODOMETRY, (i, j, -1), nodes, right)
-    return _gradient(f, kind, (i, j, k), nodes, right)

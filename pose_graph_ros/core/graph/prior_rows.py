@@ -24,7 +24,7 @@ from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph import pools, tables as tb, transaction_log
 from pose_graph_ros.core.graph.constraints import NodeKind
 from pose_graph_ros.core.graph.factors import wrap
-from pose_graph_ros.core.graph.normal_equations import weakest_of
+from pose_graph_ros.core.graph.normal_equations import weakest as weakest_of
 from pose_graph_ros.core.graph.pools import product, row_start, triangle_size
 from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
 from pose_graph_ros.core.graph.rows import add_to_scale, touch

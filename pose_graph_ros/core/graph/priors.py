@@ -97,18 +97,17 @@ def packed(prior: Prior) -> FloatArray:
     n = 3 * len(prior.nodes)
     both = 0.5 * (prior.information + prior.information.T)
     rows = np.column_stack((both, prior.vector))
-    upper = np.concatenate([rows[k, k:] for k in range(n)])
-    return np.concatenate((upper, prior.reference.ravel(), (prior.energy,)))
+    return np.concatenate((
+        rows[np.triu_indices(n, m=n + 1)], prior.reference.ravel(), (prior.energy,)))
 
 
 def unpacked(nodes: IntArray, values: FloatArray, *, anchored: bool) -> Prior:
     """Return a prior on nodes, by id, whose numbers in the tables begin with these."""
     n = 3 * len(nodes)
-    rows, at = np.zeros((n, n + 1)), 0
-    for k in range(n):
-        rows[k, k:] = values[at:at + n + 1 - k]
-        at += n + 1 - k
-    U = np.triu(rows[:, :n])
+    rows, index = np.zeros((n, n + 1)), np.triu_indices(n, m=n + 1)
+    at = len(index[0])
+    rows[index] = values[:at]
+    U = rows[:, :n]
     return Prior(
         nodes, values[at:at + n].reshape(-1, 3).copy(), U + np.triu(U, 1).T, rows[:, n].copy(),
         float(values[at + n]), anchored)

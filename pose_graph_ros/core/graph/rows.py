@@ -111,9 +111,9 @@ def start_node(head, v):  # type: ignore[no-untyped-def]
     factors.refer_to_pose(node)
     node.scale_t = node.scale_r = 0.0
     node.clique = node.factor_list = -1
-    node.index = node.front = node.changed = node.solution_logged = 0
+    node.index = node.front = node.changed = 0
     node.logged = head[tb.UPDATE]
-    node.kind, node.dimension, node.fixed, node.touched = 0, 3, 0, 0
+    node.fixed = node.touched = 0
 
 
 # --- new rows -----------------------------------------------------------------------------------
@@ -161,36 +161,37 @@ def write_row(head, e, i, j, mean, information, kind, weight):  # type: ignore[n
 
 
 @kernel
-def write_nodes(head, first, poses):  # type: ignore[no-untyped-def]
-    """Write poses of new hidden nodes, headings wrapped; return whether all are finite."""
+def write_nodes(head, first, poses, types):  # type: ignore[no-untyped-def]
+    """
+    Write new hidden nodes, headings wrapped; return whether all poses are finite.
+
+    The types are those of `checks.other_nodes`; nodes without one are poses.
+    """
     valid = True
     for k in range(len(poses)):
-        pose = tb.nodes(head)[first + k].pose
+        node, code = tb.nodes(head)[first + k], np.int64(types[k]) if len(types) > 0 else 0
+        node.kind, node.dimension = code & 3, 3 - (code >> 2)
         for m in range(3):
-            pose[m] = poses[k, m]
+            node.pose[m] = poses[k, m]
             valid = valid and abs(poses[k, m]) < math.inf
-        pose[2] = factors.wrap(pose[2])
+        node.pose[2] = factors.wrap(node.pose[2])
     return valid
 
 
 @kernel
-def _node(head, v, first_other, types):  # type: ignore[no-untyped-def]
-    """Return kind and dimension of a node, new ones as in `write_rows`; _NO_NODE, 3 for -1."""
+def _node(head, v):  # type: ignore[no-untyped-def]
+    """Return kind and dimension of a node; _NO_NODE, 3 for -1."""
     if v < 0:
         return _NO_NODE, 3
-    if v < head[tb.N_NODES]:
-        return np.int64(tb.nodes(head)[v].kind), np.int64(tb.nodes(head)[v].dimension)
-    code = np.int64(types[v - first_other]) if v >= first_other else 0
-    return code & 3, 3 - (code >> 2)
+    return np.int64(tb.nodes(head)[v].kind), np.int64(tb.nodes(head)[v].dimension)
 
 
 @kernel
-def write_rows(head, n_nodes, first_other, types, records):  # type: ignore[no-untyped-def]
+def write_rows(head, n_nodes, records):  # type: ignore[no-untyped-def]
     """
     Write new factors, records of `Factors`, behind the last row; return whether all are valid.
 
-    The graph will have n_nodes nodes, from row `first_other` on with these types, see
-    `checks.other_nodes`.
+    The graph will have n_nodes nodes, of which the new ones have been written.
     """
     valid = True
     for k in range(len(records)):
@@ -207,8 +208,7 @@ def write_rows(head, n_nodes, first_other, types, records):  # type: ignore[no-u
                  and (b >= 0 or new.j == -1) and (c >= 0 or new.k == -1))
         if not valid:
             continue
-        ends = (_node(head, a, first_other, types), _node(head, b, first_other, types),
-                _node(head, c, first_other, types))
+        ends = _node(head, a), _node(head, b), _node(head, c)
         for m in range(3):
             valid = valid and (_ENDS[kind, m] >> ends[m][0]) & 1 == 1
         if kind < factors.BIAS and c >= 0:  # bias and error of the scale

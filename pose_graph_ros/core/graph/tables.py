@@ -37,7 +37,6 @@ HEAD, RECORDS = INTEGERS, types.Array(from_dtype(RECORD), 1, 'C')
 # --- records ------------------------------------------------------------------------------------
 
 NODE: Final = np.dtype([
-    # a solve changes only the fields up to `checked_turn`; see SOLUTION
     ('pose', 'f8', (3,)),       # in the map, theta in [-pi, pi) [m, m, rad]
     ('delta', 'f8', (3,)),      # solution, the pose minus `reference`, theta not wrapped
     ('seen', 'f8', (3,)),       # `delta` that the cliques below were last solved with
@@ -49,16 +48,14 @@ NODE: Final = np.dtype([
     ('scale_t', 'f8'),
     ('scale_r', 'f8'),
     ('reference', 'f8', (3,)),  # constant until all nodes are linearized anew [m, m, rad]
+    ('front', 'i8'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
+    ('changed', 'i8'),          # stamp (ITERATION) of the last move by more than alpha sigmas
+    ('logged', 'i8'),           # stamp (UPDATE) of the last log of the row
     ('clique', 'i4'),           # row of the clique that the node is frontal in
     # head of the list of its factors with a weight above 0, whose entries are 4 * factor + the
     # index of the end; LEAVES if `editing.compact` takes the node out later
     ('factor_list', 'i4'),
     ('index', 'i4'),            # place of the node in the present front; work space
-    ('front', 'i4'),            # stamp (FRONT_SERIAL) of the front that `index` is valid for
-    ('changed', 'i4'),          # stamp (ITERATION) of the last move by more than alpha sigmas
-    # stamps (UPDATE) of the last log of the row, and of its solution alone
-    ('logged', 'i4'),
-    ('solution_logged', 'i4'),
     ('kind', 'u1'),             # `NodeKind`
     ('dimension', 'u1'),        # number of its coordinates; the others are and stay 0
     ('fixed', 'u1'),            # 1 if the node keeps its pose
@@ -82,14 +79,11 @@ FACTOR: Final = np.dtype([
     ('ends', 'i4', (3,)),       # nodes i, j and k; j is -1 where it has one end, in the map
     ('next', 'i4', (3,)),       # next entries of the lists of these; LEAVES: see `factor_list`
     ('owner', 'i4'),            # row of the clique that the factor was assembled in
-    # stamps (UPDATE) of the last log of the row, and of its energy alone
-    ('logged', 'i4'),
-    ('energy_logged', 'i4'),
     ('kind', 'i4'),             # `FactorKind`
-    # a check changes only the fields from here on; see ENERGY
     ('error2', 'f8'),           # squared linearization error, weighted [sigma^2]
     ('energy', 'f8'),           # e^T information e, weighted [sigma^2]
-    ('checked', 'i4'),          # stamp (ITERATION) of the last check of the linearization
+    ('checked', 'i8'),          # stamp (ITERATION) of the last check of the linearization
+    ('logged', 'i8'),           # stamp (UPDATE) of the last log of the row
     ('waits', 'i4'),            # 1 if the factor is in the table `waiting`
 ], align=True)
 # In place of a list's head or next entry: the row leaves the graph, and is in no list.
@@ -117,14 +111,13 @@ CLIQUE: Final = np.dtype([
     ('members', 'i4'),          # index in pool_i of its nodes, frontal ones first
     # index in pool_f of its rows of R, with the update matrix behind them; see `prior_rows`
     ('values', 'i4'),
-    # stamp (FRONT_SERIAL) of the last marking for elimination; while marked cliques are
-    # eliminated, the number of marked children that are left
-    ('marked', 'i4'),
-    ('built', 'i4'),            # stamp (ITERATION) of the last elimination or solution
+    # stamp (FRONT_SERIAL) of the last marking for elimination
+    ('marked', 'i8'),
+    ('built', 'i8'),            # stamp (ITERATION) of the last elimination or solution
     # stamps (UPDATE) of taking the row, of taking the values, and of the last log of the row
-    ('born', 'i4'),
-    ('values_born', 'i4'),
-    ('logged', 'i4'),
+    ('born', 'i8'),
+    ('values_born', 'i8'),
+    ('logged', 'i8'),
     # 1 if a node at or below it is fixed or has a factor whose axes do not turn with its clique
     ('anchored', 'i4'),
 ], align=True)
@@ -163,9 +156,6 @@ TABLES: Final[dict[str, np.dtype[Any]]] = {
     ) for name in names}}
 NAMES: Final = tuple(TABLES)
 WORD: Final = 8     # bytes; the size of a record is a multiple of it
-# Number of words of a node that a solve changes, and of a factor that a check leaves as they are.
-SOLUTION: Final[int] = NODE.fields['scale_t'][1] // WORD    # type: ignore[index]
-ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index]
 
 # --- the head: addresses and capacities first, then counters ------------------------------------
 
@@ -194,12 +184,12 @@ ENERGY: Final[int] = FACTOR.fields['error2'][1] // WORD     # type: ignore[index
 #   N_LEAVING: number of rows that `editing.compact` takes out after the update, without those that
 #       leave because of the node that they are on
 #   N_PRIORS, LOOSE: number of priors, and the first of those without a parent (SIBLING: the next)
-(N_NODES, N_FACTORS, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_TOUCHED, N_FREED,
- N_WAITING, LOG_END, UPDATE, ITERATION, FRONT_SERIAL, STRUCTURE, NEED_F,
- NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED, N_VISITED, N_ITERATIONS, N_ROOTS,
- N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, NEWEST, SINCE, REFINED, LISTED, ROUND,
- INTERRUPT, NEXT_NODE, NEXT_FACTOR, N_LEAVING, N_PRIORS, LOOSE, COUNTERS_END) = range(
-     2 * len(NAMES), 2 * len(NAMES) + 40)
+# A rollback restores the first ones, up to LOOSE.
+(N_NODES, N_FACTORS, STRUCTURE, N_TOUCHED, N_WAITING, NEWEST, NEXT_NODE, NEXT_FACTOR, N_LEAVING,
+ N_PRIORS, LOOSE, N_CLIQUES, FREE_CLIQUE, POOL_F_END, POOL_I_END, N_FREED, LOG_END, UPDATE,
+ ITERATION, FRONT_SERIAL, NEED_F, NEED_I, NEED_WORK, BAD_NODE, N_RELINEARIZED, N_ELIMINATED,
+ N_VISITED, N_ITERATIONS, N_ROOTS, N_CHECKS, N_CHANGED, N_TURNED, NODE_ROOM, FACTOR_ROOM, SINCE,
+ REFINED, LISTED, ROUND, INTERRUPT, COUNTERS_END) = range(2 * len(NAMES), 2 * len(NAMES) + 40)
 # Sizes of the blocks of the pools: exact up to 64 numbers, then in steps of an eighth.
 SIZES: Final = [*range(65)]
 while SIZES[-1] < 2**31:
@@ -208,16 +198,6 @@ N_SIZES: Final = len(SIZES)
 # Heads of the free lists of pool_f and pool_i, one for each size.
 FREE_F, FREE_I = COUNTERS_END, COUNTERS_END + N_SIZES
 HEAD_SIZE: Final = COUNTERS_END + 2 * N_SIZES
-
-# Largest counter value that rows keep as a stamp of 32 bits; `restart_stamps` is due beyond it.
-# FRONT_SERIAL reaches it after hours, UPDATE after some hundred days.
-LAST_STAMP: Final = 2**30
-COUNTERS_OF_STAMPS: Final = (UPDATE, ITERATION, FRONT_SERIAL, SINCE, REFINED, LISTED)
-STAMPS: Final = {
-    'nodes': ('front', 'changed', 'logged', 'solution_logged'),
-    'factors': ('checked', 'logged', 'energy_logged'),
-    'cliques': ('marked', 'built', 'born', 'values_born', 'logged'),
-}
 
 # Capacity of a new table [rows]; rows never written to take no memory.
 FIRST_ROWS: Final = 1024
@@ -315,10 +295,3 @@ class Memory:
             as_bytes(grown)[:keep] = as_bytes(self._tables[name])[:keep]
         self._tables[name] = grown
         self.head[at], self.head[at + 1] = grown.ctypes.data, capacity
-
-    def restart_stamps(self) -> None:
-        """Set the counters of stamps and all stamps to 0; allowed between two updates only."""
-        for name, fields in STAMPS.items():
-            for field in fields:
-                self._tables[name][field] = 0
-        self.head[list(COUNTERS_OF_STAMPS)] = 0

@@ -16,19 +16,15 @@ from pose_graph_ros.core.graph.constraints import NodeKind
 
 # Kinds of entries of the log, which are words of a record, the row of it, and the kind; START has
 # its kind alone behind what `begin` logs.
-NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, SOLUTION, ENERGY, START = range(7)
+NODE, FACTOR, CLIQUE, TAKEN_CLIQUE, START = range(5)
 _POSE = int(NodeKind.POSE)
-# Counters in the first entry.
-STARTED_WITH = (
-    tb.N_NODES, tb.N_FACTORS, tb.STRUCTURE, tb.N_TOUCHED, tb.N_WAITING, tb.NEWEST, tb.NEXT_NODE,
-    tb.NEXT_FACTOR, tb.N_LEAVING, tb.N_PRIORS, tb.LOOSE)
 
 
 def largest(n_nodes: int, n_factors: int) -> int:
     """Return how many words the log of one update may have."""
-    # for each node also its solution, a clique, new cliques, and the lists of `begin`
-    of_node = (tb.NODE.itemsize + tb.CLIQUE.itemsize) // tb.WORD + tb.SOLUTION + 16
-    of_factor = 2 * tb.FACTOR.itemsize // tb.WORD - tb.ENERGY + 6
+    # for each node also a clique, new cliques, and the lists of `begin`
+    of_node = (tb.NODE.itemsize + tb.CLIQUE.itemsize) // tb.WORD + 16
+    of_factor = tb.FACTOR.itemsize // tb.WORD + 6
     return n_nodes * of_node + n_factors * of_factor + tb.SCALARS.itemsize
 
 
@@ -37,6 +33,13 @@ def copied(source, target):  # type: ignore[no-untyped-def]
     """Copy the first numbers of an array to another one, as many as that has."""
     for k in range(len(target)):
         target[k] = source[k]
+
+
+@kernel
+def _append_words(head, words):  # type: ignore[no-untyped-def]
+    begin = head[tb.LOG_END]
+    head[tb.LOG_END] = begin + len(words)
+    copied(words, tb.log(head)[begin:begin + len(words)])
 
 
 @kernel
@@ -54,12 +57,8 @@ def _words(head, kind, row):  # type: ignore[no-untyped-def]
     """Return the words of a record that an entry of a kind holds."""
     if kind == NODE:
         return tb.node_words(head)[row]
-    if kind == SOLUTION:
-        return tb.node_words(head)[row, :tb.SOLUTION]
     if kind == FACTOR:
         return tb.factor_words(head)[row]
-    if kind == ENERGY:
-        return tb.factor_words(head)[row, tb.ENERGY:]
     if kind == CLIQUE:
         return tb.clique_words(head)[row]
     return tb.clique_words(head)[row, :0]
@@ -72,24 +71,6 @@ def log_node(head, v):  # type: ignore[no-untyped-def]
     if node.logged != head[tb.UPDATE]:
         _append(head, NODE, v, tb.node_words(head)[v])
         node.logged = head[tb.UPDATE]
-
-
-@kernel
-def log_solution(head, v):  # type: ignore[no-untyped-def]
-    """Log what a solve changes of a node, before it changes."""
-    node = tb.nodes(head)[v]
-    if node.logged != head[tb.UPDATE] and node.solution_logged != head[tb.UPDATE]:
-        node.solution_logged = head[tb.UPDATE]
-        _append(head, SOLUTION, v, tb.node_words(head)[v, :tb.SOLUTION])
-
-
-@kernel
-def log_energy(head, e):  # type: ignore[no-untyped-def]
-    """Log what a check changes of a factor, before it changes."""
-    f = tb.factors(head)[e]
-    if f.logged != head[tb.UPDATE] and f.energy_logged != head[tb.UPDATE]:
-        f.energy_logged = head[tb.UPDATE]
-        _append(head, ENERGY, e, tb.factor_words(head)[e, tb.ENERGY:])
 
 
 @kernel
@@ -130,7 +111,7 @@ def take_clique(head, n_frontal, n_separator):  # type: ignore[no-untyped-def]
     row.built = head[tb.ITERATION]
     row.drift = 0.0
     row.born = row.values_born = row.logged = head[tb.UPDATE]
-    _append(head, TAKEN_CLIQUE, c, _words(head, TAKEN_CLIQUE, c))
+    _append(head, TAKEN_CLIQUE, c, tb.clique_words(head)[c, :0])
     return c
 
 
@@ -172,25 +153,15 @@ def renew_values(head, c):  # type: ignore[no-untyped-def]
 
 @kernel(signature=(tb.HEAD,))
 def begin(head):  # type: ignore[no-untyped-def]
-    """
-    Log counters, scalars and lists; return whether the counters of stamps are within `LAST_STAMP`.
-
-    If they are not, `Memory.restart_stamps` is due, and `begin` again.
-    """
-    log, n_touched = tb.log(head), head[tb.N_TOUCHED]
+    """Log counters, scalars and lists."""
     head[tb.UPDATE] += 1
-    scalars = tb.scalar_words(head)[0]
-    copied(scalars, log[:len(scalars)])
-    lists = log[len(scalars):]
-    end = n_touched + head[tb.N_WAITING]
-    copied(tb.touched(head), lists[:n_touched])
-    copied(tb.waiting(head), lists[n_touched:end])
-    for counter in STARTED_WITH:
-        lists[end] = head[counter]
-        end += 1
-    lists[end] = START
-    head[tb.LOG_END], head[tb.N_FREED] = len(scalars) + end + 1, 0
-    return head[tb.FRONT_SERIAL] <= tb.LAST_STAMP and head[tb.UPDATE] <= tb.LAST_STAMP + 1
+    head[tb.LOG_END] = head[tb.N_FREED] = 0
+    _append_words(head, head[tb.N_NODES:tb.LOOSE + 1])
+    _append_words(head, tb.scalar_words(head)[0])
+    _append_words(head, tb.touched(head)[:head[tb.N_TOUCHED]])
+    _append_words(head, tb.waiting(head)[:head[tb.N_WAITING]])
+    tb.log(head)[head[tb.LOG_END]] = START
+    head[tb.LOG_END] += 1
 
 
 @kernel(signature=(tb.HEAD,))
@@ -238,13 +209,10 @@ def rollback(head):  # type: ignore[no-untyped-def]
         if row.values != values:
             pools.give(head, pools.VALUES, values, size)
     if end > 0:
-        at = end - 1 - len(STARTED_WITH)
-        for counter in STARTED_WITH:
-            head[counter] = log[at]
-            at += 1
-        scalars, n_touched = tb.scalar_words(head)[0], head[tb.N_TOUCHED]
-        copied(log, scalars)
-        lists = log[len(scalars):]
+        counters, scalars = head[tb.N_NODES:tb.LOOSE + 1], tb.scalar_words(head)[0]
+        copied(log, counters)
+        copied(log[len(counters):], scalars)
+        lists, n_touched = log[len(counters) + len(scalars):], head[tb.N_TOUCHED]
         copied(lists, tb.touched(head)[:n_touched])
         copied(lists[n_touched:], tb.waiting(head)[:head[tb.N_WAITING]])
     head[tb.N_FREED] = head[tb.LOG_END] = 0
@@ -256,7 +224,7 @@ def largest_move(head):  # type: ignore[no-untyped-def]
     nodes, log, end, largest = tb.nodes(head), tb.log(head), head[tb.LOG_END], 0.0
     while end > 0 and log[end - 1] != START:
         end, row, kind = _entry(head, end)
-        if kind in (NODE, SOLUTION) and nodes[row].kind == _POSE:
+        if kind == NODE and nodes[row].kind == _POSE:
             for k in range(2):
                 largest = max(largest, abs(nodes[row].pose[k] - tb.log_numbers(head)[end + k]))
     return largest

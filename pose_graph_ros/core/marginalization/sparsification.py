@@ -30,7 +30,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from pose_graph_ros.core.geometry import se2
+from pose_graph_ros.core.geometry import covariance as cov, se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors
 from pose_graph_ros.core.graph.priors import Prior
@@ -306,7 +306,5 @@ def edges_between(
 
 def turned(information: FloatArray, theta: FloatArray) -> FloatArray:
     """Return symmetric information in axes turned by angles, shape (M, 3, 3)."""
-    axes = np.zeros((len(theta), 3, 3))
-    axes[:, :2, :2], axes[:, 2, 2] = se2.rotation(theta), 1.0
-    rotated = np.matmul(np.matmul(np.swapaxes(axes, 1, 2), information), axes)
+    rotated = cov.turned(information, theta)
     return np.asarray(0.5 * (rotated + np.swapaxes(rotated, 1, 2)))

@@ -14,15 +14,9 @@ import math
 from pose_graph_ros.core.compiled.jit import kernel, NUMBER, NUMBERS, ROWS
 from pose_graph_ros.core.elimination.assembly import substitute_fixed
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
-from pose_graph_ros.core.graph import (
-    factors,
-    normal_equations,
-    rows,
-    tables as tb,
-    transaction_log,
-)
+from pose_graph_ros.core.graph import factors, normal_equations, tables as tb, transaction_log
 from pose_graph_ros.core.graph.pools import give, NODES, take, VALUES
-from pose_graph_ros.core.graph.rows import scale_by
+from pose_graph_ros.core.graph.rows import scale_by, start_node, write_row
 from pose_graph_ros.core.smoother.tree_update import lacks_memory
 
 # Return codes of `extend`.
@@ -41,7 +35,8 @@ def _write_node(head, v, last, mean):  # type: ignore[no-untyped-def]
     pose[0] = before[0] + c * mean[0] - s * mean[1]
     pose[1] = before[1] + s * mean[0] + c * mean[1]
     pose[2] = factors.wrap(before[2] + mean[2])
-    rows.start_node(head, v)
+    tb.nodes(head)[v].kind, tb.nodes(head)[v].dimension = 0, 3
+    start_node(head, v)
     tb.node_id(head)[v] = head[tb.NEXT_NODE]
 
 
@@ -86,13 +81,13 @@ def extend(head, mean, information, weight):  # type: ignore[no-untyped-def]
         return NO_ROOM
     last = head[tb.NEWEST]
     if (len(mean) != 3 or information.shape != (3, 3) or last < 0 or head[tb.N_TOUCHED] > 0
-            or head[tb.UPDATE] > tb.LAST_STAMP or nodes[last].clique < 0):
+            or nodes[last].clique < 0):
         return NOT_A_CHAIN
     c = nodes[last].clique
     old = cliques[c]
     if old.n_frontal != 1 or old.n_separator != 0:
         return NOT_A_CHAIN
-    if not rows.write_row(head, e, last, v, mean, information, 0, weight):
+    if not write_row(head, e, last, v, mean, information, 0, weight):
         return NOT_A_CHAIN
     head[tb.UPDATE] += 1    # rows are stamped, but not logged: nothing has to be rolled back
     _write_node(head, v, last, mean)

@@ -239,7 +239,14 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                     if end + size * size > len(blocks):
                         blocks = grown(blocks, end + size * size)
                     below = blocks[end:end + size * size].reshape(size, size)
-                    _read_separator(head, child, inverse, below)
+                    members = separator(head, child)
+                    for a in range(0, size, 3):
+                        i = nodes[members[a // 3]].index
+                        for b in range(0, size, 3):
+                            j = nodes[members[b // 3]].index
+                            for m in range(3):
+                                for q in range(3):
+                                    below[a + m, b + q] = inverse[i + m, j + q]
                     turn_below = clique_frames.present_turn(head, child)
                     if turn_below != turn:
                         _rotate(below, turn - turn_below)
@@ -263,19 +270,6 @@ def _rotate(block, angle):  # type: ignore[no-untyped-def]
         for q in range(0, len(block), 3):
             x, y = block[r, q], block[r, q + 1]
             block[r, q], block[r, q + 1] = cos * x - sin * y, sin * x + cos * y
-
-
-@kernel
-def _read_separator(head, child, inverse, block):  # type: ignore[no-untyped-def]
-    """Copy Z_ss of a child from the inverse of its parent, whose nodes have their INDEX set."""
-    nodes, members = tb.nodes(head), separator(head, child)
-    for a in range(len(members)):
-        i = nodes[members[a]].index
-        for b in range(len(members)):
-            j = nodes[members[b]].index
-            for m in range(3):
-                for q in range(3):
-                    block[3 * a + m, 3 * b + q] = inverse[i + m, j + q]
 
 
 @kernel(fastmath=_FAST)

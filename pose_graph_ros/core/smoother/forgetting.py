@@ -21,44 +21,27 @@ from pose_graph_ros.core.graph.pools import product, row_start, triangle_size
 from pose_graph_ros.core.graph.rows import scale_by, touch
 from pose_graph_ros.core.smoother.tree_update import DONE, lacks_memory, MORE_MEMORY, ORDERED_FIRST
 
-# States of cliques: whether all nodes at and below them leave.
-_UNKNOWN, _WHOLE, _MIXED = range(3)
-
 
 @kernel(allocates=True)
-def _states(head, leaving):  # type: ignore[no-untyped-def]
-    """Return the states of all cliques, and which of all nodes are those given."""
-    cliques = tb.cliques(head)
-    nodes, pool_i, stack = tb.nodes(head), tb.pool_i(head), tb.work_i(head)
-    leaves = np.zeros(head[tb.N_NODES], np.bool_)
+def _whole(head, leaving):  # type: ignore[no-untyped-def]
+    """Tell of which cliques all nodes at and below leave, and which of all nodes leave."""
+    nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
+    leaves, whole = np.zeros(head[tb.N_NODES], np.bool_), np.zeros(head[tb.N_CLIQUES], np.bool_)
     for v in leaving:
         leaves[v] = True
-    state = np.zeros(head[tb.N_CLIQUES], np.uint8)
-    for v in leaving:
-        stack[0] = nodes[v].clique
-        depth = 1
-        while depth > 0:
-            c = stack[depth - 1]
-            row = cliques[c]
-            found = _WHOLE if state[c] == _UNKNOWN else state[c]
-            for m in range(row.members, row.members + row.n_frontal):
-                if not leaves[pool_i[m]]:
-                    found = _MIXED
-            bottom, child = depth, row.child if state[c] == _UNKNOWN else -1
-            while child >= 0 and found == _WHOLE:
-                if cliques[child].n_frontal > 0:
-                    if state[child] == _UNKNOWN and leaves[pool_i[cliques[child].members]]:
-                        stack[depth] = child
-                        depth += 1
-                    elif state[child] != _WHOLE:
-                        found = _MIXED
-                child = cliques[child].sibling
-            if found == _MIXED:
-                depth = bottom
-            if depth == bottom:
-                state[c] = found
-                depth -= 1
-    return state, leaves
+    for v in leaving:   # first of the nodes in a clique alone
+        row, whole[nodes[v].clique] = cliques[nodes[v].clique], True
+        for u in pool_i[row.members:row.members + row.n_frontal]:
+            whole[nodes[v].clique] &= leaves[u]
+    for v in leaving:   # one that has another below it is not whole, nor is what is above it
+        c, all_below = nodes[v].clique, True
+        child = cliques[c].child
+        while child >= 0:
+            all_below &= whole[child] or cliques[child].n_frontal == 0
+            child = cliques[child].sibling
+        while not all_below and c >= 0 and whole[c]:
+            whole[c], c = False, cliques[c].parent
+    return whole, leaves
 
 
 @kernel(signature=(tb.HEAD, INTEGERS))
@@ -86,18 +69,15 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
     leaving nodes are ordered before all others. The caller has begun an update.
     """
     cliques = tb.cliques(head)
-    nodes, pool_i, touched = tb.nodes(head), tb.pool_i(head), tb.touched(head)
-    stack = tb.work_i(head)
-    state, _ = _states(head, leaving)
+    nodes, pool_i, stack = tb.nodes(head), tb.pool_i(head), tb.work_i(head)
+    whole, _ = _whole(head, leaving)
     mixed = False
     for v in leaving:
-        if state[nodes[v].clique] == _WHOLE:
+        if whole[nodes[v].clique]:
             continue
         mixed = True
         transaction_log.log_node(head, v)
-        if nodes[v].touched == 0:
-            touched[head[tb.N_TOUCHED]] = v
-            head[tb.N_TOUCHED] += 1
+        touch(head, v)
         nodes[v].touched = ORDERED_FIRST
         stack[0] = nodes[v].clique
         depth = 1
@@ -105,7 +85,7 @@ def touch_mixed(head, leaving):  # type: ignore[no-untyped-def]
             depth -= 1
             child = cliques[stack[depth]].child
             while child >= 0:
-                if (cliques[child].n_frontal > 0 and state[child] != _WHOLE
+                if (cliques[child].n_frontal > 0 and not whole[child]
                         and prior_rows.is_in_separator(head, child, v)):
                     other = pool_i[cliques[child].members]
                     transaction_log.log_node(head, other)
@@ -209,13 +189,13 @@ def drop(head, leaving):  # type: ignore[no-untyped-def]
     """
     nodes, cliques, pool_i = tb.nodes(head), tb.cliques(head), tb.pool_i(head)
     waiting, scalars = tb.waiting(head), tb.scalars(head)[0]
-    state, leaves = _states(head, leaving)
+    whole, leaves = _whole(head, leaving)
     tops = np.empty(len(leaving), np.int32)
     n_tops, need_f, need_i = 0, head[tb.POOL_F_END], head[tb.POOL_I_END]
     for v in leaving:
         c = nodes[v].clique
         row = cliques[c]
-        if pool_i[row.members] == v and (row.parent < 0 or state[row.parent] != _WHOLE):
+        if pool_i[row.members] == v and (row.parent < 0 or not whole[row.parent]):
             tops[n_tops] = c
             n_tops += 1
             need_f += pools.rounded(pools.n_values(0, row.n_separator))

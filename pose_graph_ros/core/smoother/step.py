@@ -39,13 +39,6 @@ ALPHA = 1e-6
 SHARE = 1e-13
 
 
-@kernel
-def _reset_counters(head):  # type: ignore[no-untyped-def]
-    head[tb.N_RELINEARIZED] = head[tb.N_ELIMINATED] = 0
-    head[tb.N_VISITED] = head[tb.N_ITERATIONS] = 0
-    tb.scalars(head)[0].error2_before = 0.0
-
-
 @kernel(signature=(tb.HEAD, INTEGER, INTEGER), allocates=True)    # the elimination does
 def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
@@ -56,7 +49,8 @@ def run(head, max_iterations, entered):  # type: ignore[no-untyped-def]
     """
     scalars = tb.scalars(head)[0]
     if entered == FIRST:
-        _reset_counters(head)
+        head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
+        scalars.error2_before = 0.0
     if entered != RESUMED:
         scalars.lowest = scalars.chi2
     head[tb.N_TURNED] = 0   # cliques that were listed in the last update may have been replaced
@@ -148,7 +142,7 @@ def refine(head):  # type: ignore[no-untyped-def]
     scalars, cliques = tb.scalars(head)[0], tb.cliques(head)
     alpha, share = scalars.alpha, scalars.share
     scalars.alpha, scalars.share = ALPHA, SHARE     # a rollback restores them, too
-    _reset_counters(head)
+    head[tb.N_RELINEARIZED:tb.N_ITERATIONS + 1] = 0
     if head[tb.LISTED] != head[tb.UPDATE] - 1:
         head[tb.N_TURNED] = 0   # cliques that were listed may have been replaced
         # from the root down, for the cliques that have changed since the last refinement
@@ -283,7 +277,7 @@ def _solve_and_check(head):  # type: ignore[no-untyped-def]
                 owner = f.owner
                 phi = clique_frames.present_turn(head, owner)
                 frame = (phi, math.cos(phi), math.sin(phi))
-            transaction_log.log_energy(head, e)
+            transaction_log.log_factor(head, e)
             scalars.chi2 -= f.energy
             factors.check(head, e, frame)
             scalars.chi2 += f.energy

@@ -42,8 +42,9 @@ def mark(head):  # type: ignore[no-untyped-def]
     """
     Mark the cliques from all touched nodes up to the roots.
 
-    Return these cliques, in no particular order, and the affected nodes: their frontal nodes and
-    the touched nodes without a clique, but for those that leave the graph.
+    Return these cliques, for each touched node those from it up that were not marked yet, and the
+    affected nodes: their frontal nodes and the touched nodes without a clique, but for those that
+    leave the graph.
     """
     cliques = tb.cliques(head)
     nodes, pool_i, touched = tb.nodes(head), tb.pool_i(head), tb.touched(head)
@@ -121,14 +122,19 @@ def rebuild(head, marked, affected):  # type: ignore[no-untyped-def]
         transaction_log.drop_clique(head, marked[k])
     head[tb.N_ROOTS] = 0
     for c in plant(head, cliques, orphans):
-        bad = eliminate_clique(head, c, RELINEARIZED)
-        if bad >= 0:
-            head[tb.BAD_NODE] = bad
+        if not _eliminate(head, c):
             return BAD_PIVOT
-        if tree[c].parent < 0:
-            tb.work_i(head)[head[tb.N_ROOTS]] = c
-            head[tb.N_ROOTS] += 1
     return DONE
+
+
+@kernel
+def _eliminate(head, c):  # type: ignore[no-untyped-def]
+    """Eliminate a clique, and put it on the stack if it is a root; return whether it was done."""
+    head[tb.BAD_NODE] = eliminate_clique(head, c, RELINEARIZED)
+    if tb.cliques(head)[c].parent < 0:
+        tb.work_i(head)[head[tb.N_ROOTS]] = c
+        head[tb.N_ROOTS] += 1
+    return head[tb.BAD_NODE] < 0
 
 
 @kernel(inline='always')
@@ -138,45 +144,26 @@ def refresh(head, marked, interruptible):  # type: ignore[no-untyped-def]
 
     Their roots are put on the stack for the back-substitution.
     """
-    ready, cliques = tb.work_i(head), tb.cliques(head)
-    need, largest = np.int64(0), np.int64(0)
+    cliques, need, largest = tb.cliques(head), np.int64(0), np.int64(0)
     for k in range(len(marked)):
         row = cliques[marked[k]]
-        row.marked = 0
         largest = max(largest, work_size(row.n_frontal + row.n_separator))
         if row.values_born != head[tb.UPDATE]:
             need += pools.rounded(pools.n_values(row.n_frontal, row.n_separator))
     if lacks_memory(head, head[tb.POOL_F_END] + need, 0, largest):
         return MORE_MEMORY
-    for k in range(len(marked)):
-        parent = cliques[marked[k]].parent
-        if parent >= 0:
-            cliques[parent].marked += 1
-    # children first; MARKED counts the marked children that are still to be eliminated
-    n_ready = head[tb.N_ROOTS] = 0
-    for k in range(len(marked)):
-        if cliques[marked[k]].marked == 0:
-            ready[n_ready] = marked[k]
-            n_ready += 1
-    k = 0
-    while k < n_ready:
-        c = ready[k]
-        k += 1
-        if interruptible and head[tb.INTERRUPT] != 0:
-            return INTERRUPTED
-        transaction_log.renew_values(head, c)
-        bad = eliminate_clique(head, c, RELINEARIZED)
-        if bad >= 0:
-            head[tb.BAD_NODE] = bad
-            return BAD_PIVOT
-        cliques[c].built = head[tb.ITERATION]
-        parent = cliques[c].parent
-        if parent < 0:  # the stack is the first part of the queue, which is done with
-            ready[head[tb.N_ROOTS]] = c
-            head[tb.N_ROOTS] += 1
-            continue
-        cliques[parent].marked -= 1
-        if cliques[parent].marked == 0:
-            ready[n_ready] = parent
-            n_ready += 1
+    # children first: each path that was marked, from the bottom up, ends below an earlier one
+    end, head[tb.N_ROOTS] = len(marked), 0
+    while end > 0:
+        begin = end - 1
+        while begin > 0 and cliques[marked[begin - 1]].parent == marked[begin]:
+            begin -= 1
+        for k in range(begin, end):
+            if interruptible and head[tb.INTERRUPT] != 0:
+                return INTERRUPTED
+            transaction_log.renew_values(head, marked[k])
+            if not _eliminate(head, marked[k]):
+                return BAD_PIVOT
+            cliques[marked[k]].built = head[tb.ITERATION]
+        end = begin
     return DONE

@@ -10,10 +10,7 @@ from random_graphs import corridor_graph
 
 from pose_graph_ros.core.batch.levenberg_marquardt import Start, Status
 from pose_graph_ros.core.batch.optimizer import optimize_from_linear_start
-from pose_graph_ros.core.batch.plain_optimizer import (
-    PlainGraph,
-    PlainOptimizer,
-)
+from pose_graph_ros.core.batch.plain_optimizer import PlainGraph
 from pose_graph_ros.core.config import SolverConfig
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
@@ -47,7 +44,7 @@ def test_the_optimum_is_that_of_the_compiled_optimiser(seed: int) -> None:
     graph = noisy_graph(seed)
     plain = PlainGraph(graph.rows())
     assert plain.energies().chi2 == pytest.approx(graph.energies().chi2, rel=1e-12)
-    result = PlainOptimizer(plain, CONFIG).optimize(Start.CHORDAL)
+    result = plain.optimize(CONFIG, Start.CHORDAL)
     expected = optimize_from_linear_start(graph, CONFIG)
     if result is None:
         # what is not simple is left to the other one
@@ -68,7 +65,7 @@ def test_a_hard_graph_is_left_to_the_other_optimiser() -> None:
     graph = corridor_graph(1, sigma=0.3)
     plain = PlainGraph(graph.rows())
     before: FloatArray = plain.poses.copy()
-    assert PlainOptimizer(plain, CONFIG).optimize(Start.CHORDAL) is None
+    assert plain.optimize(CONFIG, Start.CHORDAL) is None
     np.testing.assert_array_equal(plain.poses, before)
 
 
@@ -102,7 +99,7 @@ def test_what_overflows_is_no_result_and_no_warning(start: Start) -> None:
             edges.replaced(information=scale * edges.information, mean=mean),
             graph.factors.observed])))
         before = plain.poses.copy()
-        if PlainOptimizer(plain, CONFIG).optimize(start) is None:
+        if plain.optimize(CONFIG, start) is None:
             refused += 1
             np.testing.assert_array_equal(plain.poses, before)
         assert np.all(np.isfinite(plain.poses))
