@@ -32,7 +32,8 @@ from std_srvs.srv import SetBool, Trigger
 from pose_graph_ros.adapters.parameter_table import Change
 from pose_graph_ros.adapters.parameters import all_parameters, checked, constraints
 from pose_graph_ros.core.exceptions import ConfigError
-from pose_graph_ros.ros import diagnostics, services, worker as requests
+from pose_graph_ros.core.io import graph_files
+from pose_graph_ros.ros import diagnostics, services
 from pose_graph_ros.ros.diagnostics import concerns
 from pose_graph_ros.ros.node import PoseGraphNode
 from pose_graph_ros.ros.services import CLOSED, REPLACED
@@ -304,7 +305,7 @@ def test_a_node_starts_with_a_graph(
         node.start()
     managed.set('datum', [])
 
-    with held(monkeypatch, 'read_graph', requests) as reading:
+    with held(monkeypatch, 'read_graph', graph_files) as reading:
         # it is read in the thread of the graph, while messages come
         managed.start()
         assert managed.session.input.reader.datum.is_of_graph
@@ -367,7 +368,7 @@ def test_a_cleanup_waits_for_no_file_and_each_request_is_answered(
 
     node.start()
     session = managed.session
-    with held(monkeypatch, 'read_graph', requests) as reading:
+    with held(monkeypatch, 'read_graph', graph_files) as reading:
         answer = managed.request('load_graph')
         managed.wait(reading.is_set, 'the file is read')
         clean_up()
@@ -383,7 +384,7 @@ def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     managed.set('graph_file', str(tmp_path / 'map.g2o'))
     managed.drive(4.0)
     assert managed.call('save_graph').success
-    with held(monkeypatch, 'read_graph', requests) as reading:
+    with held(monkeypatch, 'read_graph', graph_files) as reading:
         answer = managed.request('load_graph')
         managed.wait(reading.is_set, 'the file is read')
         managed.session.reset()
