@@ -63,8 +63,8 @@ class FactorType(NamedTuple):
     # rows that the error has; mean and information are zero in the others
     rows: tuple[int, ...] = (0, 1, 2)
     constants: tuple[int, ...] = ()     # columns of `Factors.constants` that it uses
-    # tag in g2o files of two ends, followed by i, j and, of the rows that it has, of which x is the
-    # first, mean and upper triangle of the information
+    # tag in g2o files of two ends, followed by i, j and, of its rows, which begin with x, mean and
+    # upper triangle of the information
     tag: str = ''
 
     @property
