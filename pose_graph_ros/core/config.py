@@ -269,7 +269,8 @@ LOOP_CLOSURES = MeasurementSource(covariance=CovariancePolicy(repair=False), rob
 RANGES = MeasurementSource(covariance=CovariancePolicy(default_position=0.3), loss=Loss.CAUCHY)
 
 
-# settings of a source that is not configured, by the class of its measurements
+# settings of a source that is not configured, here by the class of its measurements
+DEFAULT_ODOMETRY, DEFAULT_GYRO = OdometrySource(), GyroSource()
 DEFAULTS = {'GlobalPose': POSITIONS, 'Position': POSITIONS, 'Fix': POSITIONS,
             'HeadingOnly': HEADINGS, 'LoopClosure': LOOP_CLOSURES, 'Range': RANGES}
 
@@ -379,11 +380,11 @@ class BackendConfig(Settings):
 
     def odometry_source(self, name: str) -> OdometrySource:
         """Return the settings of a source of odometry."""
-        return self.odometry.get(name, OdometrySource())
+        return self.odometry.get(name, DEFAULT_ODOMETRY)
 
     def gyro(self, name: str) -> GyroSource:
         """Return the settings of a gyroscope."""
-        return self.gyros.get(name, GyroSource())
+        return self.gyros.get(name, DEFAULT_GYRO)
 
     @property
     def odometry_scale(self) -> float:
