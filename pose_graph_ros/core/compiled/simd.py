@@ -18,6 +18,7 @@ from typing import Any, Final
 from numba import types
 from numba.extending import intrinsic, models, register_model
 
+from pose_graph_ros.core.compiled.jit import kernel
 from pose_graph_ros.core.compiled.numba_internals import ir
 
 # Number of elements of a vector.
@@ -71,6 +72,22 @@ def store(_context: Any, array: Any, at: Any, vector: Any) -> Any:
 
 
 @_intrinsic
+def fetch(_context: Any, array: Any, at: Any) -> Any:
+    """Prefetch the cache line of `array[at]`, for a later read."""
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        byte = ir.IntType(8).as_pointer()
+        three = [ir.IntType(32)] * 3
+        function = builder.module.declare_intrinsic(
+            'llvm.prefetch', (byte,), ir.FunctionType(ir.VoidType(), [byte, *three]))
+        address = builder.bitcast(_address(context, builder, signature.args[0], *arguments), byte)
+        # arguments of llvm.prefetch: for reading, keep in all caches, data cache
+        builder.call(function, [address, *(kind(value) for kind, value in zip(
+            three, (0, 3, 1), strict=True))])
+        return context.get_dummy_value()
+    return types.void(array, types.int64), codegen
+
+
+@_intrinsic
 def spread(_context: Any, number: Any) -> Any:
     """Return a vector with the number in all four elements."""
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -95,3 +112,28 @@ def _of_vectors(n: int, build: Callable[..., Any]) -> Callable[..., Any]:
 fnmadd = _of_vectors(3, lambda builder, total, a, b: builder.fsub(
     total, builder.fmul(a, b, flags=('contract',)), flags=('contract',)))
 times = _of_vectors(2, lambda builder, a, b: builder.fmul(a, b))
+plus = _of_vectors(2, lambda builder, a, b: builder.fadd(a, b))
+
+
+@kernel(inline='always')
+def copy(source, begin, target, to, n):  # type: ignore[no-untyped-def]
+    """Copy `source[begin:begin + n]` to `target[to:to + n]`."""
+    k = 0
+    while k + WIDTH <= n:
+        store(target, to + k, load(source, begin + k))
+        k += WIDTH
+    while k < n:
+        target[to + k] = source[begin + k]
+        k += 1
+
+
+@kernel(inline='always')
+def add(source, begin, target, to, n):  # type: ignore[no-untyped-def]
+    """Add `source[begin:begin + n]` to `target[to:to + n]`."""
+    k = 0
+    while k + WIDTH <= n:
+        store(target, to + k, plus(load(target, to + k), load(source, begin + k)))
+        k += WIDTH
+    while k < n:
+        target[to + k] += source[begin + k]
+        k += 1

@@ -3,6 +3,7 @@
 """Numeric elimination of one clique: assemble its front, factorise it and store the result."""
 
 from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.simd import add
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import factorize, LEAST_PIVOT, padded, write_rows
 from pose_graph_ros.core.graph import normal_equations, prior_rows, tables as tb, transaction_log
@@ -209,20 +210,13 @@ def _extend_add(head, child, front, ld):  # type: ignore[no-untyped-def]
         for a in range(begin):
             target = index[a] * ld + column
             for k in range(3 * a, 3 * a + 3):
-                _add(update[row_start(k, size) + 3 * begin:], front[target:target + width])
+                add(update, row_start(k, size) + 3 * begin, front, target, width)
                 target += ld
         target = column * (ld + 1)
         for k in range(3 * begin, 3 * end):
-            _add(update[row_start(k, size) + k:], front[target:target + 3 * end - k])
+            add(update, row_start(k, size) + k, front, target, 3 * end - k)
             target += ld + 1
         begin = end
-
-
-@kernel
-def _add(source, target):  # type: ignore[no-untyped-def]
-    """Add the first numbers of an array to those of another one, as many as that has."""
-    for k in range(len(target)):
-        target[k] += source[k]
 
 
 @kernel

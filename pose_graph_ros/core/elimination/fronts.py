@@ -17,9 +17,8 @@ keeps its rows of R and its update matrix as upper triangles without gaps (`grap
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
-from pose_graph_ros.core.compiled.simd import fnmadd, load, spread, store, times, WIDTH
+from pose_graph_ros.core.compiled.simd import copy, fnmadd, load, spread, store, times, WIDTH
 from pose_graph_ros.core.graph.pools import row_start
-from pose_graph_ros.core.graph.transaction_log import copied
 
 # Smallest pivot, as a fraction of what the constraints of its node add to it. A smaller one has
 # lost all its digits to cancellation: the node is not determined.
@@ -115,7 +114,7 @@ def factorize(front, rows, n, ld, least):  # type: ignore[no-untyped-def]
 def write_rows(front, n, ld, pool_f, at):  # type: ignore[no-untyped-def]
     """Write the upper triangle of the n rows of a front with right-hand sides, without gaps."""
     for k in range(n):
-        copied(front[k * (ld + 1):], pool_f[at:at + n - k])
+        copy(front, k * (ld + 1), pool_f, at, n - k)
         at += n - k + 1
         pool_f[at - 1] = front[(k + 1) * ld - 1]
 

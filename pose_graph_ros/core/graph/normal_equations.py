@@ -179,7 +179,7 @@ def add_complex(head, e, headings, a, b, front, ld):  # type: ignore[no-untyped-
     front[r + ld + 1] -= weight * fx
 
 
-@kernel(forceinline=True)
+@kernel
 def gradient(head, e, right):  # type: ignore[no-untyped-def]
     """
     Add -b of a factor to `right`, shape (N, 3); return its energy and two sums of magnitudes.

@@ -20,10 +20,11 @@ its drift is added to that of its children.
 import math
 
 from pose_graph_ros.core.compiled.jit import kernel
+from pose_graph_ros.core.compiled.simd import fetch
 from pose_graph_ros.core.elimination import clique_frames
 from pose_graph_ros.core.elimination.fronts import backward_rows
 from pose_graph_ros.core.graph import factors, prior_rows, tables as tb, transaction_log
-from pose_graph_ros.core.graph.pools import separator
+from pose_graph_ros.core.graph.pools import separator, triangle_size
 
 # Energy of a constraint that is assumed to predict its linearization error from a turn [sigma^2].
 USUAL_ENERGY = 0.1
@@ -225,10 +226,11 @@ def _update_child(head, c, stack, depth):  # type: ignore[no-untyped-def]
 @kernel
 def back_substitute(head):  # type: ignore[no-untyped-def]
     """Visit the cliques from the roots on the stack down; list the nodes to be checked."""
-    cliques, stack, nodes, scalars = (
-        tb.cliques(head), tb.work_i(head), tb.nodes(head), tb.scalars(head)[0])
-    depth, turned = head[tb.N_ROOTS], stack[2 * head[tb.NODE_ROOM]:]
+    cliques, pool_f = tb.cliques(head), tb.pool_f(head)
+    work_i, nodes, scalars = tb.work_i(head), tb.nodes(head), tb.scalars(head)[0]
+    stack, depth, turned = work_i, head[tb.N_ROOTS], work_i[2 * head[tb.NODE_ROOM]:]
     refines = head[tb.SINCE] < head[tb.ITERATION]
+    n_visited = 0
     for k in range(depth):
         cliques[stack[k]].turn = 0.0
     head[tb.N_TURNED] = head[tb.N_CHECKS] = head[tb.N_CHANGED] = 0
@@ -238,39 +240,51 @@ def back_substitute(head):  # type: ignore[no-untyped-def]
             break   # the caller rolls back
         depth -= 1
         c = stack[depth]
-        _visit(head, c)
-        cliques[c].built = head[tb.ITERATION]
-        head[tb.N_VISITED] += 1
-        turn, drift, child = cliques[c].turn, cliques[c].drift, cliques[c].child
-        if drift > 0.0:
-            transaction_log.log_clique(head, c)
-            cliques[c].drift = 0.0
-        while child >= 0:
-            if cliques[child].n_frontal == 0:
-                transaction_log.log_clique(head, child)
-                prior_rows.update_energy(head, child)
-                if prior_rows.turns(head, child):
-                    turned[head[tb.N_TURNED]] = child
-                    head[tb.N_TURNED] += 1
-                child = cliques[child].sibling
-                continue
+        while c >= 0:
+            _visit(head, c)
+            cliques[c].built = head[tb.ITERATION]
+            n_visited += 1
+            turn = cliques[c].turn
+            drift = cliques[c].drift
             if drift > 0.0:
-                transaction_log.log_clique(head, child)
-                cliques[child].drift += drift
-            code = _update_child(head, child, stack, depth)
-            row = cliques[child]
-            if code != _AS_IT_IS or refines:    # no turn nor slip if it is anchored
-                row.turn = clique_frames.present_turn(head, child)
-                slip2 = (row.turn - row.turn_seen - turn)**2
-                if slip2 * (slip2 * row.slip_scale + USUAL_ENERGY) > scalars.share:
-                    turned[head[tb.N_TURNED]] = child
-                    head[tb.N_TURNED] += 1
-            if code == _SOLVED:
-                stack[depth] = child
-                depth += 1
-            child = cliques[child].sibling
-    changed = stack[3 * head[tb.NODE_ROOM]:]
+                transaction_log.log_clique(head, c)
+                cliques[c].drift = 0.0
+            # the first child to be solved for comes next, the others go on the stack
+            child, c = cliques[c].child, -1
+            while child >= 0:
+                if cliques[child].n_frontal == 0:
+                    transaction_log.log_clique(head, child)
+                    prior_rows.update_energy(head, child)
+                    if prior_rows.turns(head, child):
+                        turned[head[tb.N_TURNED]] = child
+                        head[tb.N_TURNED] += 1
+                    child = cliques[child].sibling
+                    continue
+                if drift > 0.0:
+                    transaction_log.log_clique(head, child)
+                    cliques[child].drift += drift
+                code = _update_child(head, child, stack, depth)
+                row = cliques[child]
+                if code != _AS_IT_IS or refines:    # no turn nor slip if it is anchored
+                    row.turn = clique_frames.present_turn(head, child)
+                    slip2 = (row.turn - row.turn_seen - turn)**2
+                    if slip2 * (slip2 * row.slip_scale + USUAL_ENERGY) > scalars.share:
+                        turned[head[tb.N_TURNED]] = child
+                        head[tb.N_TURNED] += 1
+                if code == _SOLVED:
+                    # the rows of R are used once and are not in the cache
+                    rows = 3 * row.n_frontal
+                    size = triangle_size(rows, rows + 3 * row.n_separator)
+                    for at in range(row.values, row.values + size, 8):
+                        fetch(pool_f, at)
+                    if c >= 0:
+                        stack[depth] = c
+                        depth += 1
+                    c = child
+                child = cliques[child].sibling
+    changed = work_i[3 * head[tb.NODE_ROOM]:]
     for k in range(head[tb.N_CHANGED]):
         f = nodes[changed[k]]
         f.seen[0], f.seen[1], f.seen[2] = f.delta[0], f.delta[1], f.delta[2]
     scalars.n_moved += head[tb.N_CHANGED]
+    head[tb.N_VISITED] += n_visited

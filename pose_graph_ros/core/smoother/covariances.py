@@ -30,6 +30,7 @@ import numpy as np
 
 from pose_graph_ros.core.compiled.jit import INTEGER, kernel, MATRICES, ROWS
 from pose_graph_ros.core.elimination import clique_frames
+from pose_graph_ros.core.elimination.fronts import forward_rows
 from pose_graph_ros.core.elimination.ordering import grown
 from pose_graph_ros.core.geometry.se2 import Covariances, FloatArray, IntArray, Poses
 from pose_graph_ros.core.graph import factors, tables as tb
@@ -150,9 +151,14 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
         row = cliques[c]
         n_frontal, n = row.n_frontal, row.n_frontal + row.n_separator
         members, values = pool_i[row.members:row.members + n], pool_f[row.values:]
-        for f in range(first, n_frontal):
-            if nodes[members[f]].fixed == 0:
-                _solve_block(values, 3 * f, 3 * n, here, out)
+        begin = 3 * first   # what is before it is zero
+        for r in range(len(here)):
+            forward_rows(values[row_start(begin, 3 * n) + begin:], 3 * n_frontal - begin,
+                         3 * n - begin, here[r, begin:])
+        for q in range(begin, 3 * n_frontal):
+            for r in range(len(here) if nodes[members[q // 3]].fixed == 0 else 0):
+                for s in range(len(here)):
+                    out[r, s] += here[r, q] * here[s, q]
         if row.parent < 0:
             break
         # the right-hand sides of the separator are those of the parent, in its frame
@@ -174,25 +180,6 @@ def _climb(head, c, top, first, here, spare, out):  # type: ignore[no-untyped-de
         first, c = 0, row.parent
         here, spare = spare, here
     return here, spare
-
-
-@kernel(allocates=True, fastmath=_FAST)
-def _solve_block(values, k, n, rhs, out):  # type: ignore[no-untyped-def]
-    """Solve for the three rows of R from row k on; add Y^T Y to `out`."""
-    r0, r1, r2 = (values[row_start(k, n):], values[row_start(k + 1, n):],
-                  values[row_start(k + 2, n):])
-    for r in range(len(rhs)):
-        x = rhs[r, :n]
-        a = x[k] * r0[k]
-        b = (x[k + 1] - a * r0[k + 1]) * r1[k + 1]
-        c = (x[k + 2] - a * r0[k + 2] - b * r1[k + 2]) * r2[k + 2]
-        x[k], x[k + 1], x[k + 2] = a, b, c
-        for q in range(k + 3, n):
-            x[q] -= a * r0[q] + b * r1[q] + c * r2[q]
-        for s in range(r + 1):
-            y = rhs[s]
-            out[s, r] += y[k] * a + y[k + 1] * b + y[k + 2] * c
-            out[r, s] = out[s, r]
 
 
 @kernel(signature=(tb.HEAD, MATRICES), allocates=True)
@@ -240,13 +227,10 @@ def all_covariances(head, out):  # type: ignore[no-untyped-def]
                         blocks = grown(blocks, end + size * size)
                     below = blocks[end:end + size * size].reshape(size, size)
                     members = separator(head, child)
-                    for a in range(0, size, 3):
-                        i = nodes[members[a // 3]].index
-                        for b in range(0, size, 3):
-                            j = nodes[members[b // 3]].index
-                            for m in range(3):
-                                for q in range(3):
-                                    below[a + m, b + q] = inverse[i + m, j + q]
+                    for a in range(size):
+                        i = nodes[members[a // 3]].index + a % 3
+                        for b in range(size):
+                            below[a, b] = inverse[i, nodes[members[b // 3]].index + b % 3]
                     turn_below = clique_frames.present_turn(head, child)
                     if turn_below != turn:
                         _rotate(below, turn - turn_below)
