@@ -410,7 +410,7 @@ class PoseGraphBackend:
         """Return a back end that continues a saved graph; see `parts.restore`."""
         backend = cls(config)
         parts.restore(backend.parts, saved)
-        backend._tuner.restored(knows_errors=len(saved.nodes.errors) > 0)
+        backend._tuner.restored()
         backend._forgetting.restored()
         backend._newest_node_covariance = np.array(saved.newest_covariance)
         # the next update eliminates all nodes

@@ -184,24 +184,9 @@ class ErrorTuner:
         change.remaining = np.flatnonzero(np.isin(numbers, change.remaining))
         change.before = change.before[numbers]
 
-    def restored(self, *, knows_errors: bool) -> None:
-        """
-        Follow the graph, which was loaded.
-
-        In files of older versions (not `knows_errors`) weights stand for the noise of odometry.
-        """
+    def restored(self) -> None:
+        """Follow the graph, which was loaded."""
         self._odometry = self._nodes.errors
-        graph, rows = self._smoother.graph, self._primary_rows()
-        # what a loss or the judge has changed has less weight
-        weight = float(np.max(graph.weights[rows], initial=0.0))
-        if knows_errors or weight in (0.0, 1.0):
-            return
-        ids, edges = graph.factor_ids[rows], graph.factors_at(graph.factor_ids[rows])
-        graph.apply(GraphUpdate(
-            measure=[Measured(ids, edges.mean, weight * edges.information)],
-            weigh=dict(zip(ids.tolist(), (edges.weight / weight).tolist(), strict=True))))
-        self._reweighting['base'][np.isin(self._reweighting['id'], ids)] *= 1.0 / weight
-        self._nodes.errors = self._odometry = OdometryErrors.scaled(weight**-0.5)
 
     def _wanted(self) -> OdometryErrors | None:
         """Return the errors that the odometry in the graph is to have; None if it has them."""

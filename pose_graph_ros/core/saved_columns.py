@@ -112,7 +112,6 @@ def decoded(kind: Any, plain: Any) -> Any:
         return {name: decoded(arguments[1], each) for name, each in plain.items()}
     if _has_fields(kind):
         hints = annotations(kind)
-        # one with a default may be missing: older versions did not write it
         return kind(**{name: decoded(hints[name], each) for name, each in plain.items()})
     return kind(plain)
 

@@ -90,13 +90,11 @@ def factor_graph(rows: GraphRows, ids: IntArray | None = None) -> Any:
     """
     graph = nx.Graph()
     kinds = [NodeKind(kind) for kind in rows.node_kind.tolist()]
-    sizes = (np.where(rows.node_kind == NodeKind.LANDMARK, 2, 3) if rows.dimension is None
-             else rows.dimension)
     for node, (node_kind, number) in enumerate(zip(
             kinds, (rows.node_ids if ids is None else ids).tolist(), strict=True)):
         letter, role = HIDDEN[node_kind]
         graph.add_node(node, name=f'{letter}{number}', role=role, fixed=bool(rows.fixed[node]),
-                       size=int(sizes[node]), pose=rows.poses[node].copy())
+                       size=int(rows.dimension[node]), pose=rows.poses[node].copy())
     factors = rows.factors.renumbered(rows.rows_of)
     found, measured = [], set()
     stepped = set(factors.i[factors.kind == FactorKind.ODOMETRY].tolist())

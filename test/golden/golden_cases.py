@@ -73,14 +73,6 @@ class Tool:
     """Whether it takes too long for the tests."""
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """A saved graph of some version, which is driven on."""
-
-    name: str
-    values: Mapping[str, Any] = field(default_factory=dict)
-
-
 def second_odometry(measurements: Stream) -> Iterator[tuple[str, OdometrySample | Measurement]]:
     """Add odometry `visual`, whose distances are 1 % too long, and with noise of its own."""
     generator = np.random.default_rng(7)
@@ -220,18 +212,6 @@ DRIVES = {
     'plaza1': Drive('robot/plaza1', large=True),
 }
 
-LOADED = {
-    'version_1': Loaded('version_1'),
-    # with a window, thinning, judged closures, slow errors of fixes and of a gyroscope
-    'version_4': Loaded('version_4', {**GYRO, **THIN, 'window.nodes': 45.0}),
-    # with a window, late fixes with a given correlation time and some whose errors were found to
-    # be correlated, a gyroscope, and a rotation and a closure that wait
-    'version_6': Loaded('version_6', {
-        'sources': ['odom', 'fix', 'rear', 'gyro'], 'rear.type': 'fix',
-        'rear.correlation_time': 20.0, 'gyro.mounting': 'up', 'gyro.bias_period': 5.0,
-        'fix.robust': 'none', 'window.nodes': 45.0}),
-}
-
 TOOLS = {
     'simulate': Tool('simulate city --duration 40 --gyro --json --tum', ('city_truth.tum',)),
     'simulate_graph': Tool(
@@ -265,7 +245,7 @@ TOOLS = {
     'parameters': Tool('parameters --yaml'),
 }
 
-CASES: dict[str, Drive | Loaded | Tool] = {**DRIVES, **LOADED, **TOOLS}
+CASES: dict[str, Drive | Tool] = {**DRIVES, **TOOLS}
 
 
 def needs(name: str) -> list[str]:
@@ -276,5 +256,4 @@ def needs(name: str) -> list[str]:
 
 def is_large(name: str) -> bool:
     """Return whether a case takes too long for the tests."""
-    case = CASES[name]
-    return not isinstance(case, Loaded) and case.large
+    return CASES[name].large

@@ -20,14 +20,14 @@ import re
 from typing import Any
 
 from bag_of_messages import write_bag
-from golden_cases import CASES, Drive, Loaded, SECOND, Tool
+from golden_cases import CASES, Drive, SECOND, Tool
 import numpy as np
 from public_data import PUBLIC
 from tum_files import read_tum
 
 from pose_graph_ros.adapters.bags import Bag, choose_inputs, open_bag, reader_of
 from pose_graph_ros.adapters.parameters import checked
-from pose_graph_ros.adapters.sources import backend_config, source_list
+from pose_graph_ros.adapters.sources import source_list
 from pose_graph_ros.cli.drive import measured_in
 from pose_graph_ros.cli.main import main
 from pose_graph_ros.cli.simulate import fix_messages, odometry_messages
@@ -35,11 +35,9 @@ from pose_graph_ros.core.backend import PoseGraphBackend
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.geodesy import TangentPlane
 from pose_graph_ros.core.geometry.trajectory import Trajectory
-from pose_graph_ros.core.io.graph_files import read_graph
-from pose_graph_ros.core.measurements import GlobalPose, OdometrySample
+from pose_graph_ros.core.measurements import OdometrySample
 
 FILES = Path(__file__).parent / 'files'
-SAVED = Path(__file__).parents[1] / 'data'
 DIGITS = 12
 """Significant ones of the figures in files."""
 PORTABLE = 1e-6
@@ -67,8 +65,6 @@ class Runner:
         if isinstance(case, Drive):
             bag, truth = self._once(case.world, lambda: self._recording(case))
             return driven(case, bag, truth)
-        if isinstance(case, Loaded):
-            return driven_on(case)
         return self._once(name, lambda: self._tool(case))
 
     def _once(self, key: str, make: Callable[[], Any]) -> Any:
@@ -155,28 +151,6 @@ def driven(drive: Drive, path: Path, truth: Trajectory | None) -> Record:
     record['figures']['refused'] = {'.'.join(key): n for key, n in sorted(refused.items())}
     record['hashes']['input'] = digest
     return record
-
-
-def driven_on(case: Loaded) -> Record:
-    """Return the record of a saved graph from which a robot drives on for 20 s, in a circle."""
-    backend = PoseGraphBackend.restored(
-        backend_config(checked(case.values)), read_graph(SAVED / f'{case.name}.g2o'))
-    backend.update()
-    start, record = backend.estimate(), {}
-    record['loaded'] = state_of(backend, '', None, np.empty((0, 13)))
-    for k in range(1, 201):
-        motion = np.array((3.0 * np.sin(0.03 * k), 3.0 * (1.0 - np.cos(0.03 * k)), 0.03 * k))
-        stamp_ns = start.stamp_ns + k * SECOND // 10
-        backend.add_odometry(OdometrySample(
-            stamp_ns, se2.compose(start.T_odom_base, motion)), start.primary)
-        if k % 20 == 0:
-            backend.add_measurement(GlobalPose(
-                stamp_ns, se2.compose(start.T_map_base, motion + np.array((0.2, -0.1, 0.02))),
-                np.diag((0.2, 0.2, 0.02))), 'global_pose')
-            backend.update()
-    report = backend.optimize()
-    record['driven on'] = state_of(backend, report.status.value, None, np.empty((0, 13)))
-    return {part: {when: record[when][part] for when in record} for part in ('figures', 'hashes')}
 
 
 def state_of(

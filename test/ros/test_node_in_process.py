@@ -377,6 +377,22 @@ def test_a_cleanup_waits_for_no_file_and_each_request_is_answered(
     assert not session.worker.thread.is_alive()
 
 
+def test_a_graph_of_another_version_is_refused_and_the_present_one_stays(
+    managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    managed.start()
+    managed.set('graph_file', str(tmp_path / 'map.g2o'))
+    managed.drive(4.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(graph_files, 'VERSION', 7)
+        assert managed.call('save_graph').success
+    before = managed.session.worker.estimate
+    answer = managed.call('load_graph')
+    assert not answer.success
+    assert 'expected a pose_graph_ros graph of version 8' in answer.message
+    assert managed.session.worker.estimate is before
+
+
 def test_a_graph_is_not_replaced_by_one_that_was_asked_for_before(
     managed: Managed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -379,8 +379,7 @@ class Graph:
         begin = self.n_nodes - len(rows.poses)
         new = self.node_records[begin:]
         new['kind'] = rows.node_kind
-        new['dimension'] = rows.dimension if rows.dimension is not None else np.where(
-            rows.node_kind == NodeKind.LANDMARK, 2, 3)
+        new['dimension'] = rows.dimension
         poses = np.flatnonzero(self.is_pose)
         self.memory.head[tb.NEWEST] = poses[-1] if len(poses) > 0 else -1
         self._append('factor', GraphUpdate(factors=rows.factors), rows.factor_ids,

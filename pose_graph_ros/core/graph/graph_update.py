@@ -95,8 +95,7 @@ class GraphRows(NamedTuple):
     node_ids: IntArray      # ascending
     factor_ids: IntArray
     next_ids: NextIds       # at least 1 more than the last ones
-    # numbers of coordinates of the hidden nodes; by default those usual for their kinds
-    dimension: IntArray | None = None
+    dimension: IntArray     # numbers of coordinates of the hidden nodes
     priors: Sequence[Prior] = ()    # all dense ones, by ids
 
     @property
@@ -121,4 +120,4 @@ class GraphRows(NamedTuple):
         return GraphRows(
             self.poses[nodes], self.node_kind[nodes], self.fixed[nodes],
             self.factors.rows(factors), self.node_ids[nodes], self.factor_ids[factors],
-            self.next_ids, None if self.dimension is None else self.dimension[nodes])
+            self.next_ids, self.dimension[nodes])

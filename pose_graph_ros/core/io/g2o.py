@@ -222,8 +222,9 @@ def _graph_of(text: gt.GraphText, edge2_order: str | None) -> GraphFile:
     if len(ids) > 0 and not np.any(fixed) and np.all(factors.j >= 0):
         fixed[np.argmin(is_landmark)] = True
     n = len(ids)
-    graph = GraphRows(se2.wrapped(poses), kind, fixed,
-                      factors, np.arange(n), np.arange(len(factors)), NextIds(n, len(factors)))
+    graph = GraphRows(
+        se2.wrapped(poses), kind, fixed, factors, np.arange(n), np.arange(len(factors)),
+        NextIds(n, len(factors)), np.where(is_landmark, 2, 3))
     return GraphFile(
         graph, ids, bool(len(given) == n), text.skipped, (*loops, *notes), edge2_order)
 

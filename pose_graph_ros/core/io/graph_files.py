@@ -13,8 +13,8 @@ SHA-256 of all that follows in it. Both are read back bit for bit, or refused. T
 the path for other programs and is not read. See docs/design.md, "Saved graphs".
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
 import hashlib
 import json
 import os
@@ -32,12 +32,11 @@ from pose_graph_ros.core.geometry.se2 import FloatArray, wrap
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph import constraints as ct
 from pose_graph_ros.core.graph.graph import GraphRows, NextIds
-from pose_graph_ros.core.graph.priors import packed, Prior, unpacked
+from pose_graph_ros.core.graph.priors import packed, unpacked
 from pose_graph_ros.core.graph.reweighting import SavedLosses
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import factors_of, g2o_text, NOT_USED, STANDING_FOR
 from pose_graph_ros.core.io.g2o_text import GraphText, lines_of, MEASURED, TAGS
-from pose_graph_ros.core.io.old_versions import upgraded
 from pose_graph_ros.core.io.path_files import tum_text
 from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.odometry.node_table import SavedNodes
@@ -47,7 +46,7 @@ from pose_graph_ros.core.sources.pipeline import SavedStamps
 from pose_graph_ros.core.sources.queued import SavedQueue
 
 FORMAT = 'pose_graph_ros graph'
-VERSION = 7
+VERSION = 8
 
 SUFFIXES = ('.g2o', '.json', '.tum')
 _OPENING, _MIDDLE = b'{\n"sha256": "', b'",\n'
@@ -79,8 +78,8 @@ class SavedGraph:
     chi2: float
     n_left_out: int  # received measurements that are neither in the graph nor saved
     datum: MapOrigin | None  # of the map, if it has one
-    gyros: Mapping[str, SavedGyro] = field(default_factory=dict)
-    beacons: Mapping[str, int] = field(default_factory=dict)  # ids of their landmarks, by name
+    gyros: Mapping[str, SavedGyro]
+    beacons: Mapping[str, int]  # ids of their landmarks, by name
 
     @property
     def path(self) -> FloatArray:
@@ -92,17 +91,14 @@ MEMBERS = [item.name for item in fields(SavedGraph) if item.name != 'rows']
 
 
 @dataclass(frozen=True, slots=True)
-class SavedPriors:
-    """Dense priors, one behind the other."""
+class SavedPrior:
+    """A dense prior."""
 
-    # number k of nodes of each prior
-    sizes: sc.Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    anchored: sc.Flags = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-    # ids of the nodes of all priors
-    nodes: sc.Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    # of each prior the upper triangle of its information row by row, each row followed by the
-    # number of the vector, then the reference poses and the energy
-    numbers: sc.Numbers = field(default_factory=lambda: np.empty(0))
+    nodes: sc.Integers
+    # the upper triangle of its information row by row, each row followed by the number of the
+    # vector, then the reference poses and the energy
+    numbers: sc.Numbers
+    anchored: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,26 +106,21 @@ class SavedRows:
     """What the g2o file lacks of the rows of a graph."""
 
     fixed: sc.Integers  # ids of the fixed hidden nodes
-    biases: sc.Integers  # ids of the hidden nodes that are no poses; poses are in the g2o file
+    # ids of the hidden nodes that are no poses; poses are in the g2o file
+    biases: sc.Integers
     bias_values: sc.Rows3
+    bias_dimensions: sc.Integers
+    landmarks: sc.Integers  # ids of those of them that are landmarks
     factor_kind: ct.FactorKinds  # of all factors
     factor_weight: sc.Numbers
     # rows of the factors that are given here; edges of `IN_G2O` without a third node, and observed
     # nodes on no bias, are in the g2o file
     others: sc.Integers
-    other_i: sc.Integers
-    other_j: sc.Integers
-    other_mean: sc.Rows3
-    other_information: sc.Rows6
-    other_constants: sc.Rows4
-    other_k: sc.Integers
-    # ids of all, in order; None where they are 0, 1 and so on, without a gap
-    node_ids: sc.Integers | None = None
-    factor_ids: sc.Integers | None = None
-    next_ids: NextIds | None = None  # of the next new rows; None where they follow on the last
-    priors: SavedPriors = field(default_factory=SavedPriors)
-    bias_dimensions: sc.Integers | None = None  # of `biases`; None if all have 3 coordinates
-    landmarks: sc.Integers | None = None  # ids of those of `biases` that are landmarks
+    other_factors: ct.Factors
+    node_ids: sc.Integers  # ids of all, in order
+    factor_ids: sc.Integers
+    next_ids: NextIds  # of the next new rows
+    priors: tuple[SavedPrior, ...]
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -175,8 +166,7 @@ def read_graph(path: Path) -> SavedGraph:
     g2o_path, path, members, g2o = _verified(path)
     try:
         hints = sc.annotations(SavedGraph)
-        rest = {name: sc.decoded(hints[name], members[name]) for name in MEMBERS
-                if name in members}
+        rest = {name: sc.decoded(hints[name], members[name]) for name in MEMBERS}
         rows: SavedRows = sc.decoded(SavedRows, members['graph'])
         text = g2o.decode('ascii').partition(STANDING_FOR)[0].replace(NOT_USED, '')
         return SavedGraph(rows=_graph_rows(rows, lines_of(g2o_path, text)), **rest)
@@ -219,14 +209,11 @@ def _verified(path: Path) -> tuple[Path, Path, dict[str, Any], bytes]:
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f'{path}: expected JSON ({error})') from error
     version = members.pop('version', None)
-    if members.pop('format', None) != FORMAT or version not in range(1, VERSION + 1):
+    if members.pop('format', None) != FORMAT or version != VERSION:
         raise FileFormatError(
-            f'{path}: expected a {FORMAT} of version 1 to {VERSION}, created by pose_graph_ros; '
-            f'this one is of version {version!r}, created by {members.get("created_by")!r}')
-    try:
-        members = upgraded(members, version)
-    except sc.MISMATCHES as error:
-        raise FileFormatError(f'{path}: expected other members: {error!r}') from error
+            f'{path}: expected a {FORMAT} of version {VERSION}, created by pose_graph_ros; this '
+            f'one is of version {version!r}, created by {members.get("created_by")!r}: make it '
+            'anew from the bag')
     g2o = _content(g2o_path)
     if hashlib.sha256(g2o).hexdigest() != members.pop('g2o_sha256', None):
         raise FileFormatError(
@@ -257,74 +244,42 @@ def _saved_rows(rows: GraphRows) -> SavedRows:
     in_json = np.flatnonzero(np.where(
         factors.j < 0, np.isin(factors.i, rows.node_ids[rows.is_bias]),
         ~np.isin(factors.kind, IN_G2O) | (factors.k >= 0)))
-    given = factors.rows(in_json)
-    node_ids, factor_ids = (None if len(ids) == end else ids for ids, end in zip(
-        (rows.node_ids, rows.factor_ids), rows.next_ids, strict=True))
-    dimensions = None if rows.dimension is None else rows.dimension[others].astype(np.int64)
-    landmarks = rows.node_ids[rows.node_kind == ct.NodeKind.LANDMARK]
     return SavedRows(
         rows.node_ids[rows.fixed], rows.node_ids[others], rows.poses[others],
-        factors.kind.astype(np.int64), factors.weight, in_json, given.i, given.j, given.mean,
-        ct.upper(given.information), given.constants, given.k, node_ids, factor_ids, rows.next_ids,
-        _saved_priors(rows.priors),
-        None if dimensions is None or np.all(dimensions == 3) else dimensions,
-        landmarks if len(landmarks) > 0 else None)
+        rows.dimension[others], rows.node_ids[rows.node_kind == ct.NodeKind.LANDMARK],
+        factors.kind, factors.weight, in_json, factors.rows(in_json),
+        rows.node_ids, rows.factor_ids, rows.next_ids,
+        tuple(SavedPrior(each.nodes, packed(each), each.anchored) for each in rows.priors))
 
 
 def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
     """Return the rows of a graph from both files."""
     vertices = text.rows['VERTEX_SE2']
-    n = len(vertices) + len(rows.biases), len(rows.factor_kind)
-    node_ids, factor_ids = (np.arange(size) if ids is None else ids for size, ids in zip(
-        n, (rows.node_ids, rows.factor_ids), strict=True))
-    is_pose, fixed = ~np.isin(node_ids, rows.biases), np.isin(node_ids, rows.fixed)
+    node_ids = rows.node_ids
+    is_pose, dimension = ~np.isin(node_ids, rows.biases), np.full(len(node_ids), 3)
     poses = np.zeros((len(node_ids), 3))
     poses[is_pose], poses[~is_pose] = vertices['numbers'], rows.bias_values
+    dimension[~is_pose] = rows.bias_dimensions
     kind = np.where(is_pose, ct.NodeKind.POSE, ct.NodeKind.BIAS).astype(np.uint8)
-    if rows.landmarks is not None:
-        kind[np.isin(node_ids, rows.landmarks)] = ct.NodeKind.LANDMARK
-    dimension = np.where(kind == ct.NodeKind.LANDMARK, 2, 3)
-    if rows.bias_dimensions is not None:
-        dimension[~is_pose] = rows.bias_dimensions
+    kind[np.isin(node_ids, rows.landmarks)] = ct.NodeKind.LANDMARK
     return GraphRows(
-        poses, kind, fixed, _factors(rows, text), node_ids, factor_ids,
-        NextIds(*n) if rows.next_ids is None else rows.next_ids, dimension,
-        _restored_priors(rows.priors))
+        poses, kind, np.isin(node_ids, rows.fixed), _factors(rows, text), node_ids,
+        rows.factor_ids, rows.next_ids, dimension, tuple(
+            unpacked(each.nodes, each.numbers, anchored=each.anchored) for each in rows.priors))
 
 
 def _factors(rows: SavedRows, text: GraphText) -> ct.Factors:
     """Return the factors from both files."""
-    in_json = ct.Factors(
-        rows.other_i, rows.other_j, rows.other_mean, ct.full(rows.other_information),
-        np.zeros(len(rows.others), np.int64), constants=rows.other_constants, k=rows.other_k)
     # others are in the JSON file
     tags = [tag for tag in MEASURED if TAGS[tag].kind is None]
     in_g2o = ct.Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
     # in which those of edges come first
     lines = np.concatenate([text.rows[tag]['line'] for tag in tags])
-    table = ct.Factors.joined([in_g2o.rows(np.argsort(lines)), in_json])
+    table = ct.Factors.joined([in_g2o.rows(np.argsort(lines)), rows.other_factors])
     others = np.delete(np.arange(len(table)), rows.others)
     is_edge = np.isin(rows.factor_kind[others], IN_G2O)
     place = np.concatenate((others[is_edge], others[~is_edge], rows.others))
     return table.rows(np.argsort(place)).replaced(kind=rows.factor_kind, weight=rows.factor_weight)
-
-
-def _saved_priors(priors: Sequence[Prior]) -> SavedPriors:
-    """Return priors as columns."""
-    return SavedPriors(np.array([len(prior.nodes) for prior in priors], dtype=np.int64),
-                       np.array([prior.anchored for prior in priors], dtype=np.bool_),
-                       np.concatenate([np.empty(0, np.int64), *(prior.nodes for prior in priors)]),
-                       np.concatenate([np.empty(0), *map(packed, priors)]))
-
-
-def _restored_priors(saved: SavedPriors) -> tuple[Prior, ...]:
-    """Return saved priors."""
-    sizes = saved.sizes
-    counts = 3 * sizes * (3 * sizes + 3) // 2 + 3 * sizes + 1
-    # behind the last ones is nothing
-    return tuple(unpacked(nodes, numbers, anchored=anchored) for nodes, numbers, anchored in zip(
-        np.split(saved.nodes, np.cumsum(sizes)), np.split(saved.numbers, np.cumsum(counts)),
-        saved.anchored.tolist(), strict=False))
 
 
 def site_refusal(saved: SavedGraph, datum: MapOrigin | None, fix: MapOrigin | None) -> str | None:

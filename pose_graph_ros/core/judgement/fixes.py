@@ -358,8 +358,7 @@ class FixJudge:
         self, saved: SavedVerdicts, loosened: Mapping[int, float], spread: FloatArray, now_ns: int,
     ) -> None:
         self._now_ns, self._is_restored = now_ns, True
-        if len(spread) > 0:
-            self.bank.spread = Spread(spread[0], spread[1:])   # until it knows the records
+        self.bank.spread = Spread(spread[0], spread[1:])   # until it knows the records
         self.states.restore(saved)
         self.loosened = dict(loosened)
 

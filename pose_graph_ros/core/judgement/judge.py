@@ -12,7 +12,7 @@ changed. It does a bounded part of that; `work` does the rest, part by part, bet
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,8 +48,7 @@ class SavedJudgement:
     weights: Numbers  # their weights
     # number of odometry edges of some sources that have left the graph doubted
     odometry_left: Mapping[str, int]
-    # pose and covariance of the hypotheses on fixes, see `Spread`; empty in older files
-    spread: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
+    spread: Rows3  # pose and covariance of the hypotheses on fixes, see `Spread`
 
 
 class Judge:

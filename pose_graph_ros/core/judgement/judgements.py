@@ -47,7 +47,6 @@ class SavedVerdicts:
     """The columns of a table, and its sources."""
 
     sources: tuple[str, ...]
-    scales: sc.Numbers  # of each source, 1: older versions had a factor on its sigmas
     # of each source, how many have left the graph, by their states then
     left: Annotated[IntArray, sc.Column(int, (len(vd.State),))]
     held: sc.Integers
@@ -219,7 +218,6 @@ class Judgements:
         columns['distance'] = np.nan_to_num(columns['distance'], nan=-1.0)
         return SavedVerdicts(
             tuple(self.sources),
-            np.ones(len(self.sources)),
             np.array(self._left, dtype=np.int64).reshape(-1, len(vd.STATES)), **columns)
 
     def restore(self, saved: SavedVerdicts) -> None:

@@ -384,7 +384,7 @@ class HiddenNodes(NodeTable):
             primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
             self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
-            np.array(self.errors), np.array(sorted(self.relocated), dtype=np.int64))
+            self.errors, np.array(sorted(self.relocated), dtype=np.int64))
 
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
@@ -397,7 +397,6 @@ class HiddenNodes(NodeTable):
             self.streams[name] = OdometryStream(self._config.odometry_source(name))
             self.streams[name].restore(stream)
         self.relocated = {*saved.relocated.tolist()}
-        if len(saved.errors) > 0:
-            self.errors = OdometryErrors(*saved.errors.tolist())
+        self.errors = saved.errors
         if len(self.thinned) > 0:
             self._samples_since_ns = int(self.streams[self.primary].timeline.stamps_ns[0])

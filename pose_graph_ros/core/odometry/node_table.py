@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hidden nodes by stamp: those in the graph, and those that have left it for good."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -11,10 +11,10 @@ from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray, Pose, Poses
 from pose_graph_ros.core.graph.constraints import full, upper
-from pose_graph_ros.core.odometry.motion import Attachment, Span
+from pose_graph_ros.core.odometry.motion import Attachment, OdometryErrors, Span
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
-from pose_graph_ros.core.saved_columns import Integers, Numbers, Records, Rows3
+from pose_graph_ros.core.saved_columns import Integers, Records, Rows3
 
 
 class Place(NamedTuple):
@@ -117,15 +117,11 @@ class SavedNodes:
     bridge: Span | None
     streams: dict[str, SavedStream]  # by the name of the source
     # poses of the first nodes, which have left the graph
-    frozen: Rows3 = field(default_factory=lambda: np.empty((0, 3)))
-    travelled: float = 0.0  # path length up to the first node in the graph [m]
-    thinned: Annotated[GrowingArray, Records(PLACES)] = field(
-        default_factory=lambda: GrowingArray((), PLACES))
-    # `OdometryErrors` that the edges know of; empty in files of older versions, in which weights
-    # of the edges stand for them
-    errors: Numbers = field(default_factory=lambda: np.empty(0))
-    # numbers of the nodes at which the robot was put by hand; empty in older files
-    relocated: Integers = field(default_factory=lambda: np.empty(0, np.int64))
+    frozen: Rows3
+    travelled: float  # path length up to the first node in the graph [m]
+    thinned: Annotated[GrowingArray, Records(PLACES)]
+    errors: OdometryErrors  # that the edges know of
+    relocated: Integers  # numbers of the nodes at which the robot was put by hand
 
     def poses(self, node_ids: IntArray, poses: Poses) -> Poses:
         """Return the poses of all nodes."""
