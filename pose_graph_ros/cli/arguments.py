@@ -22,7 +22,7 @@ EDGE2_ORDERS = ('toro', 'isam')
 STARTS = ('chordal', 'file', 'odometry', 'best')
 METHODS = ('selection', 'gnc', 'gnc-gm')  # to decide which closures to believe
 VIEWS = ('pose-graph', 'factor-graph', 'mrf', 'dbn')
-PICTURES = ('.svg', '.png', '.dot')
+PICTURES = ('.svg', '.png')
 LANDMARKS = 'landmarks'
 
 
@@ -213,19 +213,19 @@ def draw(parser: argparse.ArgumentParser) -> None:
     Draw a small graph.
 
     It is drawn as pose graph, factor graph, Markov random field or dynamic Bayesian network.
-    The suffix of the picture's name says what it is: .svg, .png, or .dot for Graphviz. Hidden
-    nodes stand where they are in the file, to scale; ids are those of the file.
+    The suffix of the picture's name says what it is: .svg or .png. Hidden nodes stand where they
+    are in the file, to scale; ids are those of the file.
 
     examples:
       pose-graph draw --example -o states.svg             five states of a graph, with H
       pose-graph draw graph.g2o -o graph.svg --pattern
       pose-graph draw graph.g2o --as factor-graph -o factors.png
       pose-graph draw map.json --as dbn --nodes 0:20 -o start.svg
-      pose-graph draw graph.g2o --around 17 --hops 3 -o near.dot
+      pose-graph draw graph.g2o --around 17 --hops 3 -o near.svg
     """
     _add_graph(parser, nargs='?')
     parser.add_argument('-o', '--out', metavar='PICTURE', type=_picture, required=True,
-                        help='.svg, .png or .dot file')
+                        help='.svg or .png file')
     parser.add_argument('--as', dest='view', choices=VIEWS, default=VIEWS[0],
                         help='(default: %(default)s)')
     parser.add_argument('--pattern', action='store_true',

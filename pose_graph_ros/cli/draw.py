@@ -1,10 +1,6 @@
 # Copyright 2026 The pose_graph_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Draw a small graph with networkx and matplotlib, or write it for Graphviz.
-
-Lines and texts show on light and on dark backgrounds.
-"""
+"""Draw a small graph with networkx and matplotlib; lines and texts show on any background."""
 
 import argparse
 from collections import defaultdict
@@ -94,10 +90,7 @@ def execute(options: argparse.Namespace) -> int:
         notes = ['Terms of a single node are not in the picture: a Markov random field has lines '
                  'for pairs of nodes only.']
     print(*notes, sep='\n', end='\n' if notes else '', file=sys.stderr)
-    if options.out.suffix.lower() == '.dot':
-        options.out.write_text(_dot(panels, notes), encoding='utf-8')
-    else:
-        _draw(panels, options.out, notes, headings=options.headings)
+    _draw(panels, options.out, notes, headings=options.headings)
     print(json.dumps(_facts(options.view, panels, notes, options.out), indent=2) if options.json
           else f'written: {options.out}')
     return 0
@@ -117,11 +110,6 @@ def _chosen(options: argparse.Namespace, ids: IntArray, whole: Any) -> set[int]:
             f'{options.graph}: {len(chosen)} hidden nodes are too many for a picture, which has '
             f'room for {N_MOST}; draw a part with --around ID --hops K or --nodes A:B')
     return chosen
-
-
-def _fill(data: dict[str, Any]) -> str:
-    """Return the colour of a vertex."""
-    return FILLS[data['role']] if data['role'] in FILLS else COLOURS[data['term'].sort]
 
 
 def _facts(view: str, panels: Sequence[Panel], notes: list[str], out: Path) -> dict[str, Any]:
@@ -182,10 +170,11 @@ def _draw_view(axes: Axes, panel: Panel, unit: float, *, headings: bool) -> None
     looks: dict[Any, list[int]] = defaultdict(list)
     for node, data in sorted(vertices.items(), key=lambda each: list(Role).index(each[1]['role'])):
         opaque, role = 1.0 if 'term' not in data or data['term'].used else 0.5, data['role']
-        meaning = role.value if role in FILLS else f'{role.value}: {data["term"].sort.value}'
-        looks[meaning, _fill(data), area[node], role, opaque].append(node)
+        meaning, colour = (role.value, FILLS[role]) if role in FILLS else (
+            f'{role.value}: {data["term"].sort.value}', COLOURS[data['term'].sort])
+        looks[meaning, colour, area[node], role, opaque].append(node)
         if data.get('fixed', False):
-            looks['fixed (known): double border', _fill(data), 0.6 * area[node], role,
+            looks['fixed (known): double border', colour, 0.6 * area[node], role,
                   opaque].append(node)
     for (meaning, colour, size, role, opaque), nodes in looks.items():
         nx.draw_networkx_nodes(panel.view, panel.at, nodelist=nodes, ax=axes, node_color=colour,
@@ -246,31 +235,3 @@ def _draw_pattern(axes: Axes, blocks: Pattern | None) -> None:
     axes.set_yticks(middles, names)
     axes.tick_params(length=0, pad=1, labelsize=6, labelcolor=GREY, top=True, labeltop=True,
                      bottom=False, labelbottom=False)
-
-
-def _dot(panels: Sequence[Panel], notes: Sequence[str]) -> str:
-    """Return a text for Graphviz, with the places of a picture and a cluster for each view."""
-    lines = ['digraph pose_graph {', '  layout=neato; overlap=true; splines=true; bgcolor=none;',
-             f'  label={json.dumps(" ".join(notes))}; fontcolor="{GREY}"; fontsize=10;', '  node '
-             f'[fixedsize=true, style=filled, color="{INK}", fontcolor="{INK}", fontsize=9];']
-    bottom = 0.0
-    for n, panel in enumerate(panels):
-        places = np.array(list(panel.at.values()))
-        top, bottom = bottom, bottom - float(np.ptp(places[:, 1])) - 2.0
-        if len(panels) > 1:
-            lines.append(f'  subgraph cluster_{n} {{ label={json.dumps(panel.title)};')
-        for node, data in panel.view.nodes(data=True):
-            x, y = UNIT * (panel.at[node] + (0.0, top - float(np.max(places[:, 1]))))
-            shape = ('doublecircle' if data.get('fixed', False) else
-                     {Role.FACTOR: 'square', Role.JOINT: 'point'}.get(data['role'], 'circle'))
-            name = json.dumps('' if data['role'] in SIZES else data['name'])
-            lines.append(f'  n{n}_{node} [label={name}, '
-                         f'shape={shape}, width={DIAMETER * SIZES.get(data["role"], 1.0):.3g}, '
-                         f'fillcolor="{_fill(data)}", pos="{x:.4f},{y:.4f}!"];')
-        lines += [f'  n{n}_{start} -> n{n}_{end} [color="{COLOURS[arc["sort"]]}"'
-                  + ('' if arc['directed'] else ', dir=none')
-                  + ('' if arc['used'] else ', style=dashed') + '];'
-                  for start, end, arc in panel.view.edges(data=True)]
-        if len(panels) > 1:
-            lines.append('  }')
-    return '\n'.join([*lines, '}']) + '\n'

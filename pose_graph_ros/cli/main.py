@@ -27,7 +27,7 @@ SUMMARIES = {
     'replay': 'run a bag or a g2o file through the engine of the node, without ROS',
     'solve': 'optimise a g2o file',
     'report': 'make one HTML page of a run: map, errors, residuals, what is doubted',
-    'draw': 'draw a small graph: SVG, PNG or DOT',
+    'draw': 'draw a small graph as SVG or PNG',
     'marginalize': 'take nodes out of a graph, and keep what they told',
     'tune': 'estimate the noise of the sources from bags; write a parameter file',
     'simulate': 'write a simulated drive as a rosbag2 or a graph',

@@ -21,8 +21,8 @@ from pose_graph_ros.offline.simulation.settings import DURATIONS_S, Jump, Odomet
 PICTURES = ('.png', '.pdf', '.svg')
 FALSE_SIZE = 4  # closures of a group of false ones
 # Options of what a graph does not have, and where their values are.
-ONLY_IN_BAGS = {'--odometry': 'wheels.errors', '--wheel-scale': 'wheels.scale',
-                '--slip': 'wheels.slip_events_per_s', '--heading-drift': 'wheels.heading_drift',
+ONLY_IN_BAGS = {'--odometry': 'wheels.errors', '--slip': 'wheels.slip_events_per_s',
+                '--heading-drift': 'wheels.heading_drift',
                 '--gyro': 'gyro', '--gyro-noise': 'gyro.sigma,bias,bias_walk', '--delay': 'delay',
                 '--duplicate': 'duplicate', '--clock-offset': 'clock_offset'}
 SENSORS: dict[str, Any] = {'wheels': settings.Wheels, 'gyro': settings.Gyro,
@@ -105,8 +105,6 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
                         type=lambda text: next((e for e in OdometryErrors if e == text), text),
                         help='errors of two wheels, or a random walk as the node assumes it '
                         '(default: wheels; a graph always has the latter)')
-    wheels.add_argument('--wheel-scale', dest='wheels.scale', metavar='LEFT,RIGHT', type=_numbers(
-        0, 1), help='ratio of measured to true distance (default: 1.0068,1.0070)')
     wheels.add_argument('--slip', dest='wheels.slip_events_per_s', metavar='PER_MINUTE',
                         type=number(0.0, factor=1.0 / 60.0), help='events of slip of each wheel, '
                         'which then measures 1 cm too much at 1 m/s (default: 1; hall: 0.5)')

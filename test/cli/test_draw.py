@@ -93,22 +93,6 @@ def test_the_example_has_five_states_with_their_patterns(tmp_path) -> None:
     assert [drawn.count(f'x{n}') for n in range(5)] == [15, 9, 3, 3, 3]
 
 
-def test_dot_has_all_vertices_and_arcs(small, tmp_path) -> None:
-    out = tmp_path / 'small.dot'
-    assert main(['draw', str(small), '-o', str(out)]) == 0
-    text = out.read_text(encoding='utf-8')
-    assert text.startswith('digraph pose_graph {')
-    assert text.count('{') == text.count('}')
-    assert len(re.findall(r'^ *n0_\d+ \[label="[xlz]\d+".* pos="[-\d.]+,[-\d.]+!"\];$', text,
-                          re.M)) == 7
-    assert len(re.findall(r'^ *n0_\d+ -> n0_\d+ ', text, re.M)) == 8
-    assert 'shape=doublecircle' in text
-    assert main(['draw', '--example', '--as', 'mrf', '-o', str(out)]) == 0
-    text = out.read_text(encoding='utf-8')
-    assert text.count('subgraph cluster_') == 5
-    assert text.count('dir=none') == 1 + 1 + 4
-
-
 def test_json_has_what_is_drawn(small, tmp_path, capsys) -> None:
     out = tmp_path / 'small.svg'
     assert main(['draw', str(small), '--as', 'dbn', '--json', '-o', str(out)]) == 0

@@ -235,8 +235,8 @@ TOOLS = {
                         ('smaller.g2o',), after='solve_robust'),
     'draw': Tool('draw robust.g2o --around 17 --hops 3 --pattern -o near.svg --json',
                  ('near.svg',), after='solve_robust'),
-    'draw_factor_graph': Tool('draw robust.g2o --nodes 0:15 --as factor-graph -o near.dot --json',
-                              ('near.dot',), after='solve_robust'),
+    'draw_factor_graph': Tool('draw robust.g2o --nodes 0:15 --as factor-graph -o factors.svg '
+                              '--json', ('factors.svg',), after='solve_robust'),
     'simulate_wrong_claims': Tool(
         'simulate claims --duration 45 --closures 0 --claimed-sigma /gps/fix:0.3 '
         '--fix-correlated 0,1 --json'),

@@ -16,16 +16,15 @@ of its edges. `factors` has the errors of all kinds. Nothing in here is compiled
 which read a file and work on arrays need not load Numba.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.exceptions import GraphUpdateError
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
-from pose_graph_ros.core.saved_columns import Choices, Column, Integers, Numbers, Rows3, Rows4
 
 
 class NodeKind(IntEnum):
@@ -90,7 +89,6 @@ FACTORS = {
 assert list(FACTORS) == list(FactorKind)
 
 _NO_ROWS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
-FactorKinds = Annotated[IntArray, Choices(FactorKind)]
 
 # One factor, as it goes into a graph and comes out of it. The fields are in the order of the
 # arguments of `Factors`, whose comments say what they are.
@@ -122,11 +120,6 @@ class Factors:
     """
 
     __slots__ = ('records',)
-    # of the columns in files
-    ANNOTATIONS: ClassVar[Mapping[str, Any]] = {
-        'i': Integers, 'j': Integers, 'mean': Rows3,
-        'information': Annotated[FloatArray, Column(float, (3, 3))], 'kind': FactorKinds,
-        'weight': Numbers, 'constants': Rows4, 'k': Integers}
 
     i = _Column()       # nodes that they start from, or that are observed
     j = _Column()       # nodes that they lead to; -1 for one end, in the map

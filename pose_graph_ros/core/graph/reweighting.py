@@ -31,7 +31,7 @@ correlated.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, assert_never, Final, NamedTuple
+from typing import Any, assert_never, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.saved_columns import Choices, Integers, Numbers
+from pose_graph_ros.core.saved_columns import Integers, Numbers
 
 _LOSSES = tuple(Loss)
 
@@ -97,7 +97,7 @@ class SavedLosses:
     """Saved state of the factors that have a robust loss."""
 
     rows: Integers      # ids
-    losses: Annotated[IntArray, Choices(Loss)]
+    losses: Integers    # positions in `Loss`
     thresholds: Numbers     # [sigma]
     shares: Numbers     # base weights
     cursor: int         # index of the older factor that is reweighted next

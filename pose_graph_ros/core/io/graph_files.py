@@ -19,7 +19,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
 import numpy as np
 
@@ -111,12 +111,12 @@ class SavedRows:
     bias_values: sc.Rows3
     bias_dimensions: sc.Integers
     landmarks: sc.Integers  # ids of those of them that are landmarks
-    factor_kind: ct.FactorKinds  # of all factors
+    factor_kind: sc.Integers  # of all factors
     factor_weight: sc.Numbers
     # rows of the factors that are given here; edges of `IN_G2O` without a third node, and observed
     # nodes on no bias, are in the g2o file
     others: sc.Integers
-    other_factors: ct.Factors
+    other_factors: Annotated[ct.Factors, sc.Column(ct.RECORD)]
     node_ids: sc.Integers  # ids of all, in order
     factor_ids: sc.Integers
     next_ids: NextIds  # of the next new rows
@@ -165,7 +165,7 @@ def read_graph(path: Path) -> SavedGraph:
     """
     g2o_path, path, members, g2o = _verified(path)
     try:
-        hints = sc.annotations(SavedGraph)
+        hints = get_type_hints(SavedGraph, include_extras=True)
         rest = {name: sc.decoded(hints[name], members[name]) for name in MEMBERS}
         rows: SavedRows = sc.decoded(SavedRows, members['graph'])
         text = g2o.decode('ascii').partition(STANDING_FOR)[0].replace(NOT_USED, '')
@@ -183,7 +183,7 @@ def read_datum(path: Path) -> MapOrigin | None:
     """
     _, path, members, _ = _verified(path)
     try:
-        datum: MapOrigin | None = sc.decoded(sc.annotations(SavedGraph)['datum'], members['datum'])
+        datum: MapOrigin | None = sc.decoded(MapOrigin | None, members['datum'])
         if datum is not None:
             TangentPlane(*datum)  # raises if it is no point on the Earth
     except sc.MISMATCHES as error:

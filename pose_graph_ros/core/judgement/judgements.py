@@ -54,9 +54,9 @@ class SavedVerdicts:
     source: sc.Integers
     number: sc.Integers
     stamps_ns: sc.Pairs
-    state: Annotated[IntArray, sc.Choices(vd.State)]
+    state: sc.Integers
     since_ns: sc.Integers
-    decision: Annotated[IntArray, sc.Choices(vd.Decision)]
+    decision: sc.Integers
     distance: sc.Numbers  # -1 if it was not judged
 
 

@@ -14,7 +14,7 @@ from pose_graph_ros.core.graph.constraints import full, upper
 from pose_graph_ros.core.odometry.motion import Attachment, OdometryErrors, Span
 from pose_graph_ros.core.odometry.stream import SavedStream
 from pose_graph_ros.core.quantities import StampsNs
-from pose_graph_ros.core.saved_columns import Integers, Records, Rows3
+from pose_graph_ros.core.saved_columns import Column, Integers, Rows3
 
 
 class Place(NamedTuple):
@@ -119,7 +119,7 @@ class SavedNodes:
     # poses of the first nodes, which have left the graph
     frozen: Rows3
     travelled: float  # path length up to the first node in the graph [m]
-    thinned: Annotated[GrowingArray, Records(PLACES)]
+    thinned: Annotated[GrowingArray, Column(PLACES)]
     errors: OdometryErrors  # that the edges know of
     relocated: Integers  # numbers of the nodes at which the robot was put by hand
 

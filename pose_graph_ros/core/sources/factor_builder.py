@@ -19,7 +19,7 @@ from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.measurements import GlobalPose, LoopClosure
 from pose_graph_ros.core.odometry.hidden_nodes import NewNode
 from pose_graph_ros.core.odometry.motion import as_calibrated, AS_CLAIMED, OdometryErrors
-from pose_graph_ros.core.saved_columns import Records
+from pose_graph_ros.core.saved_columns import Column
 from pose_graph_ros.core.sources import bias as bs, source_report
 from pose_graph_ros.core.sources.queued import Queued
 from pose_graph_ros.core.sources.settings import SOURCES
@@ -42,9 +42,9 @@ class SourceState:
     given correlation time that edge is what it is added as.
     """
 
-    measured: Annotated[GrowingArray, Records(MEASURED)] = field(
+    measured: Annotated[GrowingArray, Column(MEASURED)] = field(
         default_factory=lambda: GrowingArray((), MEASURED))
-    edges: Annotated[GrowingArray, Records(EDGE)] = field(
+    edges: Annotated[GrowingArray, Column(EDGE)] = field(
         default_factory=lambda: GrowingArray((), EDGE))  # but those of primary odometry
     # of errors that are correlated, of a gyroscope, or of what an odometry is calibrated by
     bias: bs.BiasChain | None = None

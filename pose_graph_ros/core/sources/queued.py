@@ -5,16 +5,16 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
-from pose_graph_ros.core.graph.constraints import FactorKind, Factors
+from pose_graph_ros.core.graph.constraints import FactorKind, Factors, RECORD
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.saved_columns import Pairs, Rows2
+from pose_graph_ros.core.saved_columns import Column, Pairs, Rows2
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
 
@@ -74,7 +74,7 @@ class SavedQueue:
     """The columns of a queue."""
 
     sources: tuple[str, ...]
-    factors: Factors
+    factors: Annotated[Factors, Column(RECORD)]
     stamps_ns: Pairs  # of measurements and of the other ends of loop closures [ns]
     noise: Rows2
 

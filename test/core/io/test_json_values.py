@@ -4,7 +4,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum, IntEnum
 import json
 from typing import Annotated, Any, NamedTuple
 
@@ -15,14 +14,13 @@ from saved_graphs import assert_same_value
 from pose_graph_ros.core.compiled.growing_array import GrowingArray
 from pose_graph_ros.core.geometry.se2 import Pose
 from pose_graph_ros.core.saved_columns import (
-    Choices,
+    Column,
     decoded,
     encoded,
     Flags,
     Integers,
     Numbers,
     Pairs,
-    Records,
     Rows3,
 )
 
@@ -35,28 +33,12 @@ class Inner:
     matrix: tuple[Pose, Pose, Pose] | None
 
 
-class Size(Enum):
-    SMALL = 'small'
-    LARGE = 'large'
-
-
-class Colour(IntEnum):
-    GREEN = 4
-    RED = 2
-
-
-@dataclass(frozen=True)
-class Chosen:
-    sizes: Annotated[np.ndarray, Choices(Size)]
-    colours: Annotated[np.ndarray, Choices(Colour)]
-
-
 ROW = np.dtype([('id', 'i8'), ('x', 'f8', 3)])
 
 
 @dataclass(frozen=True)
 class Kept:
-    table: Annotated[GrowingArray, Records(ROW)]
+    table: Annotated[GrowingArray, Column(ROW)]
 
 
 class Tuple(NamedTuple):
@@ -100,17 +82,6 @@ def test_any_value_comes_back_to_the_bit(value: Outer) -> None:
     again = decoded(Outer, json.loads(text))
     assert_same_value(again, value)
     assert json.dumps(encoded(again)) == text   # signs of zeros too
-
-
-@given(arrays(st.integers(0, 1), np.int64), arrays(st.sampled_from([4, 2]), np.int64))
-def test_members_of_enumerations_are_names(sizes: np.ndarray, colours: np.ndarray) -> None:
-    value = Chosen(sizes, colours)
-    plain = json.loads(json.dumps(encoded(value)))
-    assert_same_value(decoded(Chosen, plain), value)
-    assert [plain['sizes']['names'][k] for k in plain['sizes']['of']] == [
-        tuple(Size)[k].value for k in sizes]
-    assert [plain['colours']['names'][k] for k in plain['colours']['of']] == [
-        Colour(k).name.lower() for k in colours]
 
 
 @given(arrays(st.tuples(whole, pose), ROW))
