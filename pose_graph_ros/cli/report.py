@@ -77,9 +77,6 @@ def _file(options: argparse.Namespace) -> Path | None:
             raise FileFormatError(f'{path}: expected one run, or several bags')
     file = first / FILE if (first / FILE).is_file() else first
     if file.suffix != '.json':
-        if (first / 'summary.json').is_file():
-            raise FileFormatError(f'{first}: no {FILE}, so it was made by an earlier version: '
-                                  'replay the bag again')
         if first.is_dir() and not (first / 'metadata.yaml').is_file():
             raise FileFormatError(f'{first}: expected the folder of a replay or a demo with '
                                   f'{FILE}, or a rosbag2 with metadata.yaml')

@@ -12,6 +12,7 @@ If odometry continues without interruption, later estimates are therefore the sa
 saving. Measurements that wait for odometry are not saved; they can be sent again.
 """
 
+from copy import deepcopy
 from itertools import combinations
 import math
 from typing import NamedTuple
@@ -41,7 +42,7 @@ from pose_graph_ros.core.smoother.incremental import IncrementalSmoother
 from pose_graph_ros.core.sources.factor_builder import FactorBuilder
 from pose_graph_ros.core.sources.kinds import KINDS, observed
 from pose_graph_ros.core.sources.pipeline import MeasurementPipeline
-from pose_graph_ros.core.sources.queued import Queued, SavedQueue
+from pose_graph_ros.core.sources.queued import Queued
 
 # Of each source, the number of believed closures whose verdicts are saved as sentences.
 MOST_BELIEVED = 2000
@@ -75,9 +76,9 @@ def capture(parts: Parts, cov: FloatArray, chi2: float, datum: MapOrigin | None)
     left_out = [*(each[1:] for each in pipeline.waiting), *pipeline.beacons.measurements]
     return SavedGraph(
         rows=parts.graph.rows(), nodes=parts.nodes.saved(), sources=parts.factors.saved(),
-        seen=pipeline.seen.saved(left_out), losses=parts.reweighting.saved(),
-        alignment=parts.alignment.saved(), waiting=SavedQueue.of(pipeline.queue),
-        set_aside=SavedQueue.of(parts.quarantine), judgement=parts.judge.saved(),
+        seen=pipeline.seen.saved(left_out), losses=deepcopy(parts.reweighting),
+        alignment=parts.alignment.saved(), waiting=tuple(pipeline.queue),
+        set_aside=tuple(parts.quarantine), judgement=parts.judge.saved(),
         verdicts={each.id: sentence(each) for each in parts.judge.verdicts(MOST_BELIEVED)
                   if each.kind is Judged.LOOP_CLOSURE or is_notable(each)},
         newest_covariance=cov.copy(), chi2=chi2, n_left_out=len(left_out),
@@ -104,8 +105,8 @@ def restore(parts: Parts, saved: SavedGraph) -> None:
         parts.reweighting.restore(saved.losses)
         parts.alignment.load(saved.alignment)
         parts.judge.restore(saved.judgement, int(parts.nodes.stamps_ns[-1]))
-        parts.pipeline.queue += saved.waiting.queue()
-        parts.quarantine.extend(saved.set_aside.queue())
+        parts.pipeline.queue += saved.waiting
+        parts.quarantine.extend(saved.set_aside)
     except MISMATCHES as error:
         raise FileFormatError(f'the parts of the saved graph do not fit: {error}') from error
 

@@ -21,10 +21,14 @@ MISMATCHES = (AttributeError, LookupError, OverflowError, TypeError, ValueError)
 
 
 class Column(NamedTuple):
-    """Type and shape of the rows of an array; a table has records, one with named fields."""
+    """
+    Type and shape of the rows of an array; None for any shape.
+
+    A type with named fields is that of the records of a table.
+    """
 
     kind: Any
-    shape: tuple[int, ...] = ()
+    shape: tuple[int, ...] | None = ()
 
 
 Integers = Annotated[IntArray, Column(int)]
@@ -33,7 +37,7 @@ Numbers = Annotated[FloatArray, Column(float)]
 Rows2 = Annotated[FloatArray, Column(float, (2,))]
 Rows3 = Annotated[FloatArray, Column(float, (3,))]
 Rows8 = Annotated[FloatArray, Column(float, (8,))]
-Pairs = Annotated[IntArray, Column(int, (2,))]
+Matrix = Annotated[FloatArray, Column(float, None)]
 
 
 def as_pose(numbers: FloatArray) -> Pose:
@@ -62,11 +66,11 @@ def decoded(kind: Any, plain: Any) -> Any:
     if origin is Annotated:
         kind, shape = arguments[1]
         names = np.dtype(kind).names or ()
-        array = (np.empty(len(plain[names[0]]), kind) if names
-                 else np.array(plain, dtype=kind).reshape(-1, *shape))
+        array = np.empty(len(plain[names[0]]), kind) if names else np.array(plain, dtype=kind)
         for name in names:
             array[name] = np.reshape(plain[name], array[name].shape)
-        return arguments[0].of(array) if names else array
+        return arguments[0].of(array) if names else (
+            array if shape is None else array.reshape(-1, *shape))
     if origin in (UnionType, Union):     # of something and None
         return None if plain is None else decoded(arguments[0], plain)
     if origin is tuple:

@@ -126,9 +126,8 @@ def collect(parts: Parts) -> dict[str, SourceResiduals]:
     smoother, nodes, factors = parts.smoother, parts.nodes, parts.factors
     graph, covariances = smoother.graph, smoother.covariances()
     # the factors on claimed sigmas that the graph uses, without those of a robust loss
-    weights, saved = graph.weights, parts.reweighting.saved()
-    rows = graph.factor_rows(saved.rows)
-    weights[rows[rows >= 0]] = saved.shares[rows >= 0]
+    weights, rows = graph.weights, graph.factor_rows(parts.reweighting['id'])
+    weights[rows[rows >= 0]] = parts.reweighting['base'][rows >= 0]
     scales = np.where(weights > 0.0, weights, 1.0)**-0.5
     found: dict[str, SourceResiduals] = {}
     for source, (stamps, ids) in factors.held().items():

@@ -136,12 +136,9 @@ def test_what_is_no_run_is_refused_in_one_line(content, said, tmp_path, capsys) 
 def test_folders_that_are_no_runs_and_wrong_options_are_named(
     folder, bag, tmp_path, capsys,
 ) -> None:
-    (tmp_path / 'old').mkdir()
-    (tmp_path / 'old' / 'summary.json').write_text('{}', encoding='utf-8')
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'words.txt').write_text('words', encoding='utf-8')
     for words, said in (
-            ([tmp_path / 'old'], 'made by an earlier version: replay the bag again'),
             ([tmp_path / 'empty'], 'expected the folder of a replay or a demo with run.json'),
             ([tmp_path / 'words.txt'], 'expected run.json, or a file with the suffix .mcap'),
             ([tmp_path / 'missing'], 'missing: does not exist'),

@@ -3,6 +3,7 @@
 """A failed update leaves everything as it was; constraints that make it fail are set aside."""
 
 from collections.abc import Callable
+from copy import deepcopy
 import math
 from typing import Any
 
@@ -49,7 +50,7 @@ def drive(backend: PoseGraphBackend, start: int, end: int) -> None:
 def state(backend: PoseGraphBackend) -> dict[str, Any]:
     """Return all that a failed update must leave alone."""
     return {
-        'factors': backend._factors.saved(), 'losses': backend._reweighting.saved(),
+        'factors': backend._factors.saved(), 'losses': deepcopy(backend._reweighting),
         'alignment': backend._alignment.saved(), 'covariance': backend._newest_node_covariance}
 
 

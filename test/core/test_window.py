@@ -137,8 +137,8 @@ def test_what_has_left_does_not_change_any_more_and_nothing_grows() -> None:
             frozen = now.copy()
             graph, stream = backend.graph, backend._nodes.streams['odom']
             sizes.append((graph.n_nodes, graph.n_edges, graph.n_factors, len(stream.timeline),
-                          sum(len(each.stamps_ns)
-                              for each in backend._pipeline.seen.saved([]).values()),
+                          sum(len(stamps_ns) for stamps_ns, _
+                              in backend._pipeline.seen.saved([]).values()),
                           len(backend._reweighting), len(backend._pipeline.queue)))
     at = len(sizes) // 3
     first, last = np.max(sizes[at:2 * at], axis=0), np.max(sizes[2 * at:], axis=0)

@@ -4,14 +4,15 @@
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray, Poses
-from pose_graph_ros.core.graph.constraints import Factors, NodeKind
+from pose_graph_ros.core.graph.constraints import Factors, NodeKind, RECORD
 from pose_graph_ros.core.graph.priors import Prior
+from pose_graph_ros.core.saved_columns import Column, Flags, Integers, Rows3
 
 # Empty parts of updates.
 NO_POSES: Final[FloatArray] = np.empty((0, 3))
@@ -88,15 +89,16 @@ class NextIds(NamedTuple):
 class GraphRows(NamedTuple):
     """Copies of all rows of a graph; nodes of factors are ids."""
 
-    poses: Poses        # estimates of all hidden nodes, biases included
-    node_kind: npt.NDArray[Any]     # `NodeKind` of the hidden nodes
-    fixed: BoolArray
-    factors: Factors
-    node_ids: IntArray      # ascending
-    factor_ids: IntArray
+    poses: Rows3        # estimates of all hidden nodes, biases included
+    # `NodeKind` of the hidden nodes
+    node_kind: Annotated[npt.NDArray[Any], Column(np.uint8)]
+    fixed: Flags
+    factors: Annotated[Factors, Column(RECORD)]
+    node_ids: Integers      # ascending
+    factor_ids: Integers
     next_ids: NextIds       # at least 1 more than the last ones
-    dimension: IntArray     # numbers of coordinates of the hidden nodes
-    priors: Sequence[Prior] = ()    # all dense ones, by ids
+    dimension: Integers     # numbers of coordinates of the hidden nodes
+    priors: tuple[Prior, ...] = ()  # all dense ones, by ids
 
     @property
     def is_bias(self) -> BoolArray:

@@ -40,16 +40,17 @@ import numpy as np
 
 from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import BoolArray, FloatArray, IntArray
+from pose_graph_ros.core.saved_columns import Integers, Matrix, Numbers, Rows3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """A quadratic form in the poses of k hidden nodes; see the module."""
 
-    nodes: IntArray     # ids, shape (k,)
-    reference: FloatArray   # poses from which displacements are counted, shape (k, 3)
-    information: FloatArray     # U, shape (3k, 3k) [1/m^2, 1/(m rad), 1/rad^2]
-    vector: FloatArray  # u, shape (3k,) [1/m, 1/rad]: minus half the gradient at the reference
+    nodes: Integers     # ids, shape (k,)
+    reference: Rows3    # poses from which displacements are counted, shape (k, 3)
+    information: Matrix     # U, shape (3k, 3k) [1/m^2, 1/(m rad), 1/rad^2]
+    vector: Numbers     # u, shape (3k,) [1/m, 1/rad]: minus half the gradient at the reference
     energy: float       # c, at the reference [sigma^2]
     anchored: bool      # whether it says where its nodes are in the map, not only in each other
 

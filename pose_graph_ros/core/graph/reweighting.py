@@ -30,8 +30,8 @@ correlated.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, assert_never, Final, NamedTuple
+from dataclasses import dataclass, field
+from typing import Annotated, Any, assert_never, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ from pose_graph_ros.core.config import Loss
 from pose_graph_ros.core.geometry.se2 import FloatArray, IntArray
 from pose_graph_ros.core.graph.factors import energies
 from pose_graph_ros.core.graph.graph import Graph
-from pose_graph_ros.core.saved_columns import Integers, Numbers
+from pose_graph_ros.core.saved_columns import Column
 
 _LOSSES = tuple(Loss)
 
@@ -92,53 +92,40 @@ def _normalized(loss: Loss, z: FloatArray) -> tuple[FloatArray, FloatArray]:
             assert_never(loss)
 
 
-@dataclass(frozen=True, slots=True)
-class SavedLosses:
-    """Saved state of the factors that have a robust loss."""
-
-    rows: Integers      # ids
-    losses: Integers    # positions in `Loss`
-    thresholds: Numbers     # [sigma]
-    shares: Numbers     # base weights
-    cursor: int         # index of the older factor that is reweighted next
-
-
 # Id of a factor, index of its loss in `Loss`, its threshold [sigma], and its base weight.
 _ROW = np.dtype([('id', 'i8'), ('loss', 'i8'), ('threshold', 'f8'), ('base', 'f8')])
 
 
+@dataclass(slots=True, eq=False)
 class Reweighting:
-    """Computes the weights of factors with a robust loss, which are in the order of their ids."""
+    """
+    Computes the weights of factors with a robust loss, which are in the order of their ids.
 
-    def __init__(self) -> None:
-        self._table = GrowingArray((), _ROW)
-        self._cursor = 0    # index of the older factor that is reweighted next
+    It is saved as it is.
+    """
+
+    table: Annotated[GrowingArray, Column(_ROW)] = field(
+        default_factory=lambda: GrowingArray((), _ROW))
+    cursor: int = 0     # index of the older factor that is reweighted next
 
     def __len__(self) -> int:
-        return len(self._table)
+        return len(self.table)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         """Return a column of `_ROW`, a view."""
-        return self._table[name]
+        return self.table[name]
 
-    def saved(self) -> SavedLosses:
-        """Return the state."""
-        ids, losses, thresholds, base = (
-            self[name].copy() for name in ('id', 'loss', 'threshold', 'base'))
-        return SavedLosses(ids, losses, thresholds, base, self._cursor)
-
-    def restore(self, saved: SavedLosses) -> None:
-        """Restore what `saved` returned; nothing may have been added before."""
-        self._table.append(np.array([*zip(
-            saved.rows, saved.losses, saved.thresholds, saved.shares, strict=True)], _ROW))
-        self._cursor = saved.cursor
+    def restore(self, saved: 'Reweighting') -> None:
+        """Copy the state of another one; nothing may have been added before."""
+        self.table.append(saved.table.values)
+        self.cursor = saved.cursor
 
     def forget(self, ids: IntArray) -> None:
         """Forget factors that have left the graph."""
         gone = np.isin(self['id'], ids)
         if np.any(gone):
-            self._cursor -= int(np.count_nonzero(gone[:self._cursor]))
-            self._table.select(np.flatnonzero(~gone))
+            self.cursor -= int(np.count_nonzero(gone[:self.cursor]))
+            self.table.select(np.flatnonzero(~gone))
 
     def add(self, number: int, loss: Loss, threshold: float) -> None:
         """
@@ -147,7 +134,7 @@ class Reweighting:
         Its id must be above those that were added before.
         """
         if loss is not Loss.NONE:
-            self._table.append_one((number, _LOSSES.index(loss), threshold, 1.0))
+            self.table.append_one((number, _LOSSES.index(loss), threshold, 1.0))
 
     def move(self, number: int, to: int) -> None:
         """
@@ -160,7 +147,7 @@ class Reweighting:
             return
         if at_new < 0:
             at_new = len(self)
-            self._table.append_one((to, self['loss'][at], self['threshold'][at], 0.0))
+            self.table.append_one((to, self['loss'][at], self['threshold'][at], 0.0))
         self['base'][at_new] = self['base'][at]
         self['base'][at] = 0.0
 
@@ -190,8 +177,8 @@ class Reweighting:
         begin = max(size - TUNING.window, 0)
         some = np.arange(begin, size)
         if begin > 0:
-            older = (self._cursor + np.arange(min(TUNING.window, begin))) % begin
-            self._cursor = int(older[-1] + 1) % begin
+            older = (self.cursor + np.arange(min(TUNING.window, begin))) % begin
+            self.cursor = int(older[-1] + 1) % begin
             some = np.concatenate((older, some))
         return self._changes(graph, some, least=TUNING.least_change)
 
@@ -224,7 +211,7 @@ class Reweighting:
     def _groups(self, index: IntArray) -> list[tuple[Loss, float, IntArray]]:
         """Return each pair of loss and threshold with the positions in `index` that have it."""
         kinds, which = np.unique(
-            self._table.values[['loss', 'threshold']][index], return_inverse=True)
+            self.table.values[['loss', 'threshold']][index], return_inverse=True)
         return [(_LOSSES[kind], threshold, np.flatnonzero(which == k))
                 for k, (kind, threshold) in enumerate(kinds.tolist())]
 

@@ -19,7 +19,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -31,9 +31,8 @@ from pose_graph_ros.core.geometry.geodesy import distances, MapOrigin, TangentPl
 from pose_graph_ros.core.geometry.se2 import FloatArray, wrap
 from pose_graph_ros.core.geometry.trajectory import Trajectory
 from pose_graph_ros.core.graph import constraints as ct
-from pose_graph_ros.core.graph.graph import GraphRows, NextIds
-from pose_graph_ros.core.graph.priors import packed, unpacked
-from pose_graph_ros.core.graph.reweighting import SavedLosses
+from pose_graph_ros.core.graph.graph import GraphRows
+from pose_graph_ros.core.graph.reweighting import Reweighting
 from pose_graph_ros.core.io.atomic_files import write_files
 from pose_graph_ros.core.io.g2o import factors_of, g2o_text, NOT_USED, STANDING_FOR
 from pose_graph_ros.core.io.g2o_text import GraphText, lines_of, MEASURED, TAGS
@@ -42,8 +41,7 @@ from pose_graph_ros.core.judgement.judge import SavedJudgement
 from pose_graph_ros.core.odometry.node_table import SavedNodes
 from pose_graph_ros.core.sources.factor_builder import SourceState
 from pose_graph_ros.core.sources.gyro import SavedGyro
-from pose_graph_ros.core.sources.pipeline import SavedStamps
-from pose_graph_ros.core.sources.queued import SavedQueue
+from pose_graph_ros.core.sources.queued import Queued
 
 FORMAT = 'pose_graph_ros graph'
 VERSION = 8
@@ -66,11 +64,12 @@ class SavedGraph:
     rows: GraphRows
     nodes: SavedNodes
     sources: Mapping[str, SourceState]
-    seen: Mapping[str, SavedStamps]
-    losses: SavedLosses
+    # stamps of the measurements of each source that were seen [ns], ascending, and references
+    seen: Mapping[str, tuple[sc.Integers, sc.Integers]]
+    losses: Reweighting
     alignment: SavedAlignment
-    waiting: SavedQueue  # constraints for the next update
-    set_aside: SavedQueue  # after a failed solve, for the next full optimisation
+    waiting: tuple[Queued, ...]  # constraints for the next update
+    set_aside: tuple[Queued, ...]  # after a failed solve, for the next full optimisation
     judgement: SavedJudgement  # what is believed, and who has decided so
     # the same for people, of all closures and all that is not believed: a sentence by id
     verdicts: Mapping[str, str]
@@ -91,36 +90,16 @@ MEMBERS = [item.name for item in fields(SavedGraph) if item.name != 'rows']
 
 
 @dataclass(frozen=True, slots=True)
-class SavedPrior:
-    """A dense prior."""
-
-    nodes: sc.Integers
-    # the upper triangle of its information row by row, each row followed by the number of the
-    # vector, then the reference poses and the energy
-    numbers: sc.Numbers
-    anchored: bool
-
-
-@dataclass(frozen=True, slots=True)
 class SavedRows:
-    """What the g2o file lacks of the rows of a graph."""
+    """The rows of a graph, as far as the g2o file lacks them."""
 
-    fixed: sc.Integers  # ids of the fixed hidden nodes
-    # ids of the hidden nodes that are no poses; poses are in the g2o file
-    biases: sc.Integers
-    bias_values: sc.Rows3
-    bias_dimensions: sc.Integers
-    landmarks: sc.Integers  # ids of those of them that are landmarks
-    factor_kind: sc.Integers  # of all factors
-    factor_weight: sc.Numbers
+    # with the values of the nodes that are no poses, and without the factors in the g2o file
+    rows: GraphRows
     # rows of the factors that are given here; edges of `IN_G2O` without a third node, and observed
     # nodes on no bias, are in the g2o file
     others: sc.Integers
-    other_factors: Annotated[ct.Factors, sc.Column(ct.RECORD)]
-    node_ids: sc.Integers  # ids of all, in order
-    factor_ids: sc.Integers
-    next_ids: NextIds  # of the next new rows
-    priors: tuple[SavedPrior, ...]
+    factor_kind: sc.Integers  # of all factors
+    factor_weight: sc.Numbers
 
 
 def graph_paths(path: Path) -> tuple[Path, Path, Path]:
@@ -240,46 +219,31 @@ def _content(path: Path) -> bytes:
 
 
 def _saved_rows(rows: GraphRows) -> SavedRows:
-    factors, others = rows.factors, ~rows.is_pose
+    factors = rows.factors
     in_json = np.flatnonzero(np.where(
         factors.j < 0, np.isin(factors.i, rows.node_ids[rows.is_bias]),
         ~np.isin(factors.kind, IN_G2O) | (factors.k >= 0)))
     return SavedRows(
-        rows.node_ids[rows.fixed], rows.node_ids[others], rows.poses[others],
-        rows.dimension[others], rows.node_ids[rows.node_kind == ct.NodeKind.LANDMARK],
-        factors.kind, factors.weight, in_json, factors.rows(in_json),
-        rows.node_ids, rows.factor_ids, rows.next_ids,
-        tuple(SavedPrior(each.nodes, packed(each), each.anchored) for each in rows.priors))
+        rows._replace(poses=rows.poses[~rows.is_pose], factors=factors.rows(in_json)), in_json,
+        factors.kind, factors.weight)
 
 
-def _graph_rows(rows: SavedRows, text: GraphText) -> GraphRows:
+def _graph_rows(saved: SavedRows, text: GraphText) -> GraphRows:
     """Return the rows of a graph from both files."""
-    vertices = text.rows['VERTEX_SE2']
-    node_ids = rows.node_ids
-    is_pose, dimension = ~np.isin(node_ids, rows.biases), np.full(len(node_ids), 3)
-    poses = np.zeros((len(node_ids), 3))
-    poses[is_pose], poses[~is_pose] = vertices['numbers'], rows.bias_values
-    dimension[~is_pose] = rows.bias_dimensions
-    kind = np.where(is_pose, ct.NodeKind.POSE, ct.NodeKind.BIAS).astype(np.uint8)
-    kind[np.isin(node_ids, rows.landmarks)] = ct.NodeKind.LANDMARK
-    return GraphRows(
-        poses, kind, np.isin(node_ids, rows.fixed), _factors(rows, text), node_ids,
-        rows.factor_ids, rows.next_ids, dimension, tuple(
-            unpacked(each.nodes, each.numbers, anchored=each.anchored) for each in rows.priors))
-
-
-def _factors(rows: SavedRows, text: GraphText) -> ct.Factors:
-    """Return the factors from both files."""
+    rows, is_pose = saved.rows, saved.rows.is_pose
+    poses = np.zeros((len(is_pose), 3))
+    poses[is_pose], poses[~is_pose] = text.rows['VERTEX_SE2']['numbers'], rows.poses
     # others are in the JSON file
     tags = [tag for tag in MEASURED if TAGS[tag].kind is None]
     in_g2o = ct.Factors.joined([factors_of(tag, text.rows[tag]) for tag in tags])
     # in which those of edges come first
     lines = np.concatenate([text.rows[tag]['line'] for tag in tags])
-    table = ct.Factors.joined([in_g2o.rows(np.argsort(lines)), rows.other_factors])
-    others = np.delete(np.arange(len(table)), rows.others)
-    is_edge = np.isin(rows.factor_kind[others], IN_G2O)
-    place = np.concatenate((others[is_edge], others[~is_edge], rows.others))
-    return table.rows(np.argsort(place)).replaced(kind=rows.factor_kind, weight=rows.factor_weight)
+    table = ct.Factors.joined([in_g2o.rows(np.argsort(lines)), rows.factors])
+    others = np.delete(np.arange(len(table)), saved.others)
+    is_edge = np.isin(saved.factor_kind[others], IN_G2O)
+    place = np.concatenate((others[is_edge], others[~is_edge], saved.others))
+    return rows._replace(poses=poses, factors=table.rows(np.argsort(place)).replaced(
+        kind=saved.factor_kind, weight=saved.factor_weight))
 
 
 def site_refusal(saved: SavedGraph, datum: MapOrigin | None, fix: MapOrigin | None) -> str | None:

@@ -317,7 +317,7 @@ class ClosureJudge:
         self._now_ns = now_ns
         self._chain.extend(self._smoother.graph)
         self.states.restore(saved)
-        self.states.measure(0, cl.claims(self._smoother.graph.factors_at(saved.held)))
+        self.states.measure(0, cl.claims(self._smoother.graph.factors_at(saved.table['held'])))
 
     def decide(self, number: int, decision: vd.Decision) -> bool:
         """

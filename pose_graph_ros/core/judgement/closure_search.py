@@ -10,6 +10,7 @@ the graph, part by part. It compares the present set, that which believes the su
 """
 
 from collections.abc import Callable, Generator, Mapping
+from copy import deepcopy
 import math
 from typing import Any, TypeAlias
 
@@ -208,9 +209,7 @@ def decide(
     the present set after retests.
     """
     copy, present = _copy(graph, np.union1d(ids, forced)), graph.poses.copy()
-    others = Reweighting()
-    if losses is not None:
-        others.restore(losses.saved())
+    others = Reweighting() if losses is None else deepcopy(losses)
     yield
     if graph.n_nodes + len(ids) > BELIEF.most_at_end:
         problem = TruncatedProblem(copy, ids, start=present)

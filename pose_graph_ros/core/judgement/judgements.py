@@ -42,6 +42,9 @@ COLUMNS: list[Any] = [
 Records = npt.NDArray[Any]
 
 
+SAVED = np.dtype(COLUMNS)
+
+
 @dataclass(frozen=True, slots=True)
 class SavedVerdicts:
     """The columns of a table, and its sources."""
@@ -49,15 +52,7 @@ class SavedVerdicts:
     sources: tuple[str, ...]
     # of each source, how many have left the graph, by their states then
     left: Annotated[IntArray, sc.Column(int, (len(vd.State),))]
-    held: sc.Integers
-    added: sc.Integers
-    source: sc.Integers
-    number: sc.Integers
-    stamps_ns: sc.Pairs
-    state: sc.Integers
-    since_ns: sc.Integers
-    decision: sc.Integers
-    distance: sc.Numbers  # -1 if it was not judged
+    table: Annotated[GrowingArray, sc.Column(SAVED)]  # the distance is -1 if it was not judged
 
 
 class Column:
@@ -214,22 +209,21 @@ class Judgements:
         return totals
 
     def saved(self) -> SavedVerdicts:
-        columns = {column[0]: self.records[column[0]].copy() for column in COLUMNS}
-        columns['distance'] = np.nan_to_num(columns['distance'], nan=-1.0)
+        table = self.records[list(SAVED.names or ())].astype(SAVED)
+        table['distance'] = np.nan_to_num(table['distance'], nan=-1.0)
         return SavedVerdicts(
-            tuple(self.sources),
-            np.array(self._left, dtype=np.int64).reshape(-1, len(vd.STATES)), **columns)
+            tuple(self.sources), np.array(self._left, dtype=np.int64).reshape(
+                -1, len(vd.STATES)), GrowingArray.of(table))
 
     def restore(self, saved: SavedVerdicts) -> None:
         """Fill the empty table with saved columns."""
         for source in saved.sources:
             self.index_of(source)
-        records = np.zeros(len(saved.held), dtype=self.records.dtype)
-        columns = {column[0] for column in COLUMNS}
-        for name in columns:
-            records[name] = getattr(saved, name)
-        for name in self._new.keys() - columns:
+        records = np.zeros(len(saved.table), dtype=self.records.dtype)
+        for name in self._new:
             records[name] = self._new[name]
+        for name in SAVED.names or ():
+            records[name] = saved.table[name]
         records['distance'][records['distance'] < 0.0] = np.nan
         self._records.append(records)
         for index, left in enumerate(saved.left):

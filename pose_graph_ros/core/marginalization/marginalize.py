@@ -204,7 +204,7 @@ def part_of(
     rows, part = graph.node_rows(ids), Graph()
     part.fill(GraphRows(
         graph.poses[rows], graph.node_kind[rows], graph.fixed[rows], graph.factors.rows(factors),
-        ids, graph.factor_ids[factors], graph.next_ids, graph.dimension[rows], priors))
+        ids, graph.factor_ids[factors], graph.next_ids, graph.dimension[rows], tuple(priors)))
     return part
 
 

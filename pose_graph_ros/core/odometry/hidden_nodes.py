@@ -377,11 +377,10 @@ class HiddenNodes(NodeTable):
 
     def saved(self) -> SavedNodes:
         """Return the state, with the odometry samples that are needed; there must be a node."""
-        after_ns, primaries = zip(*self._primaries, strict=True)
         needed_ns = self.stamps_ns[max(self.n_frozen - 1, 0):]
         return SavedNodes(
             self.stamps_ns.copy(), self.ids.copy(), self.odometry.copy(),
-            primaries, np.array(after_ns), self.covered_ns, self._base_ns, self._base, self._span,
+            tuple(self._primaries), self.covered_ns, self._base_ns, self._base, self._span,
             {name: stream.saved(needed_ns) for name, stream in self.streams.items()},
             self.frozen.copy(), float(self.travelled[0]), self.thinned.places(),
             self.errors, np.array(sorted(self.relocated), dtype=np.int64))
@@ -389,8 +388,8 @@ class HiddenNodes(NodeTable):
     def restore(self, saved: SavedNodes) -> None:
         """Set the state of this empty object to a saved one."""
         self.fill(saved)
-        for after_ns, source in zip(saved.leads_after_ns.tolist(), saved.leads, strict=True):
-            self._set_primary(after_ns, source)
+        for lead in saved.leads:
+            self._set_primary(*lead)
         self.covered_ns, self._base_ns, self._base = saved.lead_ns, saved.base_ns, saved.base
         self._span = saved.bridge
         for name, stream in saved.streams.items():

@@ -108,8 +108,8 @@ class SavedNodes:
     stamps_ns: Integers
     ids: Integers  # ascending
     odometry: Rows3  # poses by odometry alone of the nodes after the frozen ones
-    leads: tuple[str, ...]  # primary sources one after the other
-    leads_after_ns: Integers  # stamps after which each of them is the primary source
+    # stamps after which a source is the primary one, and its name, in order
+    leads: tuple[tuple[int, str], ...]
     lead_ns: int  # stamp up to which everything is settled
     base_ns: int  # stamp from which the motion to the next node is measured
     base: Pose  # pose of the primary source at `base_ns`

@@ -7,17 +7,16 @@ import bisect
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pose_graph_ros.core import measurements as ms
 from pose_graph_ros.core.config import BackendConfig
+from pose_graph_ros.core.geometry.se2 import IntArray
 from pose_graph_ros.core.graph.constraints import FactorKind
 from pose_graph_ros.core.odometry.hidden_nodes import HiddenNodes
 from pose_graph_ros.core.odometry.stream import ReorderBuffer
-from pose_graph_ros.core.saved_columns import Integers
 from pose_graph_ros.core.sources.gyro import Gyros
 from pose_graph_ros.core.sources.kinds import attach, due_ns, key, KINDS, validate
 from pose_graph_ros.core.sources.queued import Beacons, Queued, WaitingRange
@@ -28,14 +27,6 @@ class WaitingMeasurement(NamedTuple):
     due_ns: int  # stamp that odometry must reach [ns]
     source: str
     measurement: ms.PoseMeasurement
-
-
-@dataclass(frozen=True, slots=True)
-class SavedStamps:
-    """Stamps of the measurements of a source that were seen [ns], ascending, and references."""
-
-    stamps_ns: Integers
-    references: Integers
 
 
 class SeenStamps:
@@ -73,18 +64,19 @@ class SeenStamps:
             n = bisect.bisect_left(stamps, before_ns)
             del stamps[:n], references[:n]
 
-    def saved(self, without: list[tuple[str, ms.PoseMeasurement]]) -> dict[str, SavedStamps]:
+    def saved(
+        self, without: list[tuple[str, ms.PoseMeasurement]],
+    ) -> dict[str, tuple[IntArray, IntArray]]:
         """Return stamps and references, by source, without some measurements."""
         rest = deepcopy(self)
         for source, measurement in without:
             rest.remove(source, measurement)
-        return {source: SavedStamps(*(np.array(column, dtype=np.int64) for column in columns))
-                for source, columns in rest.columns.items()}
+        return {source: (np.array(stamps_ns, np.int64), np.array(references, np.int64))
+                for source, (stamps_ns, references) in rest.columns.items()}
 
-    def restore(self, saved: Mapping[str, SavedStamps]) -> None:
-        for source, each in saved.items():
-            self.columns[source] = (
-                array('q', each.stamps_ns.tolist()), array('q', each.references.tolist()))
+    def restore(self, saved: Mapping[str, tuple[IntArray, IntArray]]) -> None:
+        for source, (stamps_ns, references) in saved.items():
+            self.columns[source] = array('q', stamps_ns.tolist()), array('q', references.tolist())
 
     def _find(self, source: str, measurement: ms.PoseMeasurement) -> int:
         stamps, references = self.columns[source]

@@ -4,7 +4,6 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from pose_graph_ros.core.geometry import se2
 from pose_graph_ros.core.geometry.se2 import FloatArray
 from pose_graph_ros.core.graph.constraints import FactorKind, Factors, RECORD
 from pose_graph_ros.core.graph.graph import Graph, GraphUpdate
-from pose_graph_ros.core.saved_columns import Column, Pairs, Rows2
+from pose_graph_ros.core.saved_columns import Column, Numbers
 
 NO_NOISE: Final[FloatArray] = np.zeros(2)
 
@@ -27,11 +26,11 @@ class Queued(NamedTuple):
     """
 
     source: str
-    factor: Factors  # one row
+    factor: Annotated[Factors, Column(RECORD)]  # one row
     stamp_ns: int = -1  # of the measurement [ns]; -1 for an edge of odometry
     reference_ns: int = -1  # stamp of the other end of a loop closure [ns]; else -1
     # what the motion since the node adds to the variances of its position and heading
-    noise: FloatArray = NO_NOISE
+    noise: Numbers = NO_NOISE
     number: int = -1  # its id in the graph, once it is in an update
     held_by: int = -1  # id of the edge that holds it instead of the observed node `number`, or -1
 
@@ -67,28 +66,6 @@ class Queued(NamedTuple):
     def needs_bias(self) -> bool:
         """Whether one of its ends is a state of the bias, as those of a gyroscope."""
         return len(self.nodes) == 0 or int(self.factor.kind[0]) == FactorKind.TURN
-
-
-@dataclass(frozen=True, slots=True)
-class SavedQueue:
-    """The columns of a queue."""
-
-    sources: tuple[str, ...]
-    factors: Annotated[Factors, Column(RECORD)]
-    stamps_ns: Pairs  # of measurements and of the other ends of loop closures [ns]
-    noise: Rows2
-
-    @classmethod
-    def of(cls, queue: list[Queued]) -> 'SavedQueue':
-        stamps_ns = np.array([(each.stamp_ns, each.reference_ns) for each in queue], np.int64)
-        return cls(tuple(each.source for each in queue),
-                   Factors.joined([each.factor for each in queue]), stamps_ns.reshape(-1, 2),
-                   np.array([each.noise for each in queue]).reshape(-1, 2))
-
-    def queue(self) -> list[Queued]:
-        return [Queued(source, self.factors.rows(slice(k, k + 1)), stamp_ns, reference_ns, noise)
-                for k, (source, (stamp_ns, reference_ns), noise) in enumerate(zip(
-                    self.sources, self.stamps_ns.tolist(), self.noise, strict=True))]
 
 
 # --- beacons: landmarks of the graph, whose distances from points of the robot are measured

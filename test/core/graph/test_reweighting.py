@@ -101,11 +101,11 @@ def test_a_saved_state_goes_on_with_the_constraint_that_is_next(
     one.set_base_weight(23, 0.5)
     for _ in range(3):
         one.changes(graph)
-    other.restore(one.saved())
-    assert_same_value(other.saved(), one.saved())
+    other.restore(one)
+    assert_same_value(other, one)
     for _ in range(4):
         assert other.changes(graph) == one.changes(graph)
     # and it grows on
     for each in (one, other):
         each.add(24, Loss.CAUCHY, 1.0)
-    assert_same_value(other.saved(), one.saved())
+    assert_same_value(other, one)

@@ -3,6 +3,7 @@
 """Files of saved graphs: written completely or not at all, and refused if damaged."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 import functools
 import hashlib
@@ -212,10 +213,10 @@ def test_what_is_no_json_is_refused_even_with_a_checksum(tmp_path: Path, body: b
 
 def test_parts_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
     _, side, _ = write_graph(saved_drive(), tmp_path / 'map')
-    for change in (lambda members: members['graph'].update(fixed=['x']),
+    for change in (lambda members: members['graph']['rows'].update(node_ids=['x']),
                    lambda members: members.pop('nodes'),
                    lambda members: members['graph']['factor_weight'].append(1.0),
-                   lambda members: members['graph']['other_factors'].update(i=[10**6] * 3)):
+                   lambda members: members['graph']['rows']['factors'].update(i=[10**6] * 3)):
         write_graph(saved_drive(), tmp_path / 'map')
         rewrite(side, change)
         with pytest.raises(FileFormatError):
@@ -225,12 +226,14 @@ def test_parts_that_contradict_each_other_are_refused(tmp_path: Path) -> None:
 def test_ids_with_gaps_come_back_and_are_those_of_the_g2o_file(tmp_path: Path) -> None:
     saved = small_graph()
     rows, nodes = saved.rows, saved.nodes
+    losses = deepcopy(saved.losses)
+    losses['id'][:] *= 3
     with_gaps = replace(
         saved, nodes=replace(nodes, ids=2 * nodes.ids + 5), rows=rows._replace(
             factors=rows.factors.renumbered(lambda ids: 2 * ids + 5),
             node_ids=2 * rows.node_ids + 5, factor_ids=3 * rows.factor_ids,
             next_ids=NextIds(1000, 1000)),
-        losses=replace(saved.losses, rows=3 * saved.losses.rows))
+        losses=losses)
     g2o, side, _ = write_graph(with_gaps, tmp_path / 'gaps')
     assert_same_value(read_graph(side), with_gaps)
     assert g2o.read_text().startswith('VERTEX_SE2 5 ')

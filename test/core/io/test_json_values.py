@@ -20,9 +20,10 @@ from pose_graph_ros.core.saved_columns import (
     Flags,
     Integers,
     Numbers,
-    Pairs,
     Rows3,
 )
+
+Pairs = Annotated[np.ndarray, Column(int, (2,))]
 
 
 @dataclass(frozen=True)
